@@ -1,0 +1,111 @@
+"""The seams of the system, as Protocols: what a front end, a graph and a sequence must offer to be used by the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.types import Features, FloatArray, Frame, IntArray, Matches
+
+if TYPE_CHECKING:
+    from dualslam.core.camera import Camera
+    from dualslam.core.submap import Submap
+
+
+class Frontend(Protocol):
+    """Features and how they are compared. Nothing outside a front end knows what its descriptors are made of.
+
+    Attributes
+    ----------
+    name : str
+        The word that selects it in the config.
+    scale_factor : float
+        Ratio of the patch sizes of neighbouring octaves.
+    n_octaves : int
+        Number of pyramid levels.
+    max_distance : float
+        Descriptor distance above which two features are not views of the same point.
+    max_distance_strict : float
+        The same for searches without a geometric guide.
+    """
+
+    name: str
+    scale_factor: float
+    n_octaves: int
+    max_distance: float
+    max_distance_strict: float
+
+    def extract(self, image: NDArray[np.uint8]) -> Features:
+        """Detect and describe; `uv_rect_px` equals `uv_px` (the caller rectifies), `sigma_px` is set."""
+        ...
+
+    def distance(self, a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
+        """Distance of paired descriptors (N, D), (N, D) -> (N,) float."""
+        ...
+
+    def match_wide(self, a: Features, b: Features) -> Matches:
+        """Match without a geometric guide, one to one."""
+        ...
+
+
+class Sequence(Protocol):
+    """A source of frames: folder, video, archive, webcam or renderer."""
+
+    name: str
+    camera: Camera
+    rate_hz: float
+
+    def __len__(self) -> int: ...
+
+    def __iter__(self) -> Iterator[Frame]: ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraphEstimate:
+    """What a solved graph hands back to its submap: refined variables, and how well the newest factors fit.
+
+    Attributes
+    ----------
+    keyframe_ids : (K,) int64, T_submap_kf : (K, 4, 4)
+    landmark_ids : (L,) int64, xyz_mu : (L, 3)
+    outlier_rows : (R,) int64
+        Rows of the submap's observation table whose residual is beyond the graph's chi-square gate.
+    chi2_newest : float
+        Mean squared whitened residual per degree of freedom of the factors added last (1 is expected).
+    rebuilt : bool
+        True where the solver threw and the graph was made anew from the submap's arrays.
+    seconds : float
+    """
+
+    keyframe_ids: IntArray
+    T_submap_kf: FloatArray
+    landmark_ids: IntArray
+    xyz_mu: FloatArray
+    outlier_rows: IntArray
+    chi2_newest: float
+    rebuilt: bool
+    seconds: float
+
+
+class SubmapGraph(Protocol):
+    """The factor graph of one submap. The submap's arrays are the record, the graph follows them."""
+
+    def update(self, submap: Submap) -> GraphEstimate:
+        """Take in what changed in the submap since the last call (rows added, rows that died) and solve."""
+        ...
+
+    def rebuild(self, submap: Submap) -> GraphEstimate:
+        """Throw the solver's state away and make it anew from the submap's arrays."""
+        ...
+
+    def pose_covariance(self, keyframe_id: int) -> FloatArray:
+        """(6, 6) marginal covariance of `T_submap_kf`, tangent order rotation, translation, in the keyframe's frame."""
+        ...
+
+    def point_covariances(self, landmark_ids: IntArray) -> FloatArray:
+        """(L, 3, 3) marginal covariances of landmarks, in the submap's frame."""
+        ...

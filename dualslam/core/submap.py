@@ -1,0 +1,281 @@
+"""A submap: keyframes and landmarks in one local frame, as numpy arrays. The source of truth that graphs are made from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.tables import Table
+from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe
+
+NO_LANDMARK = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Anchor:
+    """Where a culled keyframe (or a plain frame) stands: a pose relative to a keyframe that is still there."""
+
+    keyframe_id: int
+    T_kf_cam: FloatArray
+
+
+class Submap:
+    """Keyframes, landmarks and observations in one local frame, in that frame's own unit of length.
+
+    Landmark ids and observation rows only grow and are never reused, so that a graph can follow the submap by looking
+    at the rows added since its last update and at the rows that died. Keyframe ids are the indices of their frames.
+
+    Attributes
+    ----------
+    id : int
+    K : (3, 3) float64
+        Pinhole intrinsics of the rectified pixels (`Features.uv_rect_px`).
+    keyframes : dict of int to Keyframe
+        In order of insertion.
+    T_submap_kf : dict of int to (4, 4) float64
+        Poses, camera to submap.
+    landmark_of : dict of int to (N,) int64
+        For each feature of a keyframe its landmark, or `NO_LANDMARK`.
+    landmarks : Table
+        ``xyz_mu`` (3), ``alive``, ``descriptor``, ``normal`` (3, mean unit vector from landmark to cameras),
+        ``distance_mu`` (at the reference view), ``scale`` (patch scale there), ``first_kf``, ``replaced_by``,
+        ``n_visible``, ``n_found`` (how often tracking should have seen it, and did).
+    observations : Table
+        ``kf``, ``feature``, ``landmark``, ``alive``.
+    anchors : dict of int to Anchor
+        Keyframes that were culled as redundant.
+    gauge : tuple of int
+        The two keyframes of the first baseline: the first pose is fixed, their distance fixes the scale.
+    """
+
+    def __init__(self, submap_id: int, K: FloatArray, descriptor: NDArray[np.generic]) -> None:
+        """`descriptor` is an example row of the front end's descriptors: it gives type and length."""
+        self.id = submap_id
+        self.K = np.asarray(K, float)
+        self.keyframes: dict[int, Keyframe] = {}
+        self.T_submap_kf: dict[int, FloatArray] = {}
+        self.landmark_of: dict[int, IntArray] = {}
+        self.anchors: dict[int, Anchor] = {}
+        self.gauge: tuple[int, int] = (-1, -1)
+        self.landmarks = Table(
+            xyz_mu=(np.float64, (3,)),
+            alive=(np.bool_, ()),
+            descriptor=(descriptor.dtype, descriptor.shape),
+            normal=(np.float64, (3,)),
+            distance_mu=(np.float64, ()),
+            scale=(np.float64, ()),
+            first_kf=(np.int64, ()),
+            replaced_by=(np.int64, ()),
+            n_visible=(np.int64, ()),
+            n_found=(np.int64, ()),
+        )
+        self.observations = Table(
+            kf=(np.int64, ()), feature=(np.int64, ()), landmark=(np.int64, ()), alive=(np.bool_, ())
+        )
+
+    # --- keyframes
+
+    def add_keyframe(self, keyframe: Keyframe, T_submap_kf: FloatArray) -> None:
+        """Insert a keyframe without observations."""
+        if keyframe.id in self.keyframes:
+            raise ValueError(f"submap {self.id} has keyframe {keyframe.id} already")
+        self.keyframes[keyframe.id] = keyframe
+        self.T_submap_kf[keyframe.id] = np.array(T_submap_kf, float)
+        self.landmark_of[keyframe.id] = np.full(len(keyframe.features), NO_LANDMARK, np.int64)
+
+    def remove_keyframe(self, keyframe_id: int, anchor_id: int) -> None:
+        """Cull a keyframe: its observations die, its pose lives on relative to `anchor_id`."""
+        rows = np.flatnonzero((self.observations["kf"] == keyframe_id) & self.observations["alive"])
+        self.remove_observations(rows)
+        T_kf_cam = np.linalg.inv(self.T_submap_kf[anchor_id]) @ self.T_submap_kf[keyframe_id]
+        self.anchors[keyframe_id] = Anchor(anchor_id, T_kf_cam)
+        del self.keyframes[keyframe_id], self.T_submap_kf[keyframe_id], self.landmark_of[keyframe_id]
+
+    def resolve_anchor(self, keyframe_id: int, T_kf_cam: FloatArray) -> FloatArray:
+        """Return ``T_submap_cam`` of a frame posed relative to a keyframe, also if that keyframe was culled since."""
+        while keyframe_id not in self.T_submap_kf:
+            anchor = self.anchors[keyframe_id]
+            keyframe_id, T_kf_cam = anchor.keyframe_id, anchor.T_kf_cam @ T_kf_cam
+        return self.T_submap_kf[keyframe_id] @ T_kf_cam
+
+    def keyframe_poses(self, keyframe_ids: IntArray | list[int]) -> FloatArray:
+        """Return (K, 4, 4) poses, camera to submap."""
+        return np.array([self.T_submap_kf[int(k)] for k in keyframe_ids]).reshape(-1, 4, 4)
+
+    # --- landmarks
+
+    def add_landmarks(
+        self, xyz_mu: FloatArray, descriptors: NDArray[Any], scale: FloatArray, keyframe_id: int
+    ) -> IntArray:
+        """Append landmarks first described in `keyframe_id` (scale: of the feature there); return their ids."""
+        to_camera = self.T_submap_kf[keyframe_id][:3, 3] - xyz_mu
+        distance = np.linalg.norm(to_camera, axis=1)
+        return self.landmarks.append(
+            len(xyz_mu),
+            xyz_mu=xyz_mu,
+            alive=True,
+            descriptor=descriptors,
+            normal=to_camera / np.maximum(distance, 1e-12)[:, None],
+            distance_mu=distance,
+            scale=scale,
+            first_kf=keyframe_id,
+            replaced_by=NO_LANDMARK,
+            n_visible=1,
+            n_found=1,
+        )
+
+    def remove_landmarks(self, landmark_ids: IntArray) -> None:
+        """Cull landmarks and their observations."""
+        if len(landmark_ids) == 0:
+            return
+        self.landmarks["alive"][landmark_ids] = False
+        self.remove_observations(self.rows_of_landmarks(landmark_ids))
+
+    def merge_landmarks(self, keep: IntArray, drop: IntArray) -> None:
+        """Make each ``drop[i]`` one with ``keep[i]``: its observations move over, save where both are in a keyframe."""
+        for kept, dropped in zip(keep.tolist(), drop.tolist(), strict=True):
+            kept, dropped = self.current_id(kept), self.current_id(dropped)
+            if kept == dropped:
+                continue
+            obs = self.observations
+            rows = np.flatnonzero(obs["alive"] & (obs["landmark"] == dropped))
+            taken = obs["kf"][obs["alive"] & (obs["landmark"] == kept)]
+            kf, feature = obs["kf"][rows], obs["feature"][rows]
+            self.remove_observations(rows)
+            free = ~np.isin(kf, taken)
+            self.add_observations(kf[free], feature[free], np.full(int(free.sum()), kept))
+            lm = self.landmarks
+            lm["alive"][dropped] = False
+            lm["replaced_by"][dropped] = kept
+            lm["n_visible"][kept] += lm["n_visible"][dropped]
+            lm["n_found"][kept] += lm["n_found"][dropped]
+
+    def current_id(self, landmark_id: int) -> int:
+        """Follow `replaced_by` to the landmark that stands for `landmark_id` now (it may be dead)."""
+        replaced_by = self.landmarks["replaced_by"]
+        while replaced_by[landmark_id] != NO_LANDMARK:
+            landmark_id = int(replaced_by[landmark_id])
+        return landmark_id
+
+    def current_ids(self, landmark_ids: IntArray) -> IntArray:
+        """`current_id` for an array in which `NO_LANDMARK` may stand; dead landmarks become `NO_LANDMARK`."""
+        ids = np.array(landmark_ids, np.int64)
+        if len(self.landmarks) == 0:
+            return ids
+        while True:
+            heir = np.where(ids >= 0, self.landmarks["replaced_by"][ids], NO_LANDMARK)
+            moved = heir != NO_LANDMARK
+            if not moved.any():
+                break
+            ids[moved] = heir[moved]
+        ids[(ids >= 0) & ~self.landmarks["alive"][ids]] = NO_LANDMARK
+        return ids
+
+    # --- observations
+
+    def add_observations(self, kf: IntArray | int, feature: IntArray, landmark: IntArray) -> IntArray:
+        """Append observations; a feature that has a landmark already, or a landmark seen twice, is the caller's bug."""
+        n = len(feature)
+        rows = self.observations.append(n, kf=kf, feature=feature, landmark=landmark, alive=True)
+        if np.ndim(kf) == 0:
+            self.landmark_of[int(kf)][feature] = landmark  # type: ignore[arg-type]
+        else:
+            for k, f, j in zip(np.asarray(kf).tolist(), feature.tolist(), landmark.tolist(), strict=True):
+                self.landmark_of[k][f] = j
+        return rows
+
+    def remove_observations(self, rows: IntArray) -> None:
+        """Let observation rows die; they stay in the table."""
+        obs = self.observations
+        rows = rows[obs["alive"][rows]]
+        obs["alive"][rows] = False
+        for k in np.unique(obs["kf"][rows]).tolist():
+            if k in self.landmark_of:
+                self.landmark_of[k][obs["feature"][rows[obs["kf"][rows] == k]]] = NO_LANDMARK
+
+    def rows_of_landmarks(self, landmark_ids: IntArray) -> IntArray:
+        """Return the live observation rows of a set of landmarks."""
+        wanted = self._mask(landmark_ids)
+        return np.flatnonzero(self.observations["alive"] & wanted[self.observations["landmark"]])
+
+    def n_observations(self, landmark_ids: IntArray) -> IntArray:
+        """Return how many keyframes see each landmark."""
+        obs = self.observations
+        counts = np.bincount(obs["landmark"][obs["alive"]], minlength=len(self.landmarks))
+        return counts[landmark_ids]
+
+    def covisible(self, landmark_ids: IntArray) -> tuple[IntArray, IntArray]:
+        """Return the keyframes that see any of `landmark_ids` and how many each sees, most first (ties: older id)."""
+        rows = self.rows_of_landmarks(landmark_ids)
+        ids, counts = np.unique(self.observations["kf"][rows], return_counts=True)
+        order = np.lexsort((ids, -counts))
+        return ids[order], counts[order]
+
+    def landmarks_of_keyframes(self, keyframe_ids: IntArray | list[int]) -> IntArray:
+        """Return the ids of all live landmarks that any of the keyframes sees, ascending."""
+        seen = np.zeros(len(self.landmarks), bool)
+        for k in keyframe_ids:
+            ids = self.landmark_of[int(k)]
+            seen[ids[ids >= 0]] = True
+        return np.flatnonzero(seen & self.landmarks["alive"])
+
+    def observed_pixels(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return rectified pixels (R, 2) and their sigmas (R,) of observation rows."""
+        uv = np.empty((len(rows), 2))
+        sigma = np.empty(len(rows))
+        kf, feature = self.observations["kf"][rows], self.observations["feature"][rows]
+        for k in np.unique(kf).tolist():
+            here = kf == k
+            features = self.keyframes[k].features
+            uv[here] = features.uv_rect_px[feature[here]]
+            sigma[here] = features.sigma_px[feature[here]]
+        return uv, sigma
+
+    def _mask(self, landmark_ids: IntArray) -> BoolArray:
+        mask = np.zeros(len(self.landmarks), bool)
+        mask[landmark_ids] = True
+        return mask
+
+    # --- whole map
+
+    def transform(self, scale: float, T_new_old: FloatArray) -> None:
+        """Apply ``p_new = scale * R p + t`` to all poses and points (a change of gauge)."""
+        R, t = T_new_old[:3, :3], T_new_old[:3, 3]
+        for k, T in self.T_submap_kf.items():
+            moved = np.eye(4)
+            moved[:3, :3] = R @ T[:3, :3]
+            moved[:3, 3] = scale * R @ T[:3, 3] + t
+            self.T_submap_kf[k] = moved
+        for k, anchor in self.anchors.items():
+            T_kf_cam = anchor.T_kf_cam.copy()
+            T_kf_cam[:3, 3] *= scale
+            self.anchors[k] = Anchor(anchor.keyframe_id, T_kf_cam)
+        lm = self.landmarks
+        lm["xyz_mu"][:] = scale * lm["xyz_mu"] @ R.T + t
+        lm["normal"][:] = lm["normal"] @ R.T
+        lm["distance_mu"][:] *= scale
+
+    def apply_estimate(
+        self, keyframe_ids: IntArray, T_submap_kf: FloatArray, landmark_ids: IntArray, xyz_mu: FloatArray
+    ) -> None:
+        """Take refined poses and points over."""
+        for k, T in zip(keyframe_ids.tolist(), T_submap_kf, strict=True):
+            self.T_submap_kf[k] = np.array(T)
+        self.landmarks["xyz_mu"][landmark_ids] = xyz_mu
+
+    def copy(self) -> Submap:
+        """Return an independent copy (keyframes and features are immutable and shared)."""
+        twin = Submap(self.id, self.K, self.landmarks["descriptor"][0] if len(self.landmarks) else np.zeros(0))
+        twin.keyframes = dict(self.keyframes)
+        twin.T_submap_kf = {k: T.copy() for k, T in self.T_submap_kf.items()}
+        twin.landmark_of = {k: a.copy() for k, a in self.landmark_of.items()}
+        twin.anchors = dict(self.anchors)
+        twin.gauge = self.gauge
+        twin.landmarks = Table.from_columns(self.landmarks.columns())
+        twin.observations = Table.from_columns(self.observations.columns())
+        return twin
+
+

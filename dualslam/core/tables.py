@@ -1,0 +1,60 @@
+"""Arrays that grow by rows: the storage under a submap."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Table:
+    """Named numpy columns of one length; rows are appended in bulk and never move.
+
+    Columns are reached by ``table["name"]`` as views of the live rows, writable in place. A view taken before an
+    append may be left behind by it: take it anew.
+
+    Parameters
+    ----------
+    **columns : (dtype, shape)
+        Type and trailing shape of each column.
+    """
+
+    def __init__(self, **columns: tuple[Any, tuple[int, ...]]) -> None:
+        self._spec = columns
+        self._n = 0
+        self._data: dict[str, NDArray[Any]] = {
+            name: np.zeros((64, *shape), dtype) for name, (dtype, shape) in columns.items()
+        }
+
+    def __len__(self) -> int:
+        return self._n
+
+    def __getitem__(self, column: str) -> NDArray[Any]:
+        return self._data[column][: self._n]
+
+    def append(self, n: int, **values: Any) -> NDArray[np.int64]:
+        """Append `n` rows (columns not given are zero) and return their indices."""
+        end = self._n + n
+        for name, old in self._data.items():
+            if end > len(old):
+                new = np.zeros((max(end, 2 * len(old)), *old.shape[1:]), old.dtype)
+                new[: self._n] = old[: self._n]
+                self._data[name] = new
+            if name in values:
+                self._data[name][self._n : end] = values[name]
+        rows = np.arange(self._n, end)
+        self._n = end
+        return rows
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Return copies of all columns: what is needed to make the same table again with `from_columns`."""
+        return {name: self[name].copy() for name in self._data}
+
+    @classmethod
+    def from_columns(cls, columns: dict[str, NDArray[Any]]) -> Table:
+        """Make a table that holds `columns`."""
+        table = cls(**{name: (a.dtype, a.shape[1:]) for name, a in columns.items()})
+        n = len(next(iter(columns.values())))
+        table.append(n, **columns)
+        return table

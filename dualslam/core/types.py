@@ -1,0 +1,170 @@
+"""The small frozen values that the stages of the system hand to each other.
+
+Conventions (all of dualslam): ``T_a_b`` takes coordinates in b to coordinates in a; poses are (4, 4) float64, camera to
+submap unless the name says otherwise; the camera looks along +z with x right and y down; pixels are (u, v) with (0, 0)
+at the centre of the top-left pixel; a submap's lengths are in its own monocular unit (``_mu``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+class FrameStatus(StrEnum):
+    """What became of one input frame: the `status` column of ``frames.csv``."""
+
+    INITIALISING = "initialising"
+    TRACKED = "tracked"
+    LOST = "lost"
+    RECOVERED = "recovered"
+    BYPASSED = "bypassed"
+    DROPPED = "dropped"
+    UNREADABLE = "unreadable"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One image of a sequence.
+
+    Attributes
+    ----------
+    index : int
+        Position in the source, whatever the stride or direction of reading.
+    timestamp_s : float
+        Time of exposure, seconds.
+    image : ndarray or None
+        (H, W) or (H, W, 3) RGB uint8; None where the file could not be read (`error` says why).
+    error : str
+        Empty, or the reason why the image is missing.
+    """
+
+    index: int
+    timestamp_s: float
+    image: NDArray[np.uint8] | None
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """Keypoints of one image with their descriptors, N of them.
+
+    Attributes
+    ----------
+    uv_px : (N, 2) float64
+        Where the front end found them in the image.
+    uv_rect_px : (N, 2) float64
+        The same, with lens distortion removed: pixels of the camera's pinhole equivalent. All geometry uses these.
+    sigma_px : (N,) float64
+        Standard deviation of each coordinate of `uv_rect_px`, isotropic.
+    scale : (N,) float64
+        Size of the image patch relative to the finest level (>= 1).
+    octave : (N,) int64
+        Pyramid level.
+    angle_rad : (N,) float64
+        Orientation, clockwise from +u.
+    descriptors : (N, D)
+        Opaque to all but the front end that made them.
+    """
+
+    uv_px: FloatArray
+    uv_rect_px: FloatArray
+    sigma_px: FloatArray
+    scale: FloatArray
+    octave: IntArray
+    angle_rad: FloatArray
+    descriptors: NDArray[np.generic]
+
+    def __len__(self) -> int:
+        return len(self.uv_px)
+
+    def take(self, rows: NDArray[np.generic]) -> Features:
+        """Return the features at `rows` (indices or a mask)."""
+        return Features(
+            self.uv_px[rows],
+            self.uv_rect_px[rows],
+            self.sigma_px[rows],
+            self.scale[rows],
+            self.octave[rows],
+            self.angle_rad[rows],
+            self.descriptors[rows],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matches:
+    """Pairs of features (or landmarks) of two sets.
+
+    Attributes
+    ----------
+    index : (M, 2) int64
+        Row in the first set, row in the second; no row occurs twice in a column.
+    distance : (M,) float64
+        Descriptor distance in the front end's own unit.
+    """
+
+    index: IntArray
+    distance: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keyframe:
+    """A frame that the map keeps. Its pose and its landmarks belong to the submap, not to it.
+
+    Attributes
+    ----------
+    id : int
+        The index of its source frame: the same frame has the same keyframe id in every submap.
+    """
+
+    id: int
+    timestamp_s: float
+    features: Features
+
+
+class FailureReason(StrEnum):
+    """Why an estimate, a track or a link was given up."""
+
+    NO_TEXTURE = "no_texture"
+    TOO_FEW_MATCHES = "too_few_matches"
+    TOO_FEW_INLIERS = "too_few_inliers"
+    LOW_INLIER_RATIO = "low_inlier_ratio"
+    MOTION_JUMP = "motion_jump"
+    CHI_SQUARE = "chi_square"
+    LOW_PARALLAX = "low_parallax"
+    AMBIGUOUS_MODEL = "ambiguous_model"
+    DOUBTFUL_INITIALISATION = "doubtful_initialisation"
+    DEGENERATE = "degenerate"
+    SOLVER = "solver"
+    UNREADABLE = "unreadable"
+    SCALE = "scale"
+    SPREAD = "spread"
+    AGREEMENT = "agreement"
+    TIMEOUT = "timeout"
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A falsy result: the estimate was not made, and why.
+
+    >>> pose = Failure(FailureReason.TOO_FEW_MATCHES, "12 matches, 20 needed")
+    >>> bool(pose)
+    False
+    """
+
+    reason: FailureReason
+    detail: str = ""
+    numbers: dict[str, float] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return False
