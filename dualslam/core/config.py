@@ -125,6 +125,17 @@ class GraphConfig(StrictModel):
     """Keyframes at which a submap rolls over into the next (the solver's Cholesky rejects much longer chains)."""
     rollover_keyframes: int = Field(12, ge=3, le=19)
     """Keyframes that a submap shares with the one that it rolls over into."""
+    max_depth_sigma: float = Field(0.25, gt=0)
+    """A landmark enters the graph once its views fix its distance to this relative standard deviation (0.25 is about
+    half a degree of parallax at 1 px and a focal length of 700 px); it leaves at twice that."""
+    insert_sigmas: float = Field(25.0, gt=0)
+    """Observations further than this from where the map puts them (in sigmas) are refused: no solver makes use of them."""
+    min_ties: int = Field(6, ge=3)
+    """Keyframes tied to the graph by fewer landmarks are held at their pose by a loose prior, until they have more."""
+    read_window: int = Field(20, ge=0)
+    """Keyframes (the last inserted ones, and their landmarks) whose estimate is read after each update; 0 reads all."""
+    rebuild_iterations: int = Field(8, ge=1)
+    """Batch iterations at most when a graph is made anew."""
 
 
 class Config(StrictModel):
