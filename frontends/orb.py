@@ -98,7 +98,7 @@ class OrbFrontend:
         ]
         kept, descriptors = self._descriptor.compute(level, keypoints)
         assert len(kept) == len(xy)
-        on_level = xy + refine_corners(patches) if self.options.refine else xy.astype(np.float64)
+        on_level = xy + refine_corners(patches)[0] if self.options.refine else xy.astype(np.float64)
         ratio = np.array([base_shape[1] / level.shape[1], base_shape[0] / level.shape[0]])
         return (on_level + 0.5) * ratio - 0.5, np.full(len(xy), octave), angle, descriptors
 
