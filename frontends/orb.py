@@ -19,7 +19,7 @@ Descriptor distances, in bits of 256:
     best wrong one of the whole image        4 %  17 %  83 %  99 % 100 %
     ======================================  ====  ====  ====  ====  ====
 
-So 80 with a guide, beyond which two wrong ones come in for each right one gained, and 50 without.
+So 80 with a guide, beyond which far more wrong ones come in than right ones are gained, and 50 without.
 """
 
 from __future__ import annotations
@@ -92,8 +92,6 @@ class OrbFrontend:
         self.n_octaves = self.options.n_octaves
         self.max_distance = self.options.max_distance
         self.max_distance_strict = self.options.max_distance_strict
-        # One level and no border of its own: the pyramid and the rim are ours.
-        self._descriptor = cv2.ORB.create(nfeatures=1, nlevels=1, edgeThreshold=0, patchSize=PATCH_SIDE_PX)
         self._moments = _moment_weights()
 
     @classmethod
@@ -173,13 +171,16 @@ class OrbFrontend:
         self, levels: list[NDArray[np.uint8]], corners: list[IntArray], angle_rad: FloatArray
     ) -> NDArray[np.uint8]:
         """Rotated BRIEF at whole pixels of each level, (N, 32) uint8; `angle_rad` runs through all of them."""
+        # One level and no border of its own: the pyramid and the rim are ours. Made anew each time, which costs nothing,
+        # because a front end that holds it could not be sent to another process.
+        orb = cv2.ORB.create(nfeatures=1, nlevels=1, edgeThreshold=0, patchSize=PATCH_SIDE_PX)
         turns = iter((np.degrees(angle_rad) % 360.0).tolist())
         rows = [np.empty((0, DESCRIPTOR_BYTES), np.uint8)]
         for level, xy in zip(levels, corners, strict=True):
             if len(xy) == 0:
                 continue
             keypoints = [cv2.KeyPoint(x, y, PATCH_SIDE_PX, next(turns)) for x, y in xy.tolist()]
-            kept, descriptors = self._descriptor.compute(level, keypoints)
+            kept, descriptors = orb.compute(level, keypoints)
             assert len(kept) == len(xy), "cv2.ORB dropped keypoints although it was given no border"
             rows.append(np.asarray(descriptors, np.uint8))
         return np.concatenate(rows)
