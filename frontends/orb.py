@@ -171,8 +171,8 @@ class OrbFrontend:
         self, levels: list[NDArray[np.uint8]], corners: list[IntArray], angle_rad: FloatArray
     ) -> NDArray[np.uint8]:
         """Rotated BRIEF at whole pixels of each level, (N, 32) uint8; `angle_rad` runs through all of them."""
-        # One level and no border of its own: the pyramid and the rim are ours. Made anew each time, which costs nothing,
-        # because a front end that holds it could not be sent to another process.
+        # One level and no border of its own: the pyramid and the rim are ours. Made anew each time, which costs
+        # nothing, because a front end that holds it could not be sent to another process.
         orb = cv2.ORB.create(nfeatures=1, nlevels=1, edgeThreshold=0, patchSize=PATCH_SIDE_PX)
         turns = iter((np.degrees(angle_rad) % 360.0).tolist())
         rows = [np.empty((0, DESCRIPTOR_BYTES), np.uint8)]
