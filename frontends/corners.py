@@ -15,6 +15,8 @@ from frontends.groups import rank_in_runs
 
 FAST_RADIUS_PX = 3
 """FAST reads a circle of this radius, so it finds nothing nearer to the edge of what it is given."""
+MIN_CURVATURE = 0.01
+"""Grey levels per square pixel: below that the peak is made of rounding."""
 _DOG_SIGMAS_PX = (1.0, 1.6)
 """Wide enough to be smooth under FAST's noise, narrow enough to stay at the corner."""
 _DOG_REACH_PX = 6
@@ -142,7 +144,8 @@ def _quadratic_peak(response: NDArray[np.float32]) -> tuple[FloatArray, BoolArra
     uu, vv = r[:, 1, 2] - 2 * r[:, 1, 1] + r[:, 1, 0], r[:, 2, 1] - 2 * r[:, 1, 1] + r[:, 0, 1]
     uv = (r[:, 2, 2] - r[:, 2, 0] - r[:, 0, 2] + r[:, 0, 0]) / 4
     determinant = uu * vv - uv**2
-    peaked = (determinant > 0) & (uu < 0)
+    # Curved downwards in every direction, by more than rounding.
+    peaked = (determinant > 0) & (uu + vv < -MIN_CURVATURE)
     safe = np.where(peaked, determinant, 1.0)
     offset = np.stack([uv * gradient_v - vv * gradient_u, uv * gradient_u - uu * gradient_v], axis=1) / safe[:, None]
     return offset, peaked & (np.abs(offset) <= 0.75).all(axis=1)

@@ -6,9 +6,9 @@ features, epipolar geometry fitted to the matches themselves (PoseLib).
 Noise. Residuals grow in proportion to the octave's scale, so sigma is a multiple of it. Where the sub-pixel step found
 an extremum, 1.96 sigma covers 95 % of the matches at sigma = 0.20-0.22 (KITTI) and 0.38-0.42 (7-Scenes, whose camera
 is nominal), elsewhere at 0.56-0.65. With 0.45 and 0.65, 98 % (KITTI) and 94-96 % (7-Scenes) lie within 1.96 sigma. The
-tails are heavier than Gaussian: the core alone has a sigma three times smaller on KITTI.
+tails are heavier than Gaussian: the core alone has a sigma four times smaller on KITTI.
 
-Descriptor distances, in bits of 256:
+Descriptor distances, in bits of 256 (20 pairs: KITTI 1 and 3 frames apart, 7-Scenes 5 and 25; the wrong ones over all):
 
     ======================================  ====  ====  ====  ====  ====
     share with a distance of at most          40    50    70    80    90
@@ -58,13 +58,13 @@ class OrbOptions(StrictModel):
     fast_thresholds: tuple[Annotated[int, Field(ge=1, le=254)], ...] = Field((20, 7), min_length=1)
     """FAST contrasts in grey levels, descending: the first everywhere, the next only in cells without a corner yet."""
     fast_threshold_last: int = Field(4, ge=1, le=254)
-    """One more, for images that give fewer corners than asked for: it doubles the inliers under heavy blur."""
+    """One more, for images that give fewer corners than asked for: up to 1.7 times the inliers under heavy blur."""
     cell_px: int = Field(32, ge=8)
     """Side of these cells, pixels of the level."""
     sigma_px: float = Field(0.45, gt=0.0)
     """Noise of a position in pixels of its octave, where the sub-pixel step found an extremum (module docstring)."""
     sigma_unrefined_px: float = Field(0.65, gt=0.0)
-    """The same for the others, about one in twelve, which stay at a whole pixel."""
+    """The same for the others, about one in ten, which stay at a whole pixel."""
     max_distance: float = Field(80.0, gt=0.0, le=256.0)
     """Differing bits up to which a guided match is believed (module docstring)."""
     max_distance_strict: float = Field(50.0, gt=0.0, le=256.0)
@@ -171,8 +171,8 @@ class OrbFrontend:
         self, levels: list[NDArray[np.uint8]], corners: list[IntArray], angle_rad: FloatArray
     ) -> NDArray[np.uint8]:
         """Rotated BRIEF at whole pixels of each level, (N, 32) uint8; `angle_rad` runs through all of them."""
-        # One level and no border of its own: the pyramid and the rim are ours. Made anew each time, which costs nothing,
-        # because a front end that holds it could not be sent to another process.
+        # One level and no border of its own: the pyramid and the rim are ours. Made anew each time, which costs
+        # nothing, because a front end that holds it could not be sent to another process.
         orb = cv2.ORB.create(nfeatures=1, nlevels=1, edgeThreshold=0, patchSize=PATCH_SIDE_PX)
         turns = iter((np.degrees(angle_rad) % 360.0).tolist())
         rows = [np.empty((0, DESCRIPTOR_BYTES), np.uint8)]

@@ -116,7 +116,9 @@ def test_blurred_image_still_gives_most_of_the_corners(image: Image) -> None:
     assert len(OrbFrontend(1000).extract(blurred)) >= 700
 
 
-@pytest.mark.parametrize(("scale", "degrees"), [(1.0, 0.0), (1.0, 30.0), (1.0, -90.0), (1 / 1.2, 10.0), (1 / 1.2**3, 0.0)])
+@pytest.mark.parametrize(
+    ("scale", "degrees"), [(1.0, 0.0), (1.0, 30.0), (1.0, -90.0), (1 / 1.2, 10.0), (1 / 1.2**3, 0.0)]
+)
 def test_features_come_back_in_a_turned_and_scaled_image(image: Image, scale: float, degrees: float) -> None:
     frontend = OrbFrontend(1000)
     other, affine = warped(image, scale, degrees)
@@ -210,7 +212,11 @@ def test_can_be_sent_to_another_process(image: Image) -> None:
 
 def test_extremes_of_the_options() -> None:
     image = textured(200, 300, seed=4)
-    for options in (OrbOptions(n_octaves=1), OrbOptions(scale_factor=2.0, n_octaves=16), OrbOptions(fast_thresholds=(40,))):
+    for options in (
+        OrbOptions(n_octaves=1),
+        OrbOptions(scale_factor=2.0, n_octaves=16),
+        OrbOptions(fast_thresholds=(40,)),
+    ):
         features = OrbFrontend(50, options).extract(image)
         assert len(features) == 50
         assert features.octave.max() < options.n_octaves
