@@ -33,6 +33,10 @@ class Camera(ABC):
         Of the raw image, pixels.
     fx, fy, cx, cy : float
         Of the raw image, pixels: raw pixel = (fx x + cx, fy y + cy) for distorted normalised (x, y).
+    model : str
+        Name of the class in files.
+    corners_matter : bool
+        Whether `validate` wants an inverse in the corners of the image, or only at the middle of its sides.
     """
 
     model: ClassVar[str]
