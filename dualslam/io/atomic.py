@@ -13,15 +13,14 @@ from dualslam.core.errors import OutputError
 
 
 @contextmanager
-def atomic_file(path: Path, mode: str = "w") -> Iterator[IO[str] | IO[bytes]]:
-    """Open a file for writing that takes the place of `path` only when the block ends without an exception.
+def atomic_file(path: Path) -> Iterator[IO[bytes]]:
+    """Open a file for writing (bytes) that takes the place of `path` only when the block ends without an exception.
 
     The new content is on the disk before the rename, so a crash at any moment leaves the old file or the new one.
 
     Parameters
     ----------
     path : Path
-    mode : {"w", "wb"}
 
     Raises
     ------
@@ -36,7 +35,7 @@ def atomic_file(path: Path, mode: str = "w") -> Iterator[IO[str] | IO[bytes]]:
         raise OutputError(f"{path} cannot be written: {e.strerror or e}; choose another folder.") from e
     part = Path(name)
     try:
-        with os.fdopen(handle, mode, **({} if "b" in mode else {"encoding": "utf-8", "newline": "\n"})) as file:
+        with os.fdopen(handle, "wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -50,9 +49,9 @@ def atomic_file(path: Path, mode: str = "w") -> Iterator[IO[str] | IO[bytes]]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically."""
+    """Write a text file atomically, UTF-8."""
     with atomic_file(path) as file:
-        file.write(text)  # type: ignore[arg-type]
+        file.write(text.encode())
 
 
 def _umask() -> int:

@@ -9,10 +9,10 @@ import numpy as np
 
 from dualslam.core.camera import Camera
 from dualslam.core.errors import InputError
+from dualslam.core.geometry.so3 import matrix_from_quat_xyzw
 from dualslam.core.types import FloatArray
 from dualslam.io.camera_files import distorted_camera, parse_yaml
 from dualslam.io.images import ImageFiles
-from dualslam.io.quaternions import matrix_from_quat_xyzw
 from dualslam.io.sequence import Given, Recording
 from dualslam.io.times import checked_times, resolve_times
 from dualslam.io.trajectory_files import Trajectory, read_text

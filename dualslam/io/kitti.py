@@ -1,4 +1,4 @@
-"""KITTI odometry: ``sequences/NN`` with ``image_0/`` or ``image_2/``, ``calib.txt``, ``times.txt``, ``poses/NN.txt``."""
+"""KITTI odometry: ``sequences/NN`` of ``image_0/`` or ``image_2/``, ``calib.txt``, ``times.txt``, ``poses/NN.txt``."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def open_sequence(
     given_camera = None if camera_file is None else read_camera_file(camera_file)
     given = Given(camera_file is not None or fov_degrees is not None, times, rate_hz)
     if isinstance(source, int) or (str(source).isdigit() and not Path(source).exists()):
-        return video.open_webcam(int(source), given_camera, fov_degrees, selection, given, grey)
+        return video.open_webcam(int(str(source)), given_camera, fov_degrees, selection, given, grey)
     recording = _open_recording(Path(source), given)
     camera = given_camera or recording.camera
     if camera is None:

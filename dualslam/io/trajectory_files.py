@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dualslam.core.errors import InputError, OutputError
+from dualslam.core.geometry.so3 import matrix_from_quat_xyzw, quat_xyzw_from_matrix
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.io.atomic import write_text
-from dualslam.io.quaternions import matrix_from_quat_xyzw, quat_xyzw_from_matrix
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +35,7 @@ class Trajectory:
 # --- TUM
 
 
-def read_tum(path: str | Path, *, skip_nan: bool = False) -> Trajectory:
+def read_tum(path: str | Path, *, skip_nan: bool = False, allow_empty: bool = False) -> Trajectory:
     """Read ``t tx ty tz qx qy qz qw`` lines (``#`` starts a comment), sorted by time.
 
     Parameters
@@ -43,13 +43,15 @@ def read_tum(path: str | Path, *, skip_nan: bool = False) -> Trajectory:
     path : path
     skip_nan : bool
         Leave out lines that hold a NaN (TUM-Mono marks unknown poses so) instead of refusing the file.
+    allow_empty : bool
+        Take a file without lines for a trajectory without poses: a run that could not pose a frame leaves one.
 
     Raises
     ------
     InputError
         If the file is missing, empty or holds a line that is no pose.
     """
-    table = read_number_table(path, 8, "a TUM trajectory (t tx ty tz qx qy qz qw)")
+    table = read_number_table(path, 8, "a TUM trajectory (t tx ty tz qx qy qz qw)", allow_empty)
     finite = np.isfinite(table).all(axis=1)
     if skip_nan:
         table = table[finite]
@@ -78,7 +80,7 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
         " ".join([_exact(t, 9), *(_exact(x) for x in T[:3, 3]), *(_exact(x) for x in q)])
         for t, T, q in zip(trajectory.timestamps_s, trajectory.T_world_cam, quat_xyzw, strict=True)
     ]
-    write_text(Path(path), "".join(line + "\n" for line in ["# t tx ty tz qx qy qz qw", *lines]))
+    write_text(Path(path), "".join(line + "\n" for line in lines))
 
 
 # --- KITTI
@@ -143,12 +145,12 @@ def associate(reference_s: FloatArray, query_s: FloatArray, max_dt_s: float) -> 
 # --- numbers and text
 
 
-def read_number_table(path: str | Path, columns: int, what: str) -> FloatArray:
+def read_number_table(path: str | Path, columns: int, what: str, allow_empty: bool = False) -> FloatArray:
     """Read lines of `columns` numbers, separated by blanks or commas; ``#`` starts a comment.
 
     Returns
     -------
-    (N, columns) float64, N >= 1
+    (N, columns) float64
 
     Raises
     ------
@@ -167,9 +169,9 @@ def read_number_table(path: str | Path, columns: int, what: str) -> FloatArray:
         if len(row) != columns:
             raise InputError(f"{path}, line {number}: {len(row)} numbers where {columns} are due in {what}.")
         rows.append(row)
-    if not rows:
+    if not rows and not allow_empty:
         raise InputError(f"{path} is empty: it should be {what}.")
-    return np.array(rows)
+    return np.array(rows).reshape(-1, columns)
 
 
 def read_text(path: str | Path) -> str:
