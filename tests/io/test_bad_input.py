@@ -79,6 +79,23 @@ def test_truncated_jpeg_in_a_zip(make, tmp_path: Path) -> None:
     assert "00004.jpg in " in frames[4].error
 
 
+def test_what_follows_the_image_in_its_file_does_no_harm(dataset: Path) -> None:
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 255, (400, 400), np.uint8)
+    path = dataset / "images" / "000000.jpg"
+    cv2.imwrite(str(path), image)
+    (dataset / "images" / "000000.png").unlink()
+    whole = path.read_bytes()
+    assert len(whole) > 1 << 16
+    film = bytes(5000)
+    for data, readable in ((whole + film, True), (whole[: 1 << 16], False)):
+        path.write_bytes(data)
+        frame = next(iter(open_sequence(dataset / "images", fov_degrees=60, max_frames=1)))
+        # Either way it is not of the size of the others.
+        assert frame.image is None
+        assert ("400 x 400" if readable else "cut off") in frame.error
+
+
 def test_no_image_at_all_can_be_read(dataset: Path) -> None:
     for image in (dataset / "images").iterdir():
         image.write_bytes(b"junk")
