@@ -23,6 +23,7 @@ pose suffered. All variables are therefore checked.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -137,19 +138,51 @@ class IncrementalSolver:
             raise SolverFailure.of(error) from error
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class BatchOptimum:
+    """What `optimise_batch` found: poses (K, 4, 4) and points (L, 3) of ascending ids, costs, iterations."""
+
+    T_submap_kf: FloatArray
+    xyz_mu: FloatArray
+    cost_before: float
+    cost_after: float
+    iterations: int
+
+
 def optimise_batch(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keyframes: IntArray, landmarks: IntArray, iterations: int
-) -> tuple[FloatArray, FloatArray]:
-    """Run Levenberg-Marquardt, points eliminated first; return (K, 4, 4) poses and (L, 3) points of ascending ids."""
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    keyframes: IntArray,
+    landmarks: IntArray,
+    max_iterations: int,
+    tolerance: float = 1e-5,
+) -> BatchOptimum:
+    """Run Levenberg-Marquardt on poses and points, the points eliminated first.
+
+    Parameters
+    ----------
+    graph : NonlinearFactorGraph
+    values : Values
+        Of exactly the poses of `keyframes` and the points of `landmarks`, both ascending.
+    keyframes : (K,) int64
+    landmarks : (L,) int64
+    max_iterations : int
+    tolerance : float
+        Relative decrease of the cost below which to stop.
+    """
     params = gtsam.LevenbergMarquardtParams()
-    params.setMaxIterations(iterations)
+    params.setMaxIterations(max_iterations)
+    params.setRelativeErrorTol(tolerance)
     params.setLinearSolverType("SEQUENTIAL_CHOLESKY")
     params.setOrdering(gtsam.Ordering(landmarks.tolist() + convert.pose_keys(keyframes)))
     try:
-        result = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+        before = float(graph.error(values))
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+        result = optimizer.optimize()
         T, xyz = convert.poses_of(result), convert.points_of(result)
+        after, iterations = float(optimizer.error()), int(optimizer.iterations())
     except GTSAM_ERRORS as error:
         raise SolverFailure.of(error) from error
     if not (np.isfinite(T).all() and np.isfinite(xyz).all()):
         raise SolverFailure("the batch estimate is not finite")
-    return T, xyz
+    return BatchOptimum(T, xyz, before, after, iterations)
