@@ -103,8 +103,10 @@ class Painter:
             rows, cols = max(2, round(height / stretch[1])), max(2, round(width / stretch[0]))
             row, col = self.rng.integers(0, _BANK_SIZE, 2)
             turn, flip = self.rng.integers(0, 2, 2)
-            window = _window(field, int(row), int(col), cols, rows).T if turn else _window(
-                field, int(row), int(col), rows, cols
+            window = (
+                _window(field, int(row), int(col), cols, rows).T
+                if turn
+                else _window(field, int(row), int(col), rows, cols)
             )
             window = window[:, ::-1] if flip else window
             if (rows, cols) != shape:
