@@ -90,7 +90,7 @@ class Renderer:
         half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # (0, 0) is the centre of the top-left pixel
         K_big = np.linalg.inv(half) @ S @ half @ self._K
         big, _ = self._draw(T_world_cam, K_big, big_width, big_height, True)
-        return cv2.resize(big, (width, height), interpolation=cv2.INTER_AREA)
+        return np.asarray(cv2.resize(big, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
     def depth(self, T_world_cam: FloatArray) -> F32Image:
         """Return z in the camera's frame at each pixel's centre (height, width), metres, inf where nothing is hit."""
@@ -230,8 +230,8 @@ class Renderer:
                 x, y, bw, bh = _strip(planes[2], rect, low, high)
                 if bw <= 0 or bh <= 0:
                     continue
-                part = cv2.inRange(own[y : y + bh, x : x + bw], low, high)
-                part &= mask[y : y + bh, x : x + bw]
+                band_mask = np.asarray(cv2.inRange(own[y : y + bh, x : x + bw], low, high), np.uint8)
+                part = band_mask & mask[y : y + bh, x : x + bw]
                 dx, dy, bw, bh = cv2.boundingRect(part)
                 if bw == 0:
                     continue
@@ -241,7 +241,7 @@ class Renderer:
             target = np.s_[v0 + y : v0 + y + bh, u0 + x : u0 + x + bw]
             levels = _levels(planes, part_rect, texture.grey.level(0, 0).shape)
             if texture.alpha is not None:
-                part = part & (_warp(texture.alpha.level(*levels), planes, part_rect) >> 7)
+                part = part & (_warp(texture.alpha.level(*levels), planes, part_rect) >> np.uint8(7))
             grey = _warp(texture.grey.level(*levels), planes, part_rect)
             cv2.copyTo(grey, part, image[target])
             cv2.copyTo(own[y : y + bh, x : x + bw], part, inverse[target])
@@ -311,6 +311,6 @@ def _warp(level: U8Image, planes: Planes, rect: tuple[int, int, int, int]) -> U8
         r += p * u0 + q * v0
         rows.append([n * p - 0.5 * a, n * q - 0.5 * b, n * r - 0.5 * c])
     H_texel_px = np.array([*rows, [a, b, c]])
-    return cv2.warpPerspective(
-        level, H_texel_px, (w, h), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE
-    )
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    grey = cv2.warpPerspective(level, H_texel_px, (w, h), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(grey, np.uint8)

@@ -61,7 +61,7 @@ class Road:
         """Return world (x, z) at `s_m`, `lateral_m` to the right of the centre line."""
         heading = self.heading(s_m)
         right = np.stack([np.cos(heading), -np.sin(heading)], -1)
-        return self.centre(s_m) + right * np.asarray(lateral_m)[..., None]
+        return np.asarray(self.centre(s_m) + right * np.asarray(lateral_m)[..., None])
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,7 +74,7 @@ def _ground(rng: np.random.Generator, road: Road) -> list[Surface]:
         here = tuple(d for d in decals if max(abs(d.x - middle[0]), abs(d.z - middle[1])) < _TILE_M / 2 + d.radius_m)
         surfaces.append(_flat(x, z, _TILE_M, _TILE_M, GroundTile(near_line, here, x, z), 56))
     low, high = line.min(0) - 300, line.max(0) + 300
-    surfaces.append(_flat(low[0], high[1], *(high - low), _field, 1.2, 0.03))
+    surfaces.append(_flat(low[0], high[1], high[0] - low[0], high[1] - low[1], _field, 1.2, 0.03))
     return surfaces
 
 

@@ -93,7 +93,7 @@ class RipMap:
             parent = self.level(key[0], key[1] - 1) if key[1] else self.level(key[0] - 1, 0)
             height, width = self._levels[0, 0].shape
             size = (max(1, round(width / 2 ** key[0])), max(1, round(height / 2 ** key[1])))
-            image = cv2.resize(parent, size, interpolation=cv2.INTER_AREA)
+            image = np.asarray(cv2.resize(parent, size, interpolation=cv2.INTER_AREA), np.uint8)
             self._levels[key] = image
         return image
 
@@ -123,7 +123,7 @@ class TextureStore:
         Finest levels kept; the coarser ones add up to three times as much.
     """
 
-    def __init__(self, scene: Scene, detail: float = 1.0, max_bytes: int = 200_000_000) -> None:
+    def __init__(self, scene: Scene, detail: float = 1.0, max_bytes: int = 120_000_000) -> None:
         self._scene = scene
         self._detail = detail
         self._max_bytes = max_bytes

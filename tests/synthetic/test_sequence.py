@@ -120,6 +120,14 @@ def test_the_same_seed_gives_the_same_images_in_any_order(clean: SyntheticSequen
     assert not np.array_equal(other.frame(0).image, clean.frame(0).image)
 
 
+def test_forgotten_textures_come_back_the_same(clean: SyntheticSequence) -> None:
+    again = make_sequence(clean.parameters["scene"], seed=3, **SMALL)
+    again._renderer._textures._max_bytes = 20_000
+    assert np.array_equal(again.frame(12).image, clean.frame(12).image)
+    assert np.array_equal(again.frame(13).image, clean.frame(13).image)
+    assert len(again._renderer._textures._textures) < len(clean._renderer._textures._textures)
+
+
 def test_iteration_equals_random_access_and_skips_dropped_frames(spoilt: SyntheticSequence) -> None:
     frames = list(spoilt)
     assert [f.index for f in frames] == [i for i in range(40) if i not in (9, 10, 11)]
