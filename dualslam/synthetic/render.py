@@ -23,6 +23,7 @@ F32Image = NDArray[np.float32]
 U8Image = NDArray[np.uint8]
 
 _NEAR_M = 0.05
+_FAR_M = 400.0
 # A warp uses one texture level, so a surface is warped in bands of depth whose far end is this much further.
 _BAND_RATIO = 1.5
 # Below this many pixels across, relief is not drawn: it costs more than it shows.
@@ -75,6 +76,8 @@ class Renderer:
         self._origin = np.array([s.origin for s in surfaces])
         self._side_s = np.array([s.side_s for s in surfaces])
         self._side_t = np.array([s.side_t for s in surfaces])
+        self._middle = self._origin + (self._side_s + self._side_t) / 2
+        self._radius = np.linalg.norm(self._side_s + self._side_t, axis=1) / 2
         self._two_sided = np.array([s.two_sided for s in surfaces])
         self._infinite = np.array([s.infinite for s in surfaces])
         self._cutout = np.array([s.cutout for s in surfaces])
@@ -134,9 +137,12 @@ class Renderer:
         self, T_world_cam: FloatArray, K: FloatArray, width: int, height: int, infinite: bool
     ) -> _Candidates:
         """Cull what is behind, beside, seen from the back or too small; compute the rest's affine forms and bounds."""
-        chosen = np.flatnonzero(self._infinite == infinite)
         R_world_cam = T_world_cam[:3, :3]
         centre = np.zeros(3) if infinite else T_world_cam[:3, 3]
+        # First the cheap test, which leaves little of a long street.
+        z_middle = self._middle @ R_world_cam[:, 2] - centre @ R_world_cam[:, 2]
+        within = (z_middle > -self._radius) & (z_middle < _FAR_M + self._radius)
+        chosen = np.flatnonzero((self._infinite == infinite) & within)
         origin = (self._origin[chosen] - centre) @ R_world_cam
         side_s, side_t = self._side_s[chosen] @ R_world_cam, self._side_t[chosen] @ R_world_cam
         ahead = np.einsum("ni,ni->n", np.cross(side_s, side_t), origin)
