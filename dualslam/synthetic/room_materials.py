@@ -11,7 +11,7 @@ from dualslam.synthetic.painter import Painter
 def plaster(p: Painter) -> None:
     """A painted wall: nearly blank, with stains, sockets, a skirting board and notes pinned to it."""
     width, height = p.size_m
-    p.fill(p.uniform(110, 215), rough=1.2, smooth=6)
+    p.fill(p.uniform(110, 175), rough=1.2, smooth=5)
     p.image += np.linspace(8, -14, p.image.shape[0], dtype=np.float32)[:, None]
     for _ in range(int(p.rng.integers(3, 8))):
         p.crack(p.uniform(90, 140), p.uniform(0.1, 0.5))

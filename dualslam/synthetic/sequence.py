@@ -21,7 +21,8 @@ from dualslam.synthetic.street import make_street
 if TYPE_CHECKING:
     from dualslam.core.camera import PinholeCamera
 
-_N_SUBFRAMES = 9
+# A smear of motion blur is the average of images about three pixels apart, within these bounds on their number.
+_N_SUBFRAMES = (9, 33)
 SCENES = ("street", "room")
 
 
@@ -99,11 +100,14 @@ class SyntheticSequence:
             raise InputError(f"{self.name}: frame {index} is dropped by an event of the script; see `indices`")
         if what.shutter:
             # Averaged in display values, as most cameras' images are used; the truth is the middle of the exposure.
-            shifts = what.shutter * (np.arange(_N_SUBFRAMES) / (_N_SUBFRAMES - 1) - 0.5)
+            opened, closed = self._T_world_cam(index - what.shutter / 2), self._T_world_cam(index + what.shutter / 2)
+            turn_rad = np.arccos(np.clip(opened[:3, 2] @ closed[:3, 2], -1, 1))
+            n_subframes = int(np.clip(turn_rad * self.camera.K[0, 0] / 3, *_N_SUBFRAMES))
+            shifts = what.shutter * (np.arange(n_subframes) / (n_subframes - 1) - 0.5)
             total = np.zeros((self.camera.height, self.camera.width), np.float32)
             for shift in shifts:
                 cv2.accumulate(self._renderer.image(self._T_world_cam(index + shift)), total)
-            scene = np.rint(total / _N_SUBFRAMES).astype(np.uint8)
+            scene = np.rint(total / n_subframes).astype(np.uint8)
         else:
             scene = self._renderer.image(self.ground_truth_T_world_cam[index])
         return Frame(index, float(self.timestamps_s[index]), self._sensor.expose(scene, index, what))
@@ -197,7 +201,7 @@ def make_sequence(
         world = make_room(seed)
         path, focal = Walk(rng, duration_s, (HALF_SIZE_M[0] - 1.3, HALF_SIZE_M[1] - 1.3)), 0.82
         # A cheap camera in the hand: softer than the one on the car.
-        sensor = Sensor(seed, width, height, blur_px=0.9, noise=1.2, stops=0.6)
+        sensor = Sensor(seed, width, height, blur_px=0.9, noise=1.2, stops=0.4)
     camera = _pinhole(focal * width, width, height)
     renderer = Renderer(world, camera.K, width, height, detail=min(1.0, width / 640), supersampling=supersampling)
     parameters = {
