@@ -17,7 +17,6 @@ from dualslam.core import strict_yaml
 from dualslam.core.config import Config
 from dualslam.core.errors import ConfigError
 
-
 _PLAIN_WORDS = {
     "must be an object": "must be a mapping of fields",
     "a valid integer": "a whole number",
