@@ -24,6 +24,96 @@ class FrontendConfig(StrictModel):
     """Settings of the chosen front end alone; it checks their names itself."""
 
 
+class InitialiserConfig(StrictModel):
+    """How a submap starts: two views, a first bundle adjustment, and a check after it."""
+
+    min_matches: int = Field(60, ge=20)
+    """Matches between the two views below which no model is tried."""
+    min_points: int = Field(50, ge=15)
+    """Triangulated points that must survive the first bundle adjustment."""
+    min_parallax_deg: float = Field(1.0, gt=0)
+    """Median angle under which the two cameras see the points, after the rotation is taken out."""
+    max_direction_sigma_deg: float = Field(1.5, gt=0)
+    """Largest standard deviation (from the bundle adjustment's Hessian) of the direction of translation."""
+    max_chi2: float = Field(2.5, gt=0)
+    """Mean squared whitened residual per degree of freedom after the bundle adjustment (1 is expected)."""
+    min_support: float = Field(0.6, gt=0, le=1)
+    """Share of the points that the frames between the two views must confirm by their own pixels."""
+    homography_ratio: float = Field(0.45, gt=0, lt=1)
+    """Share of the homography's score in both models' above which the scene counts as planar or the motion as a turn."""
+    max_views: int = Field(120, ge=5)
+    """How many recent frames are kept as possible first views."""
+
+
+class TrackingConfig(StrictModel):
+    """Pose of each frame against the submap."""
+
+    search_radius_px: float = Field(15.0, gt=0)
+    """Search radius about a landmark's predicted pixel, at the finest octave, when the motion model is trusted."""
+    local_radius_px: float = Field(4.0, gt=0)
+    """The same for the landmarks of the local map, after a first pose is found."""
+    min_inliers: int = Field(20, ge=6)
+    """Landmarks that must agree with a pose for it to be taken at all."""
+    local_keyframes: int = Field(20, ge=2)
+    """Covisible keyframes whose landmarks make the local map."""
+    wide_keyframes: int = Field(3, ge=1)
+    """Recent keyframes that are tried by wide matching and PnP when guided matching fails."""
+    max_lost_frames: int = Field(8, ge=0)
+    """Frames in a row that wide matching may fail on before the submap is given up."""
+
+
+class KeyframeConfig(StrictModel):
+    """When a frame becomes a keyframe."""
+
+    max_tracked_ratio: float = Field(0.8, gt=0, le=1)
+    """A keyframe is due when fewer than this share of the last keyframe's landmarks is still tracked."""
+    min_parallax_deg: float = Field(0.5, ge=0)
+    """...and the camera has moved enough to see the scene's median depth under this angle (or tracking is weak)."""
+    max_parallax_deg: float = Field(4.0, gt=0)
+    """Parallax at which a keyframe is due whatever is tracked."""
+    max_frames: int = Field(30, ge=1)
+    """Frames after which a keyframe is due if the camera moved at all."""
+    weak_landmarks: int = Field(60, ge=10)
+    """Tracked landmarks below which tracking is weak and a keyframe is due at once."""
+
+
+class MappingConfig(StrictModel):
+    """New landmarks at a keyframe, and what is culled."""
+
+    triangulate_against: int = Field(6, ge=1)
+    """Older keyframes that a new keyframe is paired with."""
+    min_parallax_deg: float = Field(1.0, gt=0)
+    """Smallest angle between the two rays of a new landmark."""
+    reprojection_chi2: float = Field(5.991, gt=0)
+    """Gate of a new landmark's squared whitened residual in each view: chi-square, 2 degrees of freedom, 95 %."""
+    min_found_ratio: float = Field(0.25, ge=0, le=1)
+    """A young landmark that tracking finds in fewer of the frames that should see it is culled."""
+    min_observations: int = Field(3, ge=2)
+    """Keyframes that must see a landmark by the time that two more keyframes have come."""
+    redundant_ratio: float = Field(0.9, gt=0, le=1)
+    """A keyframe of whose landmarks this share is seen by three others at the same or a finer scale is culled."""
+
+
+class HealthConfig(StrictModel):
+    """When a tracked frame counts as explained by the map."""
+
+    min_inliers: int = Field(25, ge=6)
+    """Landmarks that must agree with the frame's pose."""
+    min_inlier_ratio: float = Field(0.35, ge=0, le=1)
+    """Share of the matched landmarks that must agree."""
+    max_chi2: float = Field(2.5, gt=0)
+    """Mean squared whitened residual per degree of freedom of the agreeing landmarks (1 is expected)."""
+
+
+class BufferConfig(StrictModel):
+    """The frames that a walk back in time can still read."""
+
+    duration_s: float = Field(10.0, gt=0)
+    """Seconds of video that are kept (the paper's k)."""
+    max_views: int = Field(3000, ge=50)
+    """Hard bound on the frames kept while no submap is live; beyond it the oldest go."""
+
+
 class GraphConfig(StrictModel):
     """The factor graph of a submap and its solver."""
 
@@ -33,6 +123,19 @@ class GraphConfig(StrictModel):
     """Squared whitened residual above which an observation is an outlier: chi-square, 2 degrees of freedom, 95 %."""
     max_keyframes: int = Field(500, ge=20, le=1000)
     """Keyframes at which a submap rolls over into the next (the solver's Cholesky rejects much longer chains)."""
+    rollover_keyframes: int = Field(12, ge=3, le=19)
+    """Keyframes that a submap shares with the one that it rolls over into."""
+    max_depth_sigma: float = Field(0.25, gt=0)
+    """A landmark enters the graph once its views fix its distance to this relative standard deviation (0.25 is about
+    half a degree of parallax at 1 px and a focal length of 700 px); it leaves at twice that."""
+    insert_sigmas: float = Field(25.0, gt=0)
+    """Observations further than this from where the map puts them (in sigmas) are refused: no solver makes use of them."""
+    min_ties: int = Field(6, ge=3)
+    """Keyframes tied to the graph by fewer landmarks are held at their pose by a loose prior, until they have more."""
+    read_window: int = Field(20, ge=0)
+    """Keyframes (the last inserted ones, and their landmarks) whose estimate is read after each update; 0 reads all."""
+    rebuild_iterations: int = Field(8, ge=1)
+    """Batch iterations at most when a graph is made anew."""
 
 
 class Config(StrictModel):
@@ -41,4 +144,10 @@ class Config(StrictModel):
     seed: int = Field(0, ge=0)
     """Seed of every random choice of the run."""
     frontend: FrontendConfig = FrontendConfig()
+    initialiser: InitialiserConfig = InitialiserConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    keyframes: KeyframeConfig = KeyframeConfig()
+    mapping: MappingConfig = MappingConfig()
+    health: HealthConfig = HealthConfig()
+    buffer: BufferConfig = BufferConfig()
     graph: GraphConfig = GraphConfig()

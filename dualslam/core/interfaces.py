@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.types import Features, FloatArray, Frame, IntArray, Matches
+from dualslam.core.types import BoolArray, Failure, Features, FloatArray, Frame, IntArray, Matches, Start, Track, View
 
 if TYPE_CHECKING:
     from dualslam.core.camera import Camera
@@ -108,4 +108,112 @@ class SubmapGraph(Protocol):
 
     def point_covariances(self, landmark_ids: IntArray) -> FloatArray:
         """(L, 3, 3) marginal covariances of landmarks, in the submap's frame."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BundleProblem:
+    """A bundle adjustment over plain arrays: V views, N points, O observations.
+
+    Attributes
+    ----------
+    K : (3, 3) float64
+    T_w_cam : (V, 4, 4) float64
+    fixed : (V,) bool
+        Views that stay where they are.
+    xyz : (N, 3) float64
+    view_of, point_of : (O,) int64
+    uv_px : (O, 2) float64, rectified pixels
+    sigma_px : (O,) float64
+    scale_pair : (int, int) or None
+        Two views whose distance fixes the scale; None where the fixed views do.
+    """
+
+    K: FloatArray
+    T_w_cam: FloatArray
+    fixed: BoolArray
+    xyz: FloatArray
+    view_of: IntArray
+    point_of: IntArray
+    uv_px: FloatArray
+    sigma_px: FloatArray
+    scale_pair: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BundleResult:
+    """The optimum: poses, points, and the squared whitened residual of each observation (O,)."""
+
+    T_w_cam: FloatArray
+    xyz: FloatArray
+    chi2: FloatArray
+
+
+class BundleAdjuster(Protocol):
+    """Batch bundle adjustment, robust."""
+
+    def __call__(self, problem: BundleProblem) -> BundleResult | Failure: ...
+
+
+@dataclass(frozen=True, slots=True)
+class MappingReport:
+    """What one keyframe added and removed."""
+
+    n_new: int
+    n_merged: int
+    n_culled: int
+    n_extended: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeReport:
+    """What a keyframe did to the map and how its graph took it."""
+
+    mapping: MappingReport
+    estimate: GraphEstimate
+    n_outliers: int
+    culled_keyframe: int | None
+
+
+class MapStarter(Protocol):
+    """Collects views until some of them start a map."""
+
+    def collect(self, view: View) -> None:
+        """Keep a view as a possible first view, without trying to start from it."""
+        ...
+
+    def add(self, view: View) -> Start | Failure:
+        """Take a view in and try to start a map that ends with it."""
+        ...
+
+
+class VisualOdometry(Protocol):
+    """Tracks frames against one submap and extends it by keyframes, in whatever order of time the frames come."""
+
+    submap: Submap
+    graph: SubmapGraph
+
+    @property
+    def reference_id(self) -> int:
+        """The keyframe that frames are posed against."""
+        ...
+
+    def start_at(self, keyframe_id: int) -> None:
+        """Begin at a keyframe of the submap, at rest."""
+        ...
+
+    def track(self, view: View) -> Track | Failure:
+        """Pose a frame."""
+        ...
+
+    def relative_pose(self, track: Track) -> FloatArray:
+        """Return ``T_kf_cam``: the track's pose relative to the reference keyframe."""
+        ...
+
+    def keyframe_due(self, track: Track) -> bool:
+        """Whether the frame should become a keyframe."""
+        ...
+
+    def insert_keyframe(self, track: Track) -> KeyframeReport:
+        """Make the frame a keyframe and solve the graph."""
         ...

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.tables import Table
-from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe
+from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe, Start
 
 NO_LANDMARK = -1
 
@@ -75,6 +75,22 @@ class Submap:
         self.observations = Table(
             kf=(np.int64, ()), feature=(np.int64, ()), landmark=(np.int64, ()), alive=(np.bool_, ())
         )
+
+    @classmethod
+    def from_start(cls, start: Start, submap_id: int, K: FloatArray) -> Submap:
+        """Make a submap of a verified start: its views become keyframes, its points landmarks."""
+        submap = cls(submap_id, K, start.views[0].features.descriptors[0])
+        for view, T in zip(start.views, start.T_first_cam, strict=True):
+            submap.add_keyframe(Keyframe(view.index, view.timestamp_s, view.features), T)
+        last, feature = start.views[-1], start.feature
+        ids = submap.add_landmarks(
+            start.xyz, last.features.descriptors[feature[-1]], last.features.scale[feature[-1]], last.index
+        )
+        for v, view in enumerate(start.views):
+            seen = feature[v] >= 0
+            submap.add_observations(view.index, feature[v][seen], ids[seen])
+        submap.gauge = (start.views[0].index, last.index)
+        return submap
 
     # --- keyframes
 

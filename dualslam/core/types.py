@@ -99,6 +99,15 @@ class Features:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A frame as the system sees it once its features are found: what the frame buffer keeps."""
+
+    index: int
+    timestamp_s: float
+    features: Features
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Matches:
     """Pairs of features (or landmarks) of two sets.
 
@@ -130,6 +139,64 @@ class Keyframe:
     id: int
     timestamp_s: float
     features: Features
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """A posed frame.
+
+    Attributes
+    ----------
+    view : View
+    T_cam_submap : (4, 4) float64
+    T_predicted : (4, 4) float64
+        What the motion model said.
+    landmark_ids : (N,) int64
+        For each feature of the view the landmark it agrees with, or `NO_LANDMARK`.
+    n_visible, n_matches, n_inliers : int
+        Landmarks that should be seen, were matched, and agree with the pose.
+    chi2 : float
+        Mean squared whitened residual per degree of freedom of the inliers.
+    wide : bool
+        Whether guided matching failed and the pose came from wide matching.
+    covariance : (6, 6) float64
+        Of `T_cam_submap`, for a left perturbation (rotation, translation).
+    """
+
+    view: View
+    T_cam_submap: FloatArray
+    T_predicted: FloatArray
+    landmark_ids: IntArray
+    n_visible: int
+    n_matches: int
+    n_inliers: int
+    chi2: float
+    wide: bool
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """A verified start of a submap.
+
+    Attributes
+    ----------
+    views : list of View
+        First view, witnesses, last view, in the order in which they were given.
+    T_first_cam : (V, 4, 4) float64
+    xyz : (N, 3) float64
+        In the first camera's frame; the median depth is 1.
+    feature : (V, N) int64
+        Feature of each point in each view, or -1.
+    numbers : dict
+        The measures that the checks looked at.
+    """
+
+    views: list[View]
+    T_first_cam: FloatArray
+    xyz: FloatArray
+    feature: IntArray
+    numbers: dict[str, float]
 
 
 class FailureReason(StrEnum):

@@ -1,0 +1,66 @@
+"""Factors, inserted in bulk where there are many."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from backend.convert import pose_key, to_pose3
+from backend.noise import GAUGE_RANGE_RATIO, GAUGE_SIGMA, PixelNoise, pose_sigmas
+from dualslam.core.types import FloatArray, IntArray
+
+
+def insert_projections(
+    graph: gtsam.NonlinearFactorGraph,
+    kf: IntArray,
+    landmark: IntArray,
+    uv_px: FloatArray,
+    sigma_px: FloatArray,
+    K: gtsam.Cal3_S2,
+    noise: PixelNoise,
+) -> IntArray:
+    """Append one projection factor per observation, in as few calls as keyframes and sigmas allow.
+
+    Parameters
+    ----------
+    graph : NonlinearFactorGraph
+        Is appended to.
+    kf, landmark : (R,) int64
+    uv_px : (R, 2), sigma_px : (R,)
+    K : Cal3_S2
+    noise : PixelNoise
+
+    Returns
+    -------
+    (R,) int64
+        Order of insertion: the i-th new factor is that of observation ``order[i]``.
+    """
+    order = np.lexsort((landmark, sigma_px, kf))
+    if len(order) == 0:
+        return order
+    k, s = kf[order], sigma_px[order]
+    cuts = np.flatnonzero((np.diff(k) != 0) | (np.diff(s) != 0)) + 1
+    starts = np.concatenate(([0], cuts))
+    ends = np.append(cuts, len(order)).tolist()
+    keys, sigmas = k[starts].tolist(), s[starts].tolist()
+    J = landmark[order].astype(float)
+    Z = np.ascontiguousarray(uv_px[order].T)
+    insert = gtsam.utilities.insertProjectionFactors
+    for a, b, key, sigma in zip(starts.tolist(), ends, keys, sigmas, strict=True):
+        insert(graph, pose_key(key), J[a:b], Z[:, a:b], noise(sigma), K)
+    return order
+
+
+def pose_prior(
+    keyframe_id: int, T_submap_kf: FloatArray, rotation_rad: float = GAUGE_SIGMA, translation_mu: float = GAUGE_SIGMA
+) -> gtsam.PriorFactorPose3:
+    """Return a prior on a keyframe's pose; tight (a gauge) unless told otherwise."""
+    return gtsam.PriorFactorPose3(
+        pose_key(keyframe_id), to_pose3(T_submap_kf), pose_sigmas(rotation_rad, translation_mu)
+    )
+
+
+def baseline_factor(first: int, second: int, length_mu: float) -> gtsam.RangeFactorPose3:
+    """Return the factor that fixes a submap's scale: the distance between the centres of two keyframes."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, GAUGE_RANGE_RATIO * length_mu)
+    return gtsam.RangeFactorPose3(pose_key(first), pose_key(second), length_mu, noise)

@@ -1,0 +1,136 @@
+"""Which observations a factor graph can bear: residuals, depth and the certainty of points, vectorised.
+
+A landmark with one view, or with views along one line, makes the whole linear system indeterminate, and a point behind
+a camera has no derivative at all. Whoever is to enter is therefore looked at first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.core.types import BoolArray, FloatArray, IntArray
+
+MIN_DEPTH_MU = 1e-3
+"""Points nearer to the camera's plane than this are taken as behind it (a submap's median initial depth is 1)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """How R observations fit.
+
+    Attributes
+    ----------
+    chi2 : (R,) float64
+        Squared whitened residual; infinite where the point is not in front of the camera.
+    depth_mu : (R,) float64
+        Along the optical axis.
+    xyz_cam : (R, 3) float64
+    """
+
+    chi2: FloatArray
+    depth_mu: FloatArray
+    xyz_cam: FloatArray
+
+
+def compute_residuals(
+    K: FloatArray, T_submap_kf: FloatArray, pose: IntArray, xyz_mu: FloatArray, uv_px: FloatArray, sigma_px: FloatArray
+) -> Residuals:
+    """Reproject.
+
+    Parameters
+    ----------
+    K : (3, 3)
+    T_submap_kf : (P, 4, 4)
+    pose : (R,) int64
+        Row of `T_submap_kf` of each observation.
+    xyz_mu : (R, 3)
+    uv_px : (R, 2), sigma_px : (R,)
+    """
+    R, t = T_submap_kf[pose, :3, :3], T_submap_kf[pose, :3, 3]
+    xyz_cam = np.einsum("rji,rj->ri", R, xyz_mu - t)
+    depth = xyz_cam[:, 2]
+    front = depth > MIN_DEPTH_MU
+    x = xyz_cam[:, :2] / np.where(front, depth, 1.0)[:, None]
+    u = K[0, 0] * x[:, 0] + K[0, 1] * x[:, 1] + K[0, 2] - uv_px[:, 0]
+    v = K[1, 1] * x[:, 1] + K[1, 2] - uv_px[:, 1]
+    chi2 = np.where(front, (u * u + v * v) / (sigma_px * sigma_px), np.inf)
+    chi2[~np.isfinite(chi2)] = np.inf
+    return Residuals(chi2, depth, xyz_cam)
+
+
+def compute_depth_sigmas(
+    K: FloatArray,
+    T_submap_kf: FloatArray,
+    pose: IntArray,
+    xyz_cam: FloatArray,
+    sigma_px: FloatArray,
+    point: IntArray,
+    n_points: int,
+) -> FloatArray:
+    """Return how well each point is fixed by its views alone, the poses taken as known.
+
+    Parameters
+    ----------
+    K : (3, 3), T_submap_kf : (P, 4, 4), pose : (R,), sigma_px : (R,)
+        As in `compute_residuals`.
+    xyz_cam : (R, 3)
+        The point of each observation, in front of its camera.
+    point : (R,) int64
+        Which of the `n_points` points each observation sees.
+
+    Returns
+    -------
+    (n_points,) float64
+        Largest standard deviation of the point relative to its least depth; infinite with fewer than two views.
+    """
+    x, y, z = xyz_cam.T
+    # Rows of the projection's derivative by the point in the camera, whitened.
+    J = np.zeros((len(xyz_cam), 2, 3))
+    J[:, 0, 0] = K[0, 0] / z
+    J[:, 0, 1] = K[0, 1] / z
+    J[:, 0, 2] = -(K[0, 0] * x + K[0, 1] * y) / (z * z)
+    J[:, 1, 1] = K[1, 1] / z
+    J[:, 1, 2] = -K[1, 1] * y / (z * z)
+    J = (J / sigma_px[:, None, None]) @ T_submap_kf[pose, :3, :3].transpose(0, 2, 1)
+    information = np.zeros((n_points, 9))
+    products = np.einsum("rai,raj->rij", J, J).reshape(-1, 9)
+    for column in range(9):
+        information[:, column] = np.bincount(point, products[:, column], n_points)
+    depth = np.full(n_points, np.inf)
+    np.minimum.at(depth, point, z)
+    smallest = np.linalg.eigvalsh(information.reshape(-1, 3, 3))[:, 0]
+    views = np.bincount(point, minlength=n_points)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sigma = 1 / (np.sqrt(np.maximum(smallest, 0)) * depth)
+    return np.where((views >= 2) & (smallest > 0), sigma, np.inf)
+
+
+def find_components(kf: IntArray, landmark: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the keyframes that occur, ascending, and for each the number of the connected piece it belongs to.
+
+    Two keyframes are connected where they share a landmark. Labels spread along landmarks until they settle; each
+    round also follows the label's own label, so that a chain of n keyframes takes about log n rounds.
+    """
+    ids, k = np.unique(kf, return_inverse=True)
+    _, j = np.unique(landmark, return_inverse=True)
+    label = np.arange(len(ids))
+    n_landmarks = int(j.max()) + 1 if len(j) else 0
+    while True:
+        of_landmark = np.full(n_landmarks, len(ids))
+        np.minimum.at(of_landmark, j, label[k])
+        new = label.copy()
+        np.minimum.at(new, k, of_landmark[j])
+        np.minimum.at(new, label, new)  # the old root learns what its members found
+        new = new[new]
+        if np.array_equal(new, label):
+            return ids, label
+        label = new
+
+
+def take_mask(ids: IntArray, size: int) -> BoolArray:
+    """Return a mask of `size` that is true at `ids`."""
+    mask = np.zeros(size, bool)
+    mask[ids] = True
+    return mask

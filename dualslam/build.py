@@ -1,0 +1,73 @@
+"""The composition root: the one place that knows front ends, back end and system, and puts them together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from backend.local_ba import adjust_bundle
+from backend.submap_graph import ISam2SubmapGraph
+from dualslam.core.camera import Camera
+from dualslam.core.config import Config
+from dualslam.core.interfaces import Frontend
+from dualslam.core.types import Failure, FailureReason, Features, Frame, View
+from dualslam.system import Components, System
+from frontends.initialiser import Initialiser
+from frontends.registry import create_frontend
+from frontends.visual import VisualFrontEnd
+
+
+def build_system(config: Config, camera: Camera) -> System:
+    """Build a system from its config.
+
+    Parameters
+    ----------
+    config : Config
+    camera : Camera
+        Lens model and size of the images that `System.step` will be given.
+
+    Returns
+    -------
+    System
+
+    Raises
+    ------
+    ConfigError
+        If the front end is not known or its options are wrong.
+    """
+    frontend = create_frontend(config.frontend)
+    size_px = (camera.width, camera.height)
+    return System(
+        Components(
+            view_of=lambda frame: view_of(frame, frontend, camera),
+            new_starter=lambda: Initialiser(
+                frontend, adjust_bundle, config.initialiser, camera.K, size_px, config.seed
+            ),
+            new_graph=lambda: ISam2SubmapGraph(config.graph),
+            new_odometry=lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px),
+            K=camera.K,
+        ),
+        config,
+    )
+
+
+def view_of(frame: Frame, frontend: Frontend, camera: Camera) -> View | Failure:
+    """Find a frame's features and take the lens distortion out of them."""
+    if frame.image is None:
+        return Failure(FailureReason.UNREADABLE, frame.error)
+    height, width = frame.image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        return Failure(
+            FailureReason.UNREADABLE,
+            f"frame {frame.index} is {width}x{height}, the calibration is for {camera.width}x{camera.height}",
+        )
+    return View(frame.index, frame.timestamp_s, rectify(frontend.extract(frame.image), camera))
+
+
+def rectify(features: Features, camera: Camera) -> Features:
+    """Move features to the camera's pinhole equivalent; those that it cannot hold are dropped."""
+    uv_rect_px, magnification = camera.rectify(features.uv_px)
+    rectified = replace(features, uv_rect_px=uv_rect_px, sigma_px=features.sigma_px * magnification)
+    inside = np.isfinite(uv_rect_px).all(axis=1) & np.isfinite(magnification)
+    return rectified if inside.all() else rectified.take(inside)

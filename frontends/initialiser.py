@@ -1,0 +1,319 @@
+"""How a submap starts: two views with parallax, a first bundle adjustment, and a check that refuses doubtful starts.
+
+A wrong start costs more than a late one: it is refused unless (1) the two views determine the direction of translation
+to within a stated sigma, (2) no other pose explains them nearly as well, and (3) the frames between them, which had no
+part in the estimate, agree with the points by their own pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.core.config import InitialiserConfig
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.projection import refine_pose
+from dualslam.core.geometry.triangulation import triangulate_two_view
+from dualslam.core.interfaces import BundleAdjuster, BundleProblem, Frontend
+from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray, Matches, Start, View
+from frontends.matching import FeatureGrid, match_projected
+from frontends.two_view_hypotheses import CHI2_2, propose_relative_poses
+
+LAGS = (2, 4, 8, 16, 32, 64)  # frames back that are tried as the first view
+N_WITNESSES = 3  # frames between the two views that must agree
+WITNESS_RADIUS_PX = 30.0  # they stand near the path that is interpolated between the two views
+RUNNER_UP = 0.75  # another pose that explains this share of the winner's points makes the start ambiguous
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Two views, their matches, and one pose with the points that it gives."""
+
+    a: View
+    b: View
+    matches: Matches
+    T_b_a: FloatArray
+    xyz: FloatArray
+    good: BoolArray
+    parallax_deg: float
+
+
+class Initialiser:
+    """Collects views until two of them start a map."""
+
+    def __init__(
+        self,
+        frontend: Frontend,
+        adjuster: BundleAdjuster,
+        config: InitialiserConfig,
+        K: FloatArray,
+        size_px: tuple[int, int],
+        seed: int,
+    ) -> None:
+        self._frontend = frontend
+        self._adjuster = adjuster
+        self._config = config
+        self._K = K
+        self._size_px = size_px
+        self._seed = seed
+        self._views: list[View] = []
+
+    def collect(self, view: View) -> None:
+        """Keep a view as a possible first view, without trying to start from it."""
+        self._views = [*self._views[-self._config.max_views :], view]
+
+    def add(self, view: View) -> Start | Failure:
+        """Take a view in and try to start from it and an earlier one, the nearest first."""
+        self.collect(view)
+        best = Failure(FailureReason.TOO_FEW_MATCHES, "one view")
+        if len(view.features) < self._config.min_matches:
+            return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image")
+        for lag in LAGS:
+            if lag >= len(self._views):
+                break
+            start = self.try_pair(len(self._views) - 1 - lag, len(self._views) - 1)
+            if start:
+                return start
+            assert isinstance(start, Failure)
+            best = start
+            if start.reason in (FailureReason.TOO_FEW_MATCHES, FailureReason.NO_TEXTURE):
+                break
+        return best
+
+    def try_pair(self, first: int, last: int) -> Start | Failure:
+        """Try to start from two of the collected views (positions in the list)."""
+        a, b = self._views[first], self._views[last]
+        matches = self._frontend.match_wide(a.features, b.features)
+        if len(matches) < self._config.min_matches:
+            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(matches)} matches, {self._config.min_matches} needed")
+        pair = self._best_pose(a, b, matches)
+        if isinstance(pair, Failure):
+            return pair
+        views = [a, *self._witnesses(first, last), b]
+        return self._verify(pair, views)
+
+    # --- two views
+
+    def _best_pose(self, a: View, b: View, matches: Matches) -> _Pair | Failure:
+        fa, fb = matches.index[:, 0], matches.index[:, 1]
+        uv_a, uv_b = a.features.uv_rect_px[fa], b.features.uv_rect_px[fb]
+        sigma = np.maximum(a.features.sigma_px[fa], b.features.sigma_px[fb])
+        hypotheses = propose_relative_poses(
+            uv_a, uv_b, sigma, self._K, self._size_px, self._config.homography_ratio, self._seed
+        )
+        pairs = [self._evaluate(a, b, matches, T_b_a) for T_b_a in hypotheses.T_b_a]
+        pairs.sort(key=lambda p: -int(p.good.sum()))
+        best = pairs[0]
+        n_good = int(best.good.sum())
+        numbers = {
+            "n_matches": float(len(matches)),
+            "n_points": float(n_good),
+            "parallax_deg": best.parallax_deg,
+            "homography_share": hypotheses.homography_share,
+        }
+        if n_good < self._config.min_points:
+            return Failure(FailureReason.TOO_FEW_INLIERS, f"{n_good} points of {len(matches)} matches", numbers)
+        if best.parallax_deg < self._config.min_parallax_deg:
+            return Failure(FailureReason.LOW_PARALLAX, f"median parallax {best.parallax_deg:.2f} deg", numbers)
+        for other in pairs[1:]:
+            if int(other.good.sum()) > RUNNER_UP * n_good and _direction_angle_deg(best.T_b_a, other.T_b_a) > 10:
+                return Failure(FailureReason.AMBIGUOUS_MODEL, "two poses explain the views alike", numbers)
+        return best
+
+    def _evaluate(self, a: View, b: View, matches: Matches, T_b_a: FloatArray) -> _Pair:
+        fa, fb = matches.index[:, 0], matches.index[:, 1]
+        points = triangulate_two_view(
+            a.features.uv_rect_px[fa], b.features.uv_rect_px[fb], self._K, np.eye(4), se3.inverse(T_b_a)
+        )
+        good = (
+            (points.depth_a > 0)
+            & (points.depth_b > 0)
+            & (points.error2_a < CHI2_2 * a.features.sigma_px[fa] ** 2)
+            & (points.error2_b < CHI2_2 * b.features.sigma_px[fb] ** 2)
+        )
+        angle = np.degrees(np.arccos(np.clip(points.cos_parallax[good], -1, 1)))
+        # Points without parallax are no points of the map: their depth is anything.
+        good[good] = angle > 0.5 * self._config.min_parallax_deg
+        parallax = float(np.median(angle)) if len(angle) else 0.0
+        return _Pair(a, b, matches, T_b_a, points.xyz, good, parallax)
+
+    # --- witnesses and bundle adjustment
+
+    def _witnesses(self, first: int, last: int) -> list[View]:
+        """Views spread evenly between the two."""
+        between = np.linspace(first, last, N_WITNESSES + 2)[1:-1]
+        positions = sorted({round(p) for p in between} - {first, last})
+        return [self._views[p] for p in positions if len(self._views[p].features) >= self._config.min_points]
+
+    def _verify(self, pair: _Pair, views: list[View]) -> Start | Failure:
+        config = self._config
+        good = np.flatnonzero(pair.good)
+        xyz = pair.xyz[good]
+        feature = np.full((len(views), len(good)), -1, np.int64)
+        feature[0], feature[-1] = pair.matches.index[good, 0], pair.matches.index[good, 1]
+        T_first_cam = np.tile(np.eye(4), (len(views), 1, 1))
+        T_first_cam[-1] = se3.inverse(pair.T_b_a)
+        support = []
+        for v in range(1, len(views) - 1):
+            share = (views[v].index - pair.a.index) / (pair.b.index - pair.a.index)
+            T_guess = se3.exp(share * se3.log(pair.T_b_a))
+            found = self._resect(views[v], T_guess, xyz, pair.a.features.descriptors[feature[0]], pair, good)
+            if isinstance(found, Failure):
+                support.append(0.0)
+                continue
+            T_cam_first, feature[v], ratio = found
+            T_first_cam[v] = se3.inverse(T_cam_first)
+            support.append(ratio)
+        keep_views = (feature >= 0).any(axis=1)
+        numbers = {
+            "n_points": float(len(good)),
+            "parallax_deg": pair.parallax_deg,
+            "support": float(min(support)) if support else 0.0,
+        }
+        if not support or min(support) < config.min_support:
+            detail = f"the frames between confirm {numbers['support']:.0%} of the points"
+            return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers)
+        views = [v for v, keep in zip(views, keep_views, strict=True) if keep]
+        return self._adjust(views, T_first_cam[keep_views], xyz, feature[keep_views], numbers)
+
+    def _resect(
+        self, view: View, T_guess: FloatArray, xyz: FloatArray, descriptors, pair: _Pair, good: IntArray  # type: ignore[no-untyped-def]
+    ) -> tuple[FloatArray, IntArray, float] | Failure:
+        """Pose a witness from the points alone; return pose, features, and the share of its matches that agree."""
+        p_cam = xyz @ T_guess[:3, :3].T + T_guess[:3, 3]
+        uv = p_cam[:, :2] / np.maximum(p_cam[:, 2:], 1e-6) * np.diag(self._K)[:2] + self._K[:2, 2]
+        octave = pair.a.features.octave[pair.matches.index[good, 0]]
+        grid = FeatureGrid(view.features, self._size_px)
+        matches = match_projected(
+            self._frontend,
+            grid,
+            view.features,
+            uv,
+            np.full(len(uv), WITNESS_RADIUS_PX),
+            descriptors,
+            octave,
+            max_distance=self._frontend.max_distance_strict,
+        )
+        if len(matches) < self._config.min_points // 2:
+            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(matches)} of {len(xyz)} points found")
+        row, feature = matches.index[:, 0], matches.index[:, 1]
+        estimate = refine_pose(
+            self._K, T_guess, xyz[row], view.features.uv_rect_px[feature], view.features.sigma_px[feature]
+        )
+        if isinstance(estimate, Failure):
+            return estimate
+        features = np.full(len(xyz), -1, np.int64)
+        features[row[estimate.inliers]] = feature[estimate.inliers]
+        return estimate.T_cam_w, features, estimate.n_inliers / len(matches)
+
+    def _adjust(
+        self, views: list[View], T_first_cam: FloatArray, xyz: FloatArray, feature: IntArray, numbers: dict[str, float]
+    ) -> Start | Failure:
+        view_of, point_of = np.nonzero(feature >= 0)
+        seen = feature[view_of, point_of]
+        uv = np.array([views[v].features.uv_rect_px[f] for v, f in zip(view_of, seen, strict=True)])
+        sigma = np.array([views[v].features.sigma_px[f] for v, f in zip(view_of, seen, strict=True)])
+        fixed = np.zeros(len(views), bool)
+        fixed[0] = True
+        problem = BundleProblem(self._K, T_first_cam, fixed, xyz, view_of, point_of, uv, sigma, scale_pair=(0, -1))
+        result = self._adjuster(problem)
+        if isinstance(result, Failure):
+            return result
+        inlier = result.chi2 < CHI2_2
+        n_bad = np.bincount(point_of[~inlier], minlength=len(xyz))
+        direction = direction_sigma_deg(problem, result.T_w_cam, result.xyz, inlier)
+        numbers = {**numbers, "chi2": float(np.median(result.chi2) / 1.386), "direction_sigma_deg": direction}
+        # A point must agree with both ends, and may miss at most one witness.
+        ends_ok = np.ones(len(xyz), bool)
+        ends_ok[point_of[~inlier & ((view_of == 0) | (view_of == len(views) - 1))]] = False
+        in_front = np.all(
+            np.einsum("vij,nj->vni", _rotations_cam(result.T_w_cam), result.xyz)[..., 2]
+            + _translations_cam(result.T_w_cam)[:, None, 2]
+            > 0,
+            axis=0,
+        )
+        keep = ends_ok & (n_bad <= 1) & in_front
+        numbers["n_points"] = float(keep.sum())
+        if keep.sum() < self._config.min_points or keep.mean() < self._config.min_support:
+            return Failure(
+                FailureReason.DOUBTFUL_INITIALISATION, f"{keep.sum()} of {len(xyz)} points survive adjustment", numbers
+            )
+        if not numbers["chi2"] < self._config.max_chi2:
+            return Failure(FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {numbers['chi2']:.1f}", numbers)
+        if not direction < self._config.max_direction_sigma_deg:
+            return Failure(
+                FailureReason.LOW_PARALLAX, f"direction of translation known to {direction:.1f} deg only", numbers
+            )
+        feature = feature.copy()
+        feature[view_of[~inlier], point_of[~inlier]] = -1
+        depth = float(np.median(result.xyz[keep, 2]))
+        T = result.T_w_cam.copy()
+        T[:, :3, 3] /= depth
+        return Start(views, T, result.xyz[keep] / depth, feature[:, keep], numbers)
+
+
+def direction_sigma_deg(
+    problem: BundleProblem, T_w_cam: FloatArray, xyz: FloatArray, inlier: BoolArray
+) -> float:
+    """Standard deviation of the direction from the first to the last camera, by the two views' Hessian, degrees.
+
+    The points are eliminated by the Schur complement; the scale, which two views cannot tell, is held by its own prior.
+    """
+    last = len(T_w_cam) - 1
+    in_first = np.zeros(len(xyz), bool)
+    in_first[problem.point_of[(problem.view_of == 0) & inlier]] = True
+    rows = np.flatnonzero((problem.view_of == last) & inlier & in_first[problem.point_of])
+    points = xyz[problem.point_of[rows]]
+    sigma = problem.sigma_px[rows]
+    H_pp = np.zeros((len(rows), 3, 3))
+    for v in (0, last):
+        _, J_point = _jacobians(problem.K, T_w_cam[v], points)
+        H_pp += np.einsum("nki,nkj->nij", J_point, J_point) / sigma[:, None, None] ** 2
+    J_pose, J_point = _jacobians(problem.K, T_w_cam[last], points)
+    weight = 1 / sigma[:, None, None] ** 2
+    H_cp = np.einsum("nki,nkj->nij", J_pose, J_point) * weight
+    H_cc = (np.einsum("nki,nkj->nij", J_pose, J_pose) * weight).sum(0)
+    try:
+        S = H_cc - np.einsum("nij,njk,nlk->il", H_cp, np.linalg.inv(H_pp), H_cp)
+        t_cam = se3.inverse(T_w_cam[last])[:3, 3]
+        along = np.zeros(6)
+        along[3:] = t_cam / np.linalg.norm(t_cam)
+        S += np.outer(along, along) * np.trace(H_cc)
+        covariance = np.linalg.inv(S)[3:, 3:]
+    except np.linalg.LinAlgError:
+        return float("inf")
+    across = np.eye(3) - np.outer(along[3:], along[3:])
+    variance = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
+    return float(np.degrees(np.sqrt(max(variance, 0.0)) / np.linalg.norm(t_cam)))
+
+
+def _jacobians(K: FloatArray, T_w_cam: FloatArray, xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """d uv / d (left perturbation of T_cam_w) and d uv / d point, (N, 2, 6) and (N, 2, 3)."""
+    T_cam_w = se3.inverse(T_w_cam)
+    p = xyz @ T_cam_w[:3, :3].T + T_cam_w[:3, 3]
+    J_uv = np.zeros((len(p), 2, 3))
+    J_uv[:, 0, 0] = K[0, 0] / p[:, 2]
+    J_uv[:, 1, 1] = K[1, 1] / p[:, 2]
+    J_uv[:, 0, 2] = -K[0, 0] * p[:, 0] / p[:, 2] ** 2
+    J_uv[:, 1, 2] = -K[1, 1] * p[:, 1] / p[:, 2] ** 2
+    J_p = np.zeros((len(p), 3, 6))
+    J_p[:, 0, 1], J_p[:, 0, 2] = p[:, 2], -p[:, 1]
+    J_p[:, 1, 0], J_p[:, 1, 2] = -p[:, 2], p[:, 0]
+    J_p[:, 2, 0], J_p[:, 2, 1] = p[:, 1], -p[:, 0]
+    J_p[:, :, 3:] = np.eye(3)
+    return J_uv @ J_p, J_uv @ T_cam_w[:3, :3]
+
+
+def _rotations_cam(T_w_cam: FloatArray) -> FloatArray:
+    return np.swapaxes(T_w_cam[:, :3, :3], 1, 2)
+
+
+def _translations_cam(T_w_cam: FloatArray) -> FloatArray:
+    return -np.einsum("vji,vj->vi", T_w_cam[:, :3, :3], T_w_cam[:, :3, 3])
+
+
+def _direction_angle_deg(T_1: FloatArray, T_2: FloatArray) -> float:
+    t1, t2 = T_1[:3, 3], T_2[:3, 3]
+    cosine = t1 @ t2 / max(float(np.linalg.norm(t1) * np.linalg.norm(t2)), 1e-12)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

@@ -1,0 +1,228 @@
+"""What a new keyframe does to the map: observations, culling, duplicates merged, new landmarks triangulated."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dualslam.core.config import MappingConfig
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.triangulation import triangulate_two_view
+from dualslam.core.geometry.two_view import fundamental_from_pose
+from dualslam.core.interfaces import Frontend, MappingReport
+from dualslam.core.submap import NO_LANDMARK, Submap
+from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Keyframe, Track
+from frontends.local_map import LocalMap
+from frontends.matching import FeatureGrid, match_epipolar, match_projected
+
+FUSE_RADIUS_PX = 3.0  # about 3 sigma of a well-posed landmark's pixel at the finest octave
+YOUNG_KEYFRAMES = 3  # a landmark is on probation for this many keyframes
+N_OTHERS = 3  # views by others that make an observation redundant
+
+
+class Mapper:
+    """Extends a submap by keyframes; knows nothing of the order in which they come."""
+
+    def __init__(
+        self, frontend: Frontend, config: MappingConfig, submap: Submap, size_px: tuple[int, int]
+    ) -> None:
+        self._frontend = frontend
+        self._config = config
+        self._submap = submap
+        self._size_px = size_px
+        self._young: list[tuple[int, IntArray]] = []  # keyframe count at birth, landmark ids
+        self._n_inserted = 0
+
+    def insert(self, track: Track) -> MappingReport:
+        """Make a tracked frame a keyframe and grow the map about it (poses stay as they are: solving comes after)."""
+        submap, view = self._submap, track.view
+        T_submap_kf = se3.inverse(track.T_cam_submap)
+        submap.add_keyframe(Keyframe(view.index, view.timestamp_s, view.features), T_submap_kf)
+        feature = np.flatnonzero(track.landmark_ids >= 0)
+        submap.add_observations(view.index, feature, track.landmark_ids[feature])
+        self._n_inserted += 1
+        n_culled = self._cull_young()
+        neighbours = self._neighbours(view.index)
+        n_extended, n_merged = self._search_neighbour_landmarks(view.index, neighbours)
+        new = self._triangulate(view.index, neighbours)
+        self._search_new_in_neighbours(new, neighbours)
+        self._young.append((self._n_inserted, new))
+        self._refresh_descriptions(view.index)
+        return MappingReport(len(new), n_merged, n_culled, n_extended)
+
+    def remove_outliers(self, rows: IntArray) -> None:
+        """Drop observations that the graph found to disagree, and landmarks left with fewer than two."""
+        submap = self._submap
+        touched = np.unique(submap.observations["landmark"][rows])
+        submap.remove_observations(rows)
+        submap.remove_landmarks(touched[submap.n_observations(touched) < 2])
+
+    # --- steps
+
+    def _neighbours(self, keyframe_id: int) -> list[int]:
+        """Older keyframes to pair with: the most covisible, with baselines as different as they come."""
+        submap = self._submap
+        ids = submap.landmark_of[keyframe_id]
+        found, counts = submap.covisible(ids[ids >= 0])
+        keep = (found != keyframe_id) & (counts >= 15)
+        return [int(k) for k in found[keep][: self._config.triangulate_against]]
+
+    def _cull_young(self) -> int:
+        """Cull landmarks on probation that tracking does not find, or that too few keyframes came to see."""
+        submap, config, kept, n_culled = self._submap, self._config, [], 0
+        for born, ids in self._young:
+            ids = ids[submap.landmarks["alive"][ids]]
+            age = self._n_inserted - born
+            lm = submap.landmarks
+            ratio = lm["n_found"][ids] / np.maximum(lm["n_visible"][ids], 1)
+            bad = ratio < config.min_found_ratio
+            if age >= 2:
+                bad |= submap.n_observations(ids) < config.min_observations
+            submap.remove_landmarks(ids[bad])
+            n_culled += int(bad.sum())
+            if age < YOUNG_KEYFRAMES:
+                kept.append((born, ids[~bad]))
+        self._young = kept
+        return n_culled
+
+    def _search_neighbour_landmarks(self, k: int, neighbours: list[int]) -> tuple[int, int]:
+        """Look for the neighbours' landmarks in the new keyframe: new observations, or duplicates to merge."""
+        submap = self._submap
+        own = submap.landmark_of[k]
+        others = submap.landmarks_of_keyframes(neighbours)
+        local = LocalMap.of_landmarks(submap, others[~np.isin(others, own)])
+        return self._observe_in(k, local)
+
+    def _observe_in(self, k: int, local: LocalMap) -> tuple[int, int]:
+        """Search landmarks in a keyframe; a free feature becomes an observation, a taken one a pair to merge."""
+        submap, frontend = self._submap, self._frontend
+        features = submap.keyframes[k].features
+        prediction = local.predict(
+            se3.inverse(submap.T_submap_kf[k]), submap.K, self._size_px, frontend.scale_factor, frontend.n_octaves
+        )
+        matches = match_projected(
+            frontend,
+            FeatureGrid(features, self._size_px),
+            features,
+            prediction.uv_px,
+            FUSE_RADIUS_PX * frontend.scale_factor**prediction.octave,
+            local.descriptors[prediction.rows],
+            prediction.octave,
+            max_distance=frontend.max_distance_strict,
+        )
+        row, feature = matches.index[:, 0], matches.index[:, 1]
+        error = (features.uv_rect_px[feature] - prediction.uv_px[row]) / features.sigma_px[feature][:, None]
+        close = np.einsum("ij,ij->i", error, error) < self._config.reprojection_chi2
+        ids, feature = local.landmark_ids[prediction.rows[row[close]]], feature[close]
+        there = submap.landmark_of[k][feature]
+        free = there == NO_LANDMARK
+        submap.add_observations(k, feature[free], ids[free])
+        # Merge towards the landmark that more keyframes see.
+        ids, there = ids[~free], there[~free]
+        swap = submap.n_observations(ids) > submap.n_observations(there)
+        submap.merge_landmarks(np.where(swap, ids, there), np.where(swap, there, ids))
+        return int(free.sum()), len(ids)
+
+    def _triangulate(self, k: int, neighbours: list[int]) -> IntArray:
+        """Triangulate the keyframe's free features against several older keyframes."""
+        created = []
+        for other in neighbours:
+            ids = self._triangulate_pair(k, other)
+            created.append(ids)
+        return np.concatenate(created) if created else np.zeros(0, np.int64)
+
+    def _triangulate_pair(self, k: int, other: int) -> IntArray:
+        submap, config = self._submap, self._config
+        a, b = submap.keyframes[k].features, submap.keyframes[other].features
+        rows_a = np.flatnonzero(submap.landmark_of[k] == NO_LANDMARK)
+        rows_b = np.flatnonzero(submap.landmark_of[other] == NO_LANDMARK)
+        T_submap_a, T_submap_b = submap.T_submap_kf[k], submap.T_submap_kf[other]
+        baseline = float(np.linalg.norm(T_submap_a[:3, 3] - T_submap_b[:3, 3]))
+        if not self._wide_enough(other, baseline) or len(rows_a) == 0 or len(rows_b) == 0:
+            return np.zeros(0, np.int64)
+        T_b_a = se3.inverse(T_submap_b) @ T_submap_a
+        matches = match_epipolar(
+            self._frontend, a, b, rows_a, rows_b, fundamental_from_pose(submap.K, T_b_a), submap.K, T_b_a
+        )
+        fa, fb = matches.index[:, 0], matches.index[:, 1]
+        points = triangulate_two_view(a.uv_rect_px[fa], b.uv_rect_px[fb], submap.K, T_submap_a, T_submap_b)
+        ok = (
+            (points.depth_a > 0)
+            & (points.depth_b > 0)
+            & (points.cos_parallax < np.cos(np.radians(config.min_parallax_deg)))
+            & (points.error2_a < config.reprojection_chi2 * a.sigma_px[fa] ** 2)
+            & (points.error2_b < config.reprojection_chi2 * b.sigma_px[fb] ** 2)
+            & self._scales_agree(a, b, fa, fb, points.depth_a, points.depth_b)
+        )
+        fa, fb = fa[ok], fb[ok]
+        ids = submap.add_landmarks(points.xyz[ok], a.descriptors[fa], a.scale[fa], k)
+        submap.add_observations(other, fb, ids)
+        submap.add_observations(k, fa, ids)
+        return ids
+
+    def _wide_enough(self, other: int, baseline_mu: float) -> bool:
+        """Whether the baseline can give the scene's median depth the smallest parallax that is asked for."""
+        submap = self._submap
+        ids = submap.landmark_of[other]
+        ids = ids[ids >= 0]
+        if len(ids) == 0:
+            return False
+        T_cam_submap = se3.inverse(submap.T_submap_kf[other])
+        depth = submap.landmarks["xyz_mu"][ids] @ T_cam_submap[2, :3] + T_cam_submap[2, 3]
+        return baseline_mu > 0.5 * np.radians(self._config.min_parallax_deg) * float(np.median(depth))
+
+    def _scales_agree(
+        self, a: Features, b: Features, fa: IntArray, fb: IntArray, depth_a: FloatArray, depth_b: FloatArray
+    ) -> BoolArray:
+        """A patch at twice the distance has half the scale, to within 1.5 octaves' ratio."""
+        ratio = (depth_a * a.scale[fa]) / np.maximum(depth_b * b.scale[fb], 1e-12)
+        tolerance = 1.5 * self._frontend.scale_factor
+        return (ratio < tolerance) & (ratio > 1 / tolerance)
+
+    def _search_new_in_neighbours(self, new: IntArray, neighbours: list[int]) -> None:
+        """Look for the new landmarks in the neighbours that did not take part in their triangulation."""
+        submap = self._submap
+        for other in neighbours:
+            alive = new[submap.landmarks["alive"][new]]
+            unseen = alive[~np.isin(alive, submap.landmark_of[other])]
+            if len(unseen) == 0:
+                continue
+            self._observe_in(other, LocalMap.of_landmarks(submap, unseen))
+
+    def _refresh_descriptions(self, k: int) -> None:
+        """Describe each landmark that the keyframe sees as it looks from here: the view nearest to the next frames."""
+        submap, lm = self._submap, self._submap.landmarks
+        feature = np.flatnonzero(submap.landmark_of[k] >= 0)
+        ids = submap.landmark_of[k][feature]
+        features = submap.keyframes[k].features
+        to_camera = submap.T_submap_kf[k][:3, 3] - lm["xyz_mu"][ids]
+        distance = np.linalg.norm(to_camera, axis=1)
+        lm["descriptor"][ids] = features.descriptors[feature]
+        lm["normal"][ids] = to_camera / np.maximum(distance, 1e-12)[:, None]
+        lm["distance_mu"][ids] = distance
+        lm["scale"][ids] = features.scale[feature]
+
+    def redundant_keyframe(self, candidates: list[int]) -> int | None:
+        """Return the first candidate whose landmarks are nearly all seen by three others at the same or finer scale."""
+        for k in candidates:
+            if self._is_redundant(k):
+                return k
+        return None
+
+    def _is_redundant(self, k: int) -> bool:
+        submap = self._submap
+        feature = np.flatnonzero(submap.landmark_of[k] >= 0)
+        ids = submap.landmark_of[k][feature]
+        if len(ids) == 0:
+            return True
+        octave_of = dict(zip(ids.tolist(), submap.keyframes[k].features.octave[feature].tolist(), strict=True))
+        rows = submap.rows_of_landmarks(ids)
+        obs = submap.observations
+        rows = rows[obs["kf"][rows] != k]
+        landmark = obs["landmark"][rows]
+        octave = np.empty(len(rows), np.int64)
+        for other in np.unique(obs["kf"][rows]).tolist():
+            here = obs["kf"][rows] == other
+            octave[here] = submap.keyframes[other].features.octave[obs["feature"][rows[here]]]
+        own = np.array([octave_of[j] for j in landmark.tolist()])
+        as_fine = np.bincount(landmark[octave <= own + 1], minlength=len(submap.landmarks))
+        return float((as_fine[ids] >= N_OTHERS).mean()) > self._config.redundant_ratio

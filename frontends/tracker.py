@@ -1,0 +1,250 @@
+"""The pose of a frame against a submap: motion model, guided matching, robust pose; wide matching when that fails.
+
+The tracker does not know in which direction time runs: it predicts from the last two frames that it was given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import poselib
+
+from dualslam.core.config import TrackingConfig
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.projection import refine_pose
+from dualslam.core.interfaces import Frontend
+from dualslam.core.submap import NO_LANDMARK, Submap
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
+from frontends.local_map import LocalMap, Prediction
+from frontends.matching import FeatureGrid, match_projected
+
+WIDER = 2.5  # second guided search: this many times the first radius
+PNP_MIN_MATCHES = 12  # below this a RANSAC consensus of a 3-point solver is no evidence
+
+
+class Tracker:
+    """Tracks frames against one submap, one after the other, in whatever direction of time they come."""
+
+    def __init__(
+        self, frontend: Frontend, config: TrackingConfig, submap: Submap, size_px: tuple[int, int], seed: int
+    ) -> None:
+        self._frontend = frontend
+        self._config = config
+        self._submap = submap
+        self._size_px = size_px
+        self._seed = seed
+        self._last: Track | None = None
+        self._velocity: tuple[FloatArray, float] | None = None
+        self._local: LocalMap | None = None
+
+    @property
+    def last(self) -> Track | None:
+        """The last posed frame."""
+        return self._last
+
+    def start(self, track: Track) -> None:
+        """Begin at a frame whose pose is known, at rest."""
+        self._last, self._velocity = track, None
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Take the map's changes in (after a keyframe): local landmarks, merged ids, the last frame's refined pose."""
+        assert self._last is not None
+        submap, last = self._submap, self._last
+        ids = submap.current_ids(last.landmark_ids)
+        T_cam_submap = last.T_cam_submap
+        if last.view.index in submap.T_submap_kf:
+            T_cam_submap = se3.inverse(submap.T_submap_kf[last.view.index])
+            ids = submap.landmark_of[last.view.index].copy()
+        self._last = replace(last, landmark_ids=ids, T_cam_submap=T_cam_submap)
+        self._local = self._local_map(ids[ids >= 0])
+
+    def track(self, view: View) -> Track | Failure:
+        """Pose a frame. A failure leaves the tracker as it was, so that the next frame may succeed."""
+        assert self._last is not None, "start() comes first"
+        features = view.features
+        if len(features) < self._config.min_inliers:
+            return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features in the image")
+        grid = FeatureGrid(features, self._size_px)
+        T_predicted = self._predict(view.timestamp_s)
+        found: tuple[FloatArray, IntArray] | Failure = Failure(FailureReason.TOO_FEW_MATCHES)
+        for radius_px in (self._config.search_radius_px, self._config.search_radius_px * WIDER):
+            found = self._pose_from_last(view, grid, T_predicted, radius_px)
+            if found:
+                break
+        wide = not found
+        if isinstance(found, Failure):
+            found = self._pose_from_wide_matches(view)
+            if isinstance(found, Failure):
+                return found
+            self._local = self._local_map(found[1][found[1] >= 0])
+        track = self._pose_from_local_map(view, grid, *found, T_predicted, wide)
+        if isinstance(track, Failure):
+            return track
+        self._accept(track)
+        return track
+
+    # --- steps
+
+    def _predict(self, timestamp_s: float) -> FloatArray:
+        """Constant velocity: the last frame-to-frame motion, scaled to the time that has passed."""
+        assert self._last is not None
+        if self._velocity is None:
+            return self._last.T_cam_submap
+        xi, dt = self._velocity
+        ratio = (timestamp_s - self._last.view.timestamp_s) / dt if dt != 0 else 1.0
+        # Far beyond the measured interval (frames were lost) the velocity says little.
+        return se3.exp(xi * np.clip(ratio, 0.0, 3.0)) @ self._last.T_cam_submap
+
+    def _pose_from_last(
+        self, view: View, grid: FeatureGrid, T_predicted: FloatArray, radius_px: float
+    ) -> tuple[FloatArray, IntArray] | Failure:
+        """Search the last frame's landmarks about their predicted pixels."""
+        assert self._last is not None
+        last_rows = np.flatnonzero(self._last.landmark_ids >= 0)
+        ids = self._last.landmark_ids[last_rows]
+        local = LocalMap.of_landmarks(self._submap, ids)
+        prediction = self._predict_local(local, T_predicted)
+        # The last frame's own descriptor is the freshest view of the landmark.
+        descriptors = self._last.view.features.descriptors[last_rows][prediction.rows]
+        matches = match_projected(
+            self._frontend,
+            grid,
+            view.features,
+            prediction.uv_px,
+            radius_px * self._frontend.scale_factor**prediction.octave,
+            descriptors,
+            prediction.octave,
+            angle_rad=self._last.view.features.angle_rad[last_rows][prediction.rows],
+        )
+        rows, feature = prediction.rows[matches.index[:, 0]], matches.index[:, 1]
+        return self._refine(view, T_predicted, ids[rows], local.xyz_mu[rows], feature)
+
+    def _pose_from_wide_matches(self, view: View) -> tuple[FloatArray, IntArray] | Failure:
+        """Match the whole image against the recent keyframes, pose by PnP."""
+        submap, best = self._submap, Failure(FailureReason.TOO_FEW_MATCHES, "no keyframe matched")
+        for k in self._recent_keyframes(view.index):
+            has_landmark = np.flatnonzero(submap.landmark_of[k] >= 0)
+            matches = self._frontend.match_wide(submap.keyframes[k].features.take(has_landmark), view.features)
+            if len(matches) < PNP_MIN_MATCHES:
+                continue
+            ids = submap.landmark_of[k][has_landmark[matches.index[:, 0]]]
+            feature = matches.index[:, 1]
+            xyz, uv = submap.landmarks["xyz_mu"][ids], view.features.uv_rect_px[feature]
+            T_cam_submap = self._pnp(uv, xyz, float(np.median(view.features.sigma_px[feature])))
+            found = self._refine(view, T_cam_submap, ids, xyz, feature)
+            if found:
+                return found
+            assert isinstance(found, Failure)
+            best = found
+        return best
+
+    def _pnp(self, uv_px: FloatArray, xyz_mu: FloatArray, sigma_px: float) -> FloatArray:
+        K = self._submap.K
+        width, height = self._size_px
+        camera = {"model": "PINHOLE", "width": width, "height": height, "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
+        options = {"max_reproj_error": 3.0 * sigma_px, "max_iterations": 1000, "min_iterations": 50, "seed": self._seed}
+        pose, _ = poselib.estimate_absolute_pose(uv_px, xyz_mu, camera, options, {})
+        T_cam_submap = np.eye(4)
+        T_cam_submap[:3] = pose.Rt
+        return T_cam_submap
+
+    def _refine(
+        self, view: View, T_start: FloatArray, ids: IntArray, xyz_mu: FloatArray, feature: IntArray
+    ) -> tuple[FloatArray, IntArray] | Failure:
+        minimum = self._config.min_inliers
+        if len(ids) < minimum:
+            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(ids)} matches, {minimum} needed")
+        features = view.features
+        estimate = refine_pose(
+            self._submap.K, T_start, xyz_mu, features.uv_rect_px[feature], features.sigma_px[feature]
+        )
+        if isinstance(estimate, Failure):
+            return estimate
+        if estimate.n_inliers < minimum:
+            return Failure(FailureReason.TOO_FEW_INLIERS, f"{estimate.n_inliers} inliers of {len(ids)} matches")
+        landmark_ids = np.full(len(features), NO_LANDMARK, np.int64)
+        landmark_ids[feature[estimate.inliers]] = ids[estimate.inliers]
+        return estimate.T_cam_w, landmark_ids
+
+    def _pose_from_local_map(
+        self,
+        view: View,
+        grid: FeatureGrid,
+        T_cam_submap: FloatArray,
+        landmark_ids: IntArray,
+        T_predicted: FloatArray,
+        wide: bool,
+    ) -> Track | Failure:
+        """Add the local map's other landmarks about their pixels under the first pose, and refine with all of them."""
+        assert self._local is not None
+        features, local, submap = view.features, self._local, self._submap
+        prediction = self._predict_local(local, T_cam_submap)
+        new = ~np.isin(local.landmark_ids[prediction.rows], landmark_ids)
+        matches = match_projected(
+            self._frontend,
+            grid,
+            features,
+            prediction.uv_px[new],
+            self._config.local_radius_px * self._frontend.scale_factor ** prediction.octave[new],
+            local.descriptors[prediction.rows[new]],
+            prediction.octave[new],
+            taken=landmark_ids >= 0,
+        )
+        landmark_ids = landmark_ids.copy()
+        landmark_ids[matches.index[:, 1]] = local.landmark_ids[prediction.rows[new][matches.index[:, 0]]]
+        feature = np.flatnonzero(landmark_ids >= 0)
+        ids = landmark_ids[feature]
+        estimate = refine_pose(
+            submap.K,
+            T_cam_submap,
+            submap.landmarks["xyz_mu"][ids],
+            features.uv_rect_px[feature],
+            features.sigma_px[feature],
+        )
+        if isinstance(estimate, Failure):
+            return estimate
+        if estimate.n_inliers < self._config.min_inliers:
+            return Failure(FailureReason.TOO_FEW_INLIERS, f"{estimate.n_inliers} inliers of {len(ids)} matches")
+        landmark_ids[feature[~estimate.inliers]] = NO_LANDMARK
+        visible = local.landmark_ids[prediction.rows]
+        submap.landmarks["n_visible"][visible] += 1
+        submap.landmarks["n_found"][ids[estimate.inliers]] += 1
+        return Track(
+            view,
+            estimate.T_cam_w,
+            T_predicted,
+            landmark_ids,
+            n_visible=len(visible),
+            n_matches=len(ids),
+            n_inliers=estimate.n_inliers,
+            chi2=float(estimate.chi2[estimate.inliers].mean() / 2),
+            wide=wide,
+            covariance=estimate.covariance,
+        )
+
+    def _accept(self, track: Track) -> None:
+        assert self._last is not None
+        last = self._last
+        dt = track.view.timestamp_s - last.view.timestamp_s
+        self._velocity = (se3.log(track.T_cam_submap @ se3.inverse(last.T_cam_submap)), dt)
+        self._last = track
+
+    # --- the local map
+
+    def _predict_local(self, local: LocalMap, T_cam_submap: FloatArray) -> Prediction:
+        frontend = self._frontend
+        return local.predict(
+            T_cam_submap, self._submap.K, self._size_px, frontend.scale_factor, frontend.n_octaves
+        )
+
+    def _local_map(self, landmark_ids: IntArray) -> LocalMap:
+        keyframe_ids, _ = self._submap.covisible(landmark_ids)
+        nearest = keyframe_ids[: self._config.local_keyframes]
+        return LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(nearest))
+
+    def _recent_keyframes(self, frame_index: int) -> list[int]:
+        """Keyframes nearest in time, nearest first."""
+        by_time = sorted(self._submap.keyframes, key=lambda k: (abs(k - frame_index), k))
+        return by_time[: self._config.wide_keyframes]

@@ -1,0 +1,94 @@
+"""The visual front end: frames in, keyframes of one submap out, in either direction of time.
+
+The same object tracks live frames, walks back from a new submap's first keyframe to frames before it, and walks back
+through a buffer to an older submap: the only difference is the order in which it is given the frames.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dualslam.core.config import Config
+from dualslam.core.geometry import se3
+from dualslam.core.interfaces import Frontend, KeyframeReport, SubmapGraph
+from dualslam.core.submap import Submap
+from dualslam.core.types import Failure, FloatArray, Track, View
+from frontends.keyframing import keyframe_due
+from frontends.mapper import Mapper
+from frontends.tracker import Tracker
+
+CULL_BEHIND = 2  # the newest keyframes are not judged redundant: the next ones may need them
+
+
+class VisualFrontEnd:
+    """Tracks frames against a submap and extends it by keyframes."""
+
+    def __init__(
+        self, frontend: Frontend, config: Config, submap: Submap, graph: SubmapGraph, size_px: tuple[int, int]
+    ) -> None:
+        self.submap = submap
+        self.graph = graph
+        self._config = config
+        self._tracker = Tracker(frontend, config.tracking, submap, size_px, config.seed)
+        self._mapper = Mapper(frontend, config.mapping, submap, size_px)
+        self._reference_id = -1
+        self._path: list[int] = []  # keyframes in the order in which this front end met them
+
+    @property
+    def reference_id(self) -> int:
+        """The keyframe that frames are posed against."""
+        return self._reference_id
+
+    def start_at(self, keyframe_id: int) -> None:
+        """Begin at a keyframe of the submap, at rest."""
+        keyframe = self.submap.keyframes[keyframe_id]
+        view = View(keyframe.id, keyframe.timestamp_s, keyframe.features)
+        T_cam_submap = se3.inverse(self.submap.T_submap_kf[keyframe_id])
+        landmark_ids = self.submap.landmark_of[keyframe_id].copy()
+        n = int((landmark_ids >= 0).sum())
+        track = Track(view, T_cam_submap, T_cam_submap, landmark_ids, n, n, n, 1.0, False, np.zeros((6, 6)))
+        self._tracker.start(track)
+        self._reference_id = keyframe_id
+        self._path = [keyframe_id]
+
+    def track(self, view: View) -> Track | Failure:
+        """Pose a frame against the submap."""
+        track = self._tracker.track(view)
+        if track and view.index in self.submap.keyframes:
+            self._meet(view.index)
+        return track
+
+    def relative_pose(self, track: Track) -> FloatArray:
+        """Return ``T_kf_cam``, the track's pose relative to the reference keyframe."""
+        return se3.inverse(self.submap.T_submap_kf[self._reference_id]) @ se3.inverse(track.T_cam_submap)
+
+    def keyframe_due(self, track: Track) -> bool:
+        """Whether the frame should become a keyframe."""
+        return keyframe_due(track, self.submap, self._reference_id, self._config.keyframes)
+
+    def insert_keyframe(self, track: Track) -> KeyframeReport:
+        """Make the frame a keyframe: extend the map, solve its graph, drop what the solution contradicts."""
+        mapping = self._mapper.insert(track)
+        estimate = self.graph.update(self.submap)
+        self.submap.apply_estimate(
+            estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu
+        )
+        self._mapper.remove_outliers(estimate.outlier_rows)
+        self._meet(track.view.index)
+        culled = self._cull_keyframe()
+        self._tracker.refresh()
+        return KeyframeReport(mapping, estimate, len(estimate.outlier_rows), culled)
+
+    def _meet(self, keyframe_id: int) -> None:
+        if keyframe_id != self._reference_id:
+            self._reference_id = keyframe_id
+            self._path.append(keyframe_id)
+
+    def _cull_keyframe(self) -> int | None:
+        """Cull at most one keyframe that has become redundant; those of the gauge stay."""
+        candidates = [k for k in self._path[-CULL_BEHIND - 3 : -CULL_BEHIND] if k not in self.submap.gauge]
+        culled = self._mapper.redundant_keyframe(candidates)
+        if culled is not None:
+            self._path.remove(culled)
+            self.submap.remove_keyframe(culled, self._path[-1])
+        return culled
