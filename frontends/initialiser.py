@@ -17,12 +17,11 @@ from dualslam.core.geometry.projection import refine_pose
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.interfaces import BundleAdjuster, BundleProblem, Frontend
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray, Matches, Start, View
-from frontends.matching import FeatureGrid, match_projected
+from frontends.resection import resect
 from frontends.two_view_hypotheses import CHI2_2, propose_relative_poses
 
 LAGS = (2, 4, 8, 16, 32, 64)  # frames back that are tried as the first view
 N_WITNESSES = 3  # frames between the two views that must agree
-WITNESS_RADIUS_PX = 30.0  # they stand near the path that is interpolated between the two views
 RUNNER_UP = 0.75  # another pose that explains this share of the winner's points makes the start ambiguous
 
 
@@ -37,6 +36,15 @@ class _Pair:
     xyz: FloatArray
     good: BoolArray
     parallax_deg: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Witness:
+    """A view between the two: its pose, its feature of each point (or -1), the share of its matches that agree."""
+
+    T_first_cam: FloatArray
+    feature: IntArray
+    support: float
 
 
 class Initialiser:
@@ -156,15 +164,12 @@ class Initialiser:
         T_first_cam[-1] = se3.inverse(pair.T_b_a)
         support = []
         for v in range(1, len(views) - 1):
-            share = (views[v].index - pair.a.index) / (pair.b.index - pair.a.index)
-            T_guess = se3.exp(share * se3.log(pair.T_b_a))
-            found = self._resect(views[v], T_guess, xyz, pair.a.features.descriptors[feature[0]], pair, good)
-            if isinstance(found, Failure):
+            witness = self._confirm(views[v], pair.a, feature[0], xyz)
+            if isinstance(witness, Failure):
                 support.append(0.0)
                 continue
-            T_cam_first, feature[v], ratio = found
-            T_first_cam[v] = se3.inverse(T_cam_first)
-            support.append(ratio)
+            T_first_cam[v], feature[v] = witness.T_first_cam, witness.feature
+            support.append(witness.support)
         keep_views = (feature >= 0).any(axis=1)
         numbers = {
             "n_points": float(len(good)),
@@ -177,35 +182,20 @@ class Initialiser:
         views = [v for v, keep in zip(views, keep_views, strict=True) if keep]
         return self._adjust(views, T_first_cam[keep_views], xyz, feature[keep_views], numbers)
 
-    def _resect(
-        self, view: View, T_guess: FloatArray, xyz: FloatArray, descriptors, pair: _Pair, good: IntArray  # type: ignore[no-untyped-def]
-    ) -> tuple[FloatArray, IntArray, float] | Failure:
-        """Pose a witness from the points alone; return pose, features, and the share of its matches that agree."""
-        p_cam = xyz @ T_guess[:3, :3].T + T_guess[:3, 3]
-        uv = p_cam[:, :2] / np.maximum(p_cam[:, 2:], 1e-6) * np.diag(self._K)[:2] + self._K[:2, 2]
-        octave = pair.a.features.octave[pair.matches.index[good, 0]]
-        grid = FeatureGrid(view.features, self._size_px)
-        matches = match_projected(
-            self._frontend,
-            grid,
-            view.features,
-            uv,
-            np.full(len(uv), WITNESS_RADIUS_PX),
-            descriptors,
-            octave,
-            max_distance=self._frontend.max_distance_strict,
-        )
+    def _confirm(self, witness: View, first: View, feature: IntArray, xyz: FloatArray) -> _Witness | Failure:
+        """Pose a witness from the points alone, without a guess, and count how many of its matches agree."""
+        matches = self._frontend.match_wide(first.features.take(feature), witness.features)
         if len(matches) < self._config.min_points // 2:
             return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(matches)} of {len(xyz)} points found")
-        row, feature = matches.index[:, 0], matches.index[:, 1]
-        estimate = refine_pose(
-            self._K, T_guess, xyz[row], view.features.uv_rect_px[feature], view.features.sigma_px[feature]
-        )
+        point, seen = matches.index[:, 0], matches.index[:, 1]
+        uv_px, sigma_px = witness.features.uv_rect_px[seen], witness.features.sigma_px[seen]
+        T_guess = resect(self._K, self._size_px, uv_px, xyz[point], float(np.median(sigma_px)), self._seed)
+        estimate = refine_pose(self._K, T_guess, xyz[point], uv_px, sigma_px)
         if isinstance(estimate, Failure):
             return estimate
         features = np.full(len(xyz), -1, np.int64)
-        features[row[estimate.inliers]] = feature[estimate.inliers]
-        return estimate.T_cam_w, features, estimate.n_inliers / len(matches)
+        features[point[estimate.inliers]] = seen[estimate.inliers]
+        return _Witness(se3.inverse(estimate.T_cam_w), features, estimate.n_inliers / len(matches))
 
     def _adjust(
         self, views: list[View], T_first_cam: FloatArray, xyz: FloatArray, feature: IntArray, numbers: dict[str, float]

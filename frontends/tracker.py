@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import poselib
 
 from dualslam.core.config import TrackingConfig
 from dualslam.core.geometry import se3
@@ -18,6 +17,7 @@ from dualslam.core.submap import NO_LANDMARK, Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from frontends.local_map import LocalMap, Prediction
 from frontends.matching import FeatureGrid, match_projected
+from frontends.resection import resect
 
 WIDER = 2.5  # second guided search: this many times the first radius
 PNP_MIN_MATCHES = 12  # below this a RANSAC consensus of a 3-point solver is no evidence
@@ -132,23 +132,14 @@ class Tracker:
             ids = submap.landmark_of[k][has_landmark[matches.index[:, 0]]]
             feature = matches.index[:, 1]
             xyz, uv = submap.landmarks["xyz_mu"][ids], view.features.uv_rect_px[feature]
-            T_cam_submap = self._pnp(uv, xyz, float(np.median(view.features.sigma_px[feature])))
+            sigma_px = float(np.median(view.features.sigma_px[feature]))
+            T_cam_submap = resect(submap.K, self._size_px, uv, xyz, sigma_px, self._seed)
             found = self._refine(view, T_cam_submap, ids, xyz, feature)
             if found:
                 return found
             assert isinstance(found, Failure)
             best = found
         return best
-
-    def _pnp(self, uv_px: FloatArray, xyz_mu: FloatArray, sigma_px: float) -> FloatArray:
-        K = self._submap.K
-        width, height = self._size_px
-        camera = {"model": "PINHOLE", "width": width, "height": height, "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
-        options = {"max_reproj_error": 3.0 * sigma_px, "max_iterations": 1000, "min_iterations": 50, "seed": self._seed}
-        pose, _ = poselib.estimate_absolute_pose(uv_px, xyz_mu, camera, options, {})
-        T_cam_submap = np.eye(4)
-        T_cam_submap[:3] = pose.Rt
-        return T_cam_submap
 
     def _refine(
         self, view: View, T_start: FloatArray, ids: IntArray, xyz_mu: FloatArray, feature: IntArray
