@@ -1,0 +1,61 @@
+"""Files that appear whole or not at all: written beside their place under another name, then renamed into it."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+from dualslam.core.errors import OutputError
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[IO[bytes]]:
+    """Open a file for writing (bytes) that takes the place of `path` only when the block ends without an exception.
+
+    The new content is on the disk before the rename, so a crash at any moment leaves the old file or the new one.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be written to.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+    except OSError as e:
+        raise OutputError(f"{path} cannot be written: {e.strerror or e}; choose another folder.") from e
+    part = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        # mkstemp makes files private to the user; results follow the umask like any other file.
+        part.chmod(0o666 & ~_umask())
+        part.replace(path)
+    except OSError as e:
+        raise OutputError(f"{path} cannot be written: {e.strerror or e}.") from e
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically, UTF-8."""
+    with atomic_file(path) as file:
+        file.write(text.encode())
+
+
+def _umask() -> int:
+    # The mask can only be read by setting it.
+    mask = os.umask(0o022)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,178 @@
+"""Images of a sequence as files, in a folder or in a zip archive: found, put in order and decoded."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.errors import InputError
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
+# How the files of a format end; a file without its ending was cut off, which decoders fill with grey and do not tell.
+_ENDINGS = {b"\xff\xd8\xff": b"\xff\xd9", b"\x89PNG": b"IEND\xaeB`\x82"}
+_TAIL_BYTES = 1024
+
+
+class UnreadableImageError(Exception):
+    """One image of a sequence cannot be had. Its message is the sentence that the frame carries; reading goes on."""
+
+
+class ImageReader(Protocol):
+    """Gives images by their position in the source. Used by one thread."""
+
+    def read(self, index: int) -> NDArray[np.uint8]:
+        """Return (H, W) or (H, W, 3) RGB; raise `UnreadableImageError`."""
+        ...
+
+    def close(self) -> None:
+        """Let go of what is open."""
+        ...
+
+
+class ImageStore(Protocol):
+    """The images of a source; every reading of the sequence opens a reader of its own."""
+
+    def __len__(self) -> int: ...
+
+    def reader(self, grey: bool) -> ImageReader:
+        """Return a new reader; `grey` images are (H, W), others (H, W, 3) RGB."""
+        ...
+
+
+def natural_key(name: str) -> list[tuple[int, int | str]]:
+    """Sort key under which frame2 comes before frame10."""
+    return [(0, int(part)) if part.isdigit() else (1, part.lower()) for part in re.split(r"(\d+)", name) if part]
+
+
+def list_images(folder: Path) -> list[Path]:
+    """Return the image files of a folder in natural order.
+
+    Raises
+    ------
+    InputError
+        If the folder is missing or holds no image.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} does not exist or is no folder; it should hold the images.")
+    found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+    if not found:
+        raise InputError(f"{folder} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}); check the path.")
+    return sorted(found, key=lambda p: natural_key(p.name))
+
+
+def fill_gaps(paths: Sequence[Path], expected: int) -> list[Path]:
+    """Put the missing numbers back into a list of numbered files, if that makes it `expected` long.
+
+    A sequence of which a few images were lost can then be read with those frames unreadable, each at its own time.
+    Where the numbers do not tell for sure which images are missing the list is returned as it is.
+    """
+    stems = [p.stem for p in paths]
+    widths = {len(s) for s in stems}
+    padded = any(s.startswith("0") and len(s) > 1 for s in stems)
+    if len(paths) >= expected or not all(s.isdigit() for s in stems) or (padded and len(widths) > 1):
+        return list(paths)
+    by_number = {int(s): p for s, p in zip(stems, paths, strict=True)}
+    first, last = min(by_number), max(by_number)
+    if last - first + 1 != expected:
+        return list(paths)
+    width, template = min(widths), paths[0]
+    return [by_number.get(n, template.with_stem(f"{n:0{width}d}")) for n in range(first, last + 1)]
+
+
+def decode(data: bytes, name: str, grey: bool) -> NDArray[np.uint8]:
+    """Decode a file's bytes to (H, W) grey or (H, W, 3) RGB; `name` is for the message of `UnreadableImageError`."""
+    if not data:
+        raise UnreadableImageError(f"{name} is empty.")
+    for start, end in _ENDINGS.items():
+        if data.startswith(start) and end not in data[-_TAIL_BYTES:]:
+            raise UnreadableImageError(f"{name} is cut off: its end is missing.")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise UnreadableImageError(f"{name} cannot be decoded: it is damaged or no image.")
+    return np.asarray(image if grey else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+class ImageFiles:
+    """Images that are files on the disk."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.paths = list(paths)
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def reader(self, grey: bool) -> ImageReader:
+        """Return a reader of these files."""
+        return _FileReader(self.paths, grey)
+
+
+class _FileReader:
+    def __init__(self, paths: list[Path], grey: bool) -> None:
+        self._paths = paths
+        self._grey = grey
+
+    def read(self, index: int) -> NDArray[np.uint8]:
+        path = self._paths[index]
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            raise UnreadableImageError(f"{path} does not exist.") from None
+        except OSError as e:
+            raise UnreadableImageError(f"{path} cannot be read: {e.strerror or e}.") from e
+        return decode(data, str(path), self._grey)
+
+    def close(self) -> None:
+        pass
+
+
+class ZippedImages:
+    """Images inside a zip archive, read in place."""
+
+    def __init__(self, archive: Path) -> None:
+        self.archive = archive
+        try:
+            with zipfile.ZipFile(archive) as opened:
+                names = [n for n in opened.namelist() if Path(n).suffix.lower() in IMAGE_SUFFIXES]
+        except (OSError, zipfile.BadZipFile) as e:
+            raise InputError(f"{archive} cannot be read as a zip archive: {e}; fetch it again.") from e
+        # macOS adds a shadow file "._name" for every image.
+        self.names = sorted((n for n in names if not Path(n).name.startswith(".")), key=natural_key)
+        if not self.names:
+            raise InputError(f"{archive} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}); check the archive.")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def reader(self, grey: bool) -> ImageReader:
+        """Return a reader with its own handle of the archive."""
+        return _ZipReader(self.archive, self.names, grey)
+
+
+class _ZipReader:
+    def __init__(self, archive: Path, names: list[str], grey: bool) -> None:
+        self._zip = zipfile.ZipFile(archive)
+        self._names = names
+        self._grey = grey
+
+    def read(self, index: int) -> NDArray[np.uint8]:
+        name = self._names[index]
+        where = f"{name} in {self._zip.filename}"
+        try:
+            data = self._zip.read(name)
+        except (zipfile.BadZipFile, zlib.error, OSError, EOFError, NotImplementedError, RuntimeError) as e:
+            raise UnreadableImageError(f"{where} cannot be read: {e}.") from e
+        return decode(data, where, self._grey)
+
+    def close(self) -> None:
+        self._zip.close()

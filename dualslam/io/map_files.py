@@ -1,0 +1,175 @@
+"""Maps on the disk: numpy archives without pickles, and JSON for what is not an array."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.errors import InputError, OutputError
+from dualslam.core.submap import Anchor, Submap
+from dualslam.core.tables import Table
+from dualslam.core.types import Features, Keyframe
+from dualslam.io.atomic import atomic_file, write_text
+from dualslam.io.trajectory_files import read_text
+
+Arrays = Mapping[str, NDArray[Any]]
+
+METADATA = "map.json"
+SUBMAP_FORMAT = 1
+_FEATURE_FIELDS = tuple(f.name for f in fields(Features))
+
+
+# --- arrays
+
+
+def save_arrays(path: str | Path, arrays: Arrays) -> None:
+    """Write named arrays as one ``.npz``, atomically.
+
+    Raises
+    ------
+    OutputError
+        If an array holds Python objects, which only a pickle could keep.
+    """
+    path = Path(path)
+    for name, array in arrays.items():
+        if np.asarray(array).dtype.hasobject:
+            raise OutputError(f"{path}: the array {name} holds Python objects; maps are written without pickles.")
+    with atomic_file(path) as file:
+        np.savez(file, allow_pickle=False, **{name: np.asarray(a) for name, a in arrays.items()})
+
+
+def load_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
+    """Read an ``.npz`` of `save_arrays`; a file that would need unpickling is refused."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; check the path.") from None
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError, TypeError, AttributeError) as e:
+        raise InputError(f"{path} is no map file, or is damaged: {e}.") from e
+
+
+def save_map(folder: str | Path, arrays: Mapping[str, Arrays], metadata: Mapping[str, Any]) -> None:
+    """Write groups of arrays as ``<group>.npz`` and the metadata as ``map.json``.
+
+    The metadata comes last and names the groups, so a map whose writing was interrupted is not taken for a whole one.
+    """
+    folder = Path(folder)
+    for group, content in arrays.items():
+        save_arrays(folder / f"{group}.npz", content)
+    document = {"format": 1, "groups": sorted(arrays), "metadata": to_plain(metadata)}
+    write_text(folder / METADATA, json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+
+def load_map(folder: str | Path) -> tuple[dict[str, dict[str, NDArray[Any]]], dict[str, Any]]:
+    """Read what `save_map` wrote: groups of arrays, and metadata."""
+    folder = Path(folder)
+    text = read_text(folder / METADATA)
+    try:
+        document = json.loads(text)
+        groups, metadata = list(document["groups"]), dict(document["metadata"])
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError):
+        raise InputError(f"{folder / METADATA} is not the metadata of a map, or is damaged.") from None
+    return {group: load_arrays(folder / f"{group}.npz") for group in groups}, metadata
+
+
+def to_plain(value: Any) -> Any:
+    """Return `value` as JSON knows it: numpy numbers and arrays become Python's, NaN and infinity become null."""
+    if isinstance(value, Mapping):
+        return {str(k): to_plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return to_plain(value.tolist())
+    if isinstance(value, list | tuple | set | frozenset):
+        return [to_plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return to_plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, bool | int | float):
+        return value
+    return str(value)
+
+
+# --- submaps
+
+
+def submap_to_arrays(submap: Submap) -> dict[str, NDArray[Any]]:
+    """Return everything that a submap holds as flat arrays; features of all keyframes stand one after the other."""
+    keyframes = list(submap.keyframes.values())
+    ids = [kf.id for kf in keyframes]
+    arrays: dict[str, NDArray[Any]] = {
+        "format": np.array(SUBMAP_FORMAT),
+        "id": np.array(submap.id),
+        "K": submap.K,
+        "gauge": np.array(submap.gauge, np.int64),
+        "kf_id": np.array(ids, np.int64),
+        "kf_timestamp_s": np.array([kf.timestamp_s for kf in keyframes], np.float64),
+        "kf_T_submap_kf": submap.keyframe_poses(ids),
+        "kf_n_features": np.array([len(kf.features) for kf in keyframes], np.int64),
+        "kf_landmark_of": np.concatenate([np.zeros(0, np.int64), *(submap.landmark_of[k] for k in ids)]),
+        "anchor_id": np.array(list(submap.anchors), np.int64),
+        "anchor_kf": np.array([a.keyframe_id for a in submap.anchors.values()], np.int64),
+        "anchor_T_kf_cam": np.array([a.T_kf_cam for a in submap.anchors.values()], np.float64).reshape(-1, 4, 4),
+    }
+    for name in _FEATURE_FIELDS if keyframes else ():
+        arrays[f"features_{name}"] = np.concatenate([getattr(kf.features, name) for kf in keyframes])
+    arrays |= {f"landmarks_{name}": column for name, column in submap.landmarks.columns().items()}
+    arrays |= {f"observations_{name}": column for name, column in submap.observations.columns().items()}
+    return arrays
+
+
+def submap_from_arrays(arrays: Arrays) -> Submap:
+    """Make the submap of `submap_to_arrays` again.
+
+    Raises
+    ------
+    KeyError, ValueError
+        If an array is missing or of another shape.
+    """
+    if int(arrays["format"]) != SUBMAP_FORMAT:
+        raise ValueError(f"format {int(arrays['format'])} where {SUBMAP_FORMAT} is due")
+    landmarks, observations = _group(arrays, "landmarks_"), _group(arrays, "observations_")
+    descriptors = landmarks["descriptor"]
+    submap = Submap(int(arrays["id"]), arrays["K"], np.zeros(descriptors.shape[1:], descriptors.dtype))
+    submap.gauge = (int(arrays["gauge"][0]), int(arrays["gauge"][1]))
+    ends = np.cumsum(arrays["kf_n_features"]).tolist()
+    features = _group(arrays, "features_")
+    rows = zip([0, *ends[:-1]], ends, arrays["kf_id"].tolist(), arrays["kf_timestamp_s"].tolist(), strict=False)
+    for row, (start, end, keyframe_id, timestamp_s) in enumerate(rows):
+        # Copies, so that one keyframe that is kept does not hold the arrays of all.
+        own = Features(**{name: features[name][start:end].copy() for name in _FEATURE_FIELDS})
+        submap.add_keyframe(Keyframe(keyframe_id, timestamp_s, own), arrays["kf_T_submap_kf"][row])
+        submap.landmark_of[keyframe_id] = arrays["kf_landmark_of"][start:end].copy()
+    for anchor_id, keyframe_id, T_kf_cam in zip(
+        arrays["anchor_id"].tolist(), arrays["anchor_kf"].tolist(), arrays["anchor_T_kf_cam"], strict=True
+    ):
+        submap.anchors[anchor_id] = Anchor(keyframe_id, T_kf_cam.copy())
+    submap.landmarks = Table.from_columns(landmarks)
+    submap.observations = Table.from_columns(observations)
+    return submap
+
+
+def save_submap(path: str | Path, submap: Submap) -> None:
+    """Write a submap, with the features of its keyframes, as one ``.npz``."""
+    save_arrays(path, submap_to_arrays(submap))
+
+
+def load_submap(path: str | Path) -> Submap:
+    """Read a submap that `save_submap` wrote: equal to it in every array."""
+    arrays = load_arrays(path)
+    try:
+        return submap_from_arrays(arrays)
+    except (KeyError, ValueError, IndexError) as e:
+        raise InputError(f"{path} is no submap of this version, or is damaged: {e}.") from e
+
+
+def _group(arrays: Arrays, prefix: str) -> dict[str, NDArray[Any]]:
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}

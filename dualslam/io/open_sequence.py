@@ -1,0 +1,116 @@
+"""One door for every kind of source: look at what was given, open it as what it is."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Protocol
+
+from numpy.typing import ArrayLike
+
+from dualslam.core.camera import Camera, camera_from_fov
+from dualslam.core.errors import InputError
+from dualslam.io import dataset_folder, euroc, folder, kitti, tum_mono, tum_rgbd, video
+from dualslam.io.camera_files import make_camera, read_camera_file
+from dualslam.io.sequence import Given, RecordedSequence, Recording, Selection, check_image_size, image_size
+from dualslam.io.video import WebcamSequence
+
+log = logging.getLogger(__name__)
+
+
+class Format(Protocol):
+    """What a module of this package offers to be a folder format."""
+
+    def recognises(self, folder: Path) -> bool:
+        """Tell whether a folder is of this format, without reading much."""
+        ...
+
+    def open_recording(self, folder: Path, given: Given) -> Recording:
+        """Open it, or raise `InputError` with what is wrong with it."""
+        ...
+
+
+# The surer the sign, the earlier; the plain folder of images takes what no other does.
+FORMATS: tuple[Format, ...] = (euroc, tum_rgbd, kitti, tum_mono, dataset_folder, folder)
+
+
+def open_sequence(
+    source: str | Path | int,
+    *,
+    camera_file: str | Path | None = None,
+    fov_degrees: float | None = None,
+    start: int = 0,
+    stride: int = 1,
+    max_frames: int | None = None,
+    reverse: bool = False,
+    times: str | Path | ArrayLike | None = None,
+    rate_hz: float | None = None,
+    grey: bool = True,
+) -> RecordedSequence | WebcamSequence:
+    """Open a source of frames, whatever it is.
+
+    Parameters
+    ----------
+    source : path, or number of a webcam
+        A folder of a known layout (ours, KITTI odometry, TUM RGB-D, TUM-Mono, EuRoC), a plain folder of images, a
+        video file, or ``0``, ``1``, ... for a webcam.
+    camera_file : path, optional
+        Calibration to use instead of the source's own (see `dualslam.io.camera_files`).
+    fov_degrees : float, optional
+        Horizontal field of view, where there is no calibration at all.
+    start, stride, max_frames : int
+        Which frames: counted in the source, from `start`, every `stride`-th, at most `max_frames`.
+    reverse : bool
+        Read the same frames last to first. Their indices and timestamps stay what they are.
+    times : path or array, optional
+        Times to use instead of the source's own, for each of its images.
+    rate_hz : float, optional
+        Frames a second of a plain folder without times.
+    grey : bool
+        Decode to (H, W) grey; otherwise (H, W, 3) RGB.
+
+    Raises
+    ------
+    InputError
+        If the source is nothing that can be read, or its parts do not fit together.
+    """
+    if camera_file is not None and fov_degrees is not None:
+        raise InputError("A camera file and a field of view were both given; give one of them.")
+    if rate_hz is not None and not 0 < rate_hz < float("inf"):
+        raise InputError(f"The frame rate is {rate_hz} Hz; it must be above zero.")
+    selection = Selection(start, stride, max_frames, reverse)
+    given_camera = None if camera_file is None else read_camera_file(camera_file)
+    given = Given(camera_file is not None or fov_degrees is not None, times, rate_hz)
+    if isinstance(source, int) or (str(source).isdigit() and not Path(source).exists()):
+        return video.open_webcam(int(str(source)), given_camera, fov_degrees, selection, given, grey)
+    recording = _open_recording(Path(source), given)
+    camera = given_camera or recording.camera
+    if camera is None:
+        camera = _camera_from_fov(recording, fov_degrees)
+    else:
+        calibration = recording.calibration if camera_file is None else str(camera_file)
+        check_image_size(recording.images, recording.name, camera, calibration)
+    log.info("%s: %d frames, %s", recording.name, len(recording.images), camera)
+    return RecordedSequence(recording, camera, selection, grey=grey)
+
+
+def _open_recording(source: Path, given: Given) -> Recording:
+    if not source.exists():
+        raise InputError(f"{source} does not exist; give a sequence folder, a video file or the number of a webcam.")
+    if source.is_file():
+        return video.open_recording(source, given)
+    for known in FORMATS:
+        if known.recognises(source):
+            log.debug("%s: read as %s", source, known)
+            return known.open_recording(source, given)
+    raise InputError(
+        f"{source} is no sequence that can be read: it holds neither images nor a layout of ours, KITTI odometry, "
+        "TUM RGB-D, TUM-Mono or EuRoC; check the path."
+    )
+
+
+def _camera_from_fov(recording: Recording, fov_degrees: float | None) -> Camera:
+    if fov_degrees is None:
+        raise InputError(f"{recording.name} has no calibration; give a camera file, or a field of view in degrees.")
+    width, height = image_size(recording.images, recording.name)
+    return make_camera("the field of view", lambda: camera_from_fov(width, height, fov_degrees))

@@ -1,0 +1,95 @@
+"""Reading on a thread of its own, a bounded number of items ahead of whoever consumes them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator, Iterator
+from threading import Condition, Thread
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+def read_ahead(items: Iterator[T], depth: int = 8, *, drop_oldest: bool = False) -> Generator[T, None, None]:
+    """Yield `items`, produced on another thread.
+
+    The thread starts with the first item asked for. It ends when the items do, when they raise (the exception comes
+    out here, after the items before it) or when this generator is closed, as a ``break`` in the consumer's loop does.
+
+    Parameters
+    ----------
+    items : iterator
+        Closed on its own thread if it is a generator.
+    depth : int
+        How many items may wait.
+    drop_oldest : bool
+        For live sources: a full queue drops its oldest item instead of making the producer wait.
+    """
+    channel: _Channel[T] = _Channel(depth, drop_oldest)
+    thread = Thread(target=channel.produce, args=(items,), name="dualslam-read-ahead", daemon=True)
+    thread.start()
+    try:
+        yield from channel.consume()
+    finally:
+        channel.stop()
+        thread.join()
+
+
+class _Channel(Generic[T]):
+    """The queue between the two threads, with an end and a stop that neither side can miss."""
+
+    def __init__(self, depth: int, drop_oldest: bool) -> None:
+        self._changed = Condition()
+        self._waiting: deque[T] = deque()
+        self._depth = depth
+        self._drop_oldest = drop_oldest
+        self._stopped = False
+        self._ended = False
+        self._error: BaseException | None = None
+
+    def produce(self, items: Iterator[T]) -> None:
+        try:
+            for item in items:
+                if not self._put(item):
+                    break
+        except BaseException as e:  # noqa: BLE001 - handed to the consumer, which raises it
+            self._error = e
+        finally:
+            try:
+                if isinstance(items, Generator):
+                    items.close()
+            finally:
+                with self._changed:
+                    self._ended = True
+                    self._changed.notify_all()
+
+    def _put(self, item: T) -> bool:
+        with self._changed:
+            if self._drop_oldest and len(self._waiting) >= self._depth:
+                self._waiting.popleft()
+            while len(self._waiting) >= self._depth and not self._stopped:
+                self._changed.wait()
+            if self._stopped:
+                return False
+            self._waiting.append(item)
+            self._changed.notify_all()
+            return True
+
+    def consume(self) -> Iterator[T]:
+        while True:
+            with self._changed:
+                while not self._waiting and not self._ended:
+                    self._changed.wait()
+                if not self._waiting:
+                    if self._error is not None:
+                        raise self._error
+                    return
+                item = self._waiting.popleft()
+                self._changed.notify_all()
+            yield item
+
+    def stop(self) -> None:
+        with self._changed:
+            self._stopped = True
+            self._waiting.clear()
+            self._changed.notify_all()

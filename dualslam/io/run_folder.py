@@ -1,0 +1,268 @@
+"""What a run leaves behind: one folder, written so that a crash or an interrupt at any moment loses nothing."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import logging
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+import yaml
+
+from dualslam.core.errors import InputError, OutputError
+from dualslam.core.events import Event
+from dualslam.core.types import FloatArray, FrameStatus, IntArray
+from dualslam.io.atomic import write_text
+from dualslam.io.map_files import to_plain
+from dualslam.io.trajectory_files import Trajectory, read_text, write_kitti, write_tum
+
+log = logging.getLogger(__name__)
+
+TRAJECTORY = "trajectory.txt"
+TRAJECTORY_KITTI = "trajectory_kitti.txt"
+TRAJECTORY_KITTI_FRAMES = "trajectory_kitti_frames.txt"
+FRAMES = "frames.csv"
+EVENTS = "events.jsonl"
+SUMMARY = "summary.json"
+CONFIG = "config.yaml"
+REPORT = "report.html"
+SUBMAPS = "submaps"
+MAP = "map"
+
+FRAME_COLUMNS = ("index", "timestamp_s", "status", "submap", "in_main_map", "n_matches", "n_inliers", "latency_ms")
+_FILES = (TRAJECTORY, TRAJECTORY_KITTI, TRAJECTORY_KITTI_FRAMES, FRAMES, EVENTS, SUMMARY, CONFIG, REPORT)
+_SUBMAP_NAME = re.compile(r"\d+\.txt")
+_MAP_NAME = re.compile(r"[\w.-]+\.(npz|json)")
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRow:
+    """One input frame: a row of ``frames.csv``. `submap` is None for a frame that is in none."""
+
+    index: int
+    timestamp_s: float
+    status: FrameStatus
+    submap: int | None
+    in_main_map: bool
+    n_matches: int
+    n_inliers: int
+    latency_ms: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedFrames:
+    """Frames with their poses, N of them.
+
+    Attributes
+    ----------
+    index : (N,) int64
+        Frame index in the source.
+    timestamps_s : (N,) float64
+    T_world_cam : (N, 4, 4) float64
+        Camera to the frame of the map that they are in.
+    """
+
+    index: IntArray
+    timestamps_s: FloatArray
+    T_world_cam: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def in_time_order(self) -> PosedFrames:
+        """Return the same frames, ascending in time (a run may have read them backwards)."""
+        order = self.timestamps_s.argsort(kind="stable")
+        return PosedFrames(self.index[order], self.timestamps_s[order], self.T_world_cam[order])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunRecord:
+    """The result of a run as it goes to the disk.
+
+    Attributes
+    ----------
+    frames : sequence of FrameRow
+        One for every input frame.
+    main : PosedFrames
+        All frames posed in the main map.
+    unlinked : mapping of int to PosedFrames
+        Submaps that are not linked to the main map, each in its own unit.
+    summary : mapping
+        Plain numbers, strings and lists.
+    """
+
+    frames: Sequence[FrameRow]
+    main: PosedFrames
+    unlinked: Mapping[int, PosedFrames] = field(default_factory=dict)
+    summary: Mapping[str, Any] = field(default_factory=dict)
+
+
+class RunFolder:
+    """A folder that a run writes to. Every file appears whole; events are on the disk as soon as they happen.
+
+    Parameters
+    ----------
+    path : path
+        Made if it is not there.
+    overwrite : bool
+        Remove the files of an earlier run. Files that no run writes stay in any case.
+
+    Raises
+    ------
+    OutputError
+        If there is an earlier run (or files of its names) and `overwrite` is not set, or the folder cannot be made.
+    """
+
+    def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
+        self.path = Path(path)
+        self._events: IO[str] | None = None
+        try:
+            present = _run_files(self.path)
+            if present and not overwrite:
+                raise OutputError(
+                    f"{self.path} holds {present[0].relative_to(self.path)} already; "
+                    "choose another folder, or say that it may be overwritten (--overwrite)."
+                )
+            self.path.mkdir(parents=True, exist_ok=True)
+            for file in present:
+                file.unlink()
+            self._events = (self.path / EVENTS).open("w", encoding="utf-8", newline="\n")
+        except OSError as e:
+            raise OutputError(f"{self.path} cannot be written to: {e.strerror or e}; choose another folder.") from e
+
+    @property
+    def map_path(self) -> Path:
+        """Where the map belongs."""
+        return self.path / MAP
+
+    @property
+    def report_path(self) -> Path:
+        """Where the report belongs."""
+        return self.path / REPORT
+
+    def write_config(self, config: str | Mapping[str, Any]) -> None:
+        """Write the resolved configuration: YAML text, or a mapping to be dumped."""
+        text = config if isinstance(config, str) else yaml.safe_dump(to_plain(config), sort_keys=False)
+        write_text(self.path / CONFIG, text)
+
+    def append_event(self, event: Event) -> None:
+        """Append an event to ``events.jsonl`` and flush it, so that a crash of the process cannot take it back."""
+        if self._events is None:
+            raise OutputError(f"{self.path / EVENTS} is closed; events come before the end of the run.")
+        try:
+            self._events.write(json.dumps(to_plain(event.as_dict()), allow_nan=False) + "\n")
+            self._events.flush()
+        except OSError as e:
+            raise OutputError(f"{self.path / EVENTS} cannot be written: {e.strerror or e}.") from e
+
+    def write(self, record: RunRecord) -> None:
+        """Write frames, trajectories and the summary. May be called again as the run goes on: the last word holds."""
+        self.write_frames(record.frames)
+        main = record.main.in_time_order()
+        write_tum(self.path / TRAJECTORY, Trajectory(main.timestamps_s, main.T_world_cam))
+        write_kitti(self.path / TRAJECTORY_KITTI, main.T_world_cam, main.index, self.path / TRAJECTORY_KITTI_FRAMES)
+        self._write_unlinked(record.unlinked)
+        self.write_summary(record.summary)
+
+    def write_frames(self, rows: Iterable[FrameRow]) -> None:
+        """Write ``frames.csv``."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(FRAME_COLUMNS)
+        for row in rows:
+            submap = "" if row.submap is None else row.submap
+            counts = (int(row.in_main_map), row.n_matches, row.n_inliers)
+            latency = f"{row.latency_ms:.3f}"
+            writer.writerow([row.index, repr(float(row.timestamp_s)), str(row.status), submap, *counts, latency])
+        write_text(self.path / FRAMES, text.getvalue())
+
+    def write_summary(self, summary: Mapping[str, Any]) -> None:
+        """Write ``summary.json``; NaN becomes null, as JSON has none."""
+        write_text(self.path / SUMMARY, json.dumps(to_plain(summary), indent=2, allow_nan=False) + "\n")
+
+    def _write_unlinked(self, unlinked: Mapping[int, PosedFrames]) -> None:
+        folder = self.path / SUBMAPS
+        for submap_id, frames in unlinked.items():
+            ordered = frames.in_time_order()
+            write_tum(folder / f"{submap_id:02d}.txt", Trajectory(ordered.timestamps_s, ordered.T_world_cam))
+        # A submap that was written earlier in the run may be linked by now.
+        kept = {f"{submap_id:02d}.txt" for submap_id in unlinked}
+        for file in _named(folder, _SUBMAP_NAME):
+            if file.name not in kept:
+                file.unlink()
+
+    def close(self) -> None:
+        """Close the event file; more than once does no harm."""
+        if self._events is not None:
+            self._events.close()
+            self._events = None
+
+    def __enter__(self) -> RunFolder:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+
+# --- reading
+
+
+def read_frames(path: str | Path) -> list[FrameRow]:
+    """Read a ``frames.csv``."""
+    rows = []
+    reader = csv.DictReader(io.StringIO(read_text(path)))
+    if tuple(reader.fieldnames or ()) != FRAME_COLUMNS:
+        raise InputError(f"{path} is not a frames.csv: its columns should be {','.join(FRAME_COLUMNS)}.")
+    for number, row in enumerate(reader, 2):
+        try:
+            rows.append(
+                FrameRow(
+                    index=int(row["index"]),
+                    timestamp_s=float(row["timestamp_s"]),
+                    status=FrameStatus(row["status"]),
+                    submap=int(row["submap"]) if row["submap"] else None,
+                    in_main_map=row["in_main_map"] == "1",
+                    n_matches=int(row["n_matches"]),
+                    n_inliers=int(row["n_inliers"]),
+                    latency_ms=float(row["latency_ms"]),
+                )
+            )
+        except (TypeError, ValueError) as e:
+            raise InputError(f"{path}, line {number}: not a row of frames.csv ({e}).") from None
+    return rows
+
+
+def read_events(path: str | Path) -> list[dict[str, Any]]:
+    """Read an ``events.jsonl``; a last line that a crash cut off is left out."""
+    lines = [line for line in read_text(path).splitlines() if line.strip()]
+    events = []
+    for number, line in enumerate(lines, 1):
+        try:
+            events.append(json.loads(line))
+        except json.JSONDecodeError:
+            if number < len(lines):
+                raise InputError(f"{path}, line {number} is not valid JSON.") from None
+            log.warning("%s: the last line is cut off and was left out", path)
+    return events
+
+
+def unlinked_submaps(run: str | Path) -> dict[int, Path]:
+    """Return the trajectory files of a run's unlinked submaps, by submap id."""
+    return {int(file.stem): file for file in sorted(_named(Path(run) / SUBMAPS, _SUBMAP_NAME))}
+
+
+def _run_files(folder: Path) -> list[Path]:
+    found = [folder / name for name in _FILES if (folder / name).exists()]
+    return [*found, *_named(folder / SUBMAPS, _SUBMAP_NAME), *_named(folder / MAP, _MAP_NAME)]
+
+
+def _named(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    return sorted(file for file in folder.iterdir() if file.is_file() and pattern.fullmatch(file.name))

@@ -1,0 +1,214 @@
+"""A recorded sequence: what every format is opened as, and how its frames are read."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dualslam.core.camera import Camera
+from dualslam.core.errors import InputError
+from dualslam.core.types import FloatArray, Frame, IntArray
+from dualslam.io.images import ImageReader, ImageStore, UnreadableImageError
+from dualslam.io.read_ahead import read_ahead
+from dualslam.io.times import NOMINAL_RATE_HZ
+from dualslam.io.trajectory_files import Trajectory
+
+log = logging.getLogger(__name__)
+
+READ_AHEAD_FRAMES = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """What a format's reader finds: everything about a recorded sequence, no image read yet.
+
+    Attributes
+    ----------
+    name : str
+    images : ImageStore
+    timestamps_s : (N,) float64
+        One for each image, ascending.
+    camera : Camera or None
+        None where the source brings no calibration (`open_sequence` then needs one from the caller).
+    ground_truth : Trajectory or None
+    exposure_s : (N,) float64 or None
+    calibration : str
+        Where the camera is from, for messages.
+    """
+
+    name: str
+    images: ImageStore
+    timestamps_s: FloatArray
+    camera: Camera | None
+    ground_truth: Trajectory | None = None
+    exposure_s: FloatArray | None = None
+    calibration: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Given:
+    """What the caller brings himself, so that a source need not have it.
+
+    Attributes
+    ----------
+    camera : bool
+        A camera file or a field of view was given.
+    times : path, array or None
+        A file of seconds, one a line, or the numbers.
+    rate_hz : float or None
+        Frames a second of a source that has no times.
+    """
+
+    camera: bool = False
+    times: str | Path | ArrayLike | None = None
+    rate_hz: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Which frames of a source to read: first `start`, `stride` and `max_frames`, then the direction."""
+
+    start: int = 0
+    stride: int = 1
+    max_frames: int | None = None
+    reverse: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that select nothing."""
+        if self.start < 0:
+            raise InputError(f"start is {self.start}; it counts frames from 0.")
+        if self.stride < 1:
+            raise InputError(f"stride is {self.stride}; it must be at least 1 (to read backwards, use reverse).")
+        if self.max_frames is not None and self.max_frames < 1:
+            raise InputError(f"max_frames is {self.max_frames}; it must be at least 1.")
+
+    def indices(self, n: int, name: str) -> IntArray:
+        """Return the source indices in reading order, of `n` frames."""
+        if self.start >= n:
+            raise InputError(f"start is {self.start}, but {name} has {n} frames; start before its end.")
+        index = np.arange(self.start, n, self.stride)[: self.max_frames]
+        return index[::-1].copy() if self.reverse else index
+
+
+class RecordedSequence:
+    """Frames of a recording, in either direction of time, read ahead on a thread of its own.
+
+    Iterating again reads again. A frame whose image cannot be read, or is of another size than the camera's, has
+    ``image=None`` and says why in `error`; reading goes on.
+
+    Attributes
+    ----------
+    name : str
+    camera : Camera
+    rate_hz : float
+        Frames a second as they are read, so the stride counts.
+    ground_truth : Trajectory or None
+        All that the source has, whatever the selection.
+    source_indices : (M,) int64
+        Index in the source of each frame that is read, in reading order.
+    frame_timestamps : (M,) float64
+        The same frames' times, descending where `reverse`.
+    source_timestamps : (N,) float64
+        Times of all frames of the source.
+    exposure_s : (M,) float64 or None
+        Exposure times, where the source has them.
+    """
+
+    def __init__(
+        self, recording: Recording, camera: Camera, selection: Selection | None = None, *, grey: bool = True
+    ) -> None:
+        self._images = recording.images
+        self._grey = grey
+        self.name = recording.name
+        self.camera = camera
+        self.ground_truth = recording.ground_truth
+        self.source_timestamps = recording.timestamps_s
+        self.source_indices = (selection or Selection()).indices(len(recording.images), recording.name)
+        self.frame_timestamps = recording.timestamps_s[self.source_indices]
+        self.exposure_s = None if recording.exposure_s is None else recording.exposure_s[self.source_indices]
+        self.rate_hz = _rate(self.frame_timestamps)
+
+    def __len__(self) -> int:
+        return len(self.source_indices)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return read_ahead(self._read(), READ_AHEAD_FRAMES)
+
+    def _read(self) -> Iterator[Frame]:
+        reader = self._images.reader(self._grey)
+        try:
+            for index, timestamp_s in zip(self.source_indices.tolist(), self.frame_timestamps.tolist(), strict=True):
+                yield self._frame(reader, index, timestamp_s)
+        finally:
+            reader.close()
+
+    def _frame(self, reader: ImageReader, index: int, timestamp_s: float) -> Frame:
+        try:
+            image = reader.read(index)
+        except UnreadableImageError as e:
+            log.warning("frame %d: %s", index, e)
+            return Frame(index, timestamp_s, None, str(e))
+        height, width = image.shape[:2]
+        if (width, height) != (self.camera.width, self.camera.height):
+            error = (
+                f"image {index} of {self.name} is {width} x {height} pixels, "
+                f"the camera {self.camera.width} x {self.camera.height}."
+            )
+            log.warning("frame %d: %s", index, error)
+            return Frame(index, timestamp_s, None, error)
+        return Frame(index, timestamp_s, image)
+
+
+def image_size(images: ImageStore, name: str, wanted: tuple[int, int] | None = None) -> tuple[int, int]:
+    """Return (width, height) of a sequence's images.
+
+    Looks at a few images; if one is of the `wanted` size that is the answer, so a single odd image does no harm.
+
+    Raises
+    ------
+    InputError
+        If none of all the images can be read.
+    """
+    n = len(images)
+    few = list(dict.fromkeys(np.linspace(0, n - 1, min(n, 5)).astype(int).tolist()))
+    sizes: list[tuple[int, int]] = []
+    reader = images.reader(grey=True)
+    try:
+        # Beyond the few, only until one image can be read at all.
+        for i in [*few, *(i for i in range(n) if i not in few)]:
+            if sizes and i not in few:
+                break
+            try:
+                height, width = reader.read(i).shape[:2]
+            except UnreadableImageError as e:
+                log.info("looking for the image size: %s", e)
+                continue
+            if wanted is None or (width, height) == wanted:
+                return width, height
+            sizes.append((width, height))
+    finally:
+        reader.close()
+    if not sizes:
+        raise InputError(f"{name}: none of its {n} images can be read; check the files.")
+    return sizes[0]
+
+
+def check_image_size(images: ImageStore, name: str, camera: Camera, calibration: str) -> None:
+    """Refuse a calibration that was made for images of another size."""
+    width, height = image_size(images, name, (camera.width, camera.height))
+    if (width, height) != (camera.width, camera.height):
+        raise InputError(
+            f"{calibration} is for images of {camera.width} x {camera.height} pixels, but those of {name} are "
+            f"{width} x {height}; give the calibration of these images."
+        )
+
+
+def _rate(timestamps_s: FloatArray) -> float:
+    if len(timestamps_s) < 2:
+        return NOMINAL_RATE_HZ
+    return float(1.0 / np.median(np.abs(np.diff(timestamps_s))))

@@ -1,0 +1,196 @@
+"""Trajectories in the two formats that the field's tools read: TUM lines and KITTI rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dualslam.core.errors import InputError, OutputError
+from dualslam.core.geometry.so3 import matrix_from_quat_xyzw, quat_xyzw_from_matrix
+from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.io.atomic import write_text
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Poses in time, ascending.
+
+    Attributes
+    ----------
+    timestamps_s : (N,) float64
+    T_world_cam : (N, 4, 4) float64
+        Camera to world.
+    """
+
+    timestamps_s: FloatArray
+    T_world_cam: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.timestamps_s)
+
+
+# --- TUM
+
+
+def read_tum(path: str | Path, *, skip_nan: bool = False, allow_empty: bool = False) -> Trajectory:
+    """Read ``t tx ty tz qx qy qz qw`` lines (``#`` starts a comment), sorted by time.
+
+    Parameters
+    ----------
+    path : path
+    skip_nan : bool
+        Leave out lines that hold a NaN (TUM-Mono marks unknown poses so) instead of refusing the file.
+    allow_empty : bool
+        Take a file without lines for a trajectory without poses: a run that could not pose a frame leaves one.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, empty or holds a line that is no pose.
+    """
+    table = read_number_table(path, 8, "a TUM trajectory (t tx ty tz qx qy qz qw)", allow_empty)
+    finite = np.isfinite(table).all(axis=1)
+    if skip_nan:
+        table = table[finite]
+    elif not finite.all():
+        raise InputError(
+            f"{path}: pose {int(np.argmin(finite)) + 1} holds a value that is not finite; remove the line."
+        )
+    norm = np.linalg.norm(table[:, 4:8], axis=1)
+    if (norm < 0.5).any():
+        bad = int(np.argmax(norm < 0.5)) + 1
+        raise InputError(
+            f"{path}: the quaternion of pose {bad} has a norm near zero; columns are t tx ty tz qx qy qz qw."
+        )
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    T_world_cam = np.tile(np.eye(4), (len(table), 1, 1))
+    T_world_cam[:, :3, :3] = matrix_from_quat_xyzw(table[:, 4:8])
+    T_world_cam[:, :3, 3] = table[:, 1:4]
+    return Trajectory(table[:, 0].copy(), T_world_cam)
+
+
+def write_tum(path: str | Path, trajectory: Trajectory) -> None:
+    """Write a TUM file atomically; every number reads back as the very same float, times with 9 decimals or more."""
+    _check_finite(path, trajectory.timestamps_s, trajectory.T_world_cam)
+    quat_xyzw = quat_xyzw_from_matrix(trajectory.T_world_cam[:, :3, :3])
+    lines = [
+        " ".join([_exact(t, 9), *(_exact(x) for x in T[:3, 3]), *(_exact(x) for x in q)])
+        for t, T, q in zip(trajectory.timestamps_s, trajectory.T_world_cam, quat_xyzw, strict=True)
+    ]
+    write_text(Path(path), "".join(line + "\n" for line in lines))
+
+
+# --- KITTI
+
+
+def read_kitti(path: str | Path) -> FloatArray:
+    """Read KITTI poses: one line of 12 numbers (a 3x4 matrix by rows, camera to world) each. Returns (N, 4, 4)."""
+    table = read_number_table(path, 12, "a KITTI pose file (12 numbers a line)")
+    finite = np.isfinite(table).all(axis=1)
+    if not finite.all():
+        raise InputError(
+            f"{path}: pose {int(np.argmin(finite)) + 1} holds a value that is not finite; remove the line."
+        )
+    T_world_cam = np.tile(np.eye(4), (len(table), 1, 1))
+    T_world_cam[:, :3, :] = table.reshape(-1, 3, 4)
+    return T_world_cam
+
+
+def write_kitti(path: str | Path, T_world_cam: FloatArray, frames: ArrayLike, frames_path: str | Path) -> None:
+    """Write 3x4 rows, and beside them the source index of the frame that each row belongs to, one a line."""
+    index: IntArray = np.asarray(frames, np.int64)
+    if len(index) != len(T_world_cam):
+        raise OutputError(f"{path}: {len(T_world_cam)} poses for {len(index)} frames; each pose needs its frame.")
+    _check_finite(path, T_world_cam)
+    rows = T_world_cam[:, :3, :].reshape(-1, 12)
+    write_text(Path(path), "".join(" ".join(_exact(x) for x in row) + "\n" for row in rows))
+    write_text(Path(frames_path), "".join(f"{i}\n" for i in index.tolist()))
+
+
+def read_frame_list(path: str | Path) -> IntArray:
+    """Read the frame indices that `write_kitti` left beside its rows."""
+    return read_number_table(path, 1, "a list of frame indices (one a line)").ravel().astype(np.int64)
+
+
+# --- association
+
+
+def nearest_in_time(times_s: FloatArray, query_s: FloatArray) -> IntArray:
+    """Return for each query the index of the nearest of the ascending `times_s` (ties: the earlier)."""
+    if len(times_s) == 1:
+        return np.zeros(len(query_s), np.int64)
+    right = np.clip(np.searchsorted(times_s, query_s), 1, len(times_s) - 1)
+    return np.where(np.abs(times_s[right - 1] - query_s) <= np.abs(times_s[right] - query_s), right - 1, right)
+
+
+def associate(reference_s: FloatArray, query_s: FloatArray, max_dt_s: float) -> tuple[IntArray, BoolArray]:
+    """Find for each query time the nearest reference time.
+
+    Returns
+    -------
+    index : (Q,) int64
+        Row of `reference_s`, meaningful where `close`.
+    close : (Q,) bool
+        Whether the two are at most `max_dt_s` apart.
+    """
+    if len(reference_s) == 0:
+        return np.zeros(len(query_s), np.int64), np.zeros(len(query_s), bool)
+    index = nearest_in_time(reference_s, query_s)
+    return index, np.abs(reference_s[index] - query_s) <= max_dt_s
+
+
+# --- numbers and text
+
+
+def read_number_table(path: str | Path, columns: int, what: str, allow_empty: bool = False) -> FloatArray:
+    """Read lines of `columns` numbers, separated by blanks or commas; ``#`` starts a comment.
+
+    Returns
+    -------
+    (N, columns) float64
+
+    Raises
+    ------
+    InputError
+        Naming the file and the line that is not `what`.
+    """
+    rows: list[list[float]] = []
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        words = line.split("#", 1)[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            raise InputError(f"{path}, line {number}: {line.strip()[:60]!r} is not a line of {what}.") from None
+        if len(row) != columns:
+            raise InputError(f"{path}, line {number}: {len(row)} numbers where {columns} are due in {what}.")
+        rows.append(row)
+    if not rows and not allow_empty:
+        raise InputError(f"{path} is empty: it should be {what}.")
+    return np.array(rows).reshape(-1, columns)
+
+
+def read_text(path: str | Path) -> str:
+    """Read a text file, or say in one sentence why not."""
+    try:
+        return Path(path).read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; check the path.") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not a text file.") from None
+    except OSError as e:
+        raise InputError(f"{path} cannot be read: {e.strerror or e}.") from e
+
+
+def _exact(x: float, min_digits: int | None = None) -> str:
+    # The shortest decimal that parses back to the same float; plain decimals, as some readers know no exponents.
+    return np.format_float_positional(x, unique=True, trim="k" if min_digits else "0", min_digits=min_digits)
+
+
+def _check_finite(path: str | Path, *arrays: FloatArray) -> None:
+    if not all(np.isfinite(a).all() for a in arrays):
+        raise OutputError(f"{path}: a pose to be written holds a value that is not finite; nothing was written.")

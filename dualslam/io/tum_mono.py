@@ -1,0 +1,68 @@
+"""TUM-Mono: ``images.zip`` or ``images/``, ``camera.txt``, ``times.txt`` (with exposure), ``groundtruthSync.txt``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dualslam.core.errors import InputError
+from dualslam.core.types import FloatArray
+from dualslam.io.camera_files import read_tum_mono_camera
+from dualslam.io.images import ImageFiles, ImageStore, ZippedImages, list_images
+from dualslam.io.sequence import Given, Recording
+from dualslam.io.times import check_count, checked_times, resolve_times
+from dualslam.io.trajectory_files import read_text, read_tum
+
+
+def recognises(folder: Path) -> bool:
+    """Tell whether `folder` is a sequence of TUM-Mono, or meant to be."""
+    has_images = (folder / "images").is_dir() or (folder / "images.zip").is_file()
+    return has_images and ((folder / "camera.txt").is_file() or not (folder / "images").is_dir())
+
+
+def open_recording(folder: Path, given: Given) -> Recording:
+    """Open a sequence folder; images in ``images.zip`` are read in place."""
+    images: ImageStore
+    if (folder / "images").is_dir():
+        images, where = ImageFiles(list_images(folder / "images")), folder / "images"
+    else:
+        images, where = ZippedImages(folder / "images.zip"), folder / "images.zip"
+    times_path, camera_path, truth_path = folder / "times.txt", folder / "camera.txt", folder / "groundtruthSync.txt"
+    exposure_s: FloatArray | None = None
+    if given.times is not None:
+        timestamps_s = resolve_times(given.times, len(images), where)
+    elif times_path.exists():
+        timestamps_s, exposure_s = read_times_with_exposure(times_path)
+        check_count(len(timestamps_s), times_path, len(images), where)
+    else:
+        raise InputError(f"{times_path} does not exist; it belongs to the sequence: fetch it, or give a file of times.")
+    if not given.camera and not camera_path.exists():
+        raise InputError(f"{camera_path} does not exist; it belongs to the sequence: fetch it, or give a camera file.")
+    return Recording(
+        name=folder.resolve().name,
+        images=images,
+        timestamps_s=timestamps_s,
+        camera=None if given.camera else read_tum_mono_camera(camera_path),
+        # Motion capture saw only the start and the end of each sequence; the frames between are NaN.
+        ground_truth=read_tum(truth_path, skip_nan=True) if truth_path.exists() else None,
+        exposure_s=exposure_s,
+        calibration=str(camera_path),
+    )
+
+
+def read_times_with_exposure(path: Path) -> tuple[FloatArray, FloatArray | None]:
+    """Read lines ``id seconds [exposure in milliseconds]``; returns seconds, both."""
+    rows = [line.split("#", 1)[0].split() for line in read_text(path).splitlines()]
+    rows = [row for row in rows if row]
+    if not rows:
+        raise InputError(f"{path} is empty; each line should be `id seconds exposure_ms`.")
+    bad = next((i for i, row in enumerate(rows) if len(row) not in (2, 3) or len(row) != len(rows[0])), None)
+    if bad is not None:
+        raise InputError(f"{path}: entry {bad + 1} has {len(rows[bad])} fields; each is `id seconds exposure_ms`.")
+    try:
+        times = [float(row[1]) for row in rows]
+        exposure = np.array([float(row[2]) for row in rows]) * 1e-3 if len(rows[0]) == 3 else None
+    except ValueError:
+        raise InputError(f"{path} holds something that is no number; each line is `id seconds exposure_ms`.") from None
+    return checked_times(times, str(path)), exposure

@@ -1,0 +1,279 @@
+"""Video files and webcams, through OpenCV."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from itertools import count
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.camera import Camera, camera_from_fov
+from dualslam.core.errors import InputError
+from dualslam.core.types import FloatArray, Frame
+from dualslam.io.camera_files import make_camera
+from dualslam.io.images import ImageReader, UnreadableImageError
+from dualslam.io.read_ahead import read_ahead
+from dualslam.io.sequence import Given, Recording, Selection
+from dualslam.io.times import NOMINAL_RATE_HZ, resolve_times
+
+log = logging.getLogger(__name__)
+
+# Going backwards means decoding forwards from an earlier place: this many frames at a time.
+_BLOCK = 32
+_LIVE_QUEUE = 2
+
+
+class Capture(Protocol):
+    """The part of ``cv2.VideoCapture`` that is used."""
+
+    def isOpened(self) -> bool:  # noqa: N802 - OpenCV's name
+        """Tell whether there is a source behind it."""
+        ...
+
+    def grab(self) -> bool:
+        """Go to the next frame; False at the end."""
+        ...
+
+    def retrieve(self) -> tuple[bool, NDArray[np.uint8] | None]:
+        """Return the frame that was grabbed."""
+        ...
+
+    def get(self, prop: int, /) -> float:
+        """Return a property."""
+        ...
+
+    def set(self, prop: int, value: float, /) -> bool:
+        """Set a property."""
+        ...
+
+    def release(self) -> None:
+        """Let go of the source."""
+        ...
+
+
+def open_recording(path: Path, given: Given) -> Recording:
+    """Open a video file: count its frames and take their presentation times (one pass without colour conversion)."""
+    video = VideoFile(path)
+    if given.times is not None:
+        video.timestamps_s = resolve_times(given.times, len(video), path)
+    return Recording(path.stem, video, video.timestamps_s, camera=None)
+
+
+class VideoFile:
+    """The frames of a video file.
+
+    Attributes
+    ----------
+    media_s : (N,) float64
+        Presentation time of each frame in the file.
+    timestamps_s : (N,) float64
+        The same, if not replaced by the caller's times.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.media_s = _scan(path)
+        self.timestamps_s = self.media_s
+
+    def __len__(self) -> int:
+        return len(self.media_s)
+
+    def reader(self, grey: bool) -> ImageReader:
+        """Return a reader with its own decoder."""
+        return _VideoReader(self.path, self.media_s, grey)
+
+
+class _VideoReader:
+    """Random access over a decoder that can only go forwards."""
+
+    def __init__(self, path: Path, media_s: FloatArray, grey: bool) -> None:
+        self._path = path
+        self._media_s = media_s
+        self._grey = grey
+        self._capture = _open(path)
+        self._next = 0
+        self._block: dict[int, NDArray[np.uint8] | None] = {}
+
+    def read(self, index: int) -> NDArray[np.uint8]:
+        if index in self._block:
+            image = self._block.pop(index)
+        elif index >= self._next:
+            self._block.clear()
+            self._skip_to(index)
+            image = self._decode()
+        else:
+            first = max(index + 1 - _BLOCK, 0)
+            self._seek(first)
+            self._skip_to(first)
+            self._block = {i: self._decode() for i in range(first, index + 1)}
+            image = self._block.pop(index)
+        if image is None:
+            raise UnreadableImageError(f"frame {index} of {self._path} cannot be decoded.")
+        return image
+
+    def close(self) -> None:
+        self._capture.release()
+
+    def _decode(self) -> NDArray[np.uint8] | None:
+        self._next += 1
+        if not self._capture.grab():
+            return None
+        ok, image = self._capture.retrieve()
+        return convert(image, self._grey) if ok and image is not None else None
+
+    def _skip_to(self, index: int) -> None:
+        while self._next < index:
+            self._capture.grab()
+            self._next += 1
+
+    def _seek(self, index: int) -> None:
+        # Seeking is exact with some codecs only: the next frame's time tells, and if it is wrong, count from the start.
+        if index > 0 and self._capture.set(cv2.CAP_PROP_POS_FRAMES, index - 1) and self._capture.grab():
+            step = float(np.min(np.diff(self._media_s)))
+            if abs(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3 - self._media_s[index - 1]) < 0.5 * step:
+                self._next = index
+                return
+        self._capture.release()
+        self._capture = _open(self._path)
+        self._next = 0
+
+
+def _open(path: Path) -> Capture:
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise InputError(f"{path} is no video that OpenCV can open; give a video file, or convert it to another codec.")
+    return capture  # type: ignore[return-value]
+
+
+def _scan(path: Path) -> FloatArray:
+    """Return the presentation time of every frame that can be decoded; the file's own count is often wrong."""
+    capture = _open(path)
+    fps = capture.get(cv2.CAP_PROP_FPS)
+    found = []
+    while capture.grab():
+        found.append(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3)
+    capture.release()
+    if not found:
+        raise InputError(f"{path} holds no frame that can be decoded; check the file, or convert it to another codec.")
+    times = np.array(found)
+    if np.isfinite(times).all() and (np.diff(times) > 0).all():
+        return times
+    if not (np.isfinite(fps) and fps > 0):
+        raise InputError(f"{path} tells neither the times of its frames nor their rate; give a file of times.")
+    log.warning("%s has no usable times of its frames: they are counted at its %g Hz", path, fps)
+    return np.arange(len(times)) / fps
+
+
+def convert(image: NDArray[np.uint8], grey: bool) -> NDArray[np.uint8]:
+    """Return a captured image (BGR, or grey already) as (H, W) grey or (H, W, 3) RGB."""
+    if image.ndim == 2:
+        return image if grey else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), np.uint8)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY if grey else cv2.COLOR_BGR2RGB), np.uint8)
+
+
+# --- webcam
+
+
+class WebcamSequence:
+    """Live frames. Its length is known only where `max_frames` sets it.
+
+    A frame that nobody took in time gives way to a newer one; `Frame.index` counts it all the same.
+    """
+
+    ground_truth = None
+
+    def __init__(
+        self,
+        number: int,
+        camera: Camera,
+        rate_hz: float,
+        selection: Selection,
+        grey: bool,
+        connect: Callable[[], Capture],
+    ) -> None:
+        self.name = f"webcam_{number}"
+        self.camera = camera
+        self.rate_hz = rate_hz / selection.stride
+        self._selection = selection
+        self._grey = grey
+        self._connect = connect
+
+    def __len__(self) -> int:
+        if self._selection.max_frames is None:
+            raise TypeError(f"{self.name} is live: it has no length")
+        return self._selection.max_frames
+
+    def __iter__(self) -> Iterator[Frame]:
+        return read_ahead(self._capture_frames(), _LIVE_QUEUE, drop_oldest=self._selection.max_frames is None)
+
+    def _capture_frames(self) -> Iterator[Frame]:
+        wanted = self._selection
+        capture = self._connect()
+        # Time of day at the start, then a clock that never steps back.
+        epoch_s = time.time() - time.monotonic()
+        taken = 0
+        try:
+            for index in count():
+                if not capture.grab():
+                    raise InputError(f"{self.name} stopped giving frames; check that it is plugged in.")
+                timestamp_s = epoch_s + time.monotonic()
+                if index < wanted.start or (index - wanted.start) % wanted.stride:
+                    continue
+                ok, image = capture.retrieve()
+                if ok and image is not None:
+                    yield Frame(index, timestamp_s, convert(image, self._grey))
+                else:
+                    yield Frame(index, timestamp_s, None, f"frame {index} of {self.name} could not be decoded.")
+                taken += 1
+                if taken == wanted.max_frames:
+                    return
+        finally:
+            capture.release()
+
+
+def open_webcam(
+    number: int,
+    camera: Camera | None,
+    fov_degrees: float | None,
+    selection: Selection,
+    given: Given,
+    grey: bool,
+    connect: Callable[[int], Capture] = cv2.VideoCapture,  # type: ignore[assignment]
+) -> WebcamSequence:
+    """Open webcam `number`, once to learn its image size, then again whenever the sequence is read."""
+    if selection.reverse:
+        raise InputError(f"Webcam {number} is live and cannot be read in reverse.")
+    if given.times is not None:
+        raise InputError(f"Webcam {number} is live and has times of its own; leave out the file of times.")
+    if camera is None and fov_degrees is None:
+        raise InputError(f"Webcam {number} has no calibration; give a camera file, or a field of view in degrees.")
+
+    def connected() -> Capture:
+        capture = connect(number)
+        if not capture.isOpened():
+            raise InputError(f"Webcam {number} cannot be opened; check that it is plugged in and that no one uses it.")
+        return capture
+
+    capture = connected()
+    ok = capture.grab()
+    image = capture.retrieve()[1] if ok else None
+    fps = capture.get(cv2.CAP_PROP_FPS)
+    capture.release()
+    if image is None:
+        raise InputError(f"Webcam {number} gives no frames; check that it is plugged in and that no one uses it.")
+    height, width = image.shape[:2]
+    if camera is None:
+        degrees = float(fov_degrees or 0.0)
+        camera = make_camera("the field of view", lambda: camera_from_fov(width, height, degrees))
+    elif (camera.width, camera.height) != (width, height):
+        raise InputError(
+            f"The camera file is for images of {camera.width} x {camera.height} pixels, but those of webcam {number} "
+            f"are {width} x {height}; give the calibration of these images."
+        )
+    return WebcamSequence(number, camera, fps if fps > 0 else NOMINAL_RATE_HZ, selection, grey, connected)
