@@ -1,0 +1,79 @@
+"""Front ends by name: the built-in ones, imported when asked for, and those of other packages (entry points)."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from typing import Any, Protocol, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from dualslam.core.config import FrontendConfig
+from dualslam.core.errors import ConfigError
+from dualslam.core.interfaces import Frontend
+
+ENTRY_POINT_GROUP = "dualslam.frontends"
+"""A package offers a front end by ``[project.entry-points."dualslam.frontends"] name = "module:Class"``."""
+
+BUILT_IN: Mapping[str, str] = {"orb": "frontends.orb:OrbFrontend"}
+"""Name to ``module:attribute``; the module is imported only when its name is asked for."""
+
+OptionsT = TypeVar("OptionsT", bound=BaseModel)
+
+
+class FrontendFactory(Protocol):
+    """What a registered name must point to: usually a front end's class."""
+
+    def from_options(self, n_features: int, options: Mapping[str, Any]) -> Frontend:
+        """Build the front end; raise ConfigError where an option is unknown or out of range."""
+        ...
+
+
+def known_frontends() -> list[str]:
+    """Names that `create_frontend` accepts, sorted."""
+    return sorted({*BUILT_IN, *entry_points(group=ENTRY_POINT_GROUP).names})
+
+
+def create_frontend(config: FrontendConfig) -> Frontend:
+    """Build the front end that the config names; a built-in name wins over an entry point of the same name.
+
+    Raises
+    ------
+    ConfigError
+        The name is unknown, what it points to cannot be imported, or an option is wrong.
+    """
+    return _factory(config.name).from_options(config.n_features, config.options)
+
+
+def parse_options(model: type[OptionsT], frontend: str, options: Mapping[str, Any]) -> OptionsT:
+    """Check the `frontend.options` of the config against a front end's own strict model.
+
+    Raises
+    ------
+    ConfigError
+        Names each offending option and lists those that exist.
+    """
+    try:
+        return model.model_validate(dict(options))
+    except ValidationError as error:
+        problems = "; ".join(
+            f"frontend.options.{'.'.join(map(str, each['loc'])) or '*'}: {each['msg']}" for each in error.errors()
+        )
+        known = ", ".join(model.model_fields)
+        raise ConfigError(f"front end '{frontend}': {problems} (its options: {known})") from error
+
+
+def _factory(name: str) -> FrontendFactory:
+    """Import what a name points to."""
+    try:
+        if name in BUILT_IN:
+            module, _, attribute = BUILT_IN[name].partition(":")
+            built_in: FrontendFactory = getattr(importlib.import_module(module), attribute)
+            return built_in
+        for entry in entry_points(group=ENTRY_POINT_GROUP, name=name):
+            loaded: FrontendFactory = entry.load()
+            return loaded
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"frontend.name: '{name}' is known but cannot be imported: {error}") from error
+    raise ConfigError(f"frontend.name: no front end is called '{name}'; known: {', '.join(known_frontends())}")
