@@ -169,5 +169,3 @@ def _angle(text: str) -> float:
     if not 1 <= value < 180:
         raise argparse.ArgumentTypeError(f"must be an angle between 1 and 180 degrees, not {text!r}")
     return value
-
-

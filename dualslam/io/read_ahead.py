@@ -52,7 +52,7 @@ class _Channel(Generic[T]):
             for item in items:
                 if not self._put(item):
                     break
-        except BaseException as e:  # noqa: BLE001 - handed to the consumer, which raises it
+        except BaseException as e:
             self._error = e
         finally:
             try:

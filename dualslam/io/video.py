@@ -32,7 +32,7 @@ _LIVE_QUEUE = 2
 class Capture(Protocol):
     """The part of ``cv2.VideoCapture`` that is used."""
 
-    def isOpened(self) -> bool:  # noqa: N802 - OpenCV's name
+    def isOpened(self) -> bool:
         """Tell whether there is a source behind it."""
         ...
 
