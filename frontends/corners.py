@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dualslam.core.types import BoolArray, FloatArray, IntArray
-from frontends.matching import rank_in_group
+from frontends.groups import rank_in_group
 
 FAST_RADIUS_PX = 3
 """FAST reads a circle of this radius, so it finds nothing nearer to the edge of what it is given."""
@@ -148,9 +148,7 @@ def _dog_weights() -> NDArray[np.float32]:
     axis = np.arange(-_DOG_REACH_PX, _DOG_REACH_PX + 1)
     gaussians = [np.exp(-(axis**2) / (2 * sigma**2)) for sigma in _DOG_SIGMAS_PX]
     fine, coarse = (np.outer(each, each) / each.sum() ** 2 for each in gaussians)
-    kernels = [
-        np.pad(coarse - fine, ((row, 4 - row), (column, 4 - column))) for row in range(5) for column in range(5)
-    ]
+    kernels = [np.pad(coarse - fine, ((row, 4 - row), (column, 4 - column))) for row in range(5) for column in range(5)]
     return np.stack(kernels, axis=-1).reshape(-1, 25).astype(np.float32)
 
 
@@ -162,7 +160,7 @@ def _fast(image: NDArray[np.uint8], threshold: int, window: tuple[int, int, int,
     keypoints = cv2.FastFeatureDetector.create(threshold).detect(view)
     if not keypoints:
         return np.empty((0, 2), np.int64), np.empty(0)
-    xy = cv2.KeyPoint.convert(keypoints).astype(np.int64) + (left - rim, top - rim)
+    xy = np.asarray(cv2.KeyPoint.convert(keypoints)).astype(np.int64) + (left - rim, top - rim)
     return xy, np.array([keypoint.response for keypoint in keypoints])
 
 

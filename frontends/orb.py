@@ -7,6 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -14,10 +15,12 @@ from dualslam.core.config import StrictModel
 from dualslam.core.errors import InputError
 from dualslam.core.types import Features, FloatArray, IntArray, Matches
 from frontends.corners import detect_corners, refine_corners, select_spread, share_out
+from frontends.groups import consistent_rotation, mutual_best
 from frontends.registry import parse_options
 
 PATCH_RADIUS_PX = 15
 """Radius of the disc whose intensity centroid gives the orientation, in pixels of the level (ORB, section 3.2)."""
+PATCH_SIDE_PX = 2 * PATCH_RADIUS_PX + 1
 MARGIN_PX = PATCH_RADIUS_PX + 1
 """Rim of each level without corners, so that the orientation sees nothing beyond the image."""
 
@@ -33,14 +36,27 @@ class OrbOptions(StrictModel):
     """FAST contrasts in grey levels, descending: the first everywhere, the next only in cells without a corner yet."""
     cell_px: int = Field(32, ge=8)
     """Side of these cells, pixels of the level."""
-    refine: bool = True
-    """Sub-pixel corner positions."""
+    sigma_px: float = Field(0.45, gt=0.0)
+    """Noise of a position in pixels of its octave, where the sub-pixel step found an extremum (see below)."""
+    sigma_unrefined_px: float = Field(0.65, gt=0.0)
+    """The same for the others, about one in twelve, which stay at a whole pixel."""
+    max_distance: float = Field(80.0, gt=0.0, le=256.0)
+    """Differing bits up to which a guided match is believed (see below)."""
+    max_distance_strict: float = Field(50.0, gt=0.0, le=256.0)
+    """The same without a guide."""
     ratio: float = Field(0.85, gt=0.0, le=1.0)
     """`match_wide`: greatest distance of the best match over that of the second best."""
 
 
 class OrbFrontend:
-    """FAST corners, intensity-centroid orientation, rotated BRIEF descriptors of 256 bits."""
+    """FAST corners, intensity-centroid orientation, rotated BRIEF descriptors of 256 bits. Implements `Frontend`.
+
+    Parameters
+    ----------
+    n_features : int
+        Keypoints per image, at most.
+    options : OrbOptions, optional
+    """
 
     name = "orb"
 
@@ -49,72 +65,131 @@ class OrbFrontend:
         self.n_features = n_features
         self.scale_factor = self.options.scale_factor
         self.n_octaves = self.options.n_octaves
-        self.max_distance = 90.0
-        self.max_distance_strict = 50.0
-        # One level, no border filter: the pyramid and the rim are ours.
-        self._descriptor = cv2.ORB.create(nfeatures=1, nlevels=1, edgeThreshold=0, patchSize=31)
+        self.max_distance = self.options.max_distance
+        self.max_distance_strict = self.options.max_distance_strict
+        # One level and no border of its own: the pyramid and the rim are ours.
+        self._descriptor = cv2.ORB.create(nfeatures=1, nlevels=1, edgeThreshold=0, patchSize=PATCH_SIDE_PX)
         self._moments = _moment_weights()
 
     @classmethod
     def from_options(cls, n_features: int, options: Mapping[str, Any]) -> OrbFrontend:
+        """Build from the config; ConfigError names an option that is unknown or out of range."""
         return cls(n_features, parse_options(OrbOptions, cls.name, options))
 
     def extract(self, image: NDArray[np.uint8]) -> Features:
+        """Detect and describe up to `n_features` corners, the finest octave first.
+
+        Parameters
+        ----------
+        image : (H, W) or (H, W, 3) RGB uint8
+            Of any size; a flat or a tiny one has no features.
+
+        Raises
+        ------
+        InputError
+            The array is no such image.
+        """
         levels = self._pyramid(_to_grey(image))
         corners = [
             detect_corners(level, self.options.fast_thresholds, MARGIN_PX, self.options.cell_px) for level in levels
         ]
+        # As many per octave as its side is long: fine corners are the more accurate, coarse ones live the longer.
         weights = self.scale_factor ** -np.arange(len(levels), dtype=np.float64)
         quotas = share_out([len(xy) for xy, _ in corners], weights, self.n_features)
         parts = [
             self._describe(level, octave, levels[0].shape, xy[select_spread(xy, response, quota)])
             for octave, (level, (xy, response), quota) in enumerate(zip(levels, corners, quotas, strict=True))
         ]
-        uv, octave, angle, descriptors = (np.concatenate(column) for column in zip(*parts, strict=True))
+        uv, sigma, octave, angle, descriptors = (np.concatenate(column) for column in zip(*parts, strict=True))
         scale = self.scale_factor ** octave.astype(np.float64)
-        return Features(uv, uv, scale.copy(), scale, octave, angle, descriptors)
+        return Features(uv, uv, sigma * scale, scale, octave, angle, descriptors)
 
-    def _pyramid(self, grey):
+    def distance(self, a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
+        """Hamming distance of paired descriptors (N, 32), (N, 32) uint8 -> (N,) float64, 0 to 256."""
+        different = np.bitwise_count(_words(a) ^ _words(b))
+        return np.asarray(different.sum(axis=1, dtype=np.float64))
+
+    def match_wide(self, a: Features, b: Features) -> Matches:
+        """Compare all with all: mutually nearest, clearly so, within `max_distance_strict`, turned alike."""
+        found = mutual_best(_hamming_matrix(a.descriptors, b.descriptors), self.options.ratio, self.max_distance_strict)
+        kept = consistent_rotation(b.angle_rad[found.index[:, 1]] - a.angle_rad[found.index[:, 0]])
+        return Matches(found.index[kept], found.distance[kept])
+
+    def _pyramid(self, grey: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+        """Levels from the image itself down to the last that is wider than two rims."""
         levels = [grey]
         height, width = grey.shape
         for octave in range(1, self.n_octaves):
             size = (round(width / self.scale_factor**octave), round(height / self.scale_factor**octave))
             if min(size) <= 2 * MARGIN_PX:
                 break
-            levels.append(cv2.resize(levels[-1], size, interpolation=cv2.INTER_LINEAR))
+            levels.append(np.asarray(cv2.resize(levels[-1], size, interpolation=cv2.INTER_LINEAR), np.uint8))
         return levels
 
-    def _describe(self, level, octave, base_shape, xy):
+    def _describe(
+        self, level: NDArray[np.uint8], octave: int, base_shape: tuple[int, ...], xy: IntArray
+    ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray, NDArray[np.uint8]]:
+        """Base-image position, sigma (pixels of the level), octave, angle, descriptor of corners (N, 2) of a level."""
         if len(xy) == 0:
-            return np.empty((0, 2)), np.empty(0, np.int64), np.empty(0), np.empty((0, 32), np.uint8)
-        side = 2 * PATCH_RADIUS_PX + 1
-        windows = np.lib.stride_tricks.sliding_window_view(level, (side, side))
+            return np.empty((0, 2)), np.empty(0), np.empty(0, np.int64), np.empty(0), np.empty((0, 32), np.uint8)
+        windows = sliding_window_view(level, (PATCH_SIDE_PX, PATCH_SIDE_PX))
         patches = windows[xy[:, 1] - PATCH_RADIUS_PX, xy[:, 0] - PATCH_RADIUS_PX]
-        moments = patches.reshape(len(patches), side * side).astype(np.float32) @ self._moments
+        moments = patches.reshape(len(patches), -1).astype(np.float32) @ self._moments
         angle = np.arctan2(moments[:, 1], moments[:, 0]).astype(np.float64)
-        degrees = np.degrees(angle) % 360.0
+        offset, found = refine_corners(patches)
+        # INTER_LINEAR keeps the outer edges of the image in place, so it is pixel edges that scale, not centres; the
+        # ratio is of the true sizes, which are rounded.
+        ratio = np.array([base_shape[1] / level.shape[1], base_shape[0] / level.shape[0]])
+        uv = (xy + offset + 0.5) * ratio - 0.5
+        sigma = np.where(found, self.options.sigma_px, self.options.sigma_unrefined_px)
+        return uv, sigma, np.full(len(xy), octave), angle, self._descriptors(level, xy, angle)
+
+    def _descriptors(self, level: NDArray[np.uint8], xy: IntArray, angle_rad: FloatArray) -> NDArray[np.uint8]:
+        """Rotated BRIEF at whole pixels of a level, (N, 32) uint8."""
+        degrees = np.degrees(angle_rad) % 360.0
         keypoints = [
-            cv2.KeyPoint(x, y, side, a) for (x, y), a in zip(xy.tolist(), degrees.tolist(), strict=True)
+            cv2.KeyPoint(x, y, PATCH_SIDE_PX, turn) for (x, y), turn in zip(xy.tolist(), degrees.tolist(), strict=True)
         ]
         kept, descriptors = self._descriptor.compute(level, keypoints)
-        assert len(kept) == len(xy)
-        on_level = xy + refine_corners(patches)[0] if self.options.refine else xy.astype(np.float64)
-        ratio = np.array([base_shape[1] / level.shape[1], base_shape[0] / level.shape[0]])
-        return (on_level + 0.5) * ratio - 0.5, np.full(len(xy), octave), angle, descriptors
-
-    def distance(self, a, b):
-        words_a, words_b = (np.ascontiguousarray(each).view(np.uint64) for each in (a, b))
-        return np.bitwise_count(words_a ^ words_b).sum(axis=-1, dtype=np.float64)
+        assert len(kept) == len(xy), "cv2.ORB dropped keypoints although it was given no border"
+        return np.asarray(descriptors, np.uint8)
 
 
-def _to_grey(image):
+def _to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image as contiguous (H, W) uint8."""
+    if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)) or image.size == 0:
+        raise InputError(f"an image must be (H, W) or (H, W, 3) uint8, not {image.shape} {image.dtype}")
     if image.ndim == 3:
-        return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), np.uint8)
     return np.ascontiguousarray(image)
 
 
-def _moment_weights():
-    r = PATCH_RADIUS_PX
-    v, u = np.mgrid[-r : r + 1, -r : r + 1].astype(np.float32)
-    disc = u**2 + v**2 <= (r + 0.5) ** 2
+def _moment_weights() -> NDArray[np.float32]:
+    """(PATCH_SIDE_PX^2, 2): first moments (u, v) over the disc of a patch."""
+    reach = np.arange(-PATCH_RADIUS_PX, PATCH_RADIUS_PX + 1, dtype=np.float32)
+    u, v = np.meshgrid(reach, reach)
+    disc = u**2 + v**2 <= (PATCH_RADIUS_PX + 0.5) ** 2
     return np.stack([u * disc, v * disc], axis=-1).reshape(-1, 2)
+
+
+def _words(descriptors: NDArray[np.generic]) -> NDArray[np.uint64]:
+    """(N, 32) uint8 as (N, 4) uint64."""
+    return np.ascontiguousarray(descriptors).view(np.uint64)
+
+
+def _hamming_matrix(a: NDArray[np.generic], b: NDArray[np.generic]) -> NDArray[np.uint16]:
+    """Hamming distance of all pairs, (N, M): a third of the time of OpenCV's brute-force matcher, and both ways."""
+    words_a, words_b = _words(a), np.ascontiguousarray(_words(b).T)
+    distances = np.empty((len(a), len(b)), np.uint16)
+    block = 32  # rows, so that the scratch stays in the cache
+    different = np.empty((block, len(b)), np.uint64)
+    count = np.empty((block, len(b)), np.uint8)
+    for begin in range(0, len(a), block):
+        part = words_a[begin : begin + block]
+        total = distances[begin : begin + block]
+        total[:] = 0
+        for word in range(4):
+            np.bitwise_xor(part[:, word, None], words_b[word], out=different[: len(part)])
+            np.bitwise_count(different[: len(part)], out=count[: len(part)])
+            total += count[: len(part)]
+    return distances

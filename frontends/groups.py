@@ -1,0 +1,145 @@
+"""Choosing among candidate pairs: the best of each group, mutual bests, and pairs that agree on a rotation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.types import BoolArray, FloatArray, IntArray, Matches
+
+NO_MATCHES = Matches(np.empty((0, 2), np.int64), np.empty(0))
+
+
+def rank_in_group(group: IntArray, cost: NDArray[np.generic]) -> IntArray:
+    """Rank (0 is the best) of each row among the rows of its group, by ascending cost; ties go to the earlier row.
+
+    Parameters
+    ----------
+    group : (N,) int64
+    cost : (N,)
+    """
+    order = np.lexsort((cost, group))
+    position = np.arange(len(group))
+    ordered = group[order]
+    first = np.ones(len(group), np.bool_)
+    first[1:] = ordered[1:] != ordered[:-1]
+    rank = np.empty(len(group), np.int64)
+    rank[order] = position - np.maximum.accumulate(np.where(first, position, 0))
+    return rank
+
+
+def lowest_in_group(group: IntArray, cost: FloatArray, n_groups: int) -> FloatArray:
+    """Least cost of each group, (n_groups,); infinite for a group without rows."""
+    lowest = np.full(n_groups, np.inf)
+    np.minimum.at(lowest, group, cost)
+    return lowest
+
+
+def best_per_group(group: IntArray, cost: FloatArray, n_groups: int) -> IntArray:
+    """Row of the least cost in each group, ascending; ties go to the earlier row, infinite costs are never chosen.
+
+    Parameters
+    ----------
+    group : (N,) int64
+        In [0, n_groups).
+    cost : (N,) float64
+
+    Returns
+    -------
+    (G,) int64
+        Rows, one for each group that has a finite cost.
+    """
+    lowest = lowest_in_group(group, cost, n_groups)
+    candidates = np.flatnonzero((cost == lowest[group]) & np.isfinite(cost))
+    chosen = np.full(n_groups, -1)
+    chosen[group[candidates[::-1]]] = candidates[::-1]  # the last assignment stands: the earliest row
+    return np.sort(chosen[chosen >= 0])
+
+
+def best_pairs(
+    first: IntArray, second: IntArray, cost: FloatArray, rival: IntArray, ratio: float, n_first: int, n_second: int
+) -> IntArray:
+    """One-to-one choice among candidate pairs: best for the first, clearly so, then best for the second.
+
+    Parameters
+    ----------
+    first, second : (P,) int64
+        The two members of each pair.
+    cost : (P,) float64
+    rival : (P,) int64
+        Class of the second member; only candidates of the same class as the best one count as its rivals in the ratio
+        test (a corner seen in two octaves must not compete with itself).
+    ratio : float
+        The best cost must not exceed this share of its best rival's; 1 switches the test off.
+
+    Returns
+    -------
+    (M,) int64
+        Rows of the chosen pairs, ascending in `first` where the pairs are.
+    """
+    best = best_per_group(first, cost, n_first)
+    if ratio < 1.0:
+        best_row = np.full(n_first, -1)
+        best_row[first[best]] = best
+        rivals = best_row[first]
+        is_rival = (rivals >= 0) & (rivals != np.arange(len(first))) & (rival == rival[rivals])
+        runner_up = lowest_in_group(first[is_rival], cost[is_rival], n_first)
+        best = best[cost[best] <= ratio * runner_up[first[best]]]
+    return best[best_per_group(second[best], cost[best], n_second)]
+
+
+def mutual_best(distances: NDArray[Any], ratio: float, max_distance: float) -> Matches:
+    """One-to-one matches of a dense distance matrix: nearest to each other, near enough, and clearly nearest.
+
+    Parameters
+    ----------
+    distances : (N, M) uint16 or float
+        Scratch: written to, and put back as it was on return.
+    ratio : float
+        Greatest best distance over second best, row-wise.
+    max_distance : float
+    """
+    n_rows, n_columns = distances.shape
+    if n_rows == 0 or n_columns == 0:
+        return NO_MATCHES
+    rows, columns = np.arange(n_rows), distances.argmin(axis=1)
+    best = distances[rows, columns]
+    keep = (distances.argmin(axis=0)[columns] == rows) & (best <= max_distance)
+    if n_columns > 1:
+        # Hiding the best and taking the minimum again is ten times cheaper than a partition.
+        distances[rows, columns] = distances.max() + 1
+        keep &= best <= ratio * distances.min(axis=1)
+        distances[rows, columns] = best
+    return Matches(np.stack([rows[keep], columns[keep]], axis=1), best[keep].astype(np.float64))
+
+
+def consistent_rotation(turn_rad: FloatArray, tolerance_rad: float = np.radians(30.0), n_min: int = 8) -> BoolArray:
+    """Which pairs agree with the rotation that most of them share.
+
+    Parameters
+    ----------
+    turn_rad : (M,) float64
+        Orientation in the second image minus that in the first, any winding.
+    tolerance_rad : float
+        Greatest departure from the shared rotation.
+    n_min : int
+        With fewer pairs all are kept: there is no majority to ask.
+    """
+    if len(turn_rad) < n_min:
+        return np.ones(len(turn_rad), np.bool_)
+    bin_rad = 2 * np.pi / 30
+    histogram = np.bincount((turn_rad % (2 * np.pi) / bin_rad).astype(np.int64) % 30, minlength=30)
+    peak = int(np.argmax(2 * histogram + np.roll(histogram, 1) + np.roll(histogram, -1)))
+    # The mean around the peak, so that the window does not depend on where the bins happen to lie.
+    from_peak = _wrapped(turn_rad - (peak + 0.5) * bin_rad)
+    centre = from_peak[np.abs(from_peak) <= 1.5 * bin_rad].mean()
+    kept: BoolArray = np.abs(_wrapped(from_peak - centre)) <= tolerance_rad
+    return kept
+
+
+def _wrapped(angle_rad: FloatArray) -> FloatArray:
+    """The same angles in [-pi, pi)."""
+    wrapped: FloatArray = (angle_rad + np.pi) % (2 * np.pi) - np.pi
+    return wrapped
