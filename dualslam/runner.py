@@ -107,8 +107,9 @@ def run_sequence(
     latencies_ms: list[float] = []
     error: InputError | None = None
     began, cpu_began = clock(), _cpu_s()
-    frames = _in_real_time(iter(sequence), dropped, clock, sleep) if realtime else iter(sequence)
-    with _stop_on_signal() as stop:
+    source = iter(sequence)
+    frames = _in_real_time(source, dropped, clock, sleep) if realtime else source
+    with _closing(source), _stop_on_signal() as stop:
         while not stop.is_set():
             try:
                 frame = next(frames)
@@ -162,6 +163,17 @@ def _in_real_time(
                 sleep(early_s)
             yield frame
         frame = upcoming
+
+
+@contextmanager
+def _closing(frames: Iterator[Frame]) -> Iterator[None]:
+    """Close a source that can be closed: one that reads ahead on a thread ends it then."""
+    try:
+        yield
+    finally:
+        close = getattr(frames, "close", None)
+        if close is not None:
+            close()
 
 
 @contextmanager
