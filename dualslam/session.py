@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dualslam.build import build_system
+from dualslam.core.camera import Camera
 from dualslam.core.config import Config
 from dualslam.core.config_io import dump_config
 from dualslam.core.errors import InputError
@@ -55,7 +56,7 @@ def run_to_folder(
     overwrite: bool = False,
     realtime: bool = False,
     on_frame: Callable[[FrameResult], None] | None = None,
-    build: Callable[..., System] = build_system,
+    build: Callable[[Config, Camera], System] | None = None,
 ) -> Outcome:
     """Run on a sequence and write a run folder. What an interrupted run has found is kept all the same.
 
@@ -68,14 +69,14 @@ def run_to_folder(
     overwrite, realtime : bool
     on_frame : callable, optional
         Called with each frame's result.
-    build : callable
-        Makes the system of a config and a camera.
+    build : callable, optional
+        Makes the system of a config and a camera; `build_system` if it is not given.
 
     Raises
     ------
     ConfigError, InputError, OutputError
     """
-    system = build(config, sequence.camera)
+    system = (build or build_system)(config, sequence.camera)
     with RunFolder(out, overwrite=overwrite) as folder:
         folder.write_config(dump_config(config))
         n_events = 0
