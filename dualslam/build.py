@@ -68,6 +68,8 @@ def view_of(frame: Frame, frontend: Frontend, camera: Camera) -> View | Failure:
 def rectify(features: Features, camera: Camera) -> Features:
     """Move features to the camera's pinhole equivalent; those that it cannot hold are dropped."""
     uv_rect_px, magnification = camera.rectify(features.uv_px)
-    rectified = replace(features, uv_rect_px=uv_rect_px, sigma_px=features.sigma_px * magnification)
+    # In steps of an eighth of an octave: the graph shares one noise model among all pixels of one sigma.
+    sigma_px = 2.0 ** (np.rint(8.0 * np.log2(features.sigma_px * magnification)) / 8.0)
+    rectified = replace(features, uv_rect_px=uv_rect_px, sigma_px=sigma_px)
     inside = np.isfinite(uv_rect_px).all(axis=1) & np.isfinite(magnification)
     return rectified if inside.all() else rectified.take(inside)

@@ -11,12 +11,16 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dualslam.core.types import BoolArray, FloatArray, IntArray
-from frontends.groups import rank_in_group
+from frontends.groups import rank_in_runs
 
 FAST_RADIUS_PX = 3
 """FAST reads a circle of this radius, so it finds nothing nearer to the edge of what it is given."""
+MIN_CURVATURE = 0.01
+"""Grey levels per square pixel: below that the peak is made of rounding."""
 _DOG_SIGMAS_PX = (1.0, 1.6)
+"""Wide enough to be smooth under FAST's noise, narrow enough to stay at the corner."""
 _DOG_REACH_PX = 6
+"""Radius of the filter."""
 
 
 def detect_corners(
@@ -73,9 +77,13 @@ def select_spread(xy: IntArray, response: FloatArray, n_wanted: int) -> IntArray
     cell_px = max(1.0, float(np.sqrt(extent[0] * extent[1] / n_wanted)))
     column, row = ((xy - low) / cell_px).astype(np.int64).T
     cell = row * int(extent[0] / cell_px + 1) + column
-    # Ties go to the earlier corner (lexsort is stable), so the choice depends on nothing but the image.
-    order = np.lexsort((-response, rank_in_group(cell, -response)))
-    return np.sort(order[:n_wanted])
+    # FAST scores are whole numbers below 256, so one integer key sorts by two things at once. The sorts are stable:
+    # ties go to the earlier corner, and the choice depends on nothing but the image.
+    weakness = 256 - response.astype(np.int64)
+    by_cell = np.argsort(cell * 512 + weakness, kind="stable")
+    rank = rank_in_runs(cell[by_cell])
+    by_rank = np.argsort(rank * 512 + weakness[by_cell], kind="stable")
+    return np.sort(by_cell[by_rank[:n_wanted]])
 
 
 def share_out(n_available: Sequence[int], weights: FloatArray, n_wanted: int) -> list[int]:
@@ -136,7 +144,8 @@ def _quadratic_peak(response: NDArray[np.float32]) -> tuple[FloatArray, BoolArra
     uu, vv = r[:, 1, 2] - 2 * r[:, 1, 1] + r[:, 1, 0], r[:, 2, 1] - 2 * r[:, 1, 1] + r[:, 0, 1]
     uv = (r[:, 2, 2] - r[:, 2, 0] - r[:, 0, 2] + r[:, 0, 0]) / 4
     determinant = uu * vv - uv**2
-    peaked = (determinant > 0) & (uu < 0)
+    # Curved downwards in every direction, by more than rounding.
+    peaked = (determinant > 0) & (uu + vv < -MIN_CURVATURE)
     safe = np.where(peaked, determinant, 1.0)
     offset = np.stack([uv * gradient_v - vv * gradient_u, uv * gradient_u - uu * gradient_v], axis=1) / safe[:, None]
     return offset, peaked & (np.abs(offset) <= 0.75).all(axis=1)
@@ -160,7 +169,8 @@ def _fast(image: NDArray[np.uint8], threshold: int, window: tuple[int, int, int,
     keypoints = cv2.FastFeatureDetector.create(threshold).detect(view)
     if not keypoints:
         return np.empty((0, 2), np.int64), np.empty(0)
-    xy = np.asarray(cv2.KeyPoint.convert(keypoints)).astype(np.int64) + (left - rim, top - rim)
+    xy = np.asarray(cv2.KeyPoint.convert(keypoints)).astype(np.int64)
+    xy += np.array([left - rim, top - rim])
     return xy, np.array([keypoint.response for keypoint in keypoints])
 
 

@@ -12,21 +12,11 @@ from dualslam.core.types import BoolArray, FloatArray, IntArray, Matches
 NO_MATCHES = Matches(np.empty((0, 2), np.int64), np.empty(0))
 
 
-def rank_in_group(group: IntArray, cost: NDArray[np.generic]) -> IntArray:
-    """Rank (0 is the best) of each row among the rows of its group, by ascending cost; ties go to the earlier row.
-
-    Parameters
-    ----------
-    group : (N,) int64
-    cost : (N,)
-    """
-    order = np.lexsort((cost, group))
-    position = np.arange(len(group))
-    ordered = group[order]
-    first = np.ones(len(group), np.bool_)
-    first[1:] = ordered[1:] != ordered[:-1]
-    rank = np.empty(len(group), np.int64)
-    rank[order] = position - np.maximum.accumulate(np.where(first, position, 0))
+def rank_in_runs(group: IntArray) -> IntArray:
+    """Place of each row in its run of equal values, from 0: sorted by group and cost, that is the rank in the group."""
+    place = np.arange(len(group))
+    starts = np.concatenate([[True], group[1:] != group[:-1]])[: len(group)]
+    rank: IntArray = place - np.maximum.accumulate(np.where(starts, place, 0))
     return rank
 
 

@@ -101,12 +101,12 @@ class Mapper:
         )
         matches = match_projected(
             frontend,
-            FeatureGrid(features, self._size_px),
+            FeatureGrid.build(features.uv_rect_px),
             features,
             prediction.uv_px,
             FUSE_RADIUS_PX * frontend.scale_factor**prediction.octave,
             local.descriptors[prediction.rows],
-            prediction.octave,
+            octave=prediction.octave,
             max_distance=frontend.max_distance_strict,
         )
         row, feature = matches.index[:, 0], matches.index[:, 1]
@@ -141,7 +141,7 @@ class Mapper:
             return np.zeros(0, np.int64)
         T_b_a = se3.inverse(T_submap_b) @ T_submap_a
         matches = match_epipolar(
-            self._frontend, a, b, rows_a, rows_b, fundamental_from_pose(submap.K, T_b_a), submap.K, T_b_a
+            self._frontend, a, b, rows_a, rows_b, fundamental_from_pose(submap.K, T_b_a)
         )
         fa, fb = matches.index[:, 0], matches.index[:, 1]
         points = triangulate_two_view(a.uv_rect_px[fa], b.uv_rect_px[fb], submap.K, T_submap_a, T_submap_b)

@@ -66,7 +66,7 @@ class Tracker:
         features = view.features
         if len(features) < self._config.min_inliers:
             return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features in the image")
-        grid = FeatureGrid(features, self._size_px)
+        grid = FeatureGrid.build(features.uv_rect_px)
         T_predicted = self._predict(view.timestamp_s)
         found: tuple[FloatArray, IntArray] | Failure = Failure(FailureReason.TOO_FEW_MATCHES)
         for radius_px in (self._config.search_radius_px, self._config.search_radius_px * WIDER):
@@ -115,7 +115,7 @@ class Tracker:
             prediction.uv_px,
             radius_px * self._frontend.scale_factor**prediction.octave,
             descriptors,
-            prediction.octave,
+            octave=prediction.octave,
             angle_rad=self._last.view.features.angle_rad[last_rows][prediction.rows],
         )
         rows, feature = prediction.rows[matches.index[:, 0]], matches.index[:, 1]
@@ -180,7 +180,7 @@ class Tracker:
             prediction.uv_px[new],
             self._config.local_radius_px * self._frontend.scale_factor ** prediction.octave[new],
             local.descriptors[prediction.rows[new]],
-            prediction.octave[new],
+            octave=prediction.octave[new],
             taken=landmark_ids >= 0,
         )
         landmark_ids = landmark_ids.copy()

@@ -60,17 +60,22 @@ def propose_relative_poses(
     pose, _ = poselib.estimate_relative_pose(uv_a_px, uv_b_px, camera, camera, options, {})
     T_b_a = np.eye(4)
     T_b_a[:3] = pose.Rt
-    T_b_a[:3, 3] /= max(float(np.linalg.norm(T_b_a[:3, 3])), 1e-12)
     options = {"max_reproj_error": 3.0 * sigma, "max_iterations": 1000, "min_iterations": 100, "seed": seed}
     H_b_a, _ = poselib.estimate_homography(uv_a_px, uv_b_px, options, {})
     variance = sigma_px**2
     score_e = _score(sampson_error(fundamental_from_pose(K, T_b_a), uv_a_px, uv_b_px) / variance, CHI2_1)
-    score_h = _score(homography_transfer_error(H_b_a, uv_a_px, uv_b_px) / (2 * variance), CHI2_2)
+    score_h = _score(homography_transfer_error(H_b_a, uv_a_px, uv_b_px).mean(axis=1) / variance, CHI2_2)
     share = score_h / max(score_e + score_h, 1e-12)
-    candidates = [T_b_a]
+    candidates = [_unit_baseline(T_b_a)]
     if share > homography_ratio:
-        candidates += decompose_homography(H_b_a, K)
+        candidates += [_unit_baseline(T) for T in decompose_homography(H_b_a, K).T_b_a]
     return Hypotheses(candidates, share)
+
+
+def _unit_baseline(T_b_a: FloatArray) -> FloatArray:
+    T = T_b_a.copy()
+    T[:3, 3] /= max(float(np.linalg.norm(T[:3, 3])), 1e-12)
+    return T
 
 
 def _score(squared: FloatArray, gate: float) -> float:

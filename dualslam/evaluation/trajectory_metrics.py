@@ -184,9 +184,8 @@ def relative_error(
         return {}
     T_est, T_ref = _relative(est.T_world_cam, i, j), _relative(ref.T_world_cam, i, j)
     trace = np.einsum("nij,nij->n", T_ref[:, :3, :3], T_est[:, :3, :3])
-    fields: dict[str, Any] = {
-        "rpe_1s_rot_deg_median": float(np.median(np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))))
-    }
+    angle_deg = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+    fields: dict[str, Any] = {"rpe_1s_rot_deg_median": float(np.median(angle_deg))}
     moved = np.linalg.norm(T_ref[:, :3, 3], axis=1)
     typical = np.median(moved)
     enough = (moved > _MIN_MOTION * typical) & (typical > 0)

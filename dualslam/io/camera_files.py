@@ -65,23 +65,19 @@ def read_camera_file(path: str | Path) -> Camera:
 
 
 def make_camera(where: str, build: Callable[[], Camera]) -> Camera:
-    """Build a camera and check it; what is wrong with it is said with the name of the file."""
+    """Build a camera, which checks itself; what is wrong with it is said with the name of the file."""
     try:
-        camera = build()
-        camera.validate()
+        return build()
     except InputError as e:
-        raise InputError(f"{where}: {e}") from e
-    except (TypeError, ValueError) as e:
-        raise InputError(f"{where}: the calibration makes no sense: {e}.") from e
-    return camera
+        raise InputError(f"{where}: {str(e).removeprefix('camera: ').rstrip('.')}; correct the calibration.") from e
 
 
 def radtan_camera(fxycxy: list[float], distortion: list[float], size: tuple[float, float], where: str) -> Camera:
     """Make a pinhole camera, or a radial-tangential one where any of k1 k2 p1 p2 [k3] is not zero."""
-    width, height = whole_size(size, where)
+    pixels = whole_size(size, where)
     if any(d != 0 for d in distortion):
-        return make_camera(where, lambda: RadTanCamera(*fxycxy, width, height, *distortion))
-    return make_camera(where, lambda: PinholeCamera(*fxycxy, width, height))
+        return make_camera(where, lambda: RadTanCamera(*pixels, *fxycxy, *distortion))
+    return make_camera(where, lambda: PinholeCamera(*pixels, *fxycxy))
 
 
 def whole_size(size: tuple[float, float], where: str) -> tuple[int, int]:
@@ -126,19 +122,15 @@ def read_tum_mono_camera(path: Path) -> Camera:
         raise InputError(f"{path}: {model} with {len(numbers)} numbers is no known camera; {hint}.")
     check_numbers(numbers, str(path))
     width, height = whole_size(size, str(path))
-    relative = numbers[2] < 1 and numbers[3] < 1
-    if model == "fov" and numbers[4] != 0:
-        fx, fy, cx, cy, omega = numbers
-        if not relative:
-            # To the relative form, of which the camera class knows the half-pixel convention.
-            fx, fy, cx, cy = fx / width, fy / height, (cx + 0.5) / width, (cy + 0.5) / height
-        return make_camera(str(path), lambda: FovCamera.from_tum_mono(fx, fy, cx, cy, omega, width, height))
     fx, fy, cx, cy = numbers[:4]
-    if relative:
+    if model == "fov":
+        return make_camera(str(path), lambda: FovCamera.from_tum_mono(fx, fy, cx, cy, numbers[4], width, height))
+    if cx < 1 and cy < 1:
+        # Relative numbers count from the corner of the top-left pixel, ours from its centre.
         fx, fy, cx, cy = fx * width, fy * height, cx * width - 0.5, cy * height - 0.5
-    if model in ("kannalabrandt", "equidistant"):
-        return make_camera(str(path), lambda: KannalaBrandtCamera(fx, fy, cx, cy, width, height, *numbers[4:]))
-    return radtan_camera([fx, fy, cx, cy], numbers[4:] if model == "radtan" else [], (width, height), str(path))
+    distortion = [] if model == "pinhole" else numbers[4:]
+    model = "fisheye" if model in ("kannalabrandt", "equidistant") else model
+    return distorted_camera(model, [fx, fy, cx, cy], distortion, (width, height), str(path))
 
 
 def check_numbers(numbers: list[float], where: str) -> None:
@@ -204,10 +196,10 @@ def distorted_camera(
 ) -> Camera:
     """Make the camera of a named distortion model with its coefficients as OpenCV and ROS order them."""
     if model in _FISHEYE:
-        width, height = whole_size(size, where)
+        pixels = whole_size(size, where)
         if len(distortion) != 4:
             raise InputError(f"{where}: {len(distortion)} distortion coefficients; a fisheye camera has 4.")
-        return make_camera(where, lambda: KannalaBrandtCamera(*fxycxy, width, height, *distortion))
+        return make_camera(where, lambda: KannalaBrandtCamera(*pixels, *fxycxy, *distortion))
     if len(distortion) not in (0, 4, 5) and any(d != 0 for d in distortion[5:]):
         raise InputError(f"{where}: {len(distortion)} distortion coefficients; k1 k2 p1 p2 [k3] are supported.")
     return radtan_camera(fxycxy, distortion[:5], size, where)

@@ -19,6 +19,9 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".t
 # How the files of a format end; a file without its ending was cut off, which decoders fill with grey and do not tell.
 _ENDINGS = {b"\xff\xd8\xff": b"\xff\xd9", b"\x89PNG": b"IEND\xaeB`\x82"}
 _TAIL_BYTES = 1024
+# A JPEG's thumbnail, which has an ending of its own, is in its first 64 KiB. Behind the image there may be more: phones
+# append a film.
+_HEAD_BYTES = 1 << 16
 
 
 class UnreadableImageError(Exception):
@@ -92,7 +95,7 @@ def decode(data: bytes, name: str, grey: bool) -> NDArray[np.uint8]:
     if not data:
         raise UnreadableImageError(f"{name} is empty.")
     for start, end in _ENDINGS.items():
-        if data.startswith(start) and end not in data[-_TAIL_BYTES:]:
+        if data.startswith(start) and end not in data[-_TAIL_BYTES:] and data.find(end, _HEAD_BYTES) < 0:
             raise UnreadableImageError(f"{name} is cut off: its end is missing.")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)

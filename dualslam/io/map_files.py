@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -49,11 +50,12 @@ def save_arrays(path: str | Path, arrays: Arrays) -> None:
 def load_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
     """Read an ``.npz`` of `save_arrays`; a file that would need unpickling is refused."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # Opened here, as numpy leaves the file open where it is no archive.
+        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; check the path.") from None
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError, TypeError, AttributeError) as e:
+    except (OSError, ValueError, zipfile.BadZipFile, zlib.error, EOFError, KeyError, TypeError, AttributeError) as e:
         raise InputError(f"{path} is no map file, or is damaged: {e}.") from e
 
 

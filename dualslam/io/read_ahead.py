@@ -52,7 +52,7 @@ class _Channel(Generic[T]):
             for item in items:
                 if not self._put(item):
                     break
-        except BaseException as e:
+        except BaseException as e:  # handed to the consumer, which raises it
             self._error = e
         finally:
             try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -167,7 +168,8 @@ class RecordedSequence:
 def image_size(images: ImageStore, name: str, wanted: tuple[int, int] | None = None) -> tuple[int, int]:
     """Return (width, height) of a sequence's images.
 
-    Looks at a few images; if one is of the `wanted` size that is the answer, so a single odd image does no harm.
+    Looks at a few images, so that a single odd one does no harm: if one is of the `wanted` size that is the answer,
+    otherwise the size of most of them.
 
     Raises
     ------
@@ -188,14 +190,14 @@ def image_size(images: ImageStore, name: str, wanted: tuple[int, int] | None = N
             except UnreadableImageError as e:
                 log.info("looking for the image size: %s", e)
                 continue
-            if wanted is None or (width, height) == wanted:
+            if (width, height) == wanted:
                 return width, height
             sizes.append((width, height))
     finally:
         reader.close()
     if not sizes:
         raise InputError(f"{name}: none of its {n} images can be read; check the files.")
-    return sizes[0]
+    return Counter(sizes).most_common(1)[0][0]
 
 
 def check_image_size(images: ImageStore, name: str, camera: Camera, calibration: str) -> None:

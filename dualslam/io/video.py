@@ -148,7 +148,7 @@ def _open(path: Path) -> Capture:
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise InputError(f"{path} is no video that OpenCV can open; give a video file, or convert it to another codec.")
-    return capture  # type: ignore[return-value]
+    return capture
 
 
 def _scan(path: Path) -> FloatArray:
@@ -244,7 +244,7 @@ def open_webcam(
     selection: Selection,
     given: Given,
     grey: bool,
-    connect: Callable[[int], Capture] = cv2.VideoCapture,  # type: ignore[assignment]
+    connect: Callable[[int], Capture] = cv2.VideoCapture,
 ) -> WebcamSequence:
     """Open webcam `number`, once to learn its image size, then again whenever the sequence is read."""
     if selection.reverse:

@@ -105,7 +105,10 @@ class Feeder:
 
     def add(self, k: int, exact: bool = False) -> None:
         scene, submap = self.scene, self.submap
-        T = scene.T_true[k].copy()
+        # Where the drift of the neighbouring keyframe puts this one, as a tracker would find it.
+        near = min(submap.keyframes, key=lambda other: abs(other - k), default=None)
+        drift = np.eye(4) if near is None else submap.T_submap_kf[near] @ np.linalg.inv(scene.T_true[near])
+        T = drift @ scene.T_true[k]
         if not exact:
             T[:3, 3] += self.pose_noise * self.rng.normal(size=3)
         submap.add_keyframe(scene.keyframe(k), T)
@@ -125,7 +128,8 @@ class Feeder:
         if not new_point:
             return
         n = len(new_point)
-        xyz = scene.xyz_true[new_point] + self.point_noise * self.rng.normal(size=(n, 3))
+        xyz = scene.xyz_true[new_point] @ drift[:3, :3].T + drift[:3, 3]
+        xyz += self.point_noise * self.rng.normal(size=(n, 3))
         ids = submap.add_landmarks(xyz, np.zeros((n, 4), np.uint8), np.ones(n), k)
         self.landmark_of_point[new_point] = ids
         kfs, feats = np.array(first).T

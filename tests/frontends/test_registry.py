@@ -1,0 +1,68 @@
+"""Finding a front end by its name, and refusing names and options that do not exist."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.metadata import EntryPoint, EntryPoints
+from typing import Any
+
+import pytest
+
+from dualslam.core.config import FrontendConfig
+from dualslam.core.errors import ConfigError
+from frontends import registry
+from frontends.orb import OrbFrontend
+
+
+def test_orb_is_built_in_and_takes_its_options() -> None:
+    config = FrontendConfig(name="orb", n_features=123, options={"n_octaves": 4, "fast_thresholds": [30, 10]})
+    frontend = registry.create_frontend(config)
+    assert isinstance(frontend, OrbFrontend)
+    assert frontend.n_features == 123
+    assert frontend.n_octaves == 4
+    assert frontend.options.fast_thresholds == (30, 10)
+
+
+def test_unknown_name_lists_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match=r"'orbb'.*known:.*orb"):
+        registry.create_frontend(FrontendConfig(name="orbb"))
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"octaves": 8}, r"frontend\.options\.octaves.*n_octaves"),
+        ({"scale_factor": 0.5}, r"frontend\.options\.scale_factor"),
+        ({"fast_thresholds": []}, r"frontend\.options\.fast_thresholds"),
+        ({"fast_thresholds": [20, 0]}, r"frontend\.options\.fast_thresholds\.1"),
+    ],
+)
+def test_wrong_option_is_named(options: dict[str, Any], named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        registry.create_frontend(FrontendConfig(options=options))
+
+
+def offer(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
+    """Pretend that installed packages offer these front ends."""
+    offered = EntryPoints(EntryPoint(name, value, registry.ENTRY_POINT_GROUP) for name, value in entries.items())
+    monkeypatch.setattr(registry, "entry_points", lambda **wanted: offered.select(**wanted))
+
+
+def test_entry_points_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    offer(monkeypatch, theirs="frontends.orb:OrbFrontend", orb="nowhere:Nothing")
+    assert registry.known_frontends() == ["orb", "theirs"]
+    assert isinstance(registry.create_frontend(FrontendConfig(name="theirs")), OrbFrontend)
+    assert isinstance(registry.create_frontend(FrontendConfig(name="orb")), OrbFrontend)
+
+
+@pytest.mark.parametrize("value", ["no_such_module:Thing", "frontends.orb:NoSuchThing"])
+def test_broken_entry_point_is_a_config_error(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
+    offer(monkeypatch, broken=value)
+    with pytest.raises(ConfigError, match=r"'broken'.*cannot be imported"):
+        registry.create_frontend(FrontendConfig(name="broken"))
+
+
+def test_registry_imports_no_front_end_by_itself() -> None:
+    code = "import sys, frontends.registry; sys.exit('cv2' in sys.modules or 'frontends.orb' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

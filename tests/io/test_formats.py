@@ -1,0 +1,181 @@
+"""Each layout is recognised, and gives its frames, times, camera and truth."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dualslam.core.camera import FovCamera, PinholeCamera, RadTanCamera
+from dualslam.core.errors import InputError
+from dualslam.io import open_sequence
+
+N = 6
+
+
+@pytest.mark.parametrize("layout", ["dataset", "kitti", "tum_rgbd", "tum_mono", "euroc"])
+def test_every_layout_gives_all_its_frames_in_order(make, image_number, tmp_path: Path, layout: str) -> None:
+    sequence = open_sequence(make[layout](tmp_path / "data"))
+    frames = list(sequence)
+    assert len(sequence) == N
+    assert [f.index for f in frames] == list(range(N))
+    assert [image_number(f.image) for f in frames] == list(range(N))
+    assert [f.timestamp_s for f in frames] == sequence.frame_timestamps.tolist()
+    assert all(f.image.dtype == np.uint8 and f.image.ndim == 2 for f in frames)
+    assert all(f.image.shape == (sequence.camera.height, sequence.camera.width) for f in frames)
+    assert sequence.ground_truth is not None
+    assert [image_number(f.image) for f in sequence] == list(range(N)), "iterating again reads again"
+
+
+def test_dataset_folder(dataset: Path) -> None:
+    sequence = open_sequence(dataset)
+    assert sequence.name == "walk_01"
+    assert sequence.camera == PinholeCamera(fx=30.0, fy=30.0, cx=16.0, cy=12.0, width=32, height=24)
+    assert sequence.rate_hz == pytest.approx(10.0)
+    assert sequence.frame_timestamps[1] == 100.1
+    assert sequence.ground_truth.T_world_cam[:, 0, 3].tolist() == [i + 0.5 for i in range(N)]
+
+
+@pytest.mark.parametrize("numbers", ["0.1 -0.2 0.01 0.02", "0.1 -0.2 0.01 0.02 0.3"])
+def test_dataset_folder_with_distortion(dataset: Path, numbers: str) -> None:
+    (dataset / "calib.txt").write_text(f"30 30 16 12 {numbers} 32 24\n")
+    camera = open_sequence(dataset).camera
+    assert isinstance(camera, RadTanCamera)
+    assert [camera.k1, camera.k2, camera.p1, camera.p2] == [0.1, -0.2, 0.01, 0.02]
+    assert camera.k3 == (0.3 if numbers.endswith("0.3") else 0.0)
+
+
+@pytest.mark.parametrize(("camera", "offset"), [(0, 0.0), (2, 1.0)])
+def test_kitti(make, tmp_path: Path, camera: int, offset: float) -> None:
+    sequence = open_sequence(make["kitti"](tmp_path, camera))
+    assert sequence.name == "kitti_07"
+    assert sequence.camera == PinholeCamera(fx=30.0, fy=30.0, cx=16.0, cy=12.0, width=32, height=24)
+    truth = sequence.ground_truth
+    assert truth.timestamps_s.tolist() == sequence.frame_timestamps.tolist()
+    # P2 = K [I | t] with t = -1 m: camera 2 stands 1 m to the right of camera 0, whose poses the file has.
+    np.testing.assert_allclose(truth.T_world_cam[:, :3, 3], [[offset, 0, i] for i in range(N)], atol=1e-12)
+
+
+def test_kitti_without_poses(make, tmp_path: Path) -> None:
+    folder = make["kitti"](tmp_path)
+    (tmp_path / "poses" / "07.txt").unlink()
+    assert open_sequence(folder).ground_truth is None
+
+
+def test_tum_rgbd(make, tmp_path: Path) -> None:
+    sequence = open_sequence(make["tum_rgbd"](tmp_path))
+    assert isinstance(sequence.camera, RadTanCamera)
+    assert sequence.camera.fx == 520.908620
+    assert sequence.frame_timestamps[0] == 100.0
+    assert sequence.ground_truth.timestamps_s[0] == 100.003
+
+
+def test_tum_rgbd_without_a_camera_in_its_name(make, tmp_path: Path) -> None:
+    folder = make["tum_rgbd"](tmp_path).rename(tmp_path / "desk")
+    with pytest.raises(InputError, match=r"fr1, fr2 or fr3 .* give a camera file"):
+        open_sequence(folder)
+    assert open_sequence(folder, fov_degrees=60).camera.width == 640
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_tum_mono(make, tmp_path: Path, zipped: bool) -> None:
+    sequence = open_sequence(make["tum_mono"](tmp_path / "sequence_01", zipped))
+    assert isinstance(sequence.camera, FovCamera)
+    np.testing.assert_allclose(sequence.exposure_s, [(2.5 + i) * 1e-3 for i in range(N)])
+    assert len(sequence.ground_truth) == N - 1, "the pose that is NaN is left out"
+    if zipped:
+        assert sorted(p.name for p in (tmp_path / "sequence_01").iterdir()) == [
+            "camera.txt",
+            "groundtruthSync.txt",
+            "images.zip",
+            "times.txt",
+        ], "read in place"
+
+
+def test_tum_mono_pinhole(make, tmp_path: Path) -> None:
+    folder = make["tum_mono"](tmp_path / "rectified")
+    (folder / "camera.txt").write_text("0.5 0.6 0.5 0.5 0\n32 24\nnone\n32 24\n")
+    camera = open_sequence(folder).camera
+    assert camera == PinholeCamera(fx=16.0, fy=0.6 * 24, cx=15.5, cy=11.5, width=32, height=24)
+
+
+def test_euroc(make, tmp_path: Path) -> None:
+    folder = make["euroc"](tmp_path)
+    sequence = open_sequence(folder)
+    assert sequence.name == "MH_99_tiny"
+    assert isinstance(sequence.camera, RadTanCamera)
+    assert sequence.camera.k1 == -0.28
+    assert abs(sequence.frame_timestamps[0] - 1403636579.763555584) < 1e-6
+    assert sequence.rate_hz == pytest.approx(20.0, rel=1e-5)
+    # The camera sits 0.5 m along the body's x, which points along the world's y, and is turned by 90 degrees more.
+    T_world_cam = sequence.ground_truth.T_world_cam
+    np.testing.assert_allclose(T_world_cam[2, :3, 3], [2.0, 0.5, 0.0], atol=1e-12)
+    np.testing.assert_allclose(T_world_cam[2, :3, :3], np.diag([-1.0, -1.0, 1.0]), atol=1e-12)
+    assert len(open_sequence(folder / "mav0")) == N
+
+
+def test_plain_folder_in_natural_order(tmp_path: Path, image_number, caplog: pytest.LogCaptureFixture) -> None:
+    for i in range(12):
+        cv2.imwrite(str(tmp_path / f"shot{i}.png"), np.full((24, 32), 20 + 10 * i, np.uint8))
+    (tmp_path / "notes.txt").write_text("not an image")
+    with caplog.at_level(logging.WARNING):
+        sequence = open_sequence(tmp_path, fov_degrees=90)
+    assert "30 Hz" in caplog.text
+    assert [image_number(f.image) for f in sequence] == list(range(12))
+    assert sequence.camera.fx == pytest.approx(16.0)
+    assert sequence.rate_hz == pytest.approx(30.0)
+    assert open_sequence(tmp_path, fov_degrees=90, rate_hz=5).frame_timestamps[1] == 0.2
+    own = [0.0, 0.5, *np.arange(1, 11)]
+    assert open_sequence(tmp_path, fov_degrees=90, times=own).frame_timestamps.tolist() == own
+
+
+def test_plain_folder_with_a_camera_file(dataset: Path, tmp_path: Path) -> None:
+    camera = {"model": "pinhole", "fx": 30, "fy": 30, "cx": 16, "cy": 12, "width": 32, "height": 24}
+    file = tmp_path / "camera.json"
+    file.write_text(json.dumps(camera))
+    assert open_sequence(dataset / "images", camera_file=file).camera.fx == 30
+
+
+def test_a_given_camera_goes_before_the_source_s_own(dataset: Path, tmp_path: Path) -> None:
+    file = tmp_path / "calib.txt"
+    file.write_text("50 50 16 12 32 24\n")
+    assert open_sequence(dataset, camera_file=file).camera.fx == 50
+    (dataset / "calib.txt").unlink()
+    assert open_sequence(dataset, camera_file=file).camera.fx == 50
+    assert open_sequence(dataset, fov_degrees=90).camera.fx == pytest.approx(16.0)
+
+
+def test_colour_is_rgb(dataset: Path) -> None:
+    red = np.zeros((24, 32, 3), np.uint8)
+    red[..., 2] = 255  # OpenCV writes BGR
+    cv2.imwrite(str(dataset / "images" / "000000.png"), red)
+    first, second = list(open_sequence(dataset, grey=False, max_frames=2))
+    assert first.image.shape == (24, 32, 3)
+    assert first.image[0, 0].tolist() == [255, 0, 0]
+    assert second.image[0, 0].tolist() == [30, 30, 30]
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"start": 2}, [2, 3, 4, 5]),
+        ({"stride": 2}, [0, 2, 4]),
+        ({"start": 1, "stride": 2, "max_frames": 2}, [1, 3]),
+        ({"max_frames": 100}, [0, 1, 2, 3, 4, 5]),
+        ({"reverse": True}, [5, 4, 3, 2, 1, 0]),
+        ({"start": 1, "stride": 2, "max_frames": 2, "reverse": True}, [3, 1]),
+    ],
+)
+def test_selection_keeps_source_index_and_true_time(dataset: Path, image_number, options, expected) -> None:
+    sequence = open_sequence(dataset, **options)
+    frames = list(sequence)
+    assert [f.index for f in frames] == sequence.source_indices.tolist() == expected
+    assert [image_number(f.image) for f in frames] == expected
+    np.testing.assert_allclose([f.timestamp_s for f in frames], [100 + 0.1 * i for i in expected])
+    assert len(sequence) == len(expected)
+    assert sequence.rate_hz == pytest.approx(10.0 / options.get("stride", 1))
+    assert len(sequence.source_timestamps) == N

@@ -1,0 +1,133 @@
+"""Maps and submaps to the disk and back, without pickles."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dualslam.core.errors import InputError, OutputError
+from dualslam.core.geometry import se3
+from dualslam.core.submap import Submap
+from dualslam.core.types import Features, Keyframe
+from dualslam.io import load_map, load_submap, save_map, save_submap
+
+
+def features(rng: np.random.Generator, n: int) -> Features:
+    return Features(
+        uv_px=rng.uniform(0, 100, (n, 2)),
+        uv_rect_px=rng.uniform(0, 100, (n, 2)),
+        sigma_px=rng.uniform(1, 3, n),
+        scale=rng.uniform(1, 3, n),
+        octave=rng.integers(0, 8, n),
+        angle_rad=rng.uniform(-3, 3, n),
+        descriptors=rng.integers(0, 256, (n, 32), dtype=np.uint8),
+    )
+
+
+@pytest.fixture
+def submap() -> Submap:
+    rng = np.random.default_rng(3)
+    submap = Submap(4, np.array([[500.0, 0, 320], [0, 501, 240], [0, 0, 1]]), np.zeros(32, np.uint8))
+    for k, n in [(10, 30), (14, 0), (12, 25), (20, 5)]:
+        T = se3.exp(rng.normal(0, 1, 6))
+        submap.add_keyframe(Keyframe(k, 0.1 * k, features(rng, n)), T)
+    ids = submap.add_landmarks(
+        rng.normal(0, 5, (20, 3)), submap.keyframes[10].features.descriptors[:20], np.ones(20), 10
+    )
+    submap.add_observations(10, np.arange(20), ids)
+    submap.add_observations(12, np.arange(20), ids[::-1].copy())
+    submap.remove_landmarks(ids[:2])
+    submap.merge_landmarks(ids[5:6], ids[6:7])
+    submap.remove_keyframe(20, 12)
+    submap.gauge = (10, 12)
+    return submap
+
+
+def assert_same(a: Submap, b: Submap) -> None:
+    assert (a.id, a.gauge) == (b.id, b.gauge)
+    np.testing.assert_array_equal(a.K, b.K)
+    assert list(a.keyframes) == list(b.keyframes), "in the order of insertion"
+    for k in a.keyframes:
+        assert a.keyframes[k].timestamp_s == b.keyframes[k].timestamp_s
+        for field in fields(Features):
+            x, y = getattr(a.keyframes[k].features, field.name), getattr(b.keyframes[k].features, field.name)
+            assert x.dtype == y.dtype
+            np.testing.assert_array_equal(x, y)
+        assert a.T_submap_kf[k].tobytes() == b.T_submap_kf[k].tobytes()
+        np.testing.assert_array_equal(a.landmark_of[k], b.landmark_of[k])
+    assert list(a.anchors) == list(b.anchors)
+    for k in a.anchors:
+        assert a.anchors[k].keyframe_id == b.anchors[k].keyframe_id
+        np.testing.assert_array_equal(a.anchors[k].T_kf_cam, b.anchors[k].T_kf_cam)
+    for one, other in ((a.landmarks, b.landmarks), (a.observations, b.observations)):
+        x, y = one.columns(), other.columns()
+        assert list(x) == list(y)
+        for name in x:
+            assert x[name].dtype == y[name].dtype
+            np.testing.assert_array_equal(x[name], y[name])
+
+
+def test_submap_round_trip(tmp_path: Path, submap: Submap) -> None:
+    save_submap(tmp_path / "s.npz", submap)
+    back = load_submap(tmp_path / "s.npz")
+    assert_same(submap, back)
+    # It is alive: it can go on growing.
+    ids = back.add_landmarks(np.ones((3, 3)), np.zeros((3, 32), np.uint8), np.ones(3), 10)
+    back.add_observations(10, np.array([27, 28, 29]), ids)
+    back.remove_keyframe(12, 10)
+    assert len(back.landmarks) == len(submap.landmarks) + 3
+
+
+def test_empty_submap_round_trip(tmp_path: Path) -> None:
+    empty = Submap(0, np.eye(3), np.zeros(16, np.float32))
+    save_submap(tmp_path / "s.npz", empty)
+    back = load_submap(tmp_path / "s.npz")
+    assert_same(empty, back)
+    assert back.landmarks["descriptor"].dtype == np.float32
+    assert back.landmarks["descriptor"].shape == (0, 16)
+
+
+def test_map_round_trip(tmp_path: Path) -> None:
+    arrays = {"links": {"S": np.eye(4)[None], "from": np.array([1])}, "submap_00": {"x": np.zeros((0, 3), np.float32)}}
+    metadata = {"main": [0, 1], "scale": np.float32(0.5), "camera": {"model": "pinhole"}, "bad": float("nan")}
+    save_map(tmp_path / "map", arrays, metadata)
+    back, said = load_map(tmp_path / "map")
+    assert back.keys() == arrays.keys()
+    for group, content in arrays.items():
+        for name, array in content.items():
+            assert back[group][name].dtype == array.dtype
+            np.testing.assert_array_equal(back[group][name], array)
+    assert said == {"main": [0, 1], "scale": 0.5, "camera": {"model": "pinhole"}, "bad": None}
+    assert sorted(p.name for p in (tmp_path / "map").iterdir()) == ["links.npz", "map.json", "submap_00.npz"]
+
+
+def test_no_pickles(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="without pickles"):
+        save_map(tmp_path, {"a": {"x": np.array([object()])}}, {})
+    np.savez(tmp_path / "evil.npz", x=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(InputError, match="no map file"):
+        load_submap(tmp_path / "evil.npz")
+
+
+def test_damaged_files(tmp_path: Path, submap: Submap) -> None:
+    path = tmp_path / "s.npz"
+    with pytest.raises(InputError, match="does not exist"):
+        load_submap(path)
+    save_submap(path, submap)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(InputError, match="damaged"):
+        load_submap(path)
+    np.savez(path, format=np.array(1), id=np.array(0))
+    with pytest.raises(InputError, match="no submap of this version"):
+        load_submap(path)
+    np.savez(path, format=np.array(99))
+    with pytest.raises(InputError, match="format 99"):
+        load_submap(path)
+    with pytest.raises(InputError, match=r"map.json does not exist"):
+        load_map(tmp_path)
+    (tmp_path / "map.json").write_text("{}")
+    with pytest.raises(InputError, match=r"map.json is not the metadata"):
+        load_map(tmp_path)

@@ -1,0 +1,146 @@
+"""The folder that a run leaves behind."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dualslam.core.errors import InputError, OutputError
+from dualslam.core.events import EventKind, EventLog
+from dualslam.core.types import FrameStatus
+from dualslam.io import FrameRow, PosedFrames, RunFolder, RunRecord, read_kitti, read_tum
+from dualslam.io.run_folder import read_events, read_frames, unlinked_submaps
+from dualslam.io.trajectory_files import read_frame_list
+
+ROWS = [
+    FrameRow(0, 0.1, FrameStatus.INITIALISING, None, False, 0, 0, 12.3456),
+    FrameRow(2, 0.30000000000000004, FrameStatus.TRACKED, 0, True, 200, 150, 20.0),
+    FrameRow(4, 0.5, FrameStatus.UNREADABLE, None, False, 0, 0, 1.0),
+]
+
+
+def posed(index: list[int]) -> PosedFrames:
+    T = np.tile(np.eye(4), (len(index), 1, 1))
+    T[:, 0, 3] = index
+    return PosedFrames(np.array(index, np.int64), np.array(index) * 0.1, T)
+
+
+def record(**changes: object) -> RunRecord:
+    content = {
+        "frames": ROWS,
+        "main": posed([2]),
+        "unlinked": {3: posed([7, 6, 5])},
+        "summary": {"frames": 3, "fps": np.float64(12.5), "ate_rmse_m": float("nan"), "recovery_s": np.array([1.5])},
+    }
+    return RunRecord(**{**content, **changes})  # type: ignore[arg-type]
+
+
+def test_everything_is_written_and_reads_back(tmp_path: Path) -> None:
+    log = EventLog()
+    with RunFolder(tmp_path / "a" / "run") as run:
+        run.write_config({"seed": 3, "frontend": {"name": "orb"}})
+        event = log.add(EventKind.FAILED, 7, 0.7, 0, reason="jump", inliers=np.int64(3), ratio=float("inf"))
+        run.append_event(event)
+        on_disk = (run.path / "events.jsonl").read_text()
+        run.write(record())
+    assert json.loads(on_disk) == {
+        "event": "failed",
+        "frame": 7,
+        "timestamp_s": 0.7,
+        "submap": 0,
+        "reason": "jump",
+        "inliers": 3,
+        "ratio": None,
+    }, "on the disk while the run goes on"
+    assert (run.path / "frames.csv").read_text().splitlines()[:3] == [
+        "index,timestamp_s,status,submap,in_main_map,n_matches,n_inliers,latency_ms",
+        "0,0.1,initialising,,0,0,0,12.346",
+        "2,0.30000000000000004,tracked,0,1,200,150,20.000",
+    ]
+    back = read_frames(run.path / "frames.csv")
+    assert back[1:] == ROWS[1:]
+    assert read_tum(run.path / "trajectory.txt").T_world_cam[:, 0, 3].tolist() == [2]
+    assert read_kitti(run.path / "trajectory_kitti.txt").shape == (1, 4, 4)
+    assert read_frame_list(run.path / "trajectory_kitti_frames.txt").tolist() == [2]
+    submaps = unlinked_submaps(run.path)
+    assert submaps == {3: run.path / "submaps" / "03.txt"}
+    assert read_tum(submaps[3]).T_world_cam[:, 0, 3].tolist() == [5, 6, 7], "ascending in time"
+    summary = json.loads((run.path / "summary.json").read_text())
+    assert summary == {"frames": 3, "fps": 12.5, "ate_rmse_m": None, "recovery_s": [1.5]}
+    assert "seed: 3" in (run.path / "config.yaml").read_text()
+    assert read_events(run.path / "events.jsonl")[0]["event"] == "failed"
+    assert not [p for p in run.path.rglob("*") if p.name.endswith(".part")]
+
+
+def test_a_later_word_holds(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "run") as run:
+        run.write(record())
+        run.write(record(main=posed([2, 5, 6, 7]), unlinked={}))
+    assert len(read_tum(run.path / "trajectory.txt")) == 4
+    assert unlinked_submaps(run.path) == {}, "submap 3 was linked since"
+
+
+def test_a_run_that_posed_nothing(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "run") as run:
+        run.write(record(main=posed([]), unlinked={}))
+    assert (run.path / "trajectory.txt").read_text() == ""
+    assert len(read_frames(run.path / "frames.csv")) == 3
+
+
+def test_nothing_is_overwritten_without_being_told(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    path.mkdir()
+    (path / "console.log").write_text("mine")
+    with RunFolder(path) as run:
+        run.write(record())
+        (path / "map").mkdir()
+        (path / "map" / "submap_0.npz").write_bytes(b"old")
+        (path / "map" / "mine.doc").write_bytes(b"mine")
+    before = {p: p.read_bytes() for p in path.rglob("*") if p.is_file()}
+    with pytest.raises(OutputError, match=r"run holds trajectory.txt already.*--overwrite"):
+        RunFolder(path)
+    assert before == {p: p.read_bytes() for p in path.rglob("*") if p.is_file()}
+    with RunFolder(path, overwrite=True):
+        pass
+    left = sorted(str(p.relative_to(path)) for p in path.rglob("*") if p.is_file())
+    assert left == ["console.log", "events.jsonl", "map/mine.doc"], "only what runs write was removed"
+
+
+def test_places_that_cannot_be_used(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="file cannot be written to"):
+        RunFolder(tmp_path / "file")
+    with pytest.raises(OutputError, match="cannot be written to"):
+        RunFolder(tmp_path / "file" / "run")
+
+
+def test_no_event_after_the_end(tmp_path: Path) -> None:
+    run = RunFolder(tmp_path / "run")
+    run.close()
+    run.close()
+    with pytest.raises(OutputError, match="is closed"):
+        run.append_event(EventLog().add(EventKind.FUSED, 1, 0.1, 0))
+
+
+def test_events_cut_off_by_a_crash(tmp_path: Path) -> None:
+    path = tmp_path / "events.jsonl"
+    path.write_text('{"event": "failed"}\n{"event": "arch')
+    assert read_events(path) == [{"event": "failed"}]
+    path.write_text('{"event": "fai\n{"event": "archived"}\n')
+    with pytest.raises(InputError, match="line 1"):
+        read_events(path)
+
+
+def test_bad_frames_csv(tmp_path: Path) -> None:
+    path = tmp_path / "frames.csv"
+    path.write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match="columns should be index,timestamp_s"):
+        read_frames(path)
+    path.write_text(
+        "index,timestamp_s,status,submap,in_main_map,n_matches,n_inliers,latency_ms\n1,0.1,sleeping,,0,0,0,1\n"
+    )
+    with pytest.raises(InputError, match="line 2"):
+        read_frames(path)
