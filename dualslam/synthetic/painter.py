@@ -35,6 +35,23 @@ def _fractal_field(rng: np.random.Generator, exponent: float) -> F32Image:
     return (field / field.std()).astype(np.float32)
 
 
+def _window(field: F32Image, row: int, col: int, rows: int, cols: int) -> F32Image:
+    """Return a (rows, cols) window of a periodic field; copied block by block, far faster than by wrapped indices."""
+    out = np.empty((rows, cols), np.float32)
+    y = 0
+    while y < rows:
+        top = (row + y) % _BANK_SIZE
+        h = min(_BANK_SIZE - top, rows - y)
+        x = 0
+        while x < cols:
+            left = (col + x) % _BANK_SIZE
+            w = min(_BANK_SIZE - left, cols - x)
+            out[y : y + h, x : x + w] = field[top : top + h, left : left + w]
+            x += w
+        y += h
+    return out
+
+
 class Painter:
     """A canvas in metres, (0, 0) at its top left, x to the right and y down.
 
@@ -68,8 +85,8 @@ class Painter:
         return tuple(round(float(a) * self.px_per_m) for a in lengths_m)
 
     def uniform(self, low: float, high: float) -> float:
-        """Return a random number."""
-        return float(self.rng.uniform(low, high))
+        """Return a random number; `low` where there is no room for one."""
+        return float(low + max(high - low, 0.0) * self.rng.random())
 
     def chance(self, probability: float) -> bool:
         """Return True with the given probability."""
@@ -86,9 +103,9 @@ class Painter:
             rows, cols = max(2, round(height / stretch[1])), max(2, round(width / stretch[0]))
             row, col = self.rng.integers(0, _BANK_SIZE, 2)
             turn, flip = self.rng.integers(0, 2, 2)
-            source = field.T if turn else field
-            window = source.take(np.arange(row, row + rows), axis=0, mode="wrap")
-            window = window.take(np.arange(col, col + cols), axis=1, mode="wrap")
+            window = _window(field, int(row), int(col), cols, rows).T if turn else _window(
+                field, int(row), int(col), rows, cols
+            )
             window = window[:, ::-1] if flip else window
             if (rows, cols) != shape:
                 window = cv2.resize(np.ascontiguousarray(window), (width, height), interpolation=cv2.INTER_LINEAR)
@@ -98,8 +115,7 @@ class Painter:
     def anchored_noise(self, x_px: int, y_px: int, smooth: bool = False) -> F32Image:
         """Return fractal noise for the whole canvas that continues that of a canvas at other (x, y): for tiles."""
         field = (self.bank.smooth if smooth else self.bank.rough)[0]
-        rows, cols = (np.arange(n) + start for n, start in zip(self.image.shape, (y_px, x_px), strict=True))
-        return field.take(rows, axis=0, mode="wrap").take(cols, axis=1, mode="wrap")
+        return _window(field, y_px, x_px, *self.image.shape)
 
     def fill(self, level: float, rough: float = 0.0, smooth: float = 0.0) -> None:
         """Cover the canvas with a grey level and fractal noise of the given amplitudes."""

@@ -24,6 +24,10 @@ _NEAR_M = 0.05
 _BAND_RATIO = 1.4
 # Below this many pixels across, relief is not drawn: it costs more than it shows.
 _MIN_SIZE_PX = 1.0
+# Most surfaces of a street are hidden. Every so many surfaces (more seldom, as less changes) the depth buffer is reduced
+# to cells, and what lies behind all the cells that it touches is left out.
+_CELL_PX = 16
+_REFRESH_AT = (24, 80, 200, 500)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,12 +35,13 @@ class _Candidates:
     """Surfaces that may be in view, nearest first.
 
     ``index`` (N,) in the scene; ``planes`` (N, 3, 3) the affine forms of s/z, t/z, 1/z over (u, v, 1) with s, t in [0, 1]
-    on the surface; ``bounds`` (N, 4) first and past-the-last pixel: u0, v0, u1, v1.
+    on the surface; ``bounds`` (N, 4) first and past-the-last pixel: u0, v0, u1, v1; ``nearest`` (N,) the largest 1/z.
     """
 
     index: NDArray[np.int64]
     planes: FloatArray
     bounds: NDArray[np.int64]
+    nearest: FloatArray
 
 
 class Renderer:
@@ -95,18 +100,28 @@ class Renderer:
     ) -> tuple[U8Image, F32Image]:
         """Return the grey image and the inverse depth (0 where nothing is hit)."""
         image = np.full((height, width), self._scene.background, np.uint8)
-        inverse = np.zeros((height, width), np.float32)
+        # Whole cells; what is beyond the image counts as covered.
+        whole = np.full((-(-height // _CELL_PX) * _CELL_PX, -(-width // _CELL_PX) * _CELL_PX), np.inf, np.float32)
+        inverse = whole[:height, :width]
+        inverse[:] = 0
         u, v = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
         near = self._candidates(T_world_cam, K, width, height, infinite=False)
-        for index, planes, bounds in zip(near.index, near.planes, near.bounds, strict=True):
-            self._draw_surface(int(index), planes, bounds, u, v, image, inverse, shaded)
+        hidden_beyond = np.zeros((1, 1), np.float32)
+        bounds_of, nearest_of = near.bounds.tolist(), near.nearest.tolist()
+        cells_of = np.stack([near.bounds[:, :2] // _CELL_PX, -(-near.bounds[:, 2:] // _CELL_PX)], 1).reshape(-1, 4).tolist()
+        for row, index in enumerate(near.index.tolist()):
+            if row in _REFRESH_AT or row % _REFRESH_AT[-1] == 0:
+                hidden_beyond = _coarse_minimum(whole)
+            x0, y0, x1, y1 = cells_of[row]
+            if hidden_beyond[y0:y1, x0:x1].min(initial=np.inf) < nearest_of[row]:
+                self._draw_surface(index, near.planes[row], bounds_of[row], u, v, image, inverse, shaded)
         if shaded:
             # The horizon goes behind everything, on a depth buffer of its own.
             behind = np.where(inverse > 0, np.float32(np.inf), np.float32(0))
             if not behind.all():
                 sky = self._candidates(T_world_cam, K, width, height, infinite=True)
-                for index, planes, bounds in zip(sky.index, sky.planes, sky.bounds, strict=True):
-                    self._draw_surface(int(index), planes, bounds, u, v, image, behind, True)
+                for index, planes, bounds in zip(sky.index.tolist(), sky.planes, sky.bounds.tolist(), strict=True):
+                    self._draw_surface(index, planes, bounds, u, v, image, behind, True)
         return image, inverse
 
     def _candidates(
@@ -146,13 +161,13 @@ class Renderer:
         uv = np.clip(uv, -1, limit + 1)
         bounds[:, :2] = np.maximum(np.floor(uv.min(1)), 0)
         bounds[:, 2:] = np.minimum(np.ceil(uv.max(1)) + 1, limit)
-        return _Candidates(chosen[keep], planes, bounds)
+        return _Candidates(chosen[keep], planes, bounds, 1 / z_min[keep])
 
     def _draw_surface(
         self,
         index: int,
         planes: FloatArray,
-        bounds: NDArray[np.int64],
+        bounds: list[int],
         u: F32Image,
         v: F32Image,
         image: U8Image,
@@ -160,19 +175,17 @@ class Renderer:
         shaded: bool,
     ) -> None:
         """Draw one surface where it is nearer than what is there."""
-        u0, v0, u1, v1 = (int(b) for b in bounds)
+        u0, v0, u1, v1 = bounds
         if u1 <= u0 or v1 <= v0:
             return
         uu, vv = u[u0:u1], v[v0:v1]
-        s_z, t_z, inv_z = planes
-        row = np.float32(inv_z[0]) * uu
-        own = row[None, :] + (np.float32(inv_z[1]) * vv + np.float32(inv_z[2]))[:, None]
+        (a0, b0, c0), (a1, b1, c1), (a2, b2, c2) = planes.tolist()
+        own = (np.float32(a2) * uu)[None, :] + (np.float32(b2) * vv + np.float32(c2))[:, None]
         buffer = inverse[v0:v1, u0:u1]
         visible = own > buffer
         # Inside the outline: 0 <= s <= 1 and 0 <= t <= 1, multiplied by 1/z.
-        for a, b, c in (s_z, inv_z - s_z, t_z, inv_z - t_z):
-            at_u, at_v = a * np.array([u0, u1 - 1]), b * np.array([v0, v1 - 1]) + c
-            if at_u.min() + at_v.min() < 0:
+        for a, b, c in ((a0, b0, c0), (a2 - a0, b2 - b0, c2 - c0), (a1, b1, c1), (a2 - a1, b2 - b1, c2 - c1)):
+            if min(a * u0, a * (u1 - 1)) + min(b * v0, b * (v1 - 1)) + c < 0:
                 along_u, along_v = np.float32(a) * uu, np.float32(b) * vv + np.float32(c)
                 visible &= along_u[None, :] >= -along_v[:, None]
         mask = visible.view(np.uint8)
@@ -226,6 +239,14 @@ class Renderer:
             grey = _warp(texture.grey.level(*levels), planes, part_rect)
             cv2.copyTo(grey, part, image[target])
             cv2.copyTo(own[y : y + bh, x : x + bw], part, inverse[target])
+
+
+def _coarse_minimum(inverse: F32Image) -> F32Image:
+    """Return the smallest inverse depth of each cell of `_CELL_PX` x `_CELL_PX` pixels (the size is a multiple)."""
+    rows, cols = inverse.shape[0] // _CELL_PX, inverse.shape[1] // _CELL_PX
+    # Rows first: contiguous, and what remains for the slower step is small.
+    by_rows = inverse.reshape(rows, _CELL_PX, -1).min(1)
+    return np.asarray(by_rows.reshape(rows, cols, _CELL_PX).min(2))
 
 
 def _clip_near(corners: FloatArray) -> FloatArray:

@@ -213,4 +213,6 @@ def _pinhole(focal_px: float, width: int, height: int) -> PinholeCamera:
     """Return a camera with square pixels and the principal point in the middle of the image."""
     from dualslam.core.camera import PinholeCamera
 
-    return PinholeCamera(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, width, height)
+    return PinholeCamera(
+        width=width, height=height, fx=focal_px, fy=focal_px, cx=(width - 1) / 2, cy=(height - 1) / 2
+    )

@@ -125,8 +125,10 @@ def _house(
     depth: float,
     relief: bool = True,
 ) -> list[Surface]:
-    """Return a house: front, two sides, roof, and what stands out of the front."""
+    """Return a house: front, two sides, roof, and what stands out of the front; nothing where a bend leaves no room."""
     left, right = _ends(road, side, s, s + width, lateral)
+    if np.linalg.norm(right - left) < 4:
+        return []
     along = (right - left) / np.linalg.norm(right - left)
     inward = np.array([-along[1], along[0]])  # the front's normal, away from the road
     back_left, back_right = left + inward * depth, right + inward * depth
