@@ -134,6 +134,8 @@ class GraphConfig(StrictModel):
     """Keyframes tied to the graph by fewer landmarks are held at their pose by a loose prior, until they have more."""
     read_window: int = Field(20, ge=0)
     """Keyframes (the last inserted ones, and their landmarks) whose estimate is read after each update; 0 reads all."""
+    read_all_every: int = Field(10, ge=1)
+    """Each so-many-th update reads the whole estimate."""
     rebuild_iterations: int = Field(8, ge=1)
     """Batch iterations at most when a graph is made anew."""
 

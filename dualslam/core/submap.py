@@ -243,8 +243,9 @@ class Submap:
         uv = np.empty((len(rows), 2))
         sigma = np.empty(len(rows))
         kf, feature = self.observations["kf"][rows], self.observations["feature"][rows]
-        for k in np.unique(kf).tolist():
-            here = kf == k
+        order = np.argsort(kf, kind="stable")
+        ids, starts = np.unique(kf[order], return_index=True)
+        for k, here in zip(ids.tolist(), np.split(order, starts[1:]), strict=False):
             features = self.keyframes[k].features
             uv[here] = features.uv_rect_px[feature[here]]
             sigma[here] = features.sigma_px[feature[here]]

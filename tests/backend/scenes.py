@@ -86,10 +86,10 @@ def make_features(uv: FloatArray, sigma: FloatArray, octave: IntArray | None = N
 class Feeder:
     """Plays a tracker: puts a scene's keyframes into a submap one by one, from noisy guesses.
 
-    A point becomes a landmark when the second keyframe sees it, at its true place plus `point_noise` of its depth.
+    A point becomes a landmark when the second keyframe sees it, at its true place but for `point_noise` of its distance.
     """
 
-    def __init__(self, scene: Scene, seed: int = 1, pose_noise: float = 0.003, point_noise: float = 0.01) -> None:
+    def __init__(self, scene: Scene, seed: int = 1, pose_noise: float = 0.001, point_noise: float = 0.01) -> None:
         self.scene = scene
         self.rng = np.random.default_rng(seed)
         self.pose_noise, self.point_noise = pose_noise, point_noise
@@ -129,7 +129,8 @@ class Feeder:
             return
         n = len(new_point)
         xyz = scene.xyz_true[new_point] @ drift[:3, :3].T + drift[:3, 3]
-        xyz += self.point_noise * self.rng.normal(size=(n, 3))
+        # Triangulation errs along the ray.
+        xyz += self.point_noise * self.rng.normal(size=(n, 1)) * (xyz - T[:3, 3])
         ids = submap.add_landmarks(xyz, np.zeros((n, 4), np.uint8), np.ones(n), k)
         self.landmark_of_point[new_point] = ids
         kfs, feats = np.array(first).T
