@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from dualslam.atlas import Atlas, Link, LinkKind
 from dualslam.core.errors import InputError
+from dualslam.core.submap import Submap
 from dualslam.io.map_files import load_map, save_map, submap_from_arrays, submap_to_arrays
 from dualslam.io.run_folder import MAP
 from dualslam.trajectory import FramePose
@@ -26,19 +28,34 @@ class StoredMap:
     poses: dict[int, FramePose]
 
 
+class _Groups(Mapping[str, dict[str, NDArray[Any]]]):
+    """Groups of arrays of which those of a submap are made when they are asked for: one copy in memory at a time."""
+
+    def __init__(self, submaps: Mapping[int, Submap]) -> None:
+        self.small: dict[str, dict[str, NDArray[Any]]] = {}
+        self._submaps = {f"submap_{m:02d}": submap for m, submap in submaps.items()}
+
+    def __getitem__(self, name: str) -> dict[str, NDArray[Any]]:
+        return self.small[name] if name in self.small else submap_to_arrays(self._submaps[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter([*self._submaps, *self.small])
+
+    def __len__(self) -> int:
+        return len(self._submaps) + len(self.small)
+
+
 def save_atlas(folder: str | Path, atlas: Atlas, poses: dict[int, FramePose]) -> None:
     """Write submaps, links and the frames' poses relative to their keyframes: arrays without pickles."""
-    groups: dict[str, dict[str, NDArray[Any]]] = {
-        f"submap_{m:02d}": submap_to_arrays(submap) for m, submap in atlas.submaps.items()
-    }
+    groups = _Groups(atlas.submaps)
     links = atlas.links
-    groups[LINKS] = {
+    groups.small[LINKS] = {
         "ab": np.array([(link.a, link.b) for link in links], np.int64).reshape(-1, 2),
         "S_a_b": np.array([link.S_a_b for link in links], np.float64).reshape(-1, 4, 4),
         "covariance": np.array([link.covariance for link in links], np.float64).reshape(-1, 7, 7),
     }
     ordered = list(poses.values())
-    groups[FRAMES] = {
+    groups.small[FRAMES] = {
         "index": np.array([p.index for p in ordered], np.int64),
         "timestamp_s": np.array([p.timestamp_s for p in ordered], np.float64),
         "submap": np.array([p.submap_id for p in ordered], np.int64),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from dualslam.core import strict_yaml
+from dualslam.core.camera import Camera
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame
@@ -72,7 +73,7 @@ class WorldSequence:
     Attributes
     ----------
     name : str
-    camera : PinholeCamera
+    camera : Camera
     rate_hz : float
         Of the frames that are read, so the stride counts.
     ground_truth : Trajectory
@@ -85,7 +86,7 @@ class WorldSequence:
         selection = selection or Selection()
         self._world = world
         self.name = world.name
-        self.camera = world.camera
+        self.camera: Camera = world.camera
         self.rate_hz = world.rate_hz / selection.stride
         self.ground_truth = Trajectory(world.timestamps_s, world.ground_truth_T_world_cam)
         chosen = selection.indices(world.n_frames, world.name)
