@@ -5,13 +5,14 @@ Exit status: 0 done, 1 the run could not produce a map (or a bug of ours), 2 bad
 
 from __future__ import annotations
 
-import logging
+import os
 import sys
 import tempfile
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
+from dualslam.cli import logs
 from dualslam.cli.parser import parse
 from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError
 from dualslam.core.threads import limit_threads
@@ -27,17 +28,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         args = parse(arguments)
     except SystemExit as end:  # argparse has said what was wrong, or shown the help that was asked for
         return end.code if isinstance(end.code, int) else EXIT_BAD_INPUT
-    _set_up_logging(getattr(args, "verbose", 0), getattr(args, "quiet", False))
+    logs.set_up(args.verbose, args.quiet)
     try:
-        return int(args.execute(args))
+        status = int(args.execute(args))
+        logs.release()
+        return status
     except (ConfigError, InputError, OutputError) as error:
+        logs.discard()
         return _say(error, EXIT_BAD_INPUT)
     except DualSlamError as error:
         return _say(error, EXIT_FAILED)
     except KeyboardInterrupt:
         return _say("interrupted", EXIT_INTERRUPTED)
     except BrokenPipeError:  # `dualslam config | head`
-        sys.stderr.close()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter's last flush would complain
         return EXIT_DONE
     except Exception as error:  # the last resort: a bug must not reach the user as a stack trace
         return _say(_report_bug(error, arguments, getattr(args, "out", None)), EXIT_FAILED)
@@ -46,13 +50,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _say(sentence: object, status: int) -> int:
     print(f"dualslam: {' '.join(str(sentence).split())}", file=sys.stderr)
     return status
-
-
-def _set_up_logging(verbose: int, quiet: bool) -> None:
-    level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr, force=True)
-    if verbose < 2:
-        logging.getLogger("matplotlib").setLevel(logging.WARNING)
 
 
 def _report_bug(error: Exception, arguments: list[str], out: Path | None) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from dualslam.cli import logs
 from dualslam.cli.configuration import config_of
 from dualslam.cli.console import progress
 from dualslam.cli.eval_command import score_text
@@ -29,6 +30,7 @@ def execute(args: argparse.Namespace) -> int:
     if not args.quiet:
         last = covered["start"] + BLACKOUT_FRAMES - 1
         print(f"A street of {args.frames} frames; the lens is covered in frames {covered['start']} to {last}.")
+    logs.release()
     with progress(sequence, args.quiet) as on_frame:
         outcome = run_to_folder(config, sequence, args.out, overwrite=args.overwrite, on_frame=on_frame)
     if not args.quiet:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 
+from dualslam.cli import logs
 from dualslam.cli.configuration import config_of
 from dualslam.cli.console import final_line, progress, stage_table
 from dualslam.session import Outcome, run_to_folder
@@ -29,6 +30,7 @@ def execute(args: argparse.Namespace) -> int:
         max_frames=args.max_frames,
         reverse=args.reverse,
     )
+    logs.release()
     with progress(sequence, args.quiet) as on_frame:
         outcome = run_to_folder(
             config, sequence, args.out, overwrite=args.overwrite, realtime=args.realtime, on_frame=on_frame

@@ -1,15 +1,29 @@
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from dualslam.core.threads import LIMITS
 from dualslam.sources import make_world
 from dualslam.synthetic import SyntheticSequence, render_to_folder
 from tests.cli.fakes import builder
 
 N_FRAMES = 24
+
+
+@pytest.fixture(autouse=True)
+def _own_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The command sets up logging and the environment of its process; keep them out of the others' tests."""
+    for name in (*LIMITS, "OPENCV_LOG_LEVEL"):
+        monkeypatch.setenv(name, os.environ.get(name, "1"))
+    root = logging.getLogger()
+    before = (root.handlers[:], root.level)
+    yield
+    root.handlers[:], root.level = before
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@ import csv
 import json
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,16 +18,6 @@ from dualslam.synthetic import SyntheticSequence
 from tests.cli.conftest import N_FRAMES
 
 Install = Callable[..., None]
-
-
-@pytest.fixture(autouse=True)
-def _no_sticky_logging() -> Iterator[None]:
-    import logging
-
-    root = logging.getLogger()
-    before = (root.handlers[:], root.level)
-    yield
-    root.handlers[:], root.level = before
 
 
 def rows_of(out: Path) -> list[dict[str, str]]:

@@ -1,9 +1,7 @@
 from __future__ import annotations
 
-import logging
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,18 +9,6 @@ import pytest
 import dualslam
 from dualslam.cli import main
 from dualslam.core.config_io import load_config
-from dualslam.core.threads import LIMITS
-
-
-@pytest.fixture(autouse=True)
-def _quiet_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The command sets up logging and thread limits for its process; keep them out of the others' tests."""
-    for name in LIMITS:
-        monkeypatch.setenv(name, "1")
-    root = logging.getLogger()
-    before = (root.handlers[:], root.level)
-    yield
-    root.handlers[:], root.level = before
 
 
 def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
@@ -126,6 +112,19 @@ def test_a_keyboard_interrupt_outside_of_a_run(
     monkeypatch.setattr("dualslam.cli.config_command.config_of", interrupted)
     assert main(["config"]) == 130
     assert one_sentence(capsys) == "dualslam: interrupted"
+
+
+def test_warnings_wait_until_the_input_has_proved_good(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, folder: Path, fake: object
+) -> None:
+    (tmp_path / "images").mkdir()
+    for image in sorted((folder / "images").iterdir()):
+        (tmp_path / "images" / image.name).symlink_to(image)
+    command = ["run", str(tmp_path / "images"), "--out", str(tmp_path / "run")]
+    assert main(command) == 2
+    assert "no calibration" in one_sentence(capsys)
+    assert main([*command, "--fov", "70"]) == 0
+    assert "WARNING" in capsys.readouterr().err
 
 
 HEAVY = ("torch", "kornia", "matplotlib", "cv2", "gtsam", "numpy", "scipy", "pydantic", "rich", "yaml")
