@@ -303,12 +303,12 @@ class ISam2SubmapGraph:
         plan = self._ledger.plan(submap, poses, xyz, caution)
         self._hold_loose_pieces(submap, plan)
         batch = self._changes(submap, plan, poses, xyz)
-        T, points = optimise_batch(
+        optimum = optimise_batch(
             batch.graph, batch.values, plan.new_keyframes, plan.new_landmarks, self._config.rebuild_iterations
         )
-        poses = dict(zip(plan.new_keyframes.tolist(), T, strict=True))
+        poses = dict(zip(plan.new_keyframes.tolist(), optimum.T_submap_kf, strict=True))
         xyz = xyz.copy()
-        xyz[plan.new_landmarks] = points
+        xyz[plan.new_landmarks] = optimum.xyz_mu
         # Seen from the optimum, some points are no longer certain, or no longer in front: plan again.
         plan = self._ledger.plan(submap, poses, xyz, caution)
         self._hold_loose_pieces(submap, plan)

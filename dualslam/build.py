@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from backend.local_ba import adjust_bundle
+from backend.local_ba import bundle_adjust_arrays
 from backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.camera import Camera
 from dualslam.core.config import Config
@@ -42,7 +42,7 @@ def build_system(config: Config, camera: Camera) -> System:
         Components(
             view_of=lambda frame: view_of(frame, frontend, camera),
             new_starter=lambda: Initialiser(
-                frontend, adjust_bundle, config.initialiser, camera.K, size_px, config.seed
+                frontend, bundle_adjust_arrays, config.initialiser, camera.K, size_px, config.seed
             ),
             new_graph=lambda: ISam2SubmapGraph(config.graph),
             new_odometry=lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px),

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.core.config import InitialiserConfig
+from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import refine_pose
 from dualslam.core.geometry.triangulation import triangulate_two_view
@@ -206,24 +207,25 @@ class Initialiser:
         sigma = np.array([views[v].features.sigma_px[f] for v, f in zip(view_of, seen, strict=True)])
         fixed = np.zeros(len(views), bool)
         fixed[0] = True
-        problem = BundleProblem(self._K, T_first_cam, fixed, xyz, view_of, point_of, uv, sigma, scale_pair=(0, -1))
-        result = self._adjuster(problem)
-        if isinstance(result, Failure):
-            return result
+        problem = BundleProblem(self._K, T_first_cam, fixed, xyz, view_of, point_of, uv, sigma)
+        try:
+            result = self._adjuster(problem)
+        except SolverError as error:
+            return Failure(FailureReason.SOLVER, str(error), numbers)
         inlier = result.chi2 < CHI2_2
         n_bad = np.bincount(point_of[~inlier], minlength=len(xyz))
-        direction = direction_sigma_deg(problem, result.T_w_cam, result.xyz, inlier)
+        direction = direction_sigma_deg(problem, result.T_submap_kf, result.xyz_mu, inlier)
         numbers = {**numbers, "chi2": float(np.median(result.chi2) / 1.386), "direction_sigma_deg": direction}
         # A point must agree with both ends, and may miss at most one witness.
         ends_ok = np.ones(len(xyz), bool)
         ends_ok[point_of[~inlier & ((view_of == 0) | (view_of == len(views) - 1))]] = False
         in_front = np.all(
-            np.einsum("vij,nj->vni", _rotations_cam(result.T_w_cam), result.xyz)[..., 2]
-            + _translations_cam(result.T_w_cam)[:, None, 2]
+            np.einsum("vij,nj->vni", _rotations_cam(result.T_submap_kf), result.xyz_mu)[..., 2]
+            + _translations_cam(result.T_submap_kf)[:, None, 2]
             > 0,
             axis=0,
         )
-        keep = ends_ok & (n_bad <= 1) & in_front
+        keep = ends_ok & (n_bad <= 1) & in_front & result.adjusted
         numbers["n_points"] = float(keep.sum())
         if keep.sum() < self._config.min_points or keep.mean() < self._config.min_support:
             return Failure(
@@ -237,10 +239,10 @@ class Initialiser:
             )
         feature = feature.copy()
         feature[view_of[~inlier], point_of[~inlier]] = -1
-        depth = float(np.median(result.xyz[keep, 2]))
-        T = result.T_w_cam.copy()
+        depth = float(np.median(result.xyz_mu[keep, 2]))
+        T = result.T_submap_kf.copy()
         T[:, :3, 3] /= depth
-        return Start(views, T, result.xyz[keep] / depth, feature[:, keep], numbers)
+        return Start(views, T, result.xyz_mu[keep] / depth, feature[:, keep], numbers)
 
 
 def direction_sigma_deg(
@@ -252,9 +254,9 @@ def direction_sigma_deg(
     """
     last = len(T_w_cam) - 1
     in_first = np.zeros(len(xyz), bool)
-    in_first[problem.point_of[(problem.view_of == 0) & inlier]] = True
-    rows = np.flatnonzero((problem.view_of == last) & inlier & in_first[problem.point_of])
-    points = xyz[problem.point_of[rows]]
+    in_first[problem.point[(problem.kf == 0) & inlier]] = True
+    rows = np.flatnonzero((problem.kf == last) & inlier & in_first[problem.point])
+    points = xyz[problem.point[rows]]
     sigma = problem.sigma_px[rows]
     H_pp = np.zeros((len(rows), 3, 3))
     for v in (0, last):

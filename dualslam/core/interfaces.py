@@ -113,46 +113,64 @@ class SubmapGraph(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleProblem:
-    """A bundle adjustment over plain arrays: V views, N points, O observations.
+    """Poses, points and what was seen.
 
     Attributes
     ----------
-    K : (3, 3) float64
-    T_w_cam : (V, 4, 4) float64
-    fixed : (V,) bool
-        Views that stay where they are.
-    xyz : (N, 3) float64
-    view_of, point_of : (O,) int64
-    uv_px : (O, 2) float64, rectified pixels
-    sigma_px : (O,) float64
-    scale_pair : (int, int) or None
-        Two views whose distance fixes the scale; None where the fixed views do.
+    K : (3, 3)
+    T_submap_kf : (F, 4, 4)
+    fixed : (F,) bool
+        Poses that stay. One fixes the pose of the whole, two its scale too.
+    xyz_mu : (P, 3)
+    kf, point : (R,) int64
+        Rows of `T_submap_kf` and `xyz_mu` of each observation.
+    uv_px : (R, 2)
+    sigma_px : (R,)
     """
 
     K: FloatArray
-    T_w_cam: FloatArray
+    T_submap_kf: FloatArray
     fixed: BoolArray
-    xyz: FloatArray
-    view_of: IntArray
-    point_of: IntArray
+    xyz_mu: FloatArray
+    kf: IntArray
+    point: IntArray
     uv_px: FloatArray
     sigma_px: FloatArray
-    scale_pair: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleResult:
-    """The optimum: poses, points, and the squared whitened residual of each observation (O,)."""
+    """What came of a `BundleProblem`.
 
-    T_w_cam: FloatArray
-    xyz: FloatArray
+    Attributes
+    ----------
+    T_submap_kf : (F, 4, 4)
+    xyz_mu : (P, 3)
+    adjusted : (P,) bool
+        False for points left as they were: fewer than two views in front of a camera, or views along one line.
+    chi2 : (R,) float64
+        Squared whitened residual of each observation; infinite where its point is behind the camera.
+    cost_before, cost_after : float
+        Sum of the Huber losses.
+    iterations : int
+    converged : bool
+        Whether it stopped before its iterations were used up.
+    """
+
+    T_submap_kf: FloatArray
+    xyz_mu: FloatArray
+    adjusted: BoolArray
     chi2: FloatArray
+    cost_before: float
+    cost_after: float
+    iterations: int
+    converged: bool
 
 
 class BundleAdjuster(Protocol):
-    """Batch bundle adjustment, robust."""
+    """Batch bundle adjustment, robust. Raises `SolverError` where the solver fails."""
 
-    def __call__(self, problem: BundleProblem) -> BundleResult | Failure: ...
+    def __call__(self, problem: BundleProblem) -> BundleResult: ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,195 @@
+"""Similarities between keyframes and submaps: a pose graph over Sim(3), solved in batch.
+
+Here the drift of a monocular map's scale is undone: recovery links and loop closures are edges, and what the optimum says
+about keyframes is handed back to their submaps. Links may be wrong, so an edge can be marked as doubtful; graduated
+non-convexity then decides which of them to believe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from backend import convert
+from backend.membership import find_components
+from backend.noise import GAUGE_SIGMA, gaussian
+from backend.solver import GTSAM_ERRORS, SolverFailure
+from dualslam.core.errors import SolverError
+from dualslam.core.types import BoolArray, FloatArray, IntArray
+
+GNC_INLIER_PROBABILITY = 0.99
+"""A doubtful edge is an outlier beyond this quantile of the chi-square with 7 degrees of freedom."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sim3Edge:
+    """A measured similarity between two nodes.
+
+    Attributes
+    ----------
+    first, second : int
+    S_first_second : (4, 4)
+        ``[[s R, t], [0, 1]]``, takes coordinates in the second node to the first.
+    covariance : (7, 7)
+        Of the right perturbation ``S_first_second @ exp(xi)``, order rotation, translation, log-scale: in the second
+        node's frame and unit.
+    doubtful : bool
+        Where true, robust optimisation may refuse the edge.
+    """
+
+    first: int
+    second: int
+    S_first_second: FloatArray
+    covariance: FloatArray
+    doubtful: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sim3Prior:
+    """What is known of one node beforehand; `covariance` as in `Sim3Edge`, None fixes the node."""
+
+    S_world_node: FloatArray
+    covariance: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sim3Solution:
+    """The optimum of a graph over Sim(3).
+
+    Attributes
+    ----------
+    S_world_node : dict of int to (4, 4)
+    inliers : (E,) bool
+        False for the doubtful edges that were refused.
+    cost_before, cost_after : float
+        Half the sum of squared whitened residuals of the edges that were kept.
+    """
+
+    S_world_node: dict[int, FloatArray]
+    inliers: BoolArray
+    cost_before: float
+    cost_after: float
+    _graph: gtsam.NonlinearFactorGraph = field(repr=False)
+    _values: gtsam.Values = field(repr=False)
+
+    def covariances(self, nodes: Sequence[int]) -> FloatArray:
+        """Return (N, 7, 7) marginal covariances of ``S_world_node`` (right perturbation; in each node's own frame).
+
+        Raises
+        ------
+        SolverError
+            If the solver cannot tell.
+        """
+        try:
+            marginals = gtsam.Marginals(self._graph, self._values)
+            found = [np.asarray(marginals.marginalCovariance(int(n)), float) for n in nodes]
+        except GTSAM_ERRORS as error:
+            raise SolverError(f"no covariances of Sim(3) nodes {list(nodes)[:5]}: {SolverFailure.of(error)}") from error
+        return np.array(found).reshape(-1, 7, 7)
+
+
+def optimise_sim3(
+    nodes: Mapping[int, FloatArray],
+    edges: Sequence[Sim3Edge],
+    priors: Mapping[int, Sim3Prior] | None = None,
+    robust: bool = False,
+    max_iterations: int = 50,
+) -> Sim3Solution:
+    """Find the similarities that agree best with the edges.
+
+    A piece of the graph without a prior keeps its lowest node where it is: there is always a gauge.
+
+    Parameters
+    ----------
+    nodes : mapping of int to (4, 4)
+        Initial ``S_world_node``.
+    edges : sequence of Sim3Edge
+    priors : mapping of int to Sim3Prior, optional
+    robust : bool
+        Let graduated non-convexity choose among the doubtful edges; else all edges count.
+    max_iterations : int
+        Of Levenberg-Marquardt.
+
+    Raises
+    ------
+    SolverError
+        If an edge or prior names a node that is not there, a similarity is not one, or the solver fails.
+    """
+    priors = dict(priors or {})
+    if not nodes:
+        raise SolverError("a graph over Sim(3) needs at least one node")
+    for name in [n for e in edges for n in (e.first, e.second)] + list(priors):
+        if name not in nodes:
+            raise SolverError(f"an edge or prior names Sim(3) node {name}, which is not in the graph")
+    for lonely in _pieces_without_prior(np.array(sorted(nodes), np.int64), edges, priors):
+        priors[lonely] = Sim3Prior(nodes[lonely])
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    try:
+        for e in edges:
+            S = convert.to_similarity3(e.S_first_second)
+            graph.push_back(gtsam.BetweenFactorSimilarity3(int(e.first), int(e.second), S, gaussian(e.covariance)))
+        for name, prior in priors.items():
+            covariance = GAUGE_SIGMA**2 * np.eye(7) if prior.covariance is None else prior.covariance
+            S = convert.to_similarity3(prior.S_world_node)
+            graph.push_back(gtsam.PriorFactorSimilarity3(int(name), S, gaussian(covariance)))
+        for name, S_world_node in nodes.items():
+            values.insert(int(name), convert.to_similarity3(S_world_node))
+        inliers = np.ones(len(edges), bool)
+        doubtful = np.array([e.doubtful for e in edges], bool)
+        if robust and doubtful.any():
+            inliers = _choose_edges(graph, values, doubtful, max_iterations)
+            graph = _without(graph, np.flatnonzero(~inliers))
+        result = gtsam.LevenbergMarquardtOptimizer(graph, values, _lm_params(max_iterations)).optimize()
+        before, after = float(graph.error(values)), float(graph.error(result))
+        found = {int(n): convert.from_similarity3(result.atSimilarity3(int(n))) for n in nodes}
+    except GTSAM_ERRORS as error:
+        raise SolverError(f"the graph of {len(nodes)} Sim(3) nodes failed: {SolverFailure.of(error)}") from error
+    if not all(np.isfinite(S).all() for S in found.values()):
+        raise SolverError(f"the graph of {len(nodes)} Sim(3) nodes diverged: its estimate is not finite")
+    return Sim3Solution(found, inliers, before, after, graph, result)
+
+
+def _lm_params(max_iterations: int) -> gtsam.LevenbergMarquardtParams:
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(max_iterations)
+    params.setRelativeErrorTol(1e-8)
+    params.setAbsoluteErrorTol(1e-10)
+    return params
+
+
+def _choose_edges(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, doubtful: BoolArray, max_iterations: int
+) -> BoolArray:
+    """Return which edges graduated non-convexity believes; the other factors of the graph are taken as true."""
+    params = gtsam.GncLMParams(_lm_params(max_iterations))
+    sure = np.ones(graph.size(), bool)
+    sure[np.flatnonzero(doubtful)] = False
+    params.setKnownInliers(np.flatnonzero(sure).tolist())
+    optimizer = gtsam.GncLMOptimizer(graph, values, params)
+    optimizer.setInlierCostThresholdsAtProbability(GNC_INLIER_PROBABILITY)
+    optimizer.optimize()
+    weights = np.asarray(optimizer.getWeights(), float).ravel()[: len(doubtful)]
+    return ~doubtful | (weights > 0.5)
+
+
+def _without(graph: gtsam.NonlinearFactorGraph, indices: IntArray) -> gtsam.NonlinearFactorGraph:
+    dropped = set(indices.tolist())
+    kept = gtsam.NonlinearFactorGraph()
+    for i in range(graph.size()):
+        if i not in dropped:
+            kept.push_back(graph.at(i))
+    return kept
+
+
+def _pieces_without_prior(nodes: IntArray, edges: Sequence[Sim3Edge], priors: Mapping[int, Sim3Prior]) -> list[int]:
+    """Return the lowest node of each connected piece that no prior holds (doubtful edges do not connect)."""
+    sure = [(e.first, e.second) for e in edges if not e.doubtful]
+    n = len(edges)
+    node = np.concatenate([nodes, np.array(sure, np.int64).ravel()])
+    through = np.concatenate([n + np.arange(len(nodes)), np.repeat(np.arange(len(sure)), 2)])
+    ids, label = find_components(node, through)
+    held = set(label[np.isin(ids, list(priors))].tolist())
+    return [int(ids[label == piece].min()) for piece in np.unique(label).tolist() if piece not in held]
