@@ -21,7 +21,9 @@ class EventKind(StrEnum):
     EXPOSURE = "exposure"  # too bright or too dark (stops, positive is brighter)
     DROP = "drop"  # the frames do not arrive (without meaning)
     WIPE = "wipe"  # fog, or a blank wall before the lens: texture fades to flat shade (fraction)
-    ROTATION = "rotation"  # the camera is swung aside and back, in addition to its path (degrees, positive to the right)
+    ROTATION = (
+        "rotation"  # the camera is swung aside and back, in addition to its path (degrees, positive to the right)
+    )
     NOISE = "noise"  # sensor noise (standard deviation, grey levels)
 
 

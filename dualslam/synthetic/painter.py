@@ -32,7 +32,7 @@ def _fractal_field(rng: np.random.Generator, exponent: float) -> F32Image:
     spectrum /= np.maximum(frequency, 4 / _BANK_SIZE) ** exponent
     spectrum[0, 0] = 0
     field = np.fft.irfft2(spectrum, s=(_BANK_SIZE, _BANK_SIZE))
-    return (field / field.std()).astype(np.float32)
+    return np.asarray(field / field.std(), np.float32)
 
 
 def _window(field: F32Image, row: int, col: int, rows: int, cols: int) -> F32Image:
@@ -98,19 +98,22 @@ class Painter:
         Two fields are added with unrelated offsets, so that surfaces do not repeat each other nor themselves.
         """
         height, width = shape
-        sum_ = None
+        total = np.zeros(shape, np.float32)
         for field in self.bank.smooth if smooth else self.bank.rough:
             rows, cols = max(2, round(height / stretch[1])), max(2, round(width / stretch[0]))
             row, col = self.rng.integers(0, _BANK_SIZE, 2)
             turn, flip = self.rng.integers(0, 2, 2)
-            window = _window(field, int(row), int(col), cols, rows).T if turn else _window(
-                field, int(row), int(col), rows, cols
+            window = (
+                _window(field, int(row), int(col), cols, rows).T
+                if turn
+                else _window(field, int(row), int(col), rows, cols)
             )
             window = window[:, ::-1] if flip else window
             if (rows, cols) != shape:
-                window = cv2.resize(np.ascontiguousarray(window), (width, height), interpolation=cv2.INTER_LINEAR)
-            sum_ = window if sum_ is None else sum_ + window
-        return (sum_ * np.float32(0.7071)).astype(np.float32)
+                resized = cv2.resize(np.ascontiguousarray(window), (width, height), interpolation=cv2.INTER_LINEAR)
+                window = np.asarray(resized, np.float32)
+            total += np.float32(0.7071) * window
+        return total
 
     def anchored_noise(self, x_px: int, y_px: int, smooth: bool = False) -> F32Image:
         """Return fractal noise for the whole canvas that continues that of a canvas at other (x, y): for tiles."""
@@ -214,4 +217,4 @@ class Painter:
 
     def finish(self, shade: float) -> NDArray[np.uint8]:
         """Return the canvas as grey levels under the given light."""
-        return np.clip(self.image * np.float32(shade), 0, 255).astype(np.uint8)
+        return np.asarray(np.clip(self.image * np.float32(shade), 0, 255), np.uint8)

@@ -64,7 +64,9 @@ class Drive:
         for i in range(1, len(t)):
             turn = abs(float(road.heading(s[i - 1] + 8) - road.heading(s[i - 1])))
             s[i] = s[i - 1] + speed_m_s * max(0.45, 1 - 1.6 * turn) * dt
-        self._way = CubicSpline(t, np.convolve(np.pad(s, 10, mode="reflect", reflect_type="odd"), np.ones(21) / 21, "valid"))
+        self._way = CubicSpline(
+            t, np.convolve(np.pad(s, 10, mode="reflect", reflect_type="odd"), np.ones(21) / 21, "valid")
+        )
         self._lateral = Sway(rng, [0.15], (0.03, 0.09))
         self._body = Sway(rng, [0.0035, 0.004, 0.002, 0.012], (0.5, 1.6))
 
@@ -72,9 +74,9 @@ class Drive:
         """Return the pose (4, 4) at time `t_s`."""
         s = float(self._way(t_s))
         pitch, roll, yaw, bob = self._body(t_s)
-        x, z = self._road.beside(s, 1.3 + self._lateral(t_s)[0])
+        x, z = self._road.beside(s, 1.2 + self._lateral(t_s)[0])
         # The car's nose: towards a point some metres ahead on the same lane.
-        ahead = self._road.beside(s + 4.0, 1.3 + self._lateral(t_s)[0])
+        ahead = self._road.beside(s + 4.0, 1.2 + self._lateral(t_s)[0])
         heading = float(np.arctan2(ahead[0] - x, ahead[1] - z))
         return pose(np.array([x, -1.65 + bob, z]), heading + yaw, pitch - 0.01, roll)
 
@@ -100,9 +102,9 @@ class Walk:
                 np.sin(angle) * radii_m[0] * distance,
                 -rng.uniform(1.4, 1.65, n),
                 np.cos(angle) * radii_m[1] * distance,
-                angle + np.pi + rng.uniform(-0.3, 0.3, n),
-                rng.uniform(-0.34, -0.08, n),
-                rng.normal(0, 0.03, n),
+                angle + np.pi + rng.uniform(-0.45, 0.45, n),
+                rng.uniform(-0.45, -0.05, n),
+                rng.normal(0, 0.06, n),
             ],
             1,
         )

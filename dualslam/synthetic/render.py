@@ -7,6 +7,7 @@ outline of a rectangle is four affine comparisons, occlusion is a comparison of 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -16,12 +17,14 @@ from numpy.typing import NDArray
 from dualslam.core.types import FloatArray
 from dualslam.synthetic.surfaces import Scene, TextureStore
 
+# Three affine forms (a, b, c), each a * u + b * v + c: s/z, t/z, 1/z. Plain floats: per surface, arrays cost more.
+Planes = list[list[float]]
 F32Image = NDArray[np.float32]
 U8Image = NDArray[np.uint8]
 
 _NEAR_M = 0.05
 # A warp uses one texture level, so a surface is warped in bands of depth whose far end is this much further.
-_BAND_RATIO = 1.4
+_BAND_RATIO = 1.5
 # Below this many pixels across, relief is not drawn: it costs more than it shows.
 _MIN_SIZE_PX = 1.0
 # Most surfaces of a street are hidden. Every so many surfaces (more seldom, as less changes) the depth buffer is reduced
@@ -87,7 +90,7 @@ class Renderer:
         half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # (0, 0) is the centre of the top-left pixel
         K_big = np.linalg.inv(half) @ S @ half @ self._K
         big, _ = self._draw(T_world_cam, K_big, big_width, big_height, True)
-        return cv2.resize(big, (width, height), interpolation=cv2.INTER_AREA)
+        return np.asarray(cv2.resize(big, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
     def depth(self, T_world_cam: FloatArray) -> F32Image:
         """Return z in the camera's frame at each pixel's centre (height, width), metres, inf where nothing is hit."""
@@ -107,20 +110,23 @@ class Renderer:
         u, v = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
         near = self._candidates(T_world_cam, K, width, height, infinite=False)
         hidden_beyond = np.zeros((1, 1), np.float32)
-        bounds_of, nearest_of = near.bounds.tolist(), near.nearest.tolist()
-        cells_of = np.stack([near.bounds[:, :2] // _CELL_PX, -(-near.bounds[:, 2:] // _CELL_PX)], 1).reshape(-1, 4).tolist()
+        planes_of, bounds_of, nearest_of = near.planes.tolist(), near.bounds.tolist(), near.nearest.tolist()
+        cells_of = (
+            np.stack([near.bounds[:, :2] // _CELL_PX, -(-near.bounds[:, 2:] // _CELL_PX)], 1).reshape(-1, 4).tolist()
+        )
         for row, index in enumerate(near.index.tolist()):
             if row in _REFRESH_AT or row % _REFRESH_AT[-1] == 0:
                 hidden_beyond = _coarse_minimum(whole)
             x0, y0, x1, y1 = cells_of[row]
             if hidden_beyond[y0:y1, x0:x1].min(initial=np.inf) < nearest_of[row]:
-                self._draw_surface(index, near.planes[row], bounds_of[row], u, v, image, inverse, shaded)
+                self._draw_surface(index, planes_of[row], bounds_of[row], u, v, image, inverse, shaded)
         if shaded:
             # The horizon goes behind everything, on a depth buffer of its own.
             behind = np.where(inverse > 0, np.float32(np.inf), np.float32(0))
             if not behind.all():
                 sky = self._candidates(T_world_cam, K, width, height, infinite=True)
-                for index, planes, bounds in zip(sky.index.tolist(), sky.planes, sky.bounds.tolist(), strict=True):
+                lists = (sky.index.tolist(), sky.planes.tolist(), sky.bounds.tolist())
+                for index, planes, bounds in zip(*lists, strict=True):
                     self._draw_surface(index, planes, bounds, u, v, image, behind, True)
         return image, inverse
 
@@ -166,7 +172,7 @@ class Renderer:
     def _draw_surface(
         self,
         index: int,
-        planes: FloatArray,
+        planes: Planes,
         bounds: list[int],
         u: F32Image,
         v: F32Image,
@@ -179,7 +185,7 @@ class Renderer:
         if u1 <= u0 or v1 <= v0:
             return
         uu, vv = u[u0:u1], v[v0:v1]
-        (a0, b0, c0), (a1, b1, c1), (a2, b2, c2) = planes.tolist()
+        (a0, b0, c0), (a1, b1, c1), (a2, b2, c2) = planes
         own = (np.float32(a2) * uu)[None, :] + (np.float32(b2) * vv + np.float32(c2))[:, None]
         buffer = inverse[v0:v1, u0:u1]
         visible = own > buffer
@@ -201,7 +207,7 @@ class Renderer:
     def _shade(
         self,
         index: int,
-        planes: FloatArray,
+        planes: Planes,
         rect: tuple[int, int, int, int],
         mask: U8Image,
         own: F32Image,
@@ -211,21 +217,21 @@ class Renderer:
         """Write a surface's grey levels and inverse depth where `mask` is set, band of depth by band of depth."""
         u0, v0, w, h = rect
         texture = self._textures.get(index)
-        at_corners = planes[2] @ np.array([[u0, u0 + w - 1, u0, u0 + w - 1], [v0, v0, v0 + h - 1, v0 + h - 1], [1] * 4])
-        nearest = min(float(at_corners.max()), 1 / _NEAR_M)
-        furthest = max(float(at_corners.min()), 1e-4)
+        a, b, c = planes[2]
+        at_corners = [a * x + b * y + c for x in (u0, u0 + w - 1) for y in (v0, v0 + h - 1)]
+        nearest, furthest = min(max(at_corners), 1 / _NEAR_M), max(min(at_corners), 1e-4)
         # Bands at fixed depths: they stay where they are in the image while the camera moves along the surface.
-        first, last = (int(np.floor(np.log(d) / np.log(_BAND_RATIO))) for d in (furthest, nearest))
+        first, last = (math.floor(math.log(d, _BAND_RATIO)) for d in (furthest, nearest))
         for band in range(first, last + 1):
             part, (x, y, bw, bh) = mask, (0, 0, w, h)
             if first != last:
                 low = _BAND_RATIO**band if band > first else 0.0
-                high = _BAND_RATIO ** (band + 1) if band < last else np.inf
+                high = _BAND_RATIO ** (band + 1) if band < last else 1e9
                 x, y, bw, bh = _strip(planes[2], rect, low, high)
                 if bw <= 0 or bh <= 0:
                     continue
-                part = cv2.inRange(own[y : y + bh, x : x + bw], low, min(high, 1e9))
-                part &= mask[y : y + bh, x : x + bw]
+                band_mask = np.asarray(cv2.inRange(own[y : y + bh, x : x + bw], low, high), np.uint8)
+                part = band_mask & mask[y : y + bh, x : x + bw]
                 dx, dy, bw, bh = cv2.boundingRect(part)
                 if bw == 0:
                     continue
@@ -235,7 +241,7 @@ class Renderer:
             target = np.s_[v0 + y : v0 + y + bh, u0 + x : u0 + x + bw]
             levels = _levels(planes, part_rect, texture.grey.level(0, 0).shape)
             if texture.alpha is not None:
-                part = part & (_warp(texture.alpha.level(*levels), planes, part_rect) >> 7)
+                part = part & (_warp(texture.alpha.level(*levels), planes, part_rect) >> np.uint8(7))
             grey = _warp(texture.grey.level(*levels), planes, part_rect)
             cv2.copyTo(grey, part, image[target])
             cv2.copyTo(own[y : y + bh, x : x + bw], part, inverse[target])
@@ -261,47 +267,50 @@ def _clip_near(corners: FloatArray) -> FloatArray:
     return np.array(kept)
 
 
-def _strip(
-    inv_z: FloatArray, rect: tuple[int, int, int, int], low: float, high: float
-) -> tuple[int, int, int, int]:
-    """Return (x, y, w, h) within `rect` that holds all of its pixels with ``low <= 1/z < high`` (a strip)."""
+def _strip(inv_z: list[float], rect: tuple[int, int, int, int], low: float, high: float) -> tuple[int, int, int, int]:
+    """Return (x, y, w, h) within `rect` that holds all of its pixels with ``low <= 1/z <= high`` (a strip)."""
     spans = []
     for axis in (0, 1):
-        other = 1 - axis
-        slope = inv_z[axis]
-        n = rect[2 + axis]
-        ends = inv_z[other] * np.array([rect[other], rect[other] + rect[2 + other] - 1]) + slope * rect[axis] + inv_z[2]
+        slope, across, n = inv_z[axis], inv_z[1 - axis], rect[2 + axis]
         if abs(slope) < 1e-12:
             spans.append((0, n))
             continue
-        # Along this axis 1/z = slope * x + rest, with rest anywhere between the two ends.
-        limits = [(value - rest) / slope for value in (low, min(high, 1e6)) for rest in (ends.min(), ends.max())]
-        spans.append((max(int(np.floor(min(limits))), 0), min(int(np.ceil(max(limits))) + 1, n)))
+        # Along this axis 1/z = slope * x + rest, with rest anywhere between its values at the two ends.
+        start, stop = rect[1 - axis], rect[1 - axis] + rect[3 - axis] - 1
+        rests = [across * end + slope * rect[axis] + inv_z[2] for end in (start, stop)]
+        limits = [(value - rest) / slope for value in (low, high) for rest in rests]
+        first, last = max(min(limits), 0.0), min(max(limits), n - 1.0)
+        spans.append((math.floor(first), math.ceil(last) + 1))
     (x0, x1), (y0, y1) = spans
     return x0, y0, x1 - x0, y1 - y0
 
 
-def _levels(planes: FloatArray, rect: tuple[int, int, int, int], shape: tuple[int, ...]) -> tuple[int, int]:
+def _levels(planes: Planes, rect: tuple[int, int, int, int], shape: tuple[int, ...]) -> tuple[int, int]:
     """Return the texture level along s and t at which a pixel in the middle of `rect` covers about one texel."""
-    middle = np.array([rect[0] + (rect[2] - 1) / 2, rect[1] + (rect[3] - 1) / 2, 1.0])
-    s_z, t_z, inv_z = planes @ middle
+    u, v = rect[0] + (rect[2] - 1) / 2, rect[1] + (rect[3] - 1) / 2
+    a, b, c = planes[2]
+    inv_z = a * u + b * v + c
     levels = []
-    for value, form, n in ((s_z, planes[0], shape[1]), (t_z, planes[1], shape[0])):
-        gradient = (form[:2] - value / inv_z * planes[2, :2]) / inv_z
-        texels_per_px = float(np.hypot(*gradient)) * n
+    for (p, q, r), n in ((planes[0], shape[1]), (planes[1], shape[0])):
+        # The gradient of (p u + q v + r) / (a u + b v + c).
+        value = (p * u + q * v + r) / inv_z
+        texels_per_px = math.hypot(p - value * a, q - value * b) / inv_z * n
         # A level is used from 0.7 to 1.4 texels per pixel: bilinear sampling is alias-free enough, and not too soft.
-        levels.append(round(np.log2(max(texels_per_px, 1e-6))))
-    return max(levels[0], 0), max(levels[1], 0)
+        levels.append(max(round(math.log2(max(texels_per_px, 1e-6))), 0))
+    return levels[0], levels[1]
 
 
-def _warp(level: U8Image, planes: FloatArray, rect: tuple[int, int, int, int]) -> U8Image:
+def _warp(level: U8Image, planes: Planes, rect: tuple[int, int, int, int]) -> U8Image:
     """Sample a texture level at the pixels of `rect`."""
     u0, v0, w, h = rect
-    n_t, n_s = level.shape
-    # Texture coordinates in [0, 1] to texels, (0, 0) being the centre of the first one.
-    to_texels = np.array([[n_s, 0, -0.5], [0, n_t, -0.5], [0, 0, 1]])
-    shift = np.array([[1, 0, u0], [0, 1, v0], [0, 0, 1.0]])
-    H_texel_px = to_texels @ planes @ shift
-    return cv2.warpPerspective(
-        level, H_texel_px, (w, h), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE
-    )
+    a, b, c = planes[2]
+    c += a * u0 + b * v0
+    rows = []
+    for (p, q, r), n in ((planes[0], level.shape[1]), (planes[1], level.shape[0])):
+        # Texture coordinates in [0, 1] to texels, (0, 0) being the centre of the first one.
+        r += p * u0 + q * v0
+        rows.append([n * p - 0.5 * a, n * q - 0.5 * b, n * r - 0.5 * c])
+    H_texel_px = np.array([*rows, [a, b, c]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    grey = cv2.warpPerspective(level, H_texel_px, (w, h), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(grey, np.uint8)

@@ -32,7 +32,9 @@ class Road:
         heading = np.zeros(n)
         i, current = 4, 0.0
         while i < n:
-            target = float(rng.uniform(0.35, 1.13)) * (-1.0 if current > 0 else 1.0 if current < 0 else rng.choice((-1, 1)))
+            target = float(rng.uniform(0.35, 1.13)) * (
+                -1.0 if current > 0 else 1.0 if current < 0 else rng.choice((-1, 1))
+            )
             bend = max(3, round(abs(target - current) * float(rng.uniform(28, 55)) / _STEP_M))
             ramp = 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, bend + 1))[1:]
             stop = min(n, i + bend)
@@ -59,7 +61,7 @@ class Road:
         """Return world (x, z) at `s_m`, `lateral_m` to the right of the centre line."""
         heading = self.heading(s_m)
         right = np.stack([np.cos(heading), -np.sin(heading)], -1)
-        return self.centre(s_m) + right * np.asarray(lateral_m)[..., None]
+        return np.asarray(self.centre(s_m) + right * np.asarray(lateral_m)[..., None])
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,10 +97,12 @@ class GroundTile:
 
     def __call__(self, p: Painter) -> None:
         grain = p.anchored_noise(round(self.x_m * p.px_per_m), round(-self.z_m * p.px_per_m))
+        # Stones and specks of a few centimetres, which fractal noise alone lacks.
+        grain += 0.9 * p.rng.standard_normal(p.image.shape, dtype=np.float32)
         clouds = p.anchored_noise(round(self.x_m * p.px_per_m), round(-self.z_m * p.px_per_m), smooth=True)
         local = (self.line - (self.x_m, self.z_m)) * (1, -1)
         p.image[:] = 92 + 15 * grain + 12 * clouds
-        p.leaves(500, (0.03, 0.09), (40, 160))
+        p.leaves(900, (0.03, 0.09), (20, 170))
         zone = np.zeros(p.image.shape, np.uint8)
         for label, half_width in ((1, PAVEMENT_END_M), (2, ROAD_HALF_WIDTH_M + 0.2), (3, ROAD_HALF_WIDTH_M)):
             cv2.polylines(zone, [np.round(local * p.px_per_m).astype(np.int32)], False, label, p.px(2 * half_width)[0])

@@ -47,7 +47,9 @@ def _along_wall(rng: np.random.Generator, left: FloatArray, right: FloatArray, h
     inward = np.array([along[1], -along[0]])  # into the room
     yaw = float(np.arctan2(-along[1], along[0]))
 
-    def place(x: float, size: tuple[float, float, float], bottom: float, materials: list[Material], density: float) -> None:
+    def place(
+        x: float, size: tuple[float, float, float], bottom: float, materials: list[Material], density: float
+    ) -> None:
         middle = left + along * (x + size[0] / 2) + inward * size[1] / 2
         surfaces.extend(box(middle, yaw, size, bottom, materials, density))
 
@@ -101,7 +103,9 @@ def _things(
             material = paint.appliance if rng.random() < 0.3 else paint.carton
             middle = start + along * (x + size[0] / 2)
             yaw = float(np.arctan2(-along[1], along[0])) + rng.uniform(-0.5, 0.5)
-            surfaces += box(middle, yaw, size, bottom, [material, paint.carton, material, paint.carton, paint.wood], 320)
+            surfaces += box(
+                middle, yaw, size, bottom, [material, paint.carton, material, paint.carton, paint.wood], 320
+            )
         x += size[0] + rng.uniform(0.03, 0.3)
     return surfaces
 
@@ -127,7 +131,9 @@ def _table(rng: np.random.Generator) -> list[Surface]:
     yaw, size = rng.uniform(-0.2, 0.2), (rng.uniform(1.2, 1.6), rng.uniform(0.75, 0.95))
     height = 0.72
     c, s = np.cos(yaw), np.sin(yaw)
-    surfaces += box((0, 0), yaw, (*size, 0.04), height - 0.04, [*[paint.wood] * 4, paint.table_top, paint.wood], _DENSITY)
+    surfaces += box(
+        (0, 0), yaw, (*size, 0.04), height - 0.04, [*[paint.wood] * 4, paint.table_top, paint.wood], _DENSITY
+    )
     for a in (-1, 1):
         for b in (-1, 1):
             x, z = a * (size[0] / 2 - 0.06), b * (size[1] / 2 - 0.06)

@@ -11,7 +11,7 @@ from dualslam.synthetic.painter import Painter
 def plaster(p: Painter) -> None:
     """A painted wall: nearly blank, with stains, sockets, a skirting board and notes pinned to it."""
     width, height = p.size_m
-    p.fill(p.uniform(150, 200), rough=1.6, smooth=6)
+    p.fill(p.uniform(110, 215), rough=1.2, smooth=6)
     p.image += np.linspace(8, -14, p.image.shape[0], dtype=np.float32)[:, None]
     for _ in range(int(p.rng.integers(3, 8))):
         p.crack(p.uniform(90, 140), p.uniform(0.1, 0.5))
@@ -45,7 +45,7 @@ def tiles(p: Painter) -> None:
     """A tiled wall."""
     p.fill(p.uniform(120, 190), rough=3, smooth=6)
     size = p.uniform(0.1, 0.16)
-    p.bricks(size, size, p.uniform(4, 12), -p.uniform(30, 60))
+    p.bricks(size, size, p.uniform(1, 4), -p.uniform(10, 25))
     for _ in range(5):
         x, y = p.uniform(0, p.size_m[0] - 0.4), p.uniform(0, p.size_m[1] - 0.4)
         _paper(p, x, y, p.uniform(0.1, 0.3), p.uniform(0.12, 0.35))
@@ -53,9 +53,9 @@ def tiles(p: Painter) -> None:
 
 def boards(p: Painter) -> None:
     """A floor of wooden boards."""
-    p.fill(p.uniform(85, 130), smooth=7)
-    p.add_noise(9, stretch=(9, 1))
-    p.bricks(1.3, 0.13, 11, -35)
+    p.fill(p.uniform(55, 140), smooth=7)
+    p.add_noise(6, stretch=(9, 1))
+    p.bricks(1.3, 0.13, 7, -20)
     for _ in range(60):
         p.disc(p.uniform(0, p.size_m[0]), p.uniform(0, p.size_m[1]), p.uniform(0.004, 0.015), p.uniform(30, 70))
 
@@ -67,7 +67,7 @@ def carpet(p: Painter) -> None:
     for k in range(4):
         inset = 0.05 + k * 0.13
         p.frame(inset, inset, width - 2 * inset, height - 2 * inset, 0.04, p.uniform(30, 220))
-    for _ in range(int(55 * width * height)):
+    for _ in range(int(30 * width * height)):
         x, y, r = p.uniform(0.1, width - 0.1), p.uniform(0.1, height - 0.1), p.uniform(0.015, 0.06)
         corners = np.array([[-1, 0], [0, -1], [1, 0], [0, 1]]) * r + (x, y)
         cv2.fillConvexPoly(p.image, np.round(corners * p.px_per_m).astype(np.int32), p.uniform(20, 230))
@@ -76,7 +76,7 @@ def carpet(p: Painter) -> None:
 
 def ceiling(p: Painter) -> None:
     """A pale ceiling with panels and lamps."""
-    p.fill(198, rough=2, smooth=5)
+    p.fill(225, rough=1, smooth=5)
     p.bricks(0.62, 0.62, 3, -28)
     for _ in range(4):
         x, y = p.uniform(0.3, p.size_m[0] - 1), p.uniform(0.3, p.size_m[1] - 1)
@@ -86,8 +86,8 @@ def ceiling(p: Painter) -> None:
 
 def wood(p: Painter) -> None:
     """Veneer or a table top, with scratches and rings of cups."""
-    p.fill(p.uniform(70, 165), smooth=8)
-    p.add_noise(10, 4, stretch=(7, 1))
+    p.fill(p.uniform(30, 215), smooth=8)
+    p.add_noise(7, 4, stretch=(7, 1))
     for _ in range(4):
         p.crack(p.uniform(40, 200), p.uniform(0.05, 0.3))
 

@@ -26,17 +26,27 @@ class Sensor:
         Standard deviation of the lens' blur in focus.
     noise : float
         Standard deviation, grey levels.
+    stops : float
+        Exposure, relative to textures as they are painted.
     vignetting : float
         Part of the light lost in the corners.
     """
 
     def __init__(
-        self, seed: int, width: int, height: int, blur_px: float = 0.6, noise: float = 1.8, vignetting: float = 0.3
+        self,
+        seed: int,
+        width: int,
+        height: int,
+        blur_px: float = 0.6,
+        noise: float = 1.8,
+        stops: float = 0.0,
+        vignetting: float = 0.3,
     ) -> None:
         self._seed = seed
         self._size = (width, height)
         self._blur_px = blur_px
         self._noise = noise
+        self._stops = stops
         x, y = np.linspace(-1, 1, width)[None, :], np.linspace(-1, 1, height)[:, None]
         self._lens = ((1 - vignetting * (x**2 + y**2) / 2) ** (1 / _GAMMA)).astype(np.float32)
         # Drawn once; each frame takes a window at an offset of its own, ten times faster than drawing anew.
@@ -51,14 +61,14 @@ class Sensor:
             # Coarse shading remains: fog or a blank wall is lit unevenly too.
             flat = cv2.resize(cv2.resize(scene, (6, 4), interpolation=cv2.INTER_AREA), (width, height))
             flat = cv2.GaussianBlur(flat, (0, 0), width / 20)
-            image = cv2.addWeighted(scene, 1 - what.wipe, flat, what.wipe, 0)
+            image = np.asarray(cv2.addWeighted(scene, 1 - what.wipe, flat, what.wipe, 0), np.uint8)
         blur_px = float(np.hypot(self._blur_px, what.blur_px * width / 640))
         if blur_px > 0:
-            image = cv2.GaussianBlur(image, (0, 0), blur_px)
-        gain = (what.light * 2.0**what.exposure_stops) ** (1 / _GAMMA)
+            image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur_px), np.uint8)
+        gain = (what.light * 2.0 ** (self._stops + what.exposure_stops)) ** (1 / _GAMMA)
         exposed = cv2.multiply(image, self._lens, scale=gain, dtype=cv2.CV_32F)
         rng = np.random.default_rng([self._seed, 0x5E45, index])
         x, y = rng.integers(0, _NOISE_SIZE, 2)
         grain = self._grain[y : y + height, x : x + width]
         sigma = float(np.hypot(self._noise, what.noise))
-        return cv2.addWeighted(exposed, 1.0, grain, sigma, 0.0, dtype=cv2.CV_8U)
+        return np.asarray(cv2.addWeighted(exposed, 1.0, grain, sigma, 0.0, dtype=cv2.CV_8U), np.uint8)

@@ -192,9 +192,12 @@ def make_sequence(
     if scene == "street":
         world, road = make_street(seed, 10.0 * duration_s + 30)
         path, focal = Drive(road, rng, duration_s, speed_m_s=10.0), 0.72
+        sensor = Sensor(seed, width, height, blur_px=0.45)
     else:
         world = make_room(seed)
         path, focal = Walk(rng, duration_s, (HALF_SIZE_M[0] - 1.3, HALF_SIZE_M[1] - 1.3)), 0.82
+        # A cheap camera in the hand: softer than the one on the car.
+        sensor = Sensor(seed, width, height, blur_px=0.9, noise=1.2, stops=0.6)
     camera = _pinhole(focal * width, width, height)
     renderer = Renderer(world, camera.K, width, height, detail=min(1.0, width / 640), supersampling=supersampling)
     parameters = {
@@ -206,13 +209,11 @@ def make_sequence(
         "rate_hz": rate_hz,
         "supersampling": float(supersampling),
     }
-    return SyntheticSequence(parameters, camera, path, renderer, Sensor(seed, width, height), script)
+    return SyntheticSequence(parameters, camera, path, renderer, sensor, script)
 
 
 def _pinhole(focal_px: float, width: int, height: int) -> PinholeCamera:
     """Return a camera with square pixels and the principal point in the middle of the image."""
     from dualslam.core.camera import PinholeCamera
 
-    return PinholeCamera(
-        width=width, height=height, fx=focal_px, fy=focal_px, cx=(width - 1) / 2, cy=(height - 1) / 2
-    )
+    return PinholeCamera(width=width, height=height, fx=focal_px, fy=focal_px, cx=(width - 1) / 2, cy=(height - 1) / 2)

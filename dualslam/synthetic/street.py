@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from dualslam.core.types import FloatArray
@@ -36,10 +38,12 @@ def make_street(seed: int, length_m: float) -> tuple[Scene, Road]:
         surfaces += _back_row(rng, road, side)
         surfaces += _furniture(rng, road, side)
     surfaces += _horizon()
-    return Scene(tuple(surfaces), background=222, seed=seed), road
+    return Scene(tuple(surfaces), background=240, seed=seed), road
 
 
-def _flat(x: float, z: float, width: float, depth: float, material: object, texels_per_m: float, y: float = 0) -> Surface:
+def _flat(
+    x: float, z: float, width: float, depth: float, material: object, texels_per_m: float, y: float = 0
+) -> Surface:
     """Return a piece of ground whose texture's top left is at (x, z), z falling down the texture."""
     sides = np.array([width, 0, 0.0]), np.array([0, 0, -depth])
     return Surface(np.array([x, y, z]), *sides, material, texels_per_m)  # type: ignore[arg-type]
@@ -68,9 +72,9 @@ def _ground(rng: np.random.Generator, road: Road) -> list[Surface]:
         if len(near_line) < 3:
             continue
         here = tuple(d for d in decals if max(abs(d.x - middle[0]), abs(d.z - middle[1])) < _TILE_M / 2 + d.radius_m)
-        surfaces.append(_flat(x, z, _TILE_M, _TILE_M, GroundTile(near_line, here, x, z), 44))
+        surfaces.append(_flat(x, z, _TILE_M, _TILE_M, GroundTile(near_line, here, x, z), 56))
     low, high = line.min(0) - 300, line.max(0) + 300
-    surfaces.append(_flat(low[0], high[1], *(high - low), _field, 1.2, 0.03))
+    surfaces.append(_flat(low[0], high[1], high[0] - low[0], high[1] - low[1], _field, 1.2, 0.03))
     return surfaces
 
 
@@ -157,7 +161,14 @@ def _house(
         w, h = rng.uniform(1.6, 3.2), rng.uniform(0.9, 1.1)
         x, bottom = rng.uniform(0.2, max(0.3, span - w)), rng.choice((2.9, 5.9)) if height > 8 else 2.9
         material = paint.pickets if rng.random() < 0.3 else paint.panel
-        out(x, rng.uniform(0.6, 1.2), (w, h), bottom, paint.plain if material is paint.pickets else material, *[paint.plain] * 5)
+        out(
+            x,
+            rng.uniform(0.6, 1.2),
+            (w, h),
+            bottom,
+            paint.plain if material is paint.pickets else material,
+            *[paint.plain] * 5,
+        )
     if rng.random() < 0.6:  # a porch
         out(rng.uniform(0, span - 2), rng.uniform(0.8, 1.5), (1.9, 2.6), 0, paint.gable, paint.plain, None, paint.plain)
     if rng.random() < 0.7:  # a hanging sign, across the pavement
@@ -194,7 +205,7 @@ def _tree(rng: np.random.Generator, foot: FloatArray, height: float, spread: flo
         side_s, side_t = np.linalg.qr(rng.normal(size=(3, 3)))[0][:2] * size
         origin = middle - (side_s + side_t) / 2
         shade = float(rng.uniform(0.6, 1.2))
-        density = min(60.0, 130 / size)
+        density = min(70.0, 150 / size)
         surfaces.append(Surface(origin, side_s, side_t, paint.twigs, density, shade, cutout=True, two_sided=True))
     return surfaces
 
@@ -207,11 +218,11 @@ def _furniture(rng: np.random.Generator, road: Road, side: float) -> list[Surfac
         kerb = ROAD_HALF_WIDTH_M + rng.uniform(0.5, 0.9)
         foot, heading = road.beside(s, side * kerb), float(road.heading(s))
         kind = rng.random()
-        if kind < 0.3:
+        if kind < 0.38:
             surfaces += _tree(rng, foot, rng.uniform(4, 7.5), rng.uniform(1.8, 2.8), 8)
             s += rng.uniform(5, 11)
-        elif kind < 0.55:
-            surfaces += _car(rng, road.beside(s + 2, side * (ROAD_HALF_WIDTH_M - 0.75)), heading)
+        elif kind < 0.6:
+            surfaces += _car(rng, road.beside(s + 2, side * (ROAD_HALF_WIDTH_M - 0.45)), heading)
             s += rng.uniform(5.2, 9)
         elif kind < 0.75:
             height = rng.uniform(2.4, 3.2)
@@ -227,7 +238,14 @@ def _furniture(rng: np.random.Generator, road: Road, side: float) -> list[Surfac
             s += rng.uniform(4, 9)
         else:
             size = (rng.uniform(0.6, 1.4), rng.uniform(0.5, 0.9), rng.uniform(0.8, 1.6))
-            surfaces += box(road.beside(s, side * (kerb + 0.7)), heading, size, 0, [paint.panel, paint.plain] * 2 + [paint.plain], 70)
+            surfaces += box(
+                road.beside(s, side * (kerb + 0.7)),
+                heading,
+                size,
+                0,
+                [paint.panel, paint.plain] * 2 + [paint.plain],
+                70,
+            )
             s += rng.uniform(3, 8)
     return surfaces
 
@@ -239,7 +257,11 @@ def _sign(rng: np.random.Generator, foot: FloatArray, heading: float, height: fl
     middle = foot - np.array([np.sin(heading), np.cos(heading)]) * 0.08
     a, b = middle - right * size / 2, middle + right * size / 2
     round_ = bool(rng.random() < 0.5)
-    signs = [wall(a, b, height - size, height, paint.round_sign if round_ else paint.panel, 120, cutout=round_, two_sided=True)]
+    signs = [
+        wall(
+            a, b, height - size, height, paint.round_sign if round_ else paint.panel, 120, cutout=round_, two_sided=True
+        )
+    ]
     if rng.random() < 0.6:
         signs.append(wall(a, b, height - size * 1.6, height - size * 1.05, paint.panel, 120, two_sided=True))
     return signs
@@ -270,7 +292,7 @@ def _horizon() -> list[Surface]:
     hills = []
     angles = np.arange(7) * 2 * np.pi / 6
     corners = np.stack([np.sin(angles), np.cos(angles)], 1) * 10
-    for a, b in zip(corners[:-1], corners[1:], strict=True):
+    for a, b in itertools.pairwise(corners):
         low = wall(a, b, -0.2, 1.1, paint.skyline, 80, cutout=True)
         hills.append(Surface(low.origin, low.side_s, low.side_t, low.material, 80, 1.0, cutout=True, infinite=True))
     return [*hills, sky]

@@ -37,7 +37,7 @@ def facade(p: Painter) -> None:
 
 def masonry(p: Painter) -> None:
     """A bare wall."""
-    level, style = p.uniform(70, 190), p.rng.integers(0, 4)
+    level, style = p.uniform(55, 215), p.rng.integers(0, 4)
     p.fill(level, rough=5, smooth=9)
     if style == 0:
         p.bricks(0.24, 0.075, p.uniform(8, 20), p.uniform(15, 45))
@@ -197,15 +197,15 @@ def twigs(p: Painter) -> None:
     p.fill(35, rough=12)
     p.alpha[:] = 0
     dark = p.uniform(15, 40)
-    p.leaves(160, (0.07, 0.17), (dark, dark + 70), cut=True)
-    p.leaves(110, (0.04, 0.11), (dark + 30, dark + 150), cut=True)
+    p.leaves(230, (0.05, 0.13), (dark, dark + 60), cut=True)
+    p.leaves(230, (0.03, 0.08), (dark + 20, dark + 190), cut=True)
 
 
 def hedge(p: Painter) -> None:
     """Leaves without holes."""
     p.fill(40, rough=18, smooth=10)
-    count = int(min(900, 70 * p.size_m[0] * p.size_m[1]))
-    p.leaves(count, (0.03, 0.09), (15, 150))
+    count = int(min(1500, 150 * p.size_m[0] * p.size_m[1]))
+    p.leaves(count, (0.03, 0.09), (10, 170))
 
 
 def pickets(p: Painter) -> None:
@@ -270,13 +270,13 @@ def car_glass(p: Painter) -> None:
 def clouds(p: Painter) -> None:
     """The sky overhead."""
     noise = p.noise(p.image.shape, smooth=True)
-    p.image[:] = 196 + 30 * np.tanh(1.4 * noise) + 3 * p.noise(p.image.shape)
+    p.image[:] = 222 + 26 * np.tanh(1.4 * noise) + 3 * p.noise(p.image.shape)
 
 
 def skyline(p: Painter) -> None:
     """Wooded hills at the horizon (cut out)."""
     height, width = p.image.shape
-    p.fill(120, rough=9, smooth=12)
+    p.fill(105, rough=14, smooth=12)
     p.image += np.linspace(25, -15, height, dtype=np.float32)[:, None]
     ridge = p.noise((8, width), smooth=True)[0] * 0.14 + p.noise((8, width))[0] * 0.03
     top = (np.clip(0.45 + ridge, 0.05, 0.9) * height).astype(np.int64)

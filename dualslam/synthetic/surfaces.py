@@ -93,7 +93,7 @@ class RipMap:
             parent = self.level(key[0], key[1] - 1) if key[1] else self.level(key[0] - 1, 0)
             height, width = self._levels[0, 0].shape
             size = (max(1, round(width / 2 ** key[0])), max(1, round(height / 2 ** key[1])))
-            image = cv2.resize(parent, size, interpolation=cv2.INTER_AREA)
+            image = np.asarray(cv2.resize(parent, size, interpolation=cv2.INTER_AREA), np.uint8)
             self._levels[key] = image
         return image
 
@@ -123,7 +123,7 @@ class TextureStore:
         Finest levels kept; the coarser ones add up to three times as much.
     """
 
-    def __init__(self, scene: Scene, detail: float = 1.0, max_bytes: int = 200_000_000) -> None:
+    def __init__(self, scene: Scene, detail: float = 1.0, max_bytes: int = 120_000_000) -> None:
         self._scene = scene
         self._detail = detail
         self._max_bytes = max_bytes
@@ -156,7 +156,13 @@ class TextureStore:
 
 
 def wall(
-    left: ArrayLike, right: ArrayLike, bottom_m: float, top_m: float, material: Material, texels_per_m: float, **more: bool
+    left: ArrayLike,
+    right: ArrayLike,
+    bottom_m: float,
+    top_m: float,
+    material: Material,
+    texels_per_m: float,
+    **more: bool,
 ) -> Surface:
     """Return an upright rectangle over the ground line from `left` to `right` (x, z), as seen from its front.
 
@@ -164,9 +170,9 @@ def wall(
     """
     left, right = np.asarray(left, np.float64), np.asarray(right, np.float64)
     side = np.array([right[0] - left[0], 0.0, right[1] - left[1]])
-    # Sun from the front right, high: the shade depends on which way the wall looks.
+    # The light comes from one side: the shade depends on which way the wall looks.
     normal_in = np.array([-side[2], side[0]]) / max(float(np.hypot(side[0], side[2])), 1e-9)
-    shade = 0.82 + 0.24 * float(normal_in @ np.array([0.6, 0.8]))
+    shade = 0.78 + 0.36 * float(normal_in @ np.array([0.6, 0.8]))
     origin = np.array([left[0], -top_m, left[1]])
     return Surface(origin, side, np.array([0.0, top_m - bottom_m, 0.0]), material, texels_per_m, shade, **more)
 
@@ -198,7 +204,9 @@ def box(
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     along, across = np.array([c, -s]), np.array([s, c])
     middle = np.asarray(centre, np.float64)
-    corners = [middle + along * a * length / 2 + across * b * width / 2 for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    corners = [
+        middle + along * a * length / 2 + across * b * width / 2 for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    ]
     top_m = bottom_m + height
     faces = []
     for i, material in enumerate(materials[:4]):
