@@ -1,0 +1,93 @@
+"""Monocular SLAM on GTSAM submaps that recovers from tracking failure by walking backwards in time.
+
+The Python interface; each name is imported when it is first used, so ``import dualslam`` is light and sets nothing::
+
+    import dualslam
+
+    dualslam.limit_threads()                      # before numpy is imported
+    sequence = dualslam.open_source("video.mp4", fov_degrees=70)
+    system = dualslam.build_system(dualslam.load_config(), sequence.camera)
+    for frame in sequence:
+        result = system.step(frame)
+    system.finish()
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from dualslam.build import build_system
+    from dualslam.core.config import Config
+    from dualslam.core.config_io import config_from_dict, dump_config, load_config
+    from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError, SolverError
+    from dualslam.core.threads import limit_threads
+    from dualslam.core.types import Frame
+    from dualslam.map_store import load_atlas, save_atlas
+    from dualslam.results import trajectories_of
+    from dualslam.runner import run_sequence
+    from dualslam.session import run_to_folder
+    from dualslam.sources import open_source
+    from dualslam.system import FrameResult, System
+
+_WHERE = {
+    "Config": "core.config",
+    "ConfigError": "core.errors",
+    "DualSlamError": "core.errors",
+    "Frame": "core.types",
+    "FrameResult": "system",
+    "InputError": "core.errors",
+    "OutputError": "core.errors",
+    "SolverError": "core.errors",
+    "System": "system",
+    "build_system": "build",
+    "config_from_dict": "core.config_io",
+    "dump_config": "core.config_io",
+    "limit_threads": "core.threads",
+    "load_atlas": "map_store",
+    "load_config": "core.config_io",
+    "open_source": "sources",
+    "run_sequence": "runner",
+    "run_to_folder": "session",
+    "save_atlas": "map_store",
+    "trajectories_of": "results",
+}
+
+__all__ = [
+    "Config",
+    "ConfigError",
+    "DualSlamError",
+    "Frame",
+    "FrameResult",
+    "InputError",
+    "OutputError",
+    "SolverError",
+    "System",
+    "__version__",
+    "build_system",
+    "config_from_dict",
+    "dump_config",
+    "limit_threads",
+    "load_atlas",
+    "load_config",
+    "open_source",
+    "run_sequence",
+    "run_to_folder",
+    "save_atlas",
+    "trajectories_of",
+]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _WHERE:
+        raise AttributeError(f"module 'dualslam' has no attribute {name!r}")
+    value = getattr(import_module(f"dualslam.{_WHERE[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

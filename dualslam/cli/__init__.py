@@ -1,0 +1,68 @@
+"""The command line: `dualslam run`, `eval`, `render`, `config`, `demo`. It only words what the Python interface does.
+
+Exit status: 0 done, 1 the run could not produce a map (or a bug of ours), 2 bad usage or bad input, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+
+from dualslam.cli import logs
+from dualslam.cli.parser import parse
+from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError
+from dualslam.core.threads import limit_threads
+
+EXIT_DONE, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status. Never raises."""
+    limit_threads()
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        args = parse(arguments)
+    except SystemExit as end:  # argparse has said what was wrong, or shown the help that was asked for
+        return end.code if isinstance(end.code, int) else EXIT_BAD_INPUT
+    logs.set_up(args.verbose, args.quiet)
+    try:
+        status = int(args.execute(args))
+        logs.release()
+        return status
+    except (ConfigError, InputError, OutputError) as error:
+        logs.discard()
+        return _say(error, EXIT_BAD_INPUT)
+    except DualSlamError as error:
+        return _say(error, EXIT_FAILED)
+    except KeyboardInterrupt:
+        return _say("interrupted", EXIT_INTERRUPTED)
+    except BrokenPipeError:  # `dualslam config | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter's last flush would complain
+        return EXIT_DONE
+    except Exception as error:  # the last resort: a bug must not reach the user as a stack trace
+        return _say(_report_bug(error, arguments, getattr(args, "out", None)), EXIT_FAILED)
+
+
+def _say(sentence: object, status: int) -> int:
+    print(f"dualslam: {' '.join(str(sentence).split())}", file=sys.stderr)
+    return status
+
+
+def _report_bug(error: Exception, arguments: list[str], out: Path | None) -> str:
+    """Write the traceback to a file and return the sentence that says where it is."""
+    text = f"dualslam {' '.join(arguments)}\n\n" + "".join(traceback.format_exception(error))
+    folder = out if out is not None and out.is_dir() else Path(tempfile.gettempdir())
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="dualslam-bug-", suffix=".log", dir=folder, delete=False, encoding="utf-8"
+        ) as file:
+            file.write(text)
+        where = f"the traceback is in {file.name}"
+    except OSError:
+        where = "the traceback could not be written"
+    detail = " ".join(str(error).split())
+    return f"this is a bug, please report it: {type(error).__name__}{': ' if detail else ''}{detail} ({where})"

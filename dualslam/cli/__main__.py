@@ -1,0 +1,7 @@
+"""`python -m dualslam.cli` is the command `dualslam`."""
+
+import sys
+
+from dualslam.cli import main
+
+sys.exit(main())

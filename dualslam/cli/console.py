@@ -1,0 +1,81 @@
+"""What a person sees of a run: progress while it goes on, one line when it is over, a table of where the time went."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from dualslam.core.interfaces import Sequence
+from dualslam.session import Outcome
+from dualslam.system import FrameResult
+
+
+@contextmanager
+def progress(sequence: Sequence, quiet: bool) -> Iterator[Callable[[FrameResult], None] | None]:
+    """Show a bar on stderr while frames come in, if a person watches; otherwise nothing."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    try:
+        total: int | None = len(sequence)
+    except TypeError:  # a webcam has no length
+        total = None
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[state]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(sequence.name, total=total, state="")
+
+        def on_frame(result: FrameResult) -> None:
+            where = "" if result.submap_id is None else f", submap {result.submap_id}, {result.n_inliers} landmarks"
+            bar.update(task, advance=1, state=f"{result.status}{where}")
+
+        yield on_frame
+
+
+def final_line(outcome: Outcome) -> str:
+    """Return coverage, submaps, failures, speed and place in one line."""
+    s = outcome.summary
+    parts = [
+        f"coverage {100 * s['coverage']:.1f} % ({s['posed']} of {s['frames']} frames)",
+        _count(s["submaps"], "submap"),
+        _count(s["failures"], "failure"),
+    ]
+    if s["recoveries"]:
+        parts.append(_count(s["recoveries"], "recovery", "recoveries"))
+    if s["dropped"]:
+        parts.append(f"{s['dropped']} frames dropped")
+    if s.get("ate_rmse_m") is not None:
+        parts.append(f"ATE {s['ate_rmse_m']:.3g} m")
+    parts.append(f"{s['fps']:.1f} frames/s")
+    lead = "interrupted: " if s["interrupted"] else "" if outcome.has_map else "no map: "
+    return f"{lead}{', '.join(parts)}; results in {outcome.out}"
+
+
+def stage_table(outcome: Outcome) -> str:
+    """Return CPU time per frame of each stage, and of the whole process."""
+    n_frames = max(len(outcome.report.latencies_ms), 1)
+    total_s = outcome.report.cpu_s
+    lines = [f"{'stage':<28}{'calls':>8}{'CPU s':>10}{'ms/frame':>10}{'share':>8}"]
+
+    def add(name: str, calls: str, seconds: float) -> None:
+        share = 100 * seconds / total_s if total_s else 0.0
+        lines.append(f"{name:<28}{calls:>8}{seconds:>10.2f}{1e3 * seconds / n_frames:>10.2f}{share:>7.1f}%")
+
+    for name, stage in sorted(outcome.system.timer.stages.items(), key=lambda item: -item[1].seconds):
+        add(name, str(stage.calls), stage.seconds)
+    add("whole process", str(n_frames), total_s)
+    lines.append("(the whole holds reading and everything between the stages; a stage named (in x) is part of x)")
+    return "\n".join(lines)
+
+
+def _count(n: int, one: str, many: str | None = None) -> str:
+    return f"{n} {one if n == 1 else many or one + 's'}"

@@ -1,0 +1,171 @@
+"""What can be typed: commands, options and their help. Nothing heavy is imported until a command executes."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import NoReturn
+
+from dualslam import __version__
+
+SOURCE_HELP = (
+    "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours), a folder of images or a video file with --camera or "
+    "--fov, a webcam's number, or an embedded world: synthetic:street or synthetic:room, with options as in "
+    "synthetic:street,frames=300,seed=1,events=FILE"
+)
+
+
+class _Parser(argparse.ArgumentParser):
+    """An argument parser that says what is wrong in one sentence."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """Parse a command line; the result's `execute` is the function to call with it.
+
+    Raises
+    ------
+    SystemExit
+        With status 2 and one sentence on stderr where the usage is wrong; with 0 after ``--help`` and ``--version``.
+    """
+    return _build_parser().parse_args(arguments)
+
+
+def _build_parser() -> _Parser:
+    parser = _Parser(prog="dualslam", description="Monocular SLAM that recovers from tracking failure.")
+    parser.add_argument("--version", action="version", version=f"dualslam {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
+    _add_run(commands)
+    _add_eval(commands)
+    _add_render(commands)
+    _add_config(commands)
+    _add_demo(commands)
+    return parser
+
+
+def _command(
+    commands: argparse._SubParsersAction[_Parser], name: str, help_text: str
+) -> tuple[_Parser, argparse._ArgumentGroup]:
+    parser = commands.add_parser(name, help=help_text, description=help_text, allow_abbrev=False)
+    parser.set_defaults(execute=_late(name))
+    talk = parser.add_argument_group("talk")
+    talk.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
+    talk.add_argument("-v", "--verbose", action="count", default=0, help="log what happens; twice: every detail")
+    return parser, talk
+
+
+def _late(name: str) -> Callable[[argparse.Namespace], int]:
+    """Return a function that imports a command's module when it is called."""
+
+    def execute(args: argparse.Namespace) -> int:
+        status: int = import_module(f"dualslam.cli.{name}_command").execute(args)
+        return status
+
+    return execute
+
+
+def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
+    parser, talk = _command(commands, "run", "Run on a source of frames and write a run folder.")
+    parser.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
+    _add_output(parser)
+    talk.add_argument("--profile", action="store_true", help="print where the time went, stage by stage")
+    _add_configuration(parser)
+    _add_selection(parser)
+    camera = parser.add_argument_group("camera").add_mutually_exclusive_group()
+    camera.add_argument("--camera", metavar="FILE", type=Path, help="calibration, instead of the source's own")
+    camera.add_argument("--fov", metavar="DEGREES", type=_angle, help="horizontal field of view, without a calibration")
+    mode = parser.add_argument_group("mode")
+    mode.add_argument(
+        "--realtime",
+        action="store_true",
+        help="frames come at the source's rate and are dropped when late; otherwise every frame, as fast as it goes",
+    )
+    processes = mode.add_mutually_exclusive_group()
+    processes.add_argument("--inline", action="store_true", help="one process, deterministic: the same as --workers 0")
+    processes.add_argument("--workers", metavar="N", type=_count, help="processes that recover beside the tracking")
+
+
+def _add_eval(commands: argparse._SubParsersAction[_Parser]) -> None:
+    parser, _ = _command(commands, "eval", "Score a run against ground truth: coverage first, then ATE and RPE.")
+    parser.add_argument("run", metavar="RUN", type=Path, help="a run folder, or a trajectory in TUM format")
+    parser.add_argument("sequence", metavar="SEQUENCE", help="the sequence with its ground truth")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def _add_render(commands: argparse._SubParsersAction[_Parser]) -> None:
+    parser, _ = _command(commands, "render", "Render a synthetic world as a sequence folder with ground truth.")
+    parser.add_argument("world", metavar="WORLD", choices=("street", "room"), help="street or room")
+    _add_output(parser)
+    parser.add_argument("--frames", metavar="N", type=_positive, default=300, help="how many (default: 300)")
+    parser.add_argument("--seed", metavar="N", type=_count, default=0, help="which world and path (default: 0)")
+    parser.add_argument("--events", metavar="FILE", type=Path, help="YAML list of blur, black-out, ... to inject")
+
+
+def _add_config(commands: argparse._SubParsersAction[_Parser]) -> None:
+    parser, _ = _command(commands, "config", "Print the resolved configuration with the meaning of every field.")
+    _add_configuration(parser)
+
+
+def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> None:
+    parser, talk = _command(commands, "demo", "Drive through a synthetic street, lose track, and show what is left.")
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/demo"), help="default: runs/demo")
+    parser.add_argument("--overwrite", action="store_true", help="replace the run that is there")
+    parser.add_argument("--frames", metavar="N", type=_positive, default=300, help="how long a drive (default: 300)")
+    talk.add_argument("--profile", action="store_true", help="print where the time went, stage by stage")
+    _add_configuration(parser)
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
+    parser.add_argument("--overwrite", action="store_true", help="replace what is there")
+
+
+def _add_configuration(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("configuration")
+    group.add_argument("--config", metavar="FILE", type=Path, help="YAML file; what it does not name keeps its default")
+    group.add_argument(
+        "--set", metavar="KEY.PATH=VALUE", action="append", default=[], help="set one field, over the file; repeatable"
+    )
+    group.add_argument("--frontend", metavar="NAME", help="which front end (frontend.name)")
+    group.add_argument("--seed", metavar="N", type=_count, help="seed of every random choice (seed)")
+    group.add_argument("--no-recovery", action="store_true", help="do not try to link what a failure has parted")
+
+
+def _add_selection(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("which frames")
+    group.add_argument("--start", metavar="N", type=_count, default=0, help="first frame, counted from 0")
+    group.add_argument("--stride", metavar="N", type=_positive, default=1, help="take every N-th frame")
+    group.add_argument("--max-frames", metavar="N", type=_positive, help="at most so many")
+    group.add_argument("--reverse", action="store_true", help="read the same frames last to first")
+
+
+def _integer(text: str, at_least: int) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = at_least - 1
+    if value < at_least:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least {at_least}, not {text!r}")
+    return value
+
+
+def _count(text: str) -> int:
+    return _integer(text, 0)
+
+
+def _positive(text: str) -> int:
+    return _integer(text, 1)
+
+
+def _angle(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 1 <= value < 180:
+        raise argparse.ArgumentTypeError(f"must be an angle between 1 and 180 degrees, not {text!r}")
+    return value

@@ -1,0 +1,49 @@
+"""`dualslam run`: a source of frames in, a run folder out."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+
+from dualslam.cli import logs
+from dualslam.cli.configuration import config_of
+from dualslam.cli.console import final_line, progress, stage_table
+from dualslam.session import Outcome, run_to_folder
+from dualslam.sources import open_source
+
+log = logging.getLogger(__name__)
+
+EXIT_DONE, EXIT_NO_MAP, EXIT_INTERRUPTED = 0, 1, 130
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Run, and say in one line what came of it."""
+    config = config_of(args)
+    if args.workers:
+        log.info("--workers %d: there is no recovery yet that could use them", args.workers)
+    sequence = open_source(
+        args.source,
+        camera_file=args.camera,
+        fov_degrees=args.fov,
+        start=args.start,
+        stride=args.stride,
+        max_frames=args.max_frames,
+        reverse=args.reverse,
+    )
+    logs.release()
+    with progress(sequence, args.quiet) as on_frame:
+        outcome = run_to_folder(
+            config, sequence, args.out, overwrite=args.overwrite, realtime=args.realtime, on_frame=on_frame
+        )
+    return conclude(outcome, args)
+
+
+def conclude(outcome: Outcome, args: argparse.Namespace) -> int:
+    """Print what a run found, and return the exit status."""
+    if args.profile:
+        print(stage_table(outcome))
+    if not args.quiet:
+        print(final_line(outcome), flush=True)
+    if outcome.report.interrupted:
+        return EXIT_INTERRUPTED
+    return EXIT_DONE if outcome.has_map else EXIT_NO_MAP

@@ -1,0 +1,30 @@
+"""One thread for each numerical library: our parallelism is processes, and BLAS threads on busy cores only wait."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+LIMITS = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "NUMEXPR_NUM_THREADS": "1",
+    "OPENCV_FOR_THREADS_NUM": "1",
+}
+
+
+def limit_threads() -> bool:
+    """Tell the numerical libraries, which read the environment when they are loaded, to use one thread each.
+
+    Variables that the user has set are left as they are. Call it before numpy is imported, in a program of your own as
+    in ours; importing dualslam does not call it.
+
+    Returns
+    -------
+    bool
+        False where numpy was loaded already, so that the limits came too late for it.
+    """
+    for name, value in LIMITS.items():
+        os.environ.setdefault(name, value)
+    return "numpy" not in sys.modules

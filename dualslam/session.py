@@ -1,0 +1,110 @@
+"""One whole run: build the system, feed it a sequence, keep what it found in a run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from dualslam.build import build_system
+from dualslam.core.camera import Camera
+from dualslam.core.config import Config
+from dualslam.core.config_io import dump_config
+from dualslam.core.errors import InputError
+from dualslam.core.events import EventKind
+from dualslam.core.interfaces import Sequence
+from dualslam.io.run_folder import RunFolder, RunRecord
+from dualslam.io.trajectory_files import Trajectory
+from dualslam.map_store import save_atlas
+from dualslam.results import frame_rows, summarise, trajectories_of
+from dualslam.runner import RunReport, run_sequence
+from dualslam.system import FrameResult, System
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """A run that has been written down.
+
+    Attributes
+    ----------
+    out : Path
+    summary : dict
+        As in ``summary.json``.
+    report : RunReport
+    system : System
+        With the whole map.
+    """
+
+    out: Path
+    summary: dict[str, Any]
+    report: RunReport
+    system: System
+
+    @property
+    def has_map(self) -> bool:
+        """Whether any frame has a pose."""
+        return bool(self.summary["posed"])
+
+
+def run_to_folder(
+    config: Config,
+    sequence: Sequence,
+    out: str | Path,
+    *,
+    overwrite: bool = False,
+    realtime: bool = False,
+    on_frame: Callable[[FrameResult], None] | None = None,
+    build: Callable[[Config, Camera], System] | None = None,
+) -> Outcome:
+    """Run on a sequence and write a run folder. What an interrupted run has found is kept all the same.
+
+    Parameters
+    ----------
+    config : Config
+    sequence : Sequence
+        With ground truth (an attribute `ground_truth`), the summary holds the errors.
+    out : path
+    overwrite, realtime : bool
+    on_frame : callable, optional
+        Called with each frame's result.
+    build : callable, optional
+        Makes the system of a config and a camera; `build_system` if it is not given.
+
+    Raises
+    ------
+    ConfigError, InputError, OutputError
+    """
+    system = (build or build_system)(config, sequence.camera)
+    with RunFolder(out, overwrite=overwrite) as folder:
+        folder.write_config(dump_config(config))
+        n_events = 0
+
+        def after_frame(result: FrameResult) -> None:
+            nonlocal n_events
+            n_events = _write_new_events(system, folder, n_events)
+            if on_frame is not None:
+                on_frame(result)
+
+        report = run_sequence(system, sequence, realtime=realtime, on_frame=after_frame)
+        if report.interrupted and system.rows:
+            last = next(reversed(system.rows.values()))
+            system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap_id)
+        _write_new_events(system, folder, n_events)
+        trajectories = trajectories_of(system)
+        truth: Trajectory | None = getattr(sequence, "ground_truth", None)
+        summary = {"sequence": sequence.name} | summarise(system, report, trajectories, config, truth)
+        rows = frame_rows(system, trajectories.main, report.dropped)
+        folder.write(RunRecord(rows, trajectories.main, trajectories.unlinked, summary))
+        save_atlas(folder.map_path, system.atlas, system.poses)
+    if report.error is not None:
+        raise InputError(f"{report.error} What was found until then is in {out}.")
+    return Outcome(Path(out), summary, report, system)
+
+
+def _write_new_events(system: System, folder: RunFolder, n_written: int) -> int:
+    if len(system.events) > n_written:
+        for event in islice(system.events, n_written, None):
+            folder.append_event(event)
+    return len(system.events)

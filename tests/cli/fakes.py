@@ -1,0 +1,77 @@
+"""A system that knows the truth, so that the harness and the command line are tested without the algorithm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from dualslam.atlas import Atlas
+from dualslam.core.camera import Camera
+from dualslam.core.config import Config
+from dualslam.core.events import EventKind, EventLog
+from dualslam.core.stage_timer import StageTimer
+from dualslam.core.submap import Submap
+from dualslam.core.types import Features, FloatArray, Frame, FrameStatus, Keyframe
+from dualslam.system import FrameResult, FrameRow
+from dualslam.trajectory import FramePose
+
+NO_FEATURES = Features(
+    np.zeros((0, 2)),
+    np.zeros((0, 2)),
+    np.zeros(0),
+    np.zeros(0),
+    np.zeros(0, np.int64),
+    np.zeros(0),
+    np.zeros((0, 32), np.uint8),
+)
+
+
+class FakeSystem:
+    """Poses every frame at its true place, but for those in `lost`; after them a new submap begins."""
+
+    def __init__(
+        self,
+        truth: dict[int, FloatArray],
+        lost: tuple[int, ...] = (),
+        before_step: Callable[[Frame], None] = lambda frame: None,
+    ) -> None:
+        self.atlas = Atlas()
+        self.rows: dict[int, FrameRow] = {}
+        self.poses: dict[int, FramePose] = {}
+        self.events = EventLog()
+        self.timer = StageTimer()
+        self.n_finished = 0
+        self._truth, self._lost, self._before_step = truth, lost, before_step
+        self._submap: Submap | None = None
+
+    def step(self, frame: Frame) -> FrameResult:
+        self._before_step(frame)
+        with self.timer.measure("tracking"):
+            pass
+        if frame.image is None or frame.index in self._lost:
+            if self._submap is not None:
+                self.events.add(EventKind.FAILED, frame.index, frame.timestamp_s, self._submap.id)
+            self._submap = None
+            return self._result(frame, FrameStatus.LOST)
+        T_world_cam = self._truth[frame.index]
+        if self._submap is None:
+            self._submap = Submap(len(self.atlas.submaps), np.eye(3), np.zeros(32, np.uint8))
+            self.atlas.add(self._submap)
+            self.events.add(EventKind.INITIALISED, frame.index, frame.timestamp_s, self._submap.id)
+        self._submap.add_keyframe(Keyframe(frame.index, frame.timestamp_s, NO_FEATURES), T_world_cam)
+        self.poses[frame.index] = FramePose(frame.index, frame.timestamp_s, self._submap.id, frame.index, np.eye(4))
+        return self._result(frame, FrameStatus.TRACKED)
+
+    def finish(self) -> None:
+        self.n_finished += 1
+
+    def _result(self, frame: Frame, status: FrameStatus) -> FrameResult:
+        submap_id = None if self._submap is None else self._submap.id
+        self.rows[frame.index] = FrameRow(frame.index, frame.timestamp_s, status, submap_id, 100, 90, 5.0)
+        return FrameResult(frame.index, status, submap_id, None, 100, 90, 5.0, None)
+
+
+def builder(truth: dict[int, FloatArray], **options: object) -> Callable[[Config, Camera], FakeSystem]:
+    """Return what stands in for `build_system`."""
+    return lambda config, camera: FakeSystem(truth, **options)  # type: ignore[arg-type]

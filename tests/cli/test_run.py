@@ -1,0 +1,193 @@
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dualslam.cli import main
+from dualslam.core.config_io import load_config
+from dualslam.core.types import Frame
+from dualslam.map_store import load_atlas
+from dualslam.synthetic import SyntheticSequence
+from tests.cli.conftest import N_FRAMES
+
+Install = Callable[..., None]
+
+
+def rows_of(out: Path) -> list[dict[str, str]]:
+    with (out / "frames.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_run_leaves_all_that_it_should(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert main(["run", str(folder), "--out", str(out), "--seed", "3"]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    (line,) = captured.out.splitlines()
+    assert f"coverage 100.0 % ({N_FRAMES} of {N_FRAMES} frames), 1 submap, 0 failures, ATE" in line
+    assert line.endswith(f"results in {out}")
+    assert len(rows_of(out)) == len((out / "trajectory.txt").read_text().splitlines()) == N_FRAMES
+    assert all(row["in_main_map"] == "1" and row["status"] == "tracked" for row in rows_of(out))
+    assert json.loads((out / "events.jsonl").read_text().splitlines()[0])["event"] == "initialised"
+    assert load_config(out / "config.yaml") == load_config(None, ["seed=3"])
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["coverage"] == 1.0
+    assert summary["seed"] == 3
+    assert summary["ate_rmse_m"] < 1e-6
+    assert set(summary["latency_ms"]) == {"median", "p95", "p99", "max"}
+    assert {"numpy", "gtsam", "dualslam", "python"} <= set(summary["versions"])
+    for field in ("frames", "posed", "failures", "recoveries", "submaps", "links", "fps", "recovery_s", "peak_rss_mb"):
+        assert field in summary
+
+
+def test_a_lost_track_leaves_two_labelled_submaps(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fake(lost=(10, 11))
+    assert main(["run", str(folder), "--out", str(tmp_path / "run")]) == 0
+    n_main = N_FRAMES - 12
+    assert f"({n_main} of {N_FRAMES} frames), 2 submaps, 1 failure" in capsys.readouterr().out
+    rows = rows_of(tmp_path / "run")
+    assert [row["status"] for row in rows[9:13]] == ["tracked", "lost", "lost", "tracked"]
+    assert [row["in_main_map"] for row in rows] == ["0"] * 12 + ["1"] * n_main
+    assert len((tmp_path / "run" / "submaps" / "00.txt").read_text().splitlines()) == 10
+    assert not (tmp_path / "run" / "submaps" / "01.txt").exists()
+    stored = load_atlas(tmp_path / "run")
+    assert list(stored.atlas.submaps) == [0, 1]
+    assert set(stored.poses) == set(range(N_FRAMES)) - {10, 11}
+
+
+def test_an_earlier_run_is_not_overwritten_without_being_told(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["run", str(folder), "--out", str(tmp_path / "run"), "--quiet"]
+    assert main(command) == 0
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    assert main(command) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main([*command, "--overwrite", "--max-frames", "15"]) == 0
+    assert len(rows_of(tmp_path / "run")) == 15
+    assert (tmp_path / "run" / "notes.txt").read_text() == "mine"
+    captured = capsys.readouterr()
+    assert captured.out == captured.err == ""
+
+
+def test_the_frames_that_were_asked_for(folder: Path, fake: Install, tmp_path: Path) -> None:
+    options = ["--start", "3", "--stride", "2", "--max-frames", "4", "--reverse", "--quiet"]
+    assert main(["run", str(folder), "--out", str(tmp_path / "run"), *options]) == 0
+    assert [row["index"] for row in rows_of(tmp_path / "run")] == ["9", "7", "5", "3"]
+    source = f"synthetic:street,frames={N_FRAMES},seed=1"
+    assert main(["run", source, "--out", str(tmp_path / "world"), *options]) == 0
+    assert [row["index"] for row in rows_of(tmp_path / "world")] == ["9", "7", "5", "3"]
+
+
+def test_no_map_is_status_1_and_a_row_for_every_frame(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fake(lost=tuple(range(N_FRAMES)))
+    assert main(["run", str(folder), "--out", str(tmp_path / "run")]) == 1
+    assert capsys.readouterr().out.startswith("no map: coverage 0.0 %")
+    assert len(rows_of(tmp_path / "run")) == N_FRAMES
+    assert (tmp_path / "run" / "trajectory.txt").read_text() == ""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_keeps_what_it_has(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str], number: int
+) -> None:
+    def interrupt(frame: Frame) -> None:
+        if frame.index == 6:
+            os.kill(os.getpid(), number)
+
+    fake(before_step=interrupt)
+    before = signal.getsignal(number)
+    assert main(["run", str(folder), "--out", str(tmp_path / "run")]) == 130
+    assert signal.getsignal(number) is before
+    assert capsys.readouterr().out.startswith("interrupted: coverage 100.0 % (7 of 7 frames)")
+    assert len(rows_of(tmp_path / "run")) == 7
+    events = (tmp_path / "run" / "events.jsonl").read_text().splitlines()
+    assert json.loads(events[-1])["event"] == "interrupted"
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["interrupted"] is True
+
+
+def test_a_bug_in_the_system_leaves_its_log_in_the_run_folder(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(frame: Frame) -> None:
+        raise ZeroDivisionError("by zero")
+
+    fake(before_step=broken)
+    assert main(["run", str(folder), "--out", str(tmp_path / "run")]) == 1
+    assert "this is a bug" in capsys.readouterr().err
+    (log,) = (tmp_path / "run").glob("dualslam-bug-*.log")
+    assert "ZeroDivisionError: by zero" in log.read_text()
+
+
+def test_profile_prints_a_table(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", str(folder), "--out", str(tmp_path / "run"), "--profile"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["stage", "calls", "CPU", "s", "ms/frame", "share"]
+    assert any(line.startswith("tracking ") for line in lines)
+    assert any(line.startswith("whole process") for line in lines)
+
+
+def test_eval_gives_coverage_first(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fake(lost=(11,))
+    run = str(tmp_path / "run")
+    assert main(["run", str(folder), "--out", run, "--quiet"]) == 0
+    assert main(["eval", run, str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"main map: coverage 50.0 % (12 of {N_FRAMES} frames)"
+    assert lines[1].startswith("  ATE 0.0000 m RMSE")
+    assert any(line.startswith("submap 0, not linked: coverage 45.8 %") for line in lines)
+    assert main(["eval", run, str(folder), "--json"]) == 0
+    score = json.loads(capsys.readouterr().out)
+    assert score["coverage_pct"] == 50.0
+    assert score["submaps"][0]["submap"] == 0
+    assert main(["eval", run, f"synthetic:street,frames={N_FRAMES},seed=1"]) == 0
+
+
+def test_render_writes_a_sequence_and_overwrites_only_its_own(
+    tmp_path: Path, world: SyntheticSequence, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, script = tmp_path / "room", tmp_path / "events.yaml"
+    script.write_text("- {kind: drop, start: 2, length: 1}\n- {kind: blur, start: 3, length: 1, strength: 4}\n")
+    command = ["render", "room", "--out", str(out), "--frames", "5", "--events", str(script)]
+    assert main(command) == 0
+    assert "4 frames of synthetic_room_0" in capsys.readouterr().out
+    assert len(list((out / "images").iterdir())) == len(np.loadtxt(out / "times.txt")) == 4
+    assert main(command) == 2
+    assert main([*command[:4], "--frames", "2", "--overwrite", "--quiet"]) == 0
+    assert len(list((out / "images").iterdir())) == 2
+    (out / "SOURCE.md").write_text("mine")
+    assert main([*command[:4], "--frames", "2", "--overwrite"]) == 2
+    assert "not written by dualslam render" in capsys.readouterr().err
+    assert len(list((out / "images").iterdir())) == 2
+
+
+def test_demo_shows_the_evaluation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from dualslam.sources import make_world
+    from tests.cli.fakes import builder
+
+    truth = dict(enumerate(make_world("street", 60, 0).ground_truth_T_world_cam))
+    monkeypatch.setattr("dualslam.session.build_system", builder(truth, lost=tuple(range(30, 45))))
+    assert main(["demo", "--frames", "60", "--out", str(tmp_path / "demo")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "covered in frames 30 to 44" in lines[0]
+    assert lines[1].startswith("main map: coverage 50.0 %")
+    assert "2 submaps, 1 failure" in lines[-1]

@@ -1,0 +1,161 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import dualslam
+from dualslam.cli import main
+from dualslam.core.config_io import load_config
+
+
+def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.splitlines()
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith("dualslam")
+    assert "Traceback" not in lines[0]
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ("", "COMMAND"),
+        ("rum", "invalid choice: 'rum'"),
+        ("run", "SOURCE, --out"),
+        ("run here", "--out"),
+        ("run here --out there --fov 200", "between 1 and 180 degrees, not '200'"),
+        ("run here --out there --fov 70 --camera c.txt", "not allowed with"),
+        ("run here --out there --inline --workers 2", "not allowed with"),
+        ("run here --out there --stride 0", "at least 1, not '0'"),
+        ("run here --out there --start -1", "at least 0, not '-1'"),
+        ("run here --out there --max-frames many", "at least 1, not 'many'"),
+        ("run here --out there --seed -3", "at least 0"),
+        ("run here --out there --sed 3", "unrecognized arguments: --sed 3"),
+        ("run nowhere --out there", "nowhere does not exist"),
+        ("run synthetic:sea --out there", "'sea' is unknown"),
+        ("run synthetic:street,frames=x --out there", "frames must be a whole number, not 'x'"),
+        ("run synthetic:street,frames=0 --out there", "n_frames is 0"),
+        ("run synthetic:street,size=3 --out there", "no option 'size'"),
+        ("run synthetic:street,events=none.yaml --out there", "none.yaml cannot be read"),
+        ("run synthetic:street --out there --fov 70", "camera of its own"),
+        ("run synthetic:street,frames=5 --out there --start 9", "start is 9"),
+        ("run synthetic:street,frames=5 --out there --frontend sift9", "sift9"),
+        ("run synthetic:street --out there --set frontend.n_feature=3", "did you mean frontend.n_features?"),
+        ("run synthetic:street --out there --config none.yaml", "none.yaml: the configuration cannot be read"),
+        ("config --set seed=x", "seed must be a whole number"),
+        ("config --set seed", "write key.path=value"),
+        ("eval nowhere nowhere", "nowhere does not exist"),
+        ("render lake --out there", "invalid choice: 'lake'"),
+        ("render street --out there --frames 0", "at least 1"),
+        ("render street --out there --events none.yaml", "none.yaml cannot be read"),
+        ("demo --frames 3", "at least 60"),
+    ],
+)
+def test_bad_usage_is_one_sentence_and_status_2(
+    arguments: str, expected: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments.split()) == 2
+    assert expected in one_sentence(capsys)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["", "run ", "eval ", "render ", "config ", "demo "])
+def test_help_is_there_for_every_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*command.split(), "--help"]) == 0
+    assert "usage: dualslam" in capsys.readouterr().out
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"dualslam {dualslam.__version__}\n"
+
+
+def test_config_prints_what_reads_back(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["config", "--seed", "5", "--frontend", "orb", "--set", "frontend.n_features=700"]) == 0
+    file = tmp_path / "c.yaml"
+    file.write_text(capsys.readouterr().out)
+    config = load_config(file)
+    assert (config.seed, config.frontend.n_features) == (5, 700)
+    assert main(["config", "--config", str(file), "--seed", "6", "--no-recovery"]) == 0
+    assert "seed: 6" in capsys.readouterr().out
+
+
+def test_an_unexpected_exception_is_a_sentence_and_a_log(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*args: object, **kwargs: object) -> None:
+        raise KeyError("x\ny")
+
+    monkeypatch.setattr("dualslam.cli.config_command.config_of", broken)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert main(["config"]) == 1
+    sentence = one_sentence(capsys)
+    assert "bug" in sentence
+    assert "KeyError" in sentence
+    (log,) = tmp_path.glob("dualslam-bug-*.log")
+    assert str(log) in sentence
+    assert "Traceback" in log.read_text()
+
+
+def test_a_keyboard_interrupt_outside_of_a_run(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*args: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("dualslam.cli.config_command.config_of", interrupted)
+    assert main(["config"]) == 130
+    assert one_sentence(capsys) == "dualslam: interrupted"
+
+
+def test_warnings_wait_until_the_input_has_proved_good(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, folder: Path, fake: object
+) -> None:
+    (tmp_path / "images").mkdir()
+    for image in sorted((folder / "images").iterdir()):
+        (tmp_path / "images" / image.name).symlink_to(image)
+    command = ["run", str(tmp_path / "images"), "--out", str(tmp_path / "run")]
+    assert main(command) == 2
+    assert "no calibration" in one_sentence(capsys)
+    assert main([*command, "--fov", "70"]) == 0
+    assert "WARNING" in capsys.readouterr().err
+
+
+HEAVY = ("torch", "kornia", "matplotlib", "cv2", "gtsam", "numpy", "scipy", "pydantic", "rich", "yaml")
+
+
+@pytest.mark.parametrize("statement", ["import dualslam", "import dualslam.cli", "from dualslam import limit_threads"])
+def test_importing_is_light(statement: str) -> None:
+    code = f"import sys; {statement}; print(*(set(sys.modules) & set({HEAVY})))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+def test_every_public_name_is_there() -> None:
+    for name in dualslam.__all__:
+        assert getattr(dualslam, name) is not None
+        assert name in dir(dualslam)
+    with pytest.raises(AttributeError, match="nonsense"):
+        dualslam.nonsense  # noqa: B018
+
+
+def test_importing_everything_public_leaves_extras_alone() -> None:
+    code = "import sys, dualslam; [getattr(dualslam, n) for n in dualslam.__all__]; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"torch", "kornia", "matplotlib", "pandas"} & set(done.stdout.split())
+
+
+def test_limit_threads_leaves_what_the_user_has_set() -> None:
+    code = (
+        "import os; from dualslam import limit_threads; early = limit_threads(); import numpy;"
+        "print(early, limit_threads(), os.environ['OMP_NUM_THREADS'], os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    environment = {"OMP_NUM_THREADS": "3", "PATH": ""}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.split() == ["True", "False", "3", "1"]
