@@ -169,7 +169,11 @@ class Ledger:
         names, index = np.unique(point[asked], return_inverse=True)
         sigmas = compute_depth_sigmas(submap.K, T, pose[asked], res.xyz_cam[asked], sigma[asked], index, len(names))
         limit = self._config.max_depth_sigma / caution * np.where(known[names], LEAVE_RATIO, 1.0)
-        certain[names] = sigmas < limit
+        # Two views of a point fit whatever the poses are along their epipolar lines: it is the third that has a say.
+        n_views = np.bincount(index, minlength=len(names))
+        young = len(submap.keyframes) <= self._config.young_keyframes
+        enough = n_views >= np.where(known[names] | young, 2, self._config.min_views)
+        certain[names] = (sigmas < limit) & enough
         return fits, certain
 
     def _weak_keyframes(self, inside: BoolArray, kf: IntArray, lm: IntArray, live: IntArray) -> IntArray:

@@ -33,7 +33,7 @@ from dualslam.core.types import FloatArray, IntArray
 
 POSE_THRESHOLDS = (0.001, 0.005)
 """Relinearise a pose that moved by more: rotation in rad, translation in submap units (median initial depth 1)."""
-POINT_THRESHOLD_MU = 0.01
+POINT_THRESHOLD_MU = 0.05
 N_LAST = 30
 """So many of the newest poses are eliminated last."""
 GTSAM_ERRORS = (RuntimeError, ValueError, IndexError)

@@ -128,6 +128,10 @@ class GraphConfig(StrictModel):
     max_depth_sigma: float = Field(0.25, gt=0)
     """A landmark enters the graph once its views fix its distance to this relative standard deviation (0.25 is about
     half a degree of parallax at 1 px and a focal length of 700 px); it leaves at twice that."""
+    min_views: int = Field(3, ge=2)
+    """Keyframes that must see a landmark before it enters the graph: two views fit almost any pair of poses."""
+    young_keyframes: int = Field(5, ge=2)
+    """Up to so many keyframes two views are enough, or there would be no graph to start with."""
     insert_sigmas: float = Field(25.0, gt=0)
     """Observations further than this from where the map puts them (in sigmas) are refused: no solver makes use of them."""
     min_ties: int = Field(6, ge=3)
