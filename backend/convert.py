@@ -59,8 +59,8 @@ def to_similarity3(S: FloatArray) -> gtsam.Similarity3:
     ValueError
         If the scale is not positive and finite.
     """
-    determinant = np.linalg.det(S[:3, :3])
-    if not (np.isfinite(determinant) and determinant > 0):
+    determinant = float(np.linalg.det(S[:3, :3])) if np.isfinite(S).all() else float("nan")
+    if not 0 < determinant < np.inf:
         raise ValueError(f"not a similarity: the determinant of its linear part is {determinant}")
     s = float(np.cbrt(determinant))
     return gtsam.Similarity3(gtsam.Rot3(_nearest_rotation(S[:3, :3] / s)), S[:3, 3] / s, s)

@@ -32,6 +32,8 @@ logger = logging.getLogger(__name__)
 HOLD_ROTATION_RAD, HOLD_TRANSLATION_MU = 0.01, 0.02
 """Sigmas of the loose prior that holds a keyframe with too few ties where it is."""
 REBUILD_ATTEMPTS = 8
+FAR_MU = 200.0
+"""A point this far from its camera (the median initial depth is 1) is looked at again before the next solution."""
 MEDIAN_CHI2_2DOF = 1.386
 
 
@@ -90,7 +92,7 @@ class ISam2SubmapGraph:
             logger.info("submap %d changed its gauge: rebuilding its graph", submap.id)
             return self._remake(submap, start, rebuilt=True)
         try:
-            plan = self._ledger.plan(submap, submap.T_submap_kf, submap.landmarks["xyz_mu"])
+            plan = self._ledger.plan(submap, submap.T_submap_kf, submap.landmarks["xyz_mu"], suspects=self._suspects)
             changes = self._changes(submap, plan, submap.T_submap_kf, submap.landmarks["xyz_mu"])
             self._solve(self._solver, submap, plan, changes)
             self._n_updates += 1
@@ -243,7 +245,10 @@ class ISam2SubmapGraph:
         T, xyz = self._solver.estimate(keyframes, landmarks, everything)
 
         point, pose = (np.cumsum(seen) - 1)[lm[row]], np.searchsorted(keyframes, kf[row])
-        chi2 = compute_residuals(submap.K, T, pose, xyz[point], rows["uv_px"][row], rows["sigma_px"][row]).chi2
+        res = compute_residuals(submap.K, T, pose, xyz[point], rows["uv_px"][row], rows["sigma_px"][row])
+        chi2 = res.chi2
+        # The solver threw these points away. Linearised there, they would be the death of it: they go before that.
+        self._suspects = np.unique(lm[row[np.isinf(chi2) | (res.depth_mu > FAR_MU)]])
         newest = chi2[np.isin(row, entering, assume_unique=True)]
         # Where the pixels are noisier than their sigmas say, the gate opens as much: it is there for outliers.
         noise = max(1.0, float(np.median(chi2)) / MEDIAN_CHI2_2DOF) if len(chi2) else 1.0
@@ -267,6 +272,7 @@ class ISam2SubmapGraph:
         self._gauge: Gauge | None = None
         self._gauge_factors: list[int] = []
         self._holds: dict[int, int] = {}
+        self._suspects: IntArray = np.zeros(0, np.int64)
 
     def _blame(self, failure: SolverFailure, submap: Submap) -> None:
         """Keep the landmark that the solver named out of the next graph, or hold the keyframe that it named."""
@@ -300,7 +306,7 @@ class ISam2SubmapGraph:
         """Batch-optimise what the submap holds, and seed a fresh iSAM2 with the result."""
         poses: Mapping[int, FloatArray] = submap.T_submap_kf
         xyz = submap.landmarks["xyz_mu"]
-        plan = self._ledger.plan(submap, poses, xyz, caution)
+        plan = self._ledger.plan(submap, poses, xyz, caution, strict=False)
         self._hold_loose_pieces(submap, plan)
         batch = self._changes(submap, plan, poses, xyz)
         optimum = optimise_batch(

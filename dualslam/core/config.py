@@ -36,8 +36,11 @@ class GraphConfig(StrictModel):
     max_depth_sigma: float = Field(0.25, gt=0)
     """A landmark enters the graph once its views fix its distance to this relative standard deviation (0.25 is about
     half a degree of parallax at 1 px and a focal length of 700 px); it leaves at twice that."""
+    enter_sigmas: float = Field(6.0, gt=0)
+    """Observations of a landmark that is new to the graph must fit within so many sigmas: two views of which one is
+    wrong throw their point behind a camera, and the solver fails."""
     insert_sigmas: float = Field(25.0, gt=0)
-    """Observations further than this from where the map puts them (in sigmas) are refused: no solver makes use of them."""
+    """Observations of a landmark that is in the graph are refused only beyond this; the robust kernel has the rest."""
     min_ties: int = Field(6, ge=3)
     """Keyframes tied to the graph by fewer landmarks are held at their pose by a loose prior, until they have more."""
     read_window: int = Field(20, ge=0)
