@@ -57,7 +57,7 @@ def test_degenerate_landmarks_stay_out_until_they_can_be_borne():
 
 
 def test_non_finite_points_stay_out():
-    feeder, graph, rest = start()
+    feeder, graph, _ = start()
     submap = feeder.submap
     bad = add_landmark(submap, submap.T_submap_kf[1][:3, 3] + [0.0, 0.0, 1.0], [1, 2])
     submap.landmarks["xyz_mu"][bad] = np.nan
