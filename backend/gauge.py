@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeGuard
 
 import numpy as np
 
@@ -79,7 +80,7 @@ def choose_gauge(submap: Submap, current: Gauge | None, pose: Callable[[int], Fl
     def distance(k: int) -> float:
         return float(np.linalg.norm(pose(k)[:3, 3] - T_first[:3, 3]))
 
-    def serves(k: int | None) -> bool:
+    def serves(k: int | None) -> TypeGuard[int]:
         return k is not None and k in live and k != first
 
     if current is not None and first == mine[0]:

@@ -77,7 +77,15 @@ class Ledger:
         mask[submap.observations["landmark"][: len(inside)][inside]] = True
         return mask
 
-    def plan(self, submap: Submap, poses: Mapping[int, FloatArray], xyz_mu: FloatArray, caution: float = 1.0) -> Plan:
+    def plan(
+        self,
+        submap: Submap,
+        poses: Mapping[int, FloatArray],
+        xyz_mu: FloatArray,
+        caution: float = 1.0,
+        strict: bool = True,
+        suspects: IntArray | None = None,
+    ) -> Plan:
         """Compare the submap with the graph; nothing changes until `commit`.
 
         Parameters
@@ -89,6 +97,10 @@ class Ledger:
             Points to judge by (normally the submap's).
         caution : float
             Above 1 landmarks are asked for that much more certainty.
+        strict : bool
+            Hold the observations of new landmarks to `GraphConfig.enter_sigmas`; False before a batch optimisation.
+        suspects : (S,) int64, optional
+            Landmarks to look at again although nothing of theirs changed.
         """
         self._take_new_rows(submap)
         obs = submap.observations
@@ -100,13 +112,16 @@ class Ledger:
         fresh = self._n_planned + np.flatnonzero(alive[self._n_planned :])
         touched = take_mask(lm[fresh], n_landmarks)
         lost = take_mask(lm[died], n_landmarks)
+        if suspects is not None:
+            lost[suspects] = True
         if self._n_planned:
             self.banned.difference_update(lm[fresh].tolist())
         known = take_mask(lm[inside], n_landmarks)
         allowed = touched.copy()
         allowed[list(self.banned)] = False
         row = np.flatnonzero(alive & np.where(inside, lost[lm], allowed[lm]))
-        fits, certain = self._judge(submap, poses, xyz_mu, row, inside, known & ~lost, n_landmarks, known, caution)
+        gate = np.where(known | (not strict), self._config.insert_sigmas, self._config.enter_sigmas)
+        fits, certain = self._judge(submap, poses, xyz_mu, row, inside, known, known & ~lost, gate, caution)
 
         leaving = died | (inside & known[lm] & ~certain[lm] & lost[lm])
         candidate = ~inside[row]
@@ -152,9 +167,9 @@ class Ledger:
         xyz_mu: FloatArray,
         row: IntArray,
         inside: BoolArray,
-        trusted: BoolArray,
-        n_landmarks: int,
         known: BoolArray,
+        trusted: BoolArray,
+        gate_sigmas: FloatArray,
         caution: float,
     ) -> tuple[BoolArray, BoolArray]:
         """Return which of the rows fit, and which landmarks are certain enough (`trusted` ones are not asked)."""
@@ -163,7 +178,7 @@ class Ledger:
         point = submap.observations["landmark"][row]
         sigma = self.rows["sigma_px"][row]
         res = compute_residuals(submap.K, T, pose, xyz_mu[point], self.rows["uv_px"][row], sigma)
-        fits = np.where(inside[row], res.depth_mu > MIN_DEPTH_MU, res.chi2 < self._config.insert_sigmas**2)
+        fits = np.where(inside[row], res.depth_mu > MIN_DEPTH_MU, res.chi2 < gate_sigmas[point] ** 2)
         asked = fits & ~trusted[point]
         certain = trusted.copy()
         names, index = np.unique(point[asked], return_inverse=True)

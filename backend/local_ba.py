@@ -1,8 +1,9 @@
 """Batch bundle adjustment of a few keyframes and their points: initialisation, seams, windows.
 
-GTSAM's Levenberg-Marquardt with the points eliminated first. A vectorised numpy solver with a Schur complement was written
-beside it and thrown away: at 20 free and 5 fixed keyframes with 6,200 observations it took 14.4 ms an iteration against
-13.5 (and 3 ms to build the graph), at 8 and 2 with 2,500 observations 4.5 against 5.2. Both found the same optimum.
+GTSAM's Levenberg-Marquardt with the points eliminated first. A vectorised numpy solver with a Schur complement was
+written beside it and thrown away: at 20 free and 5 fixed keyframes with 6,200 observations it took 14.4 ms an iteration
+against 13.5 (and 3 ms to build the graph), at 8 and 2 with 2,500 observations 4.5 against 5.2. Both found the same
+optimum.
 """
 
 from __future__ import annotations

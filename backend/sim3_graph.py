@@ -1,8 +1,8 @@
 """Similarities between keyframes and submaps: a pose graph over Sim(3), solved in batch.
 
-Here the drift of a monocular map's scale is undone: recovery links and loop closures are edges, and what the optimum says
-about keyframes is handed back to their submaps. Links may be wrong, so an edge can be marked as doubtful; graduated
-non-convexity then decides which of them to believe.
+Here the drift of a monocular map's scale is undone: recovery links and loop closures are edges, and what the optimum
+says about keyframes is handed back to their submaps. Links may be wrong, so an edge can be marked as doubtful;
+graduated non-convexity then decides which of them to believe.
 """
 
 from __future__ import annotations

@@ -32,6 +32,11 @@ logger = logging.getLogger(__name__)
 HOLD_ROTATION_RAD, HOLD_TRANSLATION_MU = 0.01, 0.02
 """Sigmas of the loose prior that holds a keyframe with too few ties where it is."""
 REBUILD_ATTEMPTS = 8
+RELINEARISE_EVERY = 3
+MISFIT_CHI2 = 1.2
+"""Each third update relinearises, and each that follows one whose newest observations fit worse than this."""
+FAR_MU = 200.0
+"""A point this far from its camera (the median initial depth is 1) is looked at again before the next solution."""
 MEDIAN_CHI2_2DOF = 1.386
 
 
@@ -68,8 +73,13 @@ class ISam2SubmapGraph:
         self._noise = PixelNoise(config.robust_k)
         self._ledger = Ledger(config)
         self._forced_holds: set[int] = set()
+        self._solver: IncrementalSolver | None = None
+        self._gauge: Gauge | None = None
+        self._gauge_factors: list[int] = []
+        self._holds: dict[int, int] = {}
+        self._suspects: IntArray = np.zeros(0, np.int64)
         self._n_updates = 0
-        self._reset()
+        self._misfit = False
 
     # --- the SubmapGraph protocol
 
@@ -90,7 +100,7 @@ class ISam2SubmapGraph:
             logger.info("submap %d changed its gauge: rebuilding its graph", submap.id)
             return self._remake(submap, start, rebuilt=True)
         try:
-            plan = self._ledger.plan(submap, submap.T_submap_kf, submap.landmarks["xyz_mu"])
+            plan = self._ledger.plan(submap, submap.T_submap_kf, submap.landmarks["xyz_mu"], suspects=self._suspects)
             changes = self._changes(submap, plan, submap.T_submap_kf, submap.landmarks["xyz_mu"])
             self._solve(self._solver, submap, plan, changes)
             self._n_updates += 1
@@ -175,7 +185,11 @@ class ISam2SubmapGraph:
 
         wanted = (set(plan.weak_keyframes.tolist()) | self._forced_holds) & submap.keyframes.keys()
         wanted.discard(gauge.first)
-        if gauge.second in wanted and self._n_rows(submap, plan, gauge.second) >= self._config.min_ties:
+        if (
+            gauge.second is not None
+            and gauge.second in wanted
+            and self._n_rows(submap, plan, gauge.second) >= self._config.min_ties
+        ):
             wanted.discard(gauge.second)  # the baseline gives it its scale, so that landmarks of two views tie it
         remove += [factor for k, factor in self._holds.items() if k not in wanted]
         new_holds = sorted(wanted - self._holds.keys())
@@ -196,7 +210,8 @@ class ISam2SubmapGraph:
     def _solve(self, solver: IncrementalSolver, submap: Submap, plan: Plan, changes: _Changes) -> None:
         """Let the solver take the changes in, and note the factor indices that it gives."""
         newest = list(submap.keyframes)[-N_LAST:]
-        indices = solver.update(changes.graph, changes.values, changes.remove, newest)
+        due = self._n_updates % RELINEARISE_EVERY == 0 or self._misfit
+        indices = solver.update(changes.graph, changes.values, changes.remove, newest, due)
         projections = len(indices) - len(changes.order)
         holds = projections - len(changes.new_holds)
         if changes.gauge is not self._gauge:
@@ -243,8 +258,15 @@ class ISam2SubmapGraph:
         T, xyz = self._solver.estimate(keyframes, landmarks, everything)
 
         point, pose = (np.cumsum(seen) - 1)[lm[row]], np.searchsorted(keyframes, kf[row])
-        chi2 = compute_residuals(submap.K, T, pose, xyz[point], rows["uv_px"][row], rows["sigma_px"][row]).chi2
+        res = compute_residuals(submap.K, T, pose, xyz[point], rows["uv_px"][row], rows["sigma_px"][row])
+        chi2 = res.chi2
+        # The solver threw these points away. Linearised there, they would be the death of it: they go before that.
+        self._suspects = np.unique(lm[row[np.isinf(chi2) | (res.depth_mu > FAR_MU)]])
         newest = chi2[np.isin(row, entering, assume_unique=True)]
+        chi2_newest = (
+            float(np.minimum(newest, self._config.insert_sigmas**2).mean() / 2) if len(newest) else float("nan")
+        )
+        self._misfit = chi2_newest > MISFIT_CHI2
         # Where the pixels are noisier than their sigmas say, the gate opens as much: it is there for outliers.
         noise = max(1.0, float(np.median(chi2)) / MEDIAN_CHI2_2DOF) if len(chi2) else 1.0
         outliers = row[chi2 > self._config.outlier_chi2 * noise]
@@ -254,7 +276,7 @@ class ISam2SubmapGraph:
             landmark_ids=landmarks,
             xyz_mu=xyz,
             outlier_rows=np.union1d(outliers, plan.refused) if plan is not None else outliers,
-            chi2_newest=float(newest.mean() / 2) if len(newest) else float("nan"),
+            chi2_newest=chi2_newest,
             rebuilt=rebuilt,
             seconds=time.perf_counter() - start,
         )
@@ -262,11 +284,9 @@ class ISam2SubmapGraph:
     # --- starting again
 
     def _reset(self) -> None:
-        self._solver: IncrementalSolver | None = None
+        self._solver, self._gauge, self._gauge_factors, self._holds = None, None, [], {}
+        self._suspects = np.zeros(0, np.int64)
         self._ledger.clear()
-        self._gauge: Gauge | None = None
-        self._gauge_factors: list[int] = []
-        self._holds: dict[int, int] = {}
 
     def _blame(self, failure: SolverFailure, submap: Submap) -> None:
         """Keep the landmark that the solver named out of the next graph, or hold the keyframe that it named."""
@@ -300,7 +320,7 @@ class ISam2SubmapGraph:
         """Batch-optimise what the submap holds, and seed a fresh iSAM2 with the result."""
         poses: Mapping[int, FloatArray] = submap.T_submap_kf
         xyz = submap.landmarks["xyz_mu"]
-        plan = self._ledger.plan(submap, poses, xyz, caution)
+        plan = self._ledger.plan(submap, poses, xyz, caution, strict=False)
         self._hold_loose_pieces(submap, plan)
         batch = self._changes(submap, plan, poses, xyz)
         optimum = optimise_batch(

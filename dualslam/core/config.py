@@ -132,8 +132,11 @@ class GraphConfig(StrictModel):
     """Keyframes that must see a landmark before it enters the graph: two views fit almost any pair of poses."""
     young_keyframes: int = Field(5, ge=2)
     """Up to so many keyframes two views are enough, or there would be no graph to start with."""
+    enter_sigmas: float = Field(6.0, gt=0)
+    """Observations of a landmark that is new to the graph must fit within so many sigmas: two views of which one is
+    wrong throw their point behind a camera, and the solver fails."""
     insert_sigmas: float = Field(25.0, gt=0)
-    """Observations further than this from where the map puts them (in sigmas) are refused: no solver makes use of them."""
+    """Observations of a landmark that is in the graph are refused only beyond this; the robust kernel has the rest."""
     min_ties: int = Field(6, ge=3)
     """Keyframes tied to the graph by fewer landmarks are held at their pose by a loose prior, until they have more."""
     read_window: int = Field(20, ge=0)

@@ -1,4 +1,4 @@
-"""A submap: keyframes and landmarks in one local frame, as numpy arrays. The source of truth that graphs are made from."""
+"""A submap: keyframes and landmarks in one local frame, as numpy arrays: the truth that graphs are made from."""
 
 from __future__ import annotations
 

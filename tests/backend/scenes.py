@@ -86,7 +86,7 @@ def make_features(uv: FloatArray, sigma: FloatArray, octave: IntArray | None = N
 class Feeder:
     """Plays a tracker: puts a scene's keyframes into a submap one by one, from noisy guesses.
 
-    A point becomes a landmark when the second keyframe sees it, at its true place but for `point_noise` of its distance.
+    A point becomes a landmark when the second keyframe sees it, in its true place but for `point_noise` of its depth.
     """
 
     def __init__(self, scene: Scene, seed: int = 1, pose_noise: float = 0.001, point_noise: float = 0.01) -> None:
