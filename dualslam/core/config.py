@@ -18,7 +18,7 @@ class FrontendConfig(StrictModel):
 
     name: str = "orb"
     """Which front end: `orb`, or one that another package offers as an entry point of `dualslam.frontends`."""
-    n_features: int = Field(1500, ge=50, le=20000)
+    n_features: int = Field(1000, ge=50, le=20000)
     """Keypoints per image."""
     options: dict[str, Any] = Field(default_factory=dict)
     """Settings of the chosen front end alone; it checks their names itself."""
