@@ -1,0 +1,1 @@
+"""Lie groups, alignment, triangulation, two-view geometry and pose refinement, in numpy."""

@@ -1,0 +1,308 @@
+"""Projection by a pinhole camera with its Jacobians, and the robust refinement of a pose against known points.
+
+Perturbations of a pose are left ones: ``T_cam_w <- exp(xi) @ T_cam_w``, xi = (rotation, translation) in the camera
+frame. As ``T_w_cam`` is then multiplied by ``exp(-xi)`` on its right, a covariance of xi is at once the covariance of
+``T_w_cam`` in the camera's own frame, which is what GTSAM means by the covariance of a ``Pose3``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dualslam.core.geometry import se3
+from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
+
+CHI2_95_2DOF = 5.991
+"""95 % quantile of chi-square with two degrees of freedom: gate of a squared whitened pixel residual."""
+MIN_DEPTH = 1e-6
+"""Points nearer to the image plane (or behind it) do not project."""
+
+MIN_EIGENVALUE = 1e-11
+"""Of the Hessian scaled to unit diagonal: below, rounding decides the pose (squared condition of the Jacobian)."""
+
+
+def project_points(K: FloatArray, T_cam_w: FloatArray, xyz: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Project points into a pinhole image.
+
+    Parameters
+    ----------
+    K : (3, 3)
+        Intrinsics, pixels; zero skew.
+    T_cam_w : (4, 4)
+    xyz : (N, 3)
+        Points in w.
+
+    Returns
+    -------
+    uv : (N, 2)
+        Pixels; NaN where the point is not in front of the camera.
+    depth : (N,)
+        z in the camera frame.
+    """
+    p = np.asarray(xyz, np.float64) @ T_cam_w[:3, :3].T + T_cam_w[:3, 3]
+    depth = p[:, 2]
+    z = np.where(depth > MIN_DEPTH, depth, np.nan)
+    uv = p[:, :2] / z[:, None]
+    uv *= (K[0, 0], K[1, 1])
+    uv += (K[0, 2], K[1, 2])
+    return uv, depth
+
+
+def projection_jacobians(K: FloatArray, T_cam_w: FloatArray, xyz: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return derivatives of the pixels of `project_points`.
+
+    Returns
+    -------
+    J_pose : (N, 2, 6)
+        With respect to xi of ``exp(xi) @ T_cam_w``, rotation first.
+    J_point : (N, 2, 3)
+        With respect to the point in w.
+    """
+    p = np.asarray(xyz, np.float64) @ T_cam_w[:3, :3].T + T_cam_w[:3, 3]
+    iz = 1.0 / p[:, 2]
+    x, y = p[:, 0] * iz, p[:, 1] * iz
+    J_pose = np.zeros((len(p), 2, 6))
+    J_pose[:, 0, 0], J_pose[:, 0, 1], J_pose[:, 0, 2] = -x * y, 1 + x * x, -y
+    J_pose[:, 1, 0], J_pose[:, 1, 1], J_pose[:, 1, 2] = -1 - y * y, x * y, x
+    J_pose[:, 0, 3], J_pose[:, 0, 5] = iz, -x * iz
+    J_pose[:, 1, 4], J_pose[:, 1, 5] = iz, -y * iz
+    J_pose *= np.array([[K[0, 0]], [K[1, 1]]])
+    return J_pose, J_pose[:, :, 3:] @ T_cam_w[:3, :3]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseEstimate:
+    """A pose with what supports it.
+
+    Attributes
+    ----------
+    T_cam_w : (4, 4)
+    covariance : (6, 6)
+        Of xi in ``exp(xi) @ T_cam_w``: rotation (rad), translation (unit of the points), camera frame.
+    inliers : (N,) bool
+    chi2 : (N,)
+        Squared whitened residual of every point; infinite where it is not in front of the camera.
+    n_inliers : int
+    n_iterations : int
+        Gauss-Newton steps taken.
+    """
+
+    T_cam_w: FloatArray
+    covariance: FloatArray
+    inliers: BoolArray
+    chi2: FloatArray
+    n_inliers: int
+    n_iterations: int
+
+
+class _PoseProblem:
+    """Buffers and constants of one refinement. Residuals are whitened: pixels over sigma."""
+
+    def __init__(self, K: FloatArray, xyz: FloatArray, uv: FloatArray, sigma: FloatArray) -> None:
+        n = len(xyz)
+        self.xyz = np.ascontiguousarray(xyz.T)
+        focal = np.array([[K[0, 0]], [K[1, 1]]])
+        self.whiten = focal / sigma
+        self.target = (uv.T - np.array([[K[0, 2]], [K[1, 2]]])) / focal
+        # Rows: six columns of the Jacobian and the residual; the second axis: u and v of the points.
+        self.rows = np.zeros((7, 2, n))
+        self.residual = np.empty((2, n))
+        self.xy = np.empty((2, n))
+        self.inverse_depth = np.empty(n)
+
+    def evaluate(self, T: FloatArray) -> FloatArray:
+        """Set residuals at `T` and return chi2 (N,), infinite behind the camera."""
+        p = T[:3, :3] @ self.xyz
+        p += T[:3, 3:]
+        z = p[2]
+        front = z > MIN_DEPTH
+        all_front = bool(front.all())
+        if not all_front:
+            z = np.where(front, z, 1.0)
+        np.divide(1.0, z, out=self.inverse_depth)
+        np.multiply(p[:2], self.inverse_depth, out=self.xy)
+        np.subtract(self.xy, self.target, out=self.residual)
+        self.residual *= self.whiten
+        chi2: FloatArray = np.einsum("ij,ij->j", self.residual, self.residual)
+        if not all_front:
+            chi2[~front] = np.inf
+        return chi2
+
+    def normal_equations(self, weight: FloatArray) -> FloatArray:
+        """Return (7, 7): J'WJ bordered by J'Wr, for per-point weights, at the pose last evaluated."""
+        A, iz, (x, y) = self.rows, self.inverse_depth, self.xy
+        A[0, 0] = A[1, 1] = x
+        A[0, 0] *= y  # xy
+        A[1, 1] = A[0, 0]
+        np.negative(A[0, 0], out=A[0, 0])
+        np.multiply(x, x, out=A[1, 0])
+        A[1, 0] += 1.0
+        np.multiply(y, y, out=A[0, 1])
+        A[0, 1] += 1.0
+        np.negative(A[0, 1], out=A[0, 1])
+        np.negative(y, out=A[2, 0])
+        A[2, 1] = x
+        A[3, 0] = A[4, 1] = iz
+        np.multiply(self.xy, iz, out=A[5])
+        np.negative(A[5], out=A[5])
+        root = np.sqrt(weight)
+        A[:6] *= self.whiten * root
+        np.multiply(self.residual, root, out=A[6])
+        flat = A.reshape(7, -1)
+        return np.asarray(flat @ flat.T, np.float64)
+
+
+def _exp(xi: list[float]) -> FloatArray:
+    """Return `se3.exp` of one tangent vector in plain floats: five times faster than the vectorised one."""
+    a, b, c, u, v, w = xi
+    theta2 = a * a + b * b + c * c
+    if theta2 < 1e-8:
+        k1, k2, k3 = 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0
+    else:
+        theta = math.sqrt(theta2)
+        k1, k2 = math.sin(theta) / theta, 0.5 * (math.sin(0.5 * theta) / (0.5 * theta)) ** 2
+        k3 = (1.0 - k1) / theta2
+    wx, wy, wz = b * w - c * v, c * u - a * w, a * v - b * u
+    return np.array(
+        [
+            [1 - k2 * (b * b + c * c), k2 * a * b - k1 * c, k2 * a * c + k1 * b, u + k2 * wx + k3 * (b * wz - c * wy)],
+            [k2 * a * b + k1 * c, 1 - k2 * (a * a + c * c), k2 * b * c - k1 * a, v + k2 * wy + k3 * (c * wx - a * wz)],
+            [k2 * a * c - k1 * b, k2 * b * c + k1 * a, 1 - k2 * (a * a + b * b), w + k2 * wz + k3 * (a * wy - b * wx)],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def _add_prior(G: FloatArray, T: FloatArray, T_prior: FloatArray, information: FloatArray) -> None:
+    """Add to the bordered normal equations the prior ``log(T T_prior^-1) ~ N(0, information^-1)``."""
+    residual = se3.log(T @ se3.inverse(T_prior))
+    J = se3.left_jacobian_inverse(residual)
+    WJ = information @ J
+    G[:6, :6] += J.T @ WJ
+    G[:6, 6] += WJ.T @ residual
+
+
+def refine_pose(
+    K: FloatArray,
+    T_cam_w: FloatArray,
+    xyz: FloatArray,
+    uv: FloatArray,
+    sigma: FloatArray,
+    *,
+    prior_information: FloatArray | None = None,
+    min_inliers: int = 6,
+    n_rounds: int = 4,
+    n_iterations: int = 5,
+    chi2_gate: float = CHI2_95_2DOF,
+    tolerance: float = 1e-6,
+) -> PoseEstimate | Failure:
+    """Refine a camera pose against known points, with outliers.
+
+    Rounds of Gauss-Newton with Huber weights; between rounds every point is judged anew by its chi-square, so that a
+    point given up at a bad pose comes back at a better one. (The scheme of ORB-SLAM's ``PoseOptimization``.) It ends
+    early once a round neither moves the pose nor changes the set of inliers.
+
+    Parameters
+    ----------
+    K : (3, 3)
+        Intrinsics, pixels; zero skew.
+    T_cam_w : (4, 4)
+        Where to start: usually the motion model's prediction.
+    xyz : (N, 3)
+        Points in w.
+    uv : (N, 2)
+        Their rectified pixels.
+    sigma : (N,)
+        Standard deviation of each pixel coordinate, pixels.
+    prior_information : (6, 6), optional
+        Inverse covariance of xi of the starting pose; without it the start is only a start.
+    min_inliers : int
+        Fewer are a failure.
+    n_rounds, n_iterations : int
+        Rounds, and steps in each.
+    chi2_gate : float
+        Of the squared whitened residual; its root is the Huber threshold too.
+    tolerance : float
+        Decrease of the summed chi-square promised by a step, under which a round has converged. Unit-free: its root is
+        the length of the step in standard deviations of the pose.
+
+    Returns
+    -------
+    PoseEstimate or Failure
+        `TOO_FEW_MATCHES`, `TOO_FEW_INLIERS`, or `DEGENERATE` where the points do not fix the pose.
+    """
+    n = len(xyz)
+    if n < min_inliers:
+        return Failure(FailureReason.TOO_FEW_MATCHES, f"{n} points, {min_inliers} needed", {"n": n})
+    problem = _PoseProblem(K, np.asarray(xyz), np.asarray(uv), np.asarray(sigma))
+    T = T_prior = np.array(T_cam_w, np.float64)
+    chi2 = problem.evaluate(T)
+    inliers = np.isfinite(chi2)  # the first round trusts Huber alone
+    n_steps = 0
+    for _ in range(n_rounds):
+        largest_gain = 0.0
+        for _ in range(n_iterations):
+            G = problem.normal_equations(_huber_weights(chi2, chi2_gate, inliers))
+            if prior_information is not None:
+                _add_prior(G, T, T_prior, prior_information)
+            step = _solve(G)
+            if step is None:
+                return Failure(FailureReason.DEGENERATE, f"{int(inliers.sum())} of {n} points do not fix the pose")
+            T = _exp(step.tolist()) @ T
+            chi2 = problem.evaluate(T)
+            n_steps += 1
+            gain = -float(step @ G[:6, 6])
+            largest_gain = max(largest_gain, gain)
+            if gain < tolerance:
+                break
+        previous, inliers = inliers, chi2 < chi2_gate
+        n_inliers = int(np.count_nonzero(inliers))
+        if n_inliers < min_inliers:
+            numbers = {"n": float(n), "n_inliers": float(n_inliers)}
+            return Failure(FailureReason.TOO_FEW_INLIERS, f"{n_inliers} of {n} points, {min_inliers} needed", numbers)
+        if largest_gain < tolerance and np.array_equal(previous, inliers):
+            break
+    return _finish(problem, T, T_prior, prior_information, chi2, inliers, n_steps)
+
+
+def _huber_weights(chi2: FloatArray, gate: float, inliers: BoolArray) -> FloatArray:
+    """Return Huber's weights, threshold ``sqrt(gate)``, zero for outliers."""
+    weight: FloatArray = np.sqrt(gate / np.maximum(chi2, gate))
+    weight *= inliers
+    return weight
+
+
+def _solve(G: FloatArray) -> FloatArray | None:
+    """Return the Gauss-Newton step of bordered normal equations, or None where they are singular."""
+    try:
+        step = np.asarray(np.linalg.solve(G[:6, :6], -G[:6, 6]), np.float64)
+    except np.linalg.LinAlgError:
+        return None
+    return step if math.isfinite(float(step.sum())) else None
+
+
+def _finish(
+    problem: _PoseProblem,
+    T: FloatArray,
+    T_prior: FloatArray,
+    prior_information: FloatArray | None,
+    chi2: FloatArray,
+    inliers: BoolArray,
+    n_steps: int,
+) -> PoseEstimate | Failure:
+    """Compute the covariance at the final pose and pack the result."""
+    G = problem.normal_equations(inliers.astype(np.float64))
+    if prior_information is not None:
+        _add_prior(G, T, T_prior, prior_information)
+    H = G[:6, :6]
+    scale = 1.0 / np.sqrt(np.maximum(H.diagonal(), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(H * scale * scale[:, None])
+    if not eigenvalues[0] > MIN_EIGENVALUE:
+        return Failure(FailureReason.DEGENERATE, f"{int(inliers.sum())} inliers do not fix the pose")
+    half = vectors / np.sqrt(eigenvalues) * scale[:, None]
+    T[:3, :3] += 0.5 * T[:3, :3] @ (np.eye(3) - T[:3, :3].T @ T[:3, :3])  # one Newton step back onto SO(3)
+    return PoseEstimate(T, half @ half.T, inliers, chi2, int(np.count_nonzero(inliers)), n_steps)
