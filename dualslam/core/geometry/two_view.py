@@ -1,0 +1,229 @@
+"""Geometry of two views: epipolar and homography errors, and the poses that an essential matrix or homography allows.
+
+Everywhere ``T_b_a`` takes camera a to camera b, ``x_b' E x_a == 0``, ``u_b ~ H u_a``, and pixels are rectified (u, v).
+Sources: R. Hartley and A. Zisserman, "Multiple View Geometry", 2004 (HZ); Y. Ma et al., "An Invitation to 3-D Vision",
+2004 (Ma), section 5.3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.core.geometry import se3, so3
+from dualslam.core.geometry.triangulation import TwoViewPoints, triangulate_two_view
+from dualslam.core.types import BoolArray, FloatArray, IntArray
+
+CHI2_95_2DOF = 5.991
+MIN_SINGULAR_GAP = 1e-7
+"""Difference of the outer singular values of a homography (middle one 1) below which it is a rotation: |t| / d."""
+
+
+def _homogeneous(uv: FloatArray) -> FloatArray:
+    """Return (3, N) homogeneous pixels."""
+    return np.vstack([uv.T, np.ones(len(uv))])
+
+
+def essential_from_pose(T_b_a: FloatArray) -> FloatArray:
+    """Return E = hat(t) R, (3, 3), with ``x_b' E x_a == 0`` for normalised image points. HZ, eq. (9.12)."""
+    return so3.hat(T_b_a[:3, 3]) @ T_b_a[:3, :3]
+
+
+def fundamental_from_pose(K: FloatArray, T_b_a: FloatArray) -> FloatArray:
+    """Return F, (3, 3), with ``u_b' F u_a == 0`` for pixels of two images with the same K."""
+    K_inv = np.linalg.inv(K)
+    return np.asarray(K_inv.T @ essential_from_pose(T_b_a) @ K_inv, np.float64)
+
+
+def homography_from_pose(K: FloatArray, T_b_a: FloatArray, normal_a: FloatArray, distance: float) -> FloatArray:
+    """Return H, (3, 3), of the plane ``normal_a' X_a == distance``: K (R + t n' / d) K^-1. Ma, eq. (5.66)."""
+    plane = T_b_a[:3, :3] + np.outer(T_b_a[:3, 3], normal_a) / distance
+    return np.asarray(K @ plane @ np.linalg.inv(K), np.float64)
+
+
+def epipolar_distance(F: FloatArray, uv_a: FloatArray, uv_b: FloatArray) -> FloatArray:
+    """Return squared distances of matched pixels to each other's epipolar lines.
+
+    Parameters
+    ----------
+    F : (3, 3)
+    uv_a, uv_b : (N, 2)
+
+    Returns
+    -------
+    (N, 2), px^2
+        In image a, in image b.
+    """
+    a, b = _homogeneous(uv_a), _homogeneous(uv_b)
+    line_b, line_a = F @ a, F.T @ b
+    c2 = np.einsum("ij,ij->j", b, line_b) ** 2
+    norm_a, norm_b = line_a[0] ** 2 + line_a[1] ** 2, line_b[0] ** 2 + line_b[1] ** 2
+    return np.asarray(np.stack([c2 / np.maximum(norm_a, 1e-300), c2 / np.maximum(norm_b, 1e-300)], 1), np.float64)
+
+
+def sampson_error(F: FloatArray, uv_a: FloatArray, uv_b: FloatArray) -> FloatArray:
+    """Return the first-order squared geometric error, (N,), px^2. HZ, eq. (11.9).
+
+    It is about the summed squared pixel error of both images at the best 3D point: chi-square, one degree of freedom.
+    """
+    a, b = _homogeneous(uv_a), _homogeneous(uv_b)
+    line_b, line_a = F @ a, F.T @ b
+    c = np.einsum("ij,ij->j", b, line_b)
+    gradient2 = line_a[0] ** 2 + line_a[1] ** 2 + line_b[0] ** 2 + line_b[1] ** 2
+    return np.asarray(c * c / np.maximum(gradient2, 1e-300), np.float64)
+
+
+def homography_transfer_error(H_b_a: FloatArray, uv_a: FloatArray, uv_b: FloatArray) -> FloatArray:
+    """Return squared transfer errors of a homography in both directions.
+
+    Parameters
+    ----------
+    H_b_a : (3, 3)
+        Pixels of a to pixels of b.
+    uv_a, uv_b : (N, 2)
+
+    Returns
+    -------
+    (N, 2), px^2
+        In image a (b transferred back), in image b. Infinite where a pixel is sent to infinity.
+    """
+    forward, back = H_b_a @ _homogeneous(uv_a), np.linalg.inv(H_b_a) @ _homogeneous(uv_b)
+    errors = []
+    for moved, target in ((back, uv_a), (forward, uv_b)):
+        w = np.where(moved[2] == 0, np.nan, moved[2])
+        error2 = ((moved[:2] / w - target.T) ** 2).sum(0)
+        errors.append(np.where(np.isnan(error2), np.inf, error2))
+    return np.stack(errors, 1)
+
+
+def decompose_essential(E: FloatArray) -> FloatArray:
+    """Return the four poses that an essential matrix allows. HZ, result 9.19.
+
+    Returns
+    -------
+    T_b_a : (4, 4, 4)
+        Translations of length 1: two rotations, each with both signs of the translation.
+    """
+    U, _, Vt = np.linalg.svd(E)
+    U = U * np.sign(np.linalg.det(U))
+    Vt = Vt * np.sign(np.linalg.det(Vt))
+    W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    R = np.array([U @ W @ Vt, U @ W.T @ Vt])
+    t = np.array([U[:, 2], -U[:, 2]])
+    return se3.from_parts(R[[0, 0, 1, 1]], t[[0, 1, 0, 1]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HomographyPoses:
+    """The poses that a homography of a plane allows, M of them: four, or one where it is a mere rotation.
+
+    Attributes
+    ----------
+    T_b_a : (M, 4, 4)
+        Translations in units of the distance of the plane from camera a.
+    normal_a : (M, 3)
+        Unit normal, ``normal_a' X_a`` is the distance: it points away from camera a where the plane is in front of it.
+    """
+
+    T_b_a: FloatArray
+    normal_a: FloatArray
+
+
+def decompose_homography(H_b_a: FloatArray, K: FloatArray) -> HomographyPoses:
+    """Return the poses and planes that a homography of pixels allows. Ma, section 5.3.3.
+
+    The sign of `H_b_a` is settled by its middle singular value being that of a plane seen from one side by both cameras
+    (positive determinant). Two of the four are left by the positive depth of the points, which `cheirality_vote` asks.
+
+    Parameters
+    ----------
+    H_b_a : (3, 3)
+        Pixels of a to pixels of b, any scale, not singular.
+    K : (3, 3)
+    """
+    H = np.linalg.inv(K) @ H_b_a @ K
+    H = H * np.sign(np.linalg.det(H))
+    H = H / np.linalg.svd(H, compute_uv=False)[1]
+    _, s, Vt = np.linalg.svd(H)
+    if s[0] - s[2] < MIN_SINGULAR_GAP:
+        R = so3.orthonormalise(H)
+        return HomographyPoses(se3.from_parts(R, np.zeros(3))[None], np.array([[0.0, 0.0, 1.0]]))
+    # Rotations of the right singular vectors with positive determinant leave all formulas as they are.
+    v1, v2, v3 = Vt * np.sign(np.linalg.det(Vt))
+    low, high = np.sqrt(max(1.0 - s[2] ** 2, 0.0)), np.sqrt(max(s[0] ** 2 - 1.0, 0.0))
+    span = np.sqrt(s[0] ** 2 - s[2] ** 2)
+    poses, normals = [], []
+    for u in ((low * v1 + high * v3) / span, (low * v1 - high * v3) / span):
+        normal = np.cross(v2, u)
+        U = np.stack([v2, u, normal], 1)
+        Hv, Hu = H @ v2, H @ u
+        R = so3.orthonormalise(np.stack([Hv, Hu, np.cross(Hv, Hu)], 1) @ U.T)
+        t = (H - R) @ normal
+        poses += [se3.from_parts(R, t), se3.from_parts(R, -t)]
+        normals += [normal, -normal]
+    return HomographyPoses(np.array(poses), np.array(normals))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CheiralityVote:
+    """Which of several candidate poses puts the most points in front of both cameras.
+
+    Attributes
+    ----------
+    counts : (M,) int64
+        Good points of each candidate.
+    best : int
+        Index of the winner (the first of equals).
+    T_b_a : (4, 4)
+        The winner.
+    points : TwoViewPoints
+        Triangulated with the winner, in the frame of camera a.
+    good : (N,) bool
+        Of the winner: in front of both cameras and within the gate in both images.
+    """
+
+    counts: IntArray
+    best: int
+    T_b_a: FloatArray
+    points: TwoViewPoints
+    good: BoolArray
+
+    @property
+    def runner_up_ratio(self) -> float:
+        """Good points of the second best candidate over those of the best: near 1 the choice is ambiguous."""
+        ordered = np.sort(self.counts)
+        return float(ordered[-2] / max(int(ordered[-1]), 1)) if len(ordered) > 1 else 0.0
+
+
+def cheirality_vote(
+    T_b_a: FloatArray,
+    uv_a: FloatArray,
+    uv_b: FloatArray,
+    K: FloatArray,
+    *,
+    sigma_px: float | FloatArray = 1.0,
+    chi2_gate: float = CHI2_95_2DOF,
+) -> CheiralityVote:
+    """Triangulate the matches with every candidate pose and count the points that are where they can be.
+
+    Parameters
+    ----------
+    T_b_a : (M, 4, 4)
+        Candidates, none with zero translation.
+    uv_a, uv_b : (N, 2)
+    K : (3, 3)
+    sigma_px : float or (N,)
+        Standard deviation of the pixels.
+    chi2_gate : float
+        Of the squared whitened reprojection error in each image.
+    """
+    results = []
+    gate = chi2_gate * np.square(sigma_px)
+    for T in T_b_a:
+        points = triangulate_two_view(uv_a, uv_b, K, np.eye(4), se3.inverse(T))
+        good = (points.depth_a > 0) & (points.depth_b > 0) & (points.error2_a < gate) & (points.error2_b < gate)
+        results.append((points, good))
+    counts = np.array([np.count_nonzero(good) for _, good in results], np.int64)
+    best = int(np.argmax(counts))
+    return CheiralityVote(counts, best, np.array(T_b_a[best]), *results[best])
