@@ -1,0 +1,260 @@
+"""From two submaps that saw the same frames to a verified similarity between them, or to the reason why there is none.
+
+Source: Huang et al., "Dual-SLAM", section II (Map Fusion): ``X' = s R X + T`` by RANSAC with Horn's algorithm over
+3D-3D matches restricted to equal keyframes. The consensus along time, the reprojections and the gates are ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+
+from dualslam.core.config import LinkingConfig
+from dualslam.core.geometry import sim3
+from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
+from dualslam.core.submap import Submap
+from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
+from dualslam.linking import verify
+from dualslam.linking.correspondences import DescriptorMatcher, propose_correspondences
+from dualslam.linking.pairs import PairModel
+from dualslam.linking.timeline import KeyframeVotes, ask_keyframes, find_break, leading_run
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinkEstimate:
+    """A link between two submaps, with what supports it.
+
+    Attributes
+    ----------
+    S_old_new : (4, 4)
+        ``p_old = S_old_new @ p_new``.
+    covariance : (7, 7)
+        Of xi in ``S_old_new @ exp(xi)``: rotation (rad), translation (unit of new), log-scale, in the new map's frame.
+    n_matches, n_inliers : int
+        Pairs that the estimate looked at (seen in the keyframes that it trusts), and those that agree.
+    landmark_pairs : (I, 2) int64
+        Ids of all agreeing landmarks, old and new: duplicates to be merged.
+    agreeing_keyframes : (A,) int64
+        Ids of the shared keyframes that the link stands on, ascending.
+    change_point : int or None
+        First shared keyframe at which the old map no longer fits the link: from there on it is to be by-passed.
+    suspected_onset : int or None
+        The onset that was told or found (the older), from which on no keyframe was trusted.
+    numbers : dict
+        For the event log.
+    """
+
+    S_old_new: FloatArray
+    covariance: FloatArray
+    n_matches: int
+    n_inliers: int
+    landmark_pairs: IntArray
+    agreeing_keyframes: IntArray
+    change_point: int | None
+    suspected_onset: int | None
+    numbers: dict[str, float]
+
+
+def estimate_link(
+    old: Submap,
+    new: Submap,
+    config: LinkingConfig,
+    rng: Generator,
+    suspected_onset: int | None = None,
+    matcher: DescriptorMatcher | None = None,
+) -> LinkEstimate | Failure:
+    """Estimate the similarity between two submaps that share keyframes, and verify it.
+
+    Parameters
+    ----------
+    old : Submap
+        The archived map; its newest part may be corrupted.
+    new : Submap
+        The map that was extended backwards in time over the same frames.
+    config : LinkingConfig
+    rng : numpy.random.Generator
+        The only source of randomness.
+    suspected_onset : int, optional
+        Frame from which on the old map may be corrupted.
+    matcher : DescriptorMatcher, optional
+        How descriptors are compared; without it landmarks are matched by identity alone.
+
+    Returns
+    -------
+    LinkEstimate or Failure
+        `NEEDS_OLDER_KEYFRAMES` where the overlap does not reach far enough into the healthy part of the old map to
+        decide: walk on. All other reasons are refusals of this overlap.
+    """
+    # 1. Which landmarks are the same.
+    pairs = propose_correspondences(old, new, matcher)
+    if len(pairs) < config.min_inliers:
+        return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(pairs)} pairs, {config.min_inliers} needed")
+    # 2. Which keyframes may be trusted: those older than what is suspected, by others or by a tear in the old map.
+    onset = _older(suspected_onset, find_break(old, int(pairs.keyframes[0]), config))
+    has_say = pairs.count_by_keyframe(np.ones(len(pairs.view_pair), bool)) >= config.min_pairs_per_keyframe
+    trusted = has_say & (pairs.keyframes < onset) if onset is not None else has_say
+    if np.count_nonzero(trusted) < config.min_keyframes:
+        return _needs_older(int(np.count_nonzero(trusted)), config, onset)
+    # 3. The similarity on which the oldest of them agree, and how far it holds.
+    model = PairModel(pairs, old, new, config.deformation_sigma)
+    consensus = _oldest_consensus(model, trusted, config, rng, onset)
+    if isinstance(consensus, Failure):
+        return consensus
+    # 4. The gates.
+    refused = _verify(model, old, consensus, config)
+    if refused is not None:
+        return refused
+    return _link(model, consensus, onset, config)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Consensus:
+    """A similarity with the keyframes (K,) and pairs (M,) that it stands on; `seen`: the pairs that it was asked of."""
+
+    estimate: Sim3Estimate
+    votes: KeyframeVotes
+    keyframes: BoolArray
+    seen: BoolArray
+    inliers: BoolArray
+
+
+def _older(a: int | None, b: int | None) -> int | None:
+    """Return the smaller of two frames, None for neither."""
+    known = [x for x in (a, b) if x is not None]
+    return min(known) if known else None
+
+
+def _needs_older(n: int, config: LinkingConfig, onset: int | None, change: int | None = None) -> Failure:
+    """Make the refusal that asks for more keyframes."""
+    before = "" if onset is None else f" older than {onset}"
+    broken = "" if change is None else f", another similarity from {change} on"
+    numbers = {"n_keyframes": float(n)}
+    numbers |= {} if onset is None else {"onset": float(onset)}
+    numbers |= {} if change is None else {"change_point": float(change)}
+    detail = f"{n} keyframes{before} agree, {config.min_keyframes} needed{broken}"
+    return Failure(FailureReason.NEEDS_OLDER_KEYFRAMES, detail, numbers)
+
+
+def _oldest_consensus(
+    model: PairModel, trusted: BoolArray, config: LinkingConfig, rng: Generator, onset: int | None
+) -> _Consensus | Failure:
+    """Find the similarity of the oldest trusted keyframes: where two fit, the older one holds.
+
+    It is estimated on all trusted keyframes; if the oldest of them do not agree with it, or newer ones do not, it is
+    estimated again on fewer, always with the oldest among them, until all that it was estimated on agree.
+    """
+    ids = model.pairs.keyframes
+    rows = np.flatnonzero(trusted)
+    change: int | None = None
+    failure: Failure | None = None
+    while len(rows) >= config.min_keyframes:
+        chosen = np.zeros(len(ids), bool)
+        chosen[rows] = True
+        seen = model.pairs.pairs_seen_in(chosen)
+        estimate = _fit(model, seen, config, rng)
+        if isinstance(estimate, Failure):
+            failure = estimate if failure is None else failure
+            rows = rows[: len(rows) // 2]
+            continue
+        votes = ask_keyframes(model, estimate.S_dst_src, config)
+        agrees = votes.agrees[rows]
+        n_run = leading_run(agrees, config.max_misfits)
+        if n_run == len(rows):
+            return _Consensus(estimate, votes, chosen & votes.agrees, seen, estimate.inliers)
+        if n_run > 0:  # it holds for the oldest: keep those
+            change, rows = int(ids[rows[n_run]]), rows[:n_run]
+        elif agrees.any():  # it is that of newer keyframes: look before them
+            first = int(np.argmax(agrees))
+            change, rows = int(ids[rows[first]]), rows[:first]
+        else:
+            failure = Failure(FailureReason.AGREEMENT, f"none of {len(rows)} keyframes agrees with the similarity")
+            rows = rows[: len(rows) // 2]
+    if change is None and failure is not None:
+        return failure
+    return _needs_older(len(rows), config, onset, change)
+
+
+def _fit(model: PairModel, used: BoolArray, config: LinkingConfig, rng: Generator) -> Sim3Estimate | Failure:
+    """Estimate the similarity from the used pairs; `inliers` of the result are rows of all pairs."""
+    c, rows = model.pairs, np.flatnonzero(used)
+    estimate = estimate_sim3_robust(
+        c.xyz_new[rows],
+        c.xyz_old[rows],
+        model.covariance_new[rows],
+        model.covariance_old[rows],
+        rng,
+        min_inliers=config.min_inliers,
+        max_hypotheses=config.max_hypotheses,
+        chi2_gate=config.pair_chi2,
+        scale_bounds=(1.0 / config.max_scale, config.max_scale),
+    )
+    if isinstance(estimate, Failure):
+        return estimate
+    inliers = np.zeros(len(c), bool)
+    inliers[rows[estimate.inliers]] = True
+    return Sim3Estimate(estimate.S_dst_src, estimate.covariance, inliers, estimate.n_iterations, estimate.chi2_per_dof)
+
+
+def _verify(model: PairModel, old: Submap, consensus: _Consensus, config: LinkingConfig) -> Failure | None:
+    """Pass a consensus through the gates."""
+    c, S = model.pairs, consensus.estimate.S_dst_src
+    ratio = float(consensus.inliers.sum() / consensus.seen.sum())
+    if ratio <= config.min_majority:
+        detail = f"{ratio:.0%} of {int(consensus.seen.sum())} pairs agree"
+        return Failure(FailureReason.LOW_INLIER_RATIO, detail, {"inlier_ratio": ratio})
+    n_agreeing = int(consensus.keyframes.sum())
+    if n_agreeing < config.min_keyframes:
+        return Failure(FailureReason.AGREEMENT, f"{n_agreeing} keyframes agree, {config.min_keyframes} needed")
+    keyframes, inliers = consensus.keyframes, consensus.inliers
+    views = keyframes[c.view_keyframe]
+    for gate in (
+        lambda: verify.check_own_pixels(model, views, config),
+        lambda: verify.check_reprojection(model, S, views, config),
+        lambda: verify.check_spread(model, old, inliers, keyframes, config),
+        lambda: verify.check_sigmas(model, S, consensus.estimate.covariance, config),
+        lambda: verify.check_shape(model, S, inliers, keyframes, config),
+    ):
+        refused = gate()
+        if refused is not None:
+            return refused
+    return None
+
+
+def _link(model: PairModel, consensus: _Consensus, onset: int | None, config: LinkingConfig) -> LinkEstimate:
+    """Pack a verified consensus."""
+    c, estimate, votes = model.pairs, consensus.estimate, consensus.votes
+    S = estimate.S_dst_src
+    later = np.flatnonzero(votes.has_say & (c.keyframes >= c.keyframes[consensus.keyframes][0]))
+    n_run = leading_run(votes.agrees[later], config.max_misfits)
+    change_point = int(c.keyframes[later[n_run]]) if n_run < len(later) else None
+    holds = votes.agrees.copy()
+    if change_point is not None:
+        holds &= c.keyframes < change_point
+    same = (model.mahalanobis2(S) < config.pair_chi2) & c.pairs_seen_in(holds)
+    on = consensus.keyframes
+    numbers = {
+        "scale": float(sim3.scale(S)),
+        **verify.sigma_numbers(model, S, estimate.covariance),
+        "chi2": estimate.chi2_per_dof,
+        "n_pairs": float(len(c)),
+        "n_shared_pixel": float(c.shared_pixel.sum()),
+        "n_hypotheses": float(estimate.n_iterations),
+        "n_shared_keyframes": float(len(c.keyframes)),
+        "n_agreeing_keyframes": float(on.sum()),
+        "keyframe_rotation_deg": float(np.degrees(votes.rotation_rad[on]).max()),
+        "keyframe_centre": float(votes.centre[on].max()),
+        "inlier_ratio": float(consensus.inliers.sum() / consensus.seen.sum()),
+    }
+    return LinkEstimate(
+        S_old_new=S,
+        covariance=estimate.covariance,
+        n_matches=int(consensus.seen.sum()),
+        n_inliers=int(consensus.inliers.sum()),
+        landmark_pairs=np.stack([c.landmark_old[same], c.landmark_new[same]], 1),
+        agreeing_keyframes=c.keyframes[on],
+        change_point=change_point,
+        suspected_onset=onset,
+        numbers=numbers,
+    )
