@@ -19,7 +19,7 @@ from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, I
 from dualslam.linking import verify
 from dualslam.linking.correspondences import DescriptorMatcher, propose_correspondences
 from dualslam.linking.pairs import PairModel
-from dualslam.linking.timeline import KeyframeVotes, ask_keyframes, find_break, leading_run
+from dualslam.linking.timeline import KeyframeVotes, ask_keyframes, find_tears, leading_run
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,6 +32,7 @@ class LinkEstimate:
         ``p_old = S_old_new @ p_new``.
     covariance : (7, 7)
         Of xi in ``S_old_new @ exp(xi)``: rotation (rad), translation (unit of new), log-scale, in the new map's frame.
+        The Hessian's, inflated, and the share of the maps' own deformation that no number of pairs averages out.
     n_matches, n_inliers : int
         Pairs that the estimate looked at (seen in the keyframes that it trusts), and those that agree.
     landmark_pairs : (I, 2) int64
@@ -92,9 +93,18 @@ def estimate_link(
     if len(pairs) < config.min_inliers:
         return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(pairs)} pairs, {config.min_inliers} needed")
     # 2. Which keyframes may be trusted: those older than what is suspected, by others or by a tear in the old map.
-    onset = _older(suspected_onset, find_break(old, int(pairs.keyframes[0]), config))
-    has_say = pairs.count_by_keyframe(np.ones(len(pairs.view_pair), bool)) >= config.min_pairs_per_keyframe
-    trusted = has_say & (pairs.keyframes < onset) if onset is not None else has_say
+    #    The new map must be one piece there (but for its newest keyframe, the oldest, which may hang by little yet).
+    tears_old = find_tears(old, _look_back(old, int(pairs.keyframes[0]), config), max(old.keyframes), config)
+    tears_new = find_tears(new, int(pairs.keyframes[0]), int(pairs.keyframes[-1]), config)
+    onset = min([*tears_old.tolist(), *([] if suspected_onset is None else [suspected_onset])], default=None)
+    trusted = pairs.count_by_keyframe(np.ones(len(pairs.view_pair), bool)) >= config.min_pairs_per_keyframe
+    if onset is not None:
+        trusted &= pairs.keyframes < onset
+    if len(tears_new):
+        trusted &= pairs.keyframes >= tears_new[-1]
+        if np.count_nonzero(np.array(list(new.keyframes)) < tears_new[-1]) > 1:
+            detail = f"the new map is torn before keyframe {tears_new[-1]}"
+            return Failure(FailureReason.DEFORMED, detail, {"torn": float(tears_new[-1])})
     if np.count_nonzero(trusted) < config.min_keyframes:
         return _needs_older(int(np.count_nonzero(trusted)), config, onset)
     # 3. The similarity on which the oldest of them agree, and how far it holds.
@@ -120,10 +130,10 @@ class _Consensus:
     inliers: BoolArray
 
 
-def _older(a: int | None, b: int | None) -> int | None:
-    """Return the smaller of two frames, None for neither."""
-    known = [x for x in (a, b) if x is not None]
-    return min(known) if known else None
+def _look_back(old: Submap, keyframe_id: int, config: LinkingConfig) -> int:
+    """Return the id of the keyframe that stands `config.look_back` before one of the old map's."""
+    ids = sorted(old.keyframes)
+    return ids[max(ids.index(keyframe_id) - config.look_back, 0)]
 
 
 def _needs_older(n: int, config: LinkingConfig, onset: int | None, change: int | None = None) -> Failure:
@@ -192,9 +202,10 @@ def _fit(model: PairModel, used: BoolArray, config: LinkingConfig, rng: Generato
     )
     if isinstance(estimate, Failure):
         return estimate
+    covariance = estimate.covariance + verify.deformation_covariance(model, config)
     inliers = np.zeros(len(c), bool)
     inliers[rows[estimate.inliers]] = True
-    return Sim3Estimate(estimate.S_dst_src, estimate.covariance, inliers, estimate.n_iterations, estimate.chi2_per_dof)
+    return Sim3Estimate(estimate.S_dst_src, covariance, inliers, estimate.n_iterations, estimate.chi2_per_dof)
 
 
 def _verify(model: PairModel, old: Submap, consensus: _Consensus, config: LinkingConfig) -> Failure | None:
@@ -214,6 +225,7 @@ def _verify(model: PairModel, old: Submap, consensus: _Consensus, config: Linkin
         lambda: verify.check_reprojection(model, S, views, config),
         lambda: verify.check_spread(model, old, inliers, keyframes, config),
         lambda: verify.check_sigmas(model, S, consensus.estimate.covariance, config),
+        lambda: verify.check_cameras(model, S, keyframes, config),
         lambda: verify.check_shape(model, S, inliers, keyframes, config),
     ):
         refused = gate()

@@ -66,7 +66,7 @@ class PairModel:
         c, S_new_old = self.pairs, sim3.inverse(S_old_new)
         A, B = S_old_new[:3, :3], S_new_old[:3, :3]
         v = c.view_pair
-        in_old = _pixel_chi2(
+        in_old = pixel_chi2(
             self.K_old,
             self.T_kf_old[c.view_keyframe],
             sim3.act(S_old_new, c.xyz_new)[v],
@@ -74,7 +74,7 @@ class PairModel:
             c.uv_old,
             c.sigma_old,
         )
-        in_new = _pixel_chi2(
+        in_new = pixel_chi2(
             self.K_new,
             self.T_kf_new[c.view_keyframe],
             sim3.act(S_new_old, c.xyz_old)[v],
@@ -88,8 +88,8 @@ class PairModel:
         """Return squared whitened residuals (V,) of each map's points in its own keyframes, pixel noise alone."""
         c, none = self.pairs, np.zeros((3, 3))
         v, k = c.view_pair, c.view_keyframe
-        in_old = _pixel_chi2(self.K_old, self.T_kf_old[k], c.xyz_old[v], none, c.uv_old, c.sigma_old)
-        in_new = _pixel_chi2(self.K_new, self.T_kf_new[k], c.xyz_new[v], none, c.uv_new, c.sigma_new)
+        in_old = pixel_chi2(self.K_old, self.T_kf_old[k], c.xyz_old[v], none, c.uv_old, c.sigma_old)
+        in_new = pixel_chi2(self.K_new, self.T_kf_new[k], c.xyz_new[v], none, c.uv_new, c.sigma_new)
         return in_old, in_new
 
     def normal_equations(self, S_old_new: FloatArray, used: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -116,7 +116,7 @@ class PairModel:
         return 0.5 * (H + H.T), WJ.T @ residual.reshape(-1)
 
 
-def _pixel_chi2(
+def pixel_chi2(
     K: FloatArray, T_cam_w: FloatArray, xyz: FloatArray, covariance: FloatArray, uv: FloatArray, sigma: FloatArray
 ) -> FloatArray:
     """Return squared residuals (V,) whitened by the pixels' sigmas and the points' covariances projected."""

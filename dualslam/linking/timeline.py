@@ -14,7 +14,7 @@ from dualslam.core.config import LinkingConfig
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.submap import Submap
 from dualslam.core.types import BoolArray, FloatArray, IntArray
-from dualslam.linking.pairs import PairModel
+from dualslam.linking.pairs import PairModel, pixel_chi2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,7 +28,7 @@ class KeyframeVotes:
     share : (K,)
         Share of them whose points agree.
     share_pixels : (K,)
-        Share of their reprojections that agree, in the worse of the two directions.
+        Share of their pixels that agree: of the worst among either map's points in either map's keyframe.
     rotation_rad : (K,)
         Angle between the camera's orientations in the two maps.
     centre : (K,)
@@ -53,12 +53,9 @@ def ask_keyframes(model: PairModel, S_old_new: FloatArray, config: LinkingConfig
     n = c.count_by_keyframe(every)
     per = np.maximum(n, 1)
     near = model.mahalanobis2(S_old_new) < config.pair_chi2
-    in_old, in_new = model.reprojection2(S_old_new)
     share = c.count_by_keyframe(near[c.view_pair]) / per
-    share_pixels = np.minimum(
-        c.count_by_keyframe(in_old < config.pixel_chi2), c.count_by_keyframe(in_new < config.pixel_chi2)
-    )
-    share_pixels = share_pixels / per
+    residuals = (*model.reprojection2(S_old_new), *model.own_reprojection2())
+    share_pixels = np.min([c.count_by_keyframe(chi2 < config.pixel_chi2) for chi2 in residuals], axis=0) / per
     T_moved = sim3.act_on_pose(S_old_new, model.T_new_kf)
     turn = so3.log(T_moved[:, :3, :3].swapaxes(1, 2) @ model.T_old_kf[:, :3, :3])
     rotation = np.sqrt((turn**2).sum(1))
@@ -90,39 +87,57 @@ def leading_run(agrees: BoolArray, max_misfits: int) -> int:
     return end
 
 
-def find_break(old: Submap, oldest_shared: int, config: LinkingConfig) -> int | None:
-    """Return the id of the first keyframe after a place where the old map is torn, None where it holds together.
+def find_tears(submap: Submap, oldest: int, newest: int, config: LinkingConfig) -> IntArray:
+    """Return the ids of the keyframes before which a map is torn, ascending: its parts there are not held together.
 
-    A place between two keyframes is torn if too few landmarks are seen on both sides in agreement with their pixels: a
-    wrong pose either ends the tracks or leaves their observations wrong on one side.
+    A wrong pose either ends the tracks, or leaves their observations wrong on one side of it. So a place between two
+    keyframes is torn if too few landmarks are seen on both sides in agreement with their pixels, or if most
+    observations of those that are followed across it (twice on either side: a single camera cannot tell a change of
+    scale about itself) disagree.
 
     Parameters
     ----------
-    old : Submap
-    oldest_shared : int
-        Keyframe id; the search covers the newer keyframes and `config.look_back` older ones.
+    submap : Submap
+    oldest, newest : int
+        Keyframe ids; the places after `oldest` up to before `newest` are searched.
     config : LinkingConfig
     """
-    ids = np.array(sorted(old.keyframes))
-    first = int(np.searchsorted(ids, oldest_shared))
-    ids = ids[max(first - config.look_back - config.tie_window, 0) :]
-    if len(ids) < 2:
-        return None
-    obs = old.observations
+    w = config.tie_window
+    ids = np.array(sorted(submap.keyframes))
+    first, last = int(np.searchsorted(ids, oldest, "right")), int(np.searchsorted(ids, newest, "right"))
+    start = max(first - w, 0)
+    ids = ids[start : last + w]
+    seen, good = _own_agreement(submap, ids, config.pixel_chi2)
+    places = range(max(first - start, 1), last - start)
+    torn, contrast = np.zeros((2, len(ids)), bool), np.zeros(len(ids))
+    for i in places:
+        before, after = slice(max(i - w, 0), i), slice(i, i + w)
+        ties = good[:, before].any(1) & good[:, after].any(1)
+        torn[0, i] = np.count_nonzero(ties) < config.min_ties
+        followed = (seen[:, before].sum(1) >= 2) & (seen[:, after].sum(1) >= 2)
+        if np.count_nonzero(followed) >= config.min_ties:
+            share = [good[followed, side].sum() / seen[followed, side].sum() for side in (before, after)]
+            torn[1, i] = min(share) <= config.min_majority
+            contrast[i] = abs(share[0] - share[1])
+    # Windows that reach over a tear disagree already beside it: of such neighbours the clearest is the place.
+    for run in np.split(np.arange(len(ids)), np.flatnonzero(np.diff(torn[1].astype(int))) + 1):
+        if len(run) and torn[1, run[0]]:
+            torn[1, run] = False
+            torn[1, run[np.argmax(contrast[run])]] = True
+    return ids[torn.any(0)]
+
+
+def _own_agreement(submap: Submap, ids: IntArray, gate: float) -> tuple[BoolArray, BoolArray]:
+    """Return which landmarks are seen in which of the keyframes, and where their pixels agree; both (L, len(ids))."""
+    obs = submap.observations
     rows = np.flatnonzero(obs["alive"] & np.isin(obs["kf"], ids))
     column = np.searchsorted(ids, obs["kf"][rows])
     landmarks, row = np.unique(obs["landmark"][rows], return_inverse=True)
-    uv, sigma = old.observed_pixels(rows)
-    T_kf_old = se3.inverse(old.keyframe_poses(ids))
-    p = se3.act_each(T_kf_old[column], old.landmarks["xyz_mu"][landmarks][row])
-    z = np.where(p[:, 2] > 0, p[:, 2], np.nan)
-    predicted = p[:, :2] / z[:, None] * np.array([old.K[0, 0], old.K[1, 1]]) + old.K[:2, 2]
-    good = ((predicted - uv) ** 2).sum(1) / sigma**2 < config.pixel_chi2
-    seen = np.zeros((len(landmarks), len(ids)), bool)
-    seen[row[good], column[good]] = True
-    for i in range(1, len(ids)):
-        before = seen[:, max(i - config.tie_window, 0) : i].any(1)
-        after = seen[:, i : i + config.tie_window].any(1)
-        if np.count_nonzero(before & after) < config.min_ties and i >= min(config.tie_window, first):
-            return int(ids[i])
-    return None
+    uv, sigma = submap.observed_pixels(rows)
+    T_kf_submap = se3.inverse(submap.keyframe_poses(ids))
+    none = np.zeros((3, 3))
+    chi2 = pixel_chi2(submap.K, T_kf_submap[column], submap.landmarks["xyz_mu"][obs["landmark"][rows]], none, uv, sigma)
+    seen, good = np.zeros((2, len(landmarks), len(ids)), bool)
+    seen[row, column] = True
+    good[row[chi2 < gate], column[chi2 < gate]] = True
+    return seen, good

@@ -15,6 +15,9 @@ from dualslam.linking.pairs import PairModel
 UNTESTABLE = 3.0
 """A part whose own sigma is this many times the allowed deformation says nothing about it."""
 
+ROTATION_SHARE = 0.25
+"""How much less orientation drifts (rad) than scale does (relative)."""
+
 
 def check_own_pixels(model: PairModel, views: BoolArray, config: LinkingConfig) -> Failure | None:
     """Refuse where either map's points do not lie on that map's own pixels: mirrored or bent copies give way here."""
@@ -93,6 +96,19 @@ def sigma_numbers(model: PairModel, S_old_new: FloatArray, covariance: FloatArra
     }
 
 
+def deformation_covariance(model: PairModel, config: LinkingConfig) -> FloatArray:
+    """Return (7, 7) that the maps' deformation adds to a link's covariance (right perturbation, frame new).
+
+    The pairs all bend together, so that more of them do not help. Where drift is a random walk, the mean over the
+    overlap is off by about half of what its ends differ; in scale and position, that is: orientation drifts less.
+    """
+    distance = np.linalg.norm(model.pairs.xyz_new[:, None] - model.T_new_kf[None, :, :3, 3], axis=2)
+    half = 0.5 * config.deformation_sigma
+    sigma = np.repeat([ROTATION_SHARE * half, half * float(np.median(distance)), half], [3, 3, 1])
+    from_centre = sim3.adjoint(_shift(model.centre_new))
+    return np.asarray(from_centre @ np.diag(sigma**2) @ from_centre.T, np.float64)
+
+
 def _shift(t: FloatArray) -> FloatArray:
     S = np.eye(4)
     S[:3, 3] = t
@@ -125,6 +141,30 @@ def check_shape(
             numbers |= {"log_scale": moved[0], "rotation_deg": moved[1]}
             detail = f"the {name} half differs by {moved[0]:+.1%} in scale, {moved[1]:.2f} deg"
             return Failure(FailureReason.DEFORMED, detail, numbers)
+    return None
+
+
+def check_cameras(
+    model: PairModel, S_old_new: FloatArray, keyframes: BoolArray, config: LinkingConfig
+) -> Failure | None:
+    """Refuse where the cameras' path wants another scale than the landmarks: in one of the maps these two disagree.
+
+    A centre is taken to be known to one pixel's worth at the landmarks' distance; a path too short for that says
+    nothing.
+    """
+    centres = model.T_old_kf[keyframes, :3, 3]
+    moved = sim3.act(S_old_new, model.T_new_kf[keyframes, :3, 3])
+    centres, moved = centres - centres.mean(0), moved - moved.mean(0)
+    length2 = float((moved**2).sum())
+    noise = float(np.median(np.linalg.norm(model.pairs.xyz_old - model.T_old_kf[keyframes, :3, 3].mean(0), axis=1)))
+    noise /= model.K_old[0, 0]
+    if not length2 > (noise / (UNTESTABLE * config.deformation_sigma)) ** 2:
+        return None
+    difference = float((centres * moved).sum()) / length2 - 1.0
+    sigma2 = noise**2 / length2 + config.deformation_sigma**2
+    if difference**2 > config.gate_sigmas**2 * sigma2:
+        detail = f"the cameras' path differs by {difference:+.1%} in scale from the landmarks"
+        return Failure(FailureReason.DEFORMED, detail, {"path_scale": 1.0 + difference})
     return None
 
 
