@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -40,6 +41,7 @@ def hamming(a: np.ndarray, b: np.ndarray) -> FloatArray:
     return np.bitwise_count(a ^ b).sum(-1).astype(float)
 
 
+@lru_cache(maxsize=64)
 def make_world(layout: str, seed: int, n_frames: int = 24, noise_px: float = 0.8, per_view: int = 220) -> World:
     rng = np.random.default_rng(seed)
     i = np.arange(n_frames)
@@ -175,15 +177,23 @@ def make_case(
     layout: str, seed: int, old_frames: range = range(0, 16), new_frames: range = range(6, 24), **recipe: float
 ) -> Case:
     """Make two healthy maps that overlap, in different gauges."""
+    world, old, new = _two_maps(layout, seed, old_frames, new_frames, tuple(sorted(recipe.items())))
+    return finish(old.copy(), new.copy(), np.random.default_rng(3000 + seed))
+
+
+@lru_cache(maxsize=64)
+def _two_maps(
+    layout: str, seed: int, old_frames: range, new_frames: range, recipe: tuple[tuple[str, float], ...]
+) -> tuple[World, Submap, Submap]:
     rng = np.random.default_rng(1000 + seed)
     world = make_world(layout, seed)
     anchor = (new_frames.start + old_frames.stop - 1) // 2
-    old = build(world, Recipe(list(old_frames), anchor, **recipe), 0, rng)
-    new = build(world, Recipe(list(reversed(new_frames)), anchor, **recipe), 1, rng)
-    return finish(world, old, new, new_frames, rng)
+    old = build(world, Recipe(list(old_frames), anchor, **dict(recipe)), 0, rng)
+    new = build(world, Recipe(list(reversed(new_frames)), anchor, **dict(recipe)), 1, rng)
+    return world, old, new
 
 
-def finish(world: World, old: Submap, new: Submap, new_frames: range, rng: np.random.Generator) -> Case:
+def finish(old: Submap, new: Submap, rng: np.random.Generator) -> Case:
     """Put both maps into gauges of their own."""
     S_old_w, S_new_w = random_gauge(rng), random_gauge(rng)
     regauge(old, S_old_w)
@@ -227,7 +237,7 @@ def make_tail_case(
     if kept_ties:
         _attach(old, world, onset, n_healthy, kept_ties, rng)
     new = build(world, Recipe(list(reversed(new_frames)), anchor), 1, rng)
-    return finish(world, old, new, new_frames, rng)
+    return finish(old, new, rng)
 
 
 def _attach(
