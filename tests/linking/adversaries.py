@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.submap import Submap
 from dualslam.core.types import FloatArray, Keyframe
 from tests.linking.worlds import FRAME_STEP, Case, make_case, make_tail_case
+
+ONSET = 10
+ONSET_ID = ONSET * FRAME_STEP
 
 
 def set_points(submap: Submap, xyz: FloatArray) -> None:
@@ -127,8 +131,11 @@ def tail_displacement(seed: int, layout: str) -> FloatArray:
 
 
 def corrupted_tail(layout: str, seed: int, oldest_new: int, kept_ties: float) -> Case:
-    """Frames 10 to 17 of the old map are displaced; the new map reaches back to `oldest_new`."""
-    return make_tail_case(layout, seed, 10, oldest_new, tail_displacement(seed, layout), kept_ties=kept_ties)
+    """Frames from `ONSET` to 17 of the old map are displaced; the new map reaches back to frame `oldest_new`."""
+    case = _tail_case(layout, seed, oldest_new, kept_ties)
+    return replace(case, old=case.old.copy(), new=case.new.copy())
 
 
-ONSET_ID = 10 * FRAME_STEP
+@lru_cache(maxsize=256)
+def _tail_case(layout: str, seed: int, oldest_new: int, kept_ties: float) -> Case:
+    return make_tail_case(layout, seed, ONSET, oldest_new, tail_displacement(seed, layout), kept_ties=kept_ties)

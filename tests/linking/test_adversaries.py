@@ -1,7 +1,6 @@
 """Wrong links offered on purpose: none may be made. Where a part of the maps is right, a right link may."""
 
 import itertools
-from collections import Counter
 
 import numpy as np
 import pytest
@@ -51,9 +50,6 @@ CASES = [
 def label(case):
     make, arguments, onset = case
     return "-".join([make.__name__, *map(str, arguments), *([] if onset is None else [f"onset{onset}"])])
-
-
-OUTCOMES: Counter[str] = Counter()
 
 
 def offer(make, arguments, onset) -> tuple[Case, LinkEstimate | Failure]:

@@ -199,7 +199,7 @@ def finish(old: Submap, new: Submap, rng: np.random.Generator) -> Case:
     regauge(old, S_old_w)
     regauge(new, S_new_w)
     shared = [k for k in old.keyframes if k in new.keyframes]
-    points = old.landmarks["xyz_mu"][old.landmarks_of_keyframes(shared)]
+    points = old.landmarks["xyz_mu"][old.landmarks_of_keyframes(shared or list(old.keyframes))]
     extent = float(np.linalg.norm(np.percentile(points, 90, axis=0) - np.percentile(points, 10, axis=0)))
     return Case(old, new, S_old_w @ sim3.inverse(S_new_w), extent)
 
@@ -240,9 +240,7 @@ def make_tail_case(
     return finish(old, new, rng)
 
 
-def _attach(
-    old: Submap, world: World, onset: int, n_healthy: int, share: float, rng: np.random.Generator
-) -> None:
+def _attach(old: Submap, world: World, onset: int, n_healthy: int, share: float, rng: np.random.Generator) -> None:
     point_of = {}
     obs = old.observations
     for row in np.flatnonzero(obs["landmark"] < n_healthy).tolist():
