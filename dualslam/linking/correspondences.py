@@ -135,7 +135,8 @@ def propose_correspondences(old: Submap, new: Submap, matcher: DescriptorMatcher
     kept, pair_of_vote = _one_to_one(votes, len(new.landmarks))
     landmark_old, landmark_new = kept
     covariance_old, covariance_new = landmark_covariances(old, landmark_old), landmark_covariances(new, landmark_new)
-    fixed = np.isfinite(covariance_old).all((1, 2)) & np.isfinite(covariance_new).all((1, 2))
+    finite = np.isfinite(np.stack([covariance_old, covariance_new])).all((0, 2, 3))
+    fixed = np.asarray(finite, np.bool_)
     row = np.where(fixed, np.cumsum(fixed) - 1, -1)
     rows = np.flatnonzero(pair_of_vote >= 0)
     rows = rows[fixed[pair_of_vote[rows]]]

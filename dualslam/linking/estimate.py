@@ -2,6 +2,10 @@
 
 Source: Huang et al., "Dual-SLAM", section II (Map Fusion): ``X' = s R X + T`` by RANSAC with Horn's algorithm over
 3D-3D matches restricted to equal keyframes. The consensus along time, the reprojections and the gates are ours.
+
+The refinement weighs the pairs by their points' covariances. These are the pixels of both maps, propagated: so the
+reprojections both ways, which are the same pixels again, judge the result (per keyframe and over all) and are not added
+to the refinement, where they would count twice.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, I
 from dualslam.linking import verify
 from dualslam.linking.correspondences import DescriptorMatcher, propose_correspondences
 from dualslam.linking.pairs import PairModel
+from dualslam.linking.shape import Shape, deformation_covariance, measure_shape
 from dualslam.linking.timeline import KeyframeVotes, ask_keyframes, find_tears, leading_run
 
 
@@ -112,11 +117,17 @@ def estimate_link(
     consensus = _oldest_consensus(model, trusted, config, rng, onset)
     if isinstance(consensus, Failure):
         return consensus
-    # 4. The gates.
-    refused = _verify(model, old, consensus, config)
+    # 4. How far the maps' shapes differ beyond it: that is part of what is not known.
+    S_old_new = consensus.estimate.S_dst_src
+    shape = measure_shape(model, S_old_new, consensus.inliers, consensus.keyframes)
+    if isinstance(shape, Failure):
+        return shape
+    covariance = consensus.estimate.covariance + deformation_covariance(model, shape.deformation(config))
+    # 5. The gates.
+    refused = _verify(model, old, consensus, covariance, shape, config)
     if refused is not None:
         return refused
-    return _link(model, consensus, onset, config)
+    return _link(model, consensus, covariance, shape, onset, config)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,6 +139,11 @@ class _Consensus:
     keyframes: BoolArray
     seen: BoolArray
     inliers: BoolArray
+
+    @property
+    def inlier_ratio(self) -> float:
+        """Share of the pairs asked that agree."""
+        return float(self.inliers.sum() / self.seen.sum())
 
 
 def _look_back(old: Submap, keyframe_id: int, config: LinkingConfig) -> int:
@@ -202,39 +218,41 @@ def _fit(model: PairModel, used: BoolArray, config: LinkingConfig, rng: Generato
     )
     if isinstance(estimate, Failure):
         return estimate
-    covariance = estimate.covariance + verify.deformation_covariance(model, config)
     inliers = np.zeros(len(c), bool)
     inliers[rows[estimate.inliers]] = True
-    return Sim3Estimate(estimate.S_dst_src, covariance, inliers, estimate.n_iterations, estimate.chi2_per_dof)
+    return Sim3Estimate(estimate.S_dst_src, estimate.covariance, inliers, estimate.n_iterations, estimate.chi2_per_dof)
 
 
-def _verify(model: PairModel, old: Submap, consensus: _Consensus, config: LinkingConfig) -> Failure | None:
+def _verify(
+    model: PairModel, old: Submap, consensus: _Consensus, covariance: FloatArray, shape: Shape, config: LinkingConfig
+) -> Failure | None:
     """Pass a consensus through the gates."""
-    c, S = model.pairs, consensus.estimate.S_dst_src
-    ratio = float(consensus.inliers.sum() / consensus.seen.sum())
+    S, keyframes, inliers = consensus.estimate.S_dst_src, consensus.keyframes, consensus.inliers
+    ratio, n_agreeing = consensus.inlier_ratio, int(keyframes.sum())
     if ratio <= config.min_majority:
         detail = f"{ratio:.0%} of {int(consensus.seen.sum())} pairs agree"
         return Failure(FailureReason.LOW_INLIER_RATIO, detail, {"inlier_ratio": ratio})
-    n_agreeing = int(consensus.keyframes.sum())
     if n_agreeing < config.min_keyframes:
         return Failure(FailureReason.AGREEMENT, f"{n_agreeing} keyframes agree, {config.min_keyframes} needed")
-    keyframes, inliers = consensus.keyframes, consensus.inliers
-    views = keyframes[c.view_keyframe]
-    for gate in (
-        lambda: verify.check_own_pixels(model, views, config),
-        lambda: verify.check_reprojection(model, S, views, config),
-        lambda: verify.check_spread(model, old, inliers, keyframes, config),
-        lambda: verify.check_sigmas(model, S, consensus.estimate.covariance, config),
-        lambda: verify.check_cameras(model, S, keyframes, config),
-        lambda: verify.check_shape(model, S, inliers, keyframes, config),
-    ):
-        refused = gate()
-        if refused is not None:
-            return refused
-    return None
+    views = keyframes[model.pairs.view_keyframe]
+    refusals = (
+        verify.check_own_pixels(model, views, config),
+        verify.check_reprojection(model, S, views, config),
+        verify.check_spread(model, old, inliers, keyframes, config),
+        verify.check_sigmas(model, S, covariance, config),
+        verify.check_shape(shape, config),
+    )
+    return next((refused for refused in refusals if refused is not None), None)
 
 
-def _link(model: PairModel, consensus: _Consensus, onset: int | None, config: LinkingConfig) -> LinkEstimate:
+def _link(
+    model: PairModel,
+    consensus: _Consensus,
+    covariance: FloatArray,
+    shape: Shape,
+    onset: int | None,
+    config: LinkingConfig,
+) -> LinkEstimate:
     """Pack a verified consensus."""
     c, estimate, votes = model.pairs, consensus.estimate, consensus.votes
     S = estimate.S_dst_src
@@ -248,7 +266,7 @@ def _link(model: PairModel, consensus: _Consensus, onset: int | None, config: Li
     on = consensus.keyframes
     numbers = {
         "scale": float(sim3.scale(S)),
-        **verify.sigma_numbers(model, S, estimate.covariance),
+        **verify.sigma_numbers(model, S, covariance),
         "chi2": estimate.chi2_per_dof,
         "n_pairs": float(len(c)),
         "n_shared_pixel": float(c.shared_pixel.sum()),
@@ -257,11 +275,13 @@ def _link(model: PairModel, consensus: _Consensus, onset: int | None, config: Li
         "n_agreeing_keyframes": float(on.sum()),
         "keyframe_rotation_deg": float(np.degrees(votes.rotation_rad[on]).max()),
         "keyframe_centre": float(votes.centre[on].max()),
-        "inlier_ratio": float(consensus.inliers.sum() / consensus.seen.sum()),
+        "inlier_ratio": consensus.inlier_ratio,
+        "strain_chi2": shape.strain_chi2(config),
+        "deformation": shape.deformation(config),
     }
     return LinkEstimate(
         S_old_new=S,
-        covariance=estimate.covariance,
+        covariance=covariance,
         n_matches=int(consensus.seen.sum()),
         n_inliers=int(consensus.inliers.sum()),
         landmark_pairs=np.stack([c.landmark_old[same], c.landmark_new[same]], 1),

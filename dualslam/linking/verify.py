@@ -7,16 +7,11 @@ import math
 import numpy as np
 
 from dualslam.core.config import LinkingConfig
-from dualslam.core.geometry import sim3
+from dualslam.core.geometry import se3, sim3
 from dualslam.core.submap import Submap
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 from dualslam.linking.pairs import PairModel
-
-UNTESTABLE = 3.0
-"""A part whose own sigma is this many times the allowed deformation says nothing about it."""
-
-ROTATION_SHARE = 0.25
-"""How much less orientation drifts (rad) than scale does (relative)."""
+from dualslam.linking.shape import Shape
 
 
 def check_own_pixels(model: PairModel, views: BoolArray, config: LinkingConfig) -> Failure | None:
@@ -85,7 +80,7 @@ def check_sigmas(
 
 def sigma_numbers(model: PairModel, S_old_new: FloatArray, covariance: FloatArray) -> dict[str, float]:
     """Return the sigmas of scale (relative), rotation, and position of the overlap's centre (unit of the old map)."""
-    at_centre = sim3.adjoint(_shift(-model.centre_new))
+    at_centre = sim3.adjoint(se3.from_parts(np.eye(3), -model.centre_new))
     C = at_centre @ covariance @ at_centre.T
     distance = np.linalg.norm(model.pairs.xyz_old[:, None] - model.T_old_kf[None, :, :3, 3], axis=2)
     return {
@@ -96,118 +91,16 @@ def sigma_numbers(model: PairModel, S_old_new: FloatArray, covariance: FloatArra
     }
 
 
-def deformation_covariance(model: PairModel, config: LinkingConfig) -> FloatArray:
-    """Return (7, 7) that the maps' deformation adds to a link's covariance (right perturbation, frame new).
-
-    The pairs all bend together, so that more of them do not help. Where drift is a random walk, the mean over the
-    overlap is off by about half of what its ends differ; in scale and position, that is: orientation drifts less.
-    """
-    distance = np.linalg.norm(model.pairs.xyz_new[:, None] - model.T_new_kf[None, :, :3, 3], axis=2)
-    half = 0.5 * config.deformation_sigma
-    sigma = np.repeat([ROTATION_SHARE * half, half * float(np.median(distance)), half], [3, 3, 1])
-    from_centre = sim3.adjoint(_shift(model.centre_new))
-    return np.asarray(from_centre @ np.diag(sigma**2) @ from_centre.T, np.float64)
-
-
-def _shift(t: FloatArray) -> FloatArray:
-    S = np.eye(4)
-    S[:3, 3] = t
-    return S
-
-
-def check_shape(
-    model: PairModel, S_old_new: FloatArray, inliers: BoolArray, keyframes: BoolArray, config: LinkingConfig
-) -> Failure | None:
-    """Refuse maps of different shape: stretched or sheared as a whole, or parts that want another scale or rotation.
-
-    The strain between the maps is estimated together with the similarity and compared with its covariance plus the
-    deformation that healthy maps may have. Then each half of the pairs (left and right, top and bottom, near and far,
-    early and late) takes a Gauss-Newton step from the common similarity; its scale and rotation may move as little.
-    """
-    H, g = model.normal_equations(S_old_new, inliers)
-    allowed2 = config.deformation_sigma**2
-    try:
-        strain = np.linalg.solve(H, g)[7:]
-        covariance = np.linalg.inv(H)[7:, 7:]
-    except np.linalg.LinAlgError:
-        return Failure(FailureReason.DEGENERATE, "the landmarks do not fix their own shape")
-    chi2 = float(strain @ np.linalg.solve(covariance + allowed2 * np.eye(5), strain))
-    numbers = {"strain": float(np.linalg.norm(strain)), "strain_chi2": chi2}
+def check_shape(shape: Shape, config: LinkingConfig) -> Failure | None:
+    """Refuse maps of different shape: stretched or sheared as a whole, or parts that want another scale or rotation."""
+    chi2 = shape.strain_chi2(config)
     if chi2 > config.strain_chi2:
-        return Failure(FailureReason.DEFORMED, f"stretched by {numbers['strain']:.1%}", numbers)
-    for name, part in _halves(model, inliers, keyframes).items():
-        moved = _part_moves(model, S_old_new, part, config)
-        if moved is not None:
-            numbers |= {"log_scale": moved[0], "rotation_deg": moved[1]}
-            detail = f"the {name} half differs by {moved[0]:+.1%} in scale, {moved[1]:.2f} deg"
-            return Failure(FailureReason.DEFORMED, detail, numbers)
+        strain = float(np.linalg.norm(shape.strain))
+        numbers = {"strain": strain, "strain_chi2": chi2}
+        return Failure(FailureReason.DEFORMED, f"stretched by {strain:.1%}", numbers)
+    for d in shape.parts:
+        if d.scale_deviates(config) or d.turn_deviates(config):
+            degrees = math.degrees(d.turn_rad)
+            detail = f"part of the maps ({d.part}) differs by {d.log_scale:+.1%} in scale, {degrees:.2f} deg"
+            return Failure(FailureReason.DEFORMED, detail, {"log_scale": d.log_scale, "rotation_deg": degrees})
     return None
-
-
-def check_cameras(
-    model: PairModel, S_old_new: FloatArray, keyframes: BoolArray, config: LinkingConfig
-) -> Failure | None:
-    """Refuse where the cameras' path wants another scale than the landmarks: in one of the maps these two disagree.
-
-    A centre is taken to be known to one pixel's worth at the landmarks' distance; a path too short for that says
-    nothing.
-    """
-    centres = model.T_old_kf[keyframes, :3, 3]
-    moved = sim3.act(S_old_new, model.T_new_kf[keyframes, :3, 3])
-    centres, moved = centres - centres.mean(0), moved - moved.mean(0)
-    length2 = float((moved**2).sum())
-    noise = float(np.median(np.linalg.norm(model.pairs.xyz_old - model.T_old_kf[keyframes, :3, 3].mean(0), axis=1)))
-    noise /= model.K_old[0, 0]
-    if not length2 > (noise / (UNTESTABLE * config.deformation_sigma)) ** 2:
-        return None
-    difference = float((centres * moved).sum()) / length2 - 1.0
-    sigma2 = noise**2 / length2 + config.deformation_sigma**2
-    if difference**2 > config.gate_sigmas**2 * sigma2:
-        detail = f"the cameras' path differs by {difference:+.1%} in scale from the landmarks"
-        return Failure(FailureReason.DEFORMED, detail, {"path_scale": 1.0 + difference})
-    return None
-
-
-def _halves(model: PairModel, inliers: BoolArray, keyframes: BoolArray) -> dict[str, BoolArray]:
-    """Split the inlier pairs at the median of image position, depth and time."""
-    c = model.pairs
-    n = len(c)
-    views = inliers[c.view_pair] & keyframes[c.view_keyframe]
-    T = model.T_kf_old[c.view_keyframe]
-    depth_view = (T[:, 2, :3] * c.xyz_old[c.view_pair]).sum(1) + T[:, 2, 3]
-    count = np.maximum(np.bincount(c.view_pair[views], minlength=n), 1)
-
-    def mean(values: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(c.view_pair[views], values[views], n) / count, np.float64)
-
-    halves = {}
-    for low, high, value in (
-        ("left", "right", mean(c.uv_old[:, 0])),
-        ("upper", "lower", mean(c.uv_old[:, 1])),
-        ("near", "far", mean(depth_view)),
-        ("early", "late", mean(c.view_keyframe.astype(np.float64))),
-    ):
-        below = value <= np.median(value[inliers])
-        halves[low], halves[high] = inliers & below, inliers & ~below
-    return halves
-
-
-def _part_moves(
-    model: PairModel, S_old_new: FloatArray, part: BoolArray, config: LinkingConfig
-) -> tuple[float, float] | None:
-    """Return (log-scale, degrees) by which a part of the pairs wants to move, None if no more than it may."""
-    if np.count_nonzero(part) < config.min_pairs_per_keyframe:
-        return None
-    H, g = model.normal_equations(S_old_new, part)
-    try:
-        step, C = np.linalg.solve(H[:7, :7], g[:7]), np.linalg.inv(H[:7, :7])
-    except np.linalg.LinAlgError:
-        return None
-    allowed2, gate2 = config.deformation_sigma**2, config.gate_sigmas**2
-    untestable = (UNTESTABLE * config.deformation_sigma) ** 2
-    scale_moves = C[6, 6] < untestable and step[6] ** 2 > gate2 * (C[6, 6] + allowed2)
-    C_rotation = C[:3, :3] + allowed2 * np.eye(3)
-    turn = float(np.linalg.norm(step[:3]))
-    axis = step[:3] / max(turn, 1e-12)
-    turns = axis @ C[:3, :3] @ axis < untestable and turn**2 > gate2 * float(axis @ C_rotation @ axis)
-    return (float(step[6]), math.degrees(turn)) if scale_moves or turns else None

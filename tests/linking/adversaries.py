@@ -57,7 +57,7 @@ def stretched(layout: str, seed: int, axis: int, percent: float) -> Case:
 
 
 def two_scales(layout: str, seed: int, split: str, factor: float) -> Case:
-    """A copy of which a part has another scale: the newer part in time, the far half, or a random half of the points."""
+    """A copy of which a part has another scale: the newer part in time, the far half, or random points."""
     case = make_case(layout, seed)
     rng = np.random.default_rng(seed)
     new = case.new

@@ -17,28 +17,31 @@ LAYOUTS = ("street", "room")
 S = range(8)
 
 CASES = [
-    *((adversaries.different_places, (l, s), None) for l, s in itertools.product(LAYOUTS, S)),
-    *((adversaries.mirrored, (l, s, f), None) for l, s, f in itertools.product(LAYOUTS, range(6), (False, True))),
+    *((adversaries.different_places, (layout, s), None) for layout, s in itertools.product(LAYOUTS, S)),
     *(
-        (adversaries.stretched, (l, s, a, p), None)
-        for l, (s, p), a in itertools.product(LAYOUTS, enumerate((5.0, 7.0, 10.0, 15.0, 20.0, 30.0)), range(3))
+        (adversaries.mirrored, (layout, s, f), None)
+        for layout, s, f in itertools.product(LAYOUTS, range(6), (False, True))
     ),
     *(
-        (adversaries.two_scales, (l, s, split, f), None)
-        for l, split, (s, f) in itertools.product(
+        (adversaries.stretched, (layout, s, a, p), None)
+        for layout, (s, p), a in itertools.product(LAYOUTS, enumerate((5.0, 7.0, 10.0, 15.0, 20.0, 30.0)), range(3))
+    ),
+    *(
+        (adversaries.two_scales, (layout, s, split, f), None)
+        for layout, split, (s, f) in itertools.product(
             LAYOUTS, ("time", "depth", "random"), enumerate((1.1, 1.2, 1.35, 1.5, 0.9, 0.7))
         )
     ),
     *(
-        (adversaries.repeated_texture, (l, s, share, coherent), None)
-        for l, (s, share), coherent in itertools.product(
+        (adversaries.repeated_texture, (layout, s, share, coherent), None)
+        for layout, (s, share), coherent in itertools.product(
             LAYOUTS, enumerate((0.3, 0.45, 0.55, 0.7, 0.85, 1.0)), (False, True)
         )
     ),
     # The new map reaches to one frame past the onset, to it, or past it by less than is needed, or by enough.
     *(
-        (adversaries.corrupted_tail, (l, s, oldest, ties), onset)
-        for l, (s, oldest), (ties, onset) in itertools.product(
+        (adversaries.corrupted_tail, (layout, s, oldest, ties), onset)
+        for layout, (s, oldest), (ties, onset) in itertools.product(
             LAYOUTS,
             enumerate((11, 10, 9, 8, 7, 6, 5, 4)),
             ((0.0, None), (0.0, 39), (0.3, None), (0.3, 30), (0.3, 39)),

@@ -58,7 +58,7 @@ def test_pairs_are_one_to_one_and_views_belong_to_them(case):
     assert np.bincount(pairs.view_pair, minlength=len(pairs)).min() >= 1
     assert np.bincount(pairs.view_pair).max() > 3  # several keyframes, one pair
     ids = pairs.keyframes[pairs.view_keyframe]
-    for v in range(0, len(ids), 37):
+    for v in range(len(ids), 37):
         k, pair = int(ids[v]), pairs.view_pair[v]
         assert case.old.landmark_of[k][pairs.view_feature_old[v]] == pairs.landmark_old[pair]
         assert case.new.landmark_of[k][pairs.view_feature_new[v]] == pairs.landmark_new[pair]
@@ -125,7 +125,7 @@ def test_a_point_that_is_two_landmarks_is_paired_once(case):
 
 
 def test_covariances_are_those_of_the_points(case):
-    """Residuals of the points against the truth, whitened: chi-square with 3 degrees of freedom (no drift, no outlier)."""
+    """Whitened residuals against the truth (no drift, no outliers) are chi-square with 3 degrees of freedom."""
     exact = make_case(LAYOUT, SEED, outliers=0.0, drift=0.0)
     pairs = propose_correspondences(exact.old, exact.new)
     world = make_world(LAYOUT, SEED)
@@ -155,7 +155,7 @@ def test_landmarks_that_their_views_do_not_fix_have_no_covariance(case):
 
 
 def test_nothing_in_common():
-    a = make_case(LAYOUT, SEED, old_frames=range(0, 6), new_frames=range(8, 14))
+    a = make_case(LAYOUT, SEED, old_frames=range(6), new_frames=range(8, 14))
     pairs = propose_correspondences(a.old, a.new, MATCHER)
     assert len(pairs) == 0
     assert len(pairs.keyframes) == 0

@@ -47,12 +47,12 @@ def test_healthy_maps_are_linked_accurately(drift):
 def test_smallest_overlap(layout, seed):
     """As many shared keyframes as are needed make a link, one less asks for more."""
     n = CONFIG.min_keyframes
-    case = make_case(layout, seed, old_frames=range(0, 12), new_frames=range(12 - n, 24))
+    case = make_case(layout, seed, old_frames=range(12), new_frames=range(12 - n, 24))
     estimate = link(case)
     assert isinstance(estimate, LinkEstimate)
     assert list(estimate.agreeing_keyframes) == [FRAME_STEP * f for f in range(12 - n, 12)]
     assert np.all(np.array(link_error(case, estimate.S_old_new)) < [SCALE_WORST, ROTATION_WORST_DEG, POSITION_WORST])
-    shorter = make_case(layout, seed, old_frames=range(0, 11), new_frames=range(12 - n, 24))
+    shorter = make_case(layout, seed, old_frames=range(11), new_frames=range(12 - n, 24))
     refused = link(shorter)
     assert isinstance(refused, Failure)
     assert refused.reason is FailureReason.NEEDS_OLDER_KEYFRAMES
@@ -101,7 +101,7 @@ def test_link_does_not_depend_on_the_gauges():
 
 
 def test_maps_without_common_keyframes():
-    case = make_case("street", 0, old_frames=range(0, 8), new_frames=range(10, 20))
+    case = make_case("street", 0, old_frames=range(8), new_frames=range(10, 20))
     refused = link(case)
     assert isinstance(refused, Failure)
     assert refused.reason is FailureReason.TOO_FEW_MATCHES

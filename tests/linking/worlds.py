@@ -174,23 +174,23 @@ def regauge(submap: Submap, S_new_old: FloatArray) -> None:
 
 
 def make_case(
-    layout: str, seed: int, old_frames: range = range(0, 16), new_frames: range = range(6, 24), **recipe: float
+    layout: str, seed: int, old_frames: range = range(16), new_frames: range = range(6, 24), **recipe: float
 ) -> Case:
     """Make two healthy maps that overlap, in different gauges."""
-    world, old, new = _two_maps(layout, seed, old_frames, new_frames, tuple(sorted(recipe.items())))
+    old, new = _two_maps(layout, seed, old_frames, new_frames, tuple(sorted(recipe.items())))
     return finish(old.copy(), new.copy(), np.random.default_rng(3000 + seed))
 
 
 @lru_cache(maxsize=64)
 def _two_maps(
     layout: str, seed: int, old_frames: range, new_frames: range, recipe: tuple[tuple[str, float], ...]
-) -> tuple[World, Submap, Submap]:
+) -> tuple[Submap, Submap]:
     rng = np.random.default_rng(1000 + seed)
     world = make_world(layout, seed)
     anchor = (new_frames.start + old_frames.stop - 1) // 2
     old = build(world, Recipe(list(old_frames), anchor, **dict(recipe)), 0, rng)
     new = build(world, Recipe(list(reversed(new_frames)), anchor, **dict(recipe)), 1, rng)
-    return world, old, new
+    return old, new
 
 
 def finish(old: Submap, new: Submap, rng: np.random.Generator) -> Case:
@@ -210,7 +210,7 @@ def make_tail_case(
     onset: int,
     oldest_new: int,
     D: FloatArray,
-    old_frames: range = range(0, 18),
+    old_frames: range = range(18),
     kept_ties: float = 0.0,
 ) -> Case:
     """Make an old map whose part from frame `onset` on is displaced by a wrong pose D (Sim(3)) of that frame's camera.
@@ -258,7 +258,7 @@ def _attach(old: Submap, world: World, onset: int, n_healthy: int, share: float,
 
 
 def link_error(case: Case, S_old_new: FloatArray) -> tuple[float, float, float]:
-    """Return (relative scale, degrees, position relative to the extent) errors; position: worst at the shared cameras."""
+    """Return errors: relative scale, degrees, position (worst shared camera) relative to the extent."""
     E = sim3.inverse(case.S_old_new) @ S_old_new
     angle = float(np.degrees(np.linalg.norm(so3.log(sim3.rotation(E)))))
     shared = [k for k in case.old.keyframes if k in case.new.keyframes]
