@@ -14,6 +14,8 @@ from dualslam.linking.pairs import PairModel
 
 UNTESTABLE = 3.0
 """A part whose own sigma is this many times the allowed deformation says nothing about it."""
+ALONG_AXIS = 4.0
+"""How much worse a camera's centre is known along its axis than across it: focal length over the landmarks' offset."""
 ROTATION_SHARE = 0.25
 """How much less orientation drifts (rad) than scale does (relative)."""
 
@@ -161,11 +163,15 @@ def _deviation(model: PairModel, S_old_new: FloatArray, name: str, part: BoolArr
 def _deviation_of_path(model: PairModel, S_old_new: FloatArray, keyframes: BoolArray) -> Deviation:
     """Compare the scale of the cameras' path with that of the landmarks: in a sound map these two agree.
 
-    A centre is taken to be known to one pixel's worth at the landmarks' distance.
+    A centre is known to about one pixel's worth at the landmarks' distance, over the root of their number, and several
+    times worse along the optical axis. It matters where landmarks are seen in the healthy part but were placed by what
+    the corrupted one saw of them: they then agree with each other in a wrong scale, and only the path is right.
     """
     centres = model.T_old_kf[keyframes, :3, 3]
     moved = sim3.act(S_old_new, model.T_new_kf[keyframes, :3, 3])
-    noise = float(np.median(np.linalg.norm(model.pairs.xyz_old - centres.mean(0), axis=1))) / float(model.K_old[0, 0])
+    n = np.bincount(model.pairs.view_keyframe, minlength=len(keyframes))[keyframes]
+    distance = float(np.median(np.linalg.norm(model.pairs.xyz_old - centres.mean(0), axis=1)))
+    noise = ALONG_AXIS * distance / (float(model.K_old[0, 0]) * math.sqrt(float(np.median(n))))
     centres, moved = centres - centres.mean(0), moved - moved.mean(0)
     length2 = float((moved**2).sum())
     if not length2 > noise**2:

@@ -10,7 +10,17 @@ import numpy as np
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.submap import Submap
 from dualslam.core.types import FloatArray, Keyframe
-from tests.linking.worlds import FRAME_STEP, Case, make_case, make_tail_case
+from tests.linking.worlds import (
+    FRAME_STEP,
+    Case,
+    Recipe,
+    build,
+    drifted_poses,
+    finish,
+    make_case,
+    make_tail_case,
+    make_world,
+)
 
 ONSET = 10
 ONSET_ID = ONSET * FRAME_STEP
@@ -139,3 +149,22 @@ def corrupted_tail(layout: str, seed: int, oldest_new: int, kept_ties: float) ->
 @lru_cache(maxsize=256)
 def _tail_case(layout: str, seed: int, oldest_new: int, kept_ties: float) -> Case:
     return make_tail_case(layout, seed, ONSET, oldest_new, tail_displacement(seed, layout), kept_ties=kept_ties)
+
+
+def creeping_tail(layout: str, seed: int, oldest_new: int, rate: float) -> Case:
+    """The old map's scale runs away from frame `ONSET` on, by about `rate` more each frame: nowhere is it torn.
+
+    Landmarks seen on both sides are placed by what both saw, so that healthy keyframes hold some that are off.
+    """
+    rng = np.random.default_rng(4000 + seed)
+    world = make_world(layout, seed)
+    poses = drifted_poses(world, ONSET - 2, rng, 0.002)
+    sign, log_scale = rng.choice([-1.0, 1.0]), 0.0
+    for f in range(ONSET, len(poses) - 1):
+        step = se3.inverse(world.T_w_cam[f]) @ world.T_w_cam[f + 1]
+        log_scale += sign * rate * rng.uniform(0.5, 1.5)
+        step[:3, 3] *= np.exp(log_scale)
+        poses[f + 1] = poses[f] @ step @ se3.exp(np.r_[0.2 * rate * rng.normal(size=3), np.zeros(3)])
+    old = build(world, Recipe(list(range(18)), ONSET), 0, rng, poses)
+    new = build(world, Recipe(list(range(23, oldest_new - 1, -1)), (oldest_new + ONSET) // 2), 1, rng)
+    return finish(old, new, rng)

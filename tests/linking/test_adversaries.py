@@ -38,6 +38,12 @@ CASES = [
             LAYOUTS, enumerate((0.3, 0.45, 0.55, 0.7, 0.85, 1.0)), (False, True)
         )
     ),
+    *(
+        (adversaries.creeping_tail, (layout, s, oldest, rate), onset)
+        for layout, (s, rate), oldest, onset in itertools.product(
+            LAYOUTS, enumerate((0.02, 0.05, 0.1)), (10, 7, 5), (None, 36)
+        )
+    ),
     # The new map reaches to one frame past the onset, to it, or past it by less than is needed, or by enough.
     *(
         (adversaries.corrupted_tail, (layout, s, oldest, ties), onset)

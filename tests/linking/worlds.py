@@ -115,10 +115,12 @@ class Recipe:
     outliers: float = 0.05
 
 
-def build(world: World, recipe: Recipe, submap_id: int, rng: np.random.Generator) -> Submap:
+def build(
+    world: World, recipe: Recipe, submap_id: int, rng: np.random.Generator, poses: FloatArray | None = None
+) -> Submap:
     """Map frames in the given order, points triangulated from noisy pixels with drifting poses; gauge: the world's."""
     submap = Submap(submap_id, world.K, world.features[0].descriptors[0])
-    poses = drifted_poses(world, recipe.anchor, rng, recipe.drift)
+    poses = drifted_poses(world, recipe.anchor, rng, recipe.drift) if poses is None else poses
     frames = np.array(recipe.frames)
     for f in frames.tolist():
         submap.add_keyframe(Keyframe(FRAME_STEP * f, 0.1 * FRAME_STEP * f, world.features[f]), poses[f])
