@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.geometry import se3
-from dualslam.core.geometry.triangulation import point_covariance
+from dualslam.core.geometry.triangulation import point_covariance, triangulate_n_view
 from dualslam.core.submap import Submap
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray
 
@@ -112,7 +112,9 @@ def shared_keyframes(old: Submap, new: Submap) -> list[int]:
     return sorted(old.keyframes.keys() & new.keyframes.keys())
 
 
-def propose_correspondences(old: Submap, new: Submap, matcher: DescriptorMatcher | None = None) -> Correspondences:
+def propose_correspondences(
+    old: Submap, new: Submap, matcher: DescriptorMatcher | None = None, old_before: int | None = None
+) -> Correspondences:
     """Match landmarks of two submaps through their shared keyframes.
 
     In each shared keyframe two landmarks are proposed as one where both maps use the same keypoint of the same image
@@ -125,6 +127,9 @@ def propose_correspondences(old: Submap, new: Submap, matcher: DescriptorMatcher
     old, new : Submap
     matcher : DescriptorMatcher, optional
         Without it pairs come from identity alone.
+    old_before : int, optional
+        The old map's keyframes from this one on are not believed: its points are placed anew by what the older ones
+        saw of them, and those that these do not fix are left out.
 
     Returns
     -------
@@ -134,7 +139,11 @@ def propose_correspondences(old: Submap, new: Submap, matcher: DescriptorMatcher
     votes = _concatenate([_votes_of_keyframe(old, new, k, matcher) for k in shared_keyframes(old, new)])
     kept, pair_of_vote = _one_to_one(votes, len(new.landmarks))
     landmark_old, landmark_new = kept
-    covariance_old, covariance_new = landmark_covariances(old, landmark_old), landmark_covariances(new, landmark_new)
+    xyz_old, xyz_new = old.landmarks["xyz_mu"][landmark_old], new.landmarks["xyz_mu"][landmark_new]
+    if old_before is not None:
+        xyz_old = _place_anew(old, landmark_old, old_before)
+    covariance_old = _covariances(old, landmark_old, xyz_old, old_before)
+    covariance_new = _covariances(new, landmark_new, xyz_new, None)
     finite = np.isfinite(np.stack([covariance_old, covariance_new])).all((0, 2, 3))
     fixed = np.asarray(finite, np.bool_)
     row = np.where(fixed, np.cumsum(fixed) - 1, -1)
@@ -152,8 +161,8 @@ def propose_correspondences(old: Submap, new: Submap, matcher: DescriptorMatcher
     return Correspondences(
         landmark_old=landmark_old[fixed],
         landmark_new=landmark_new[fixed],
-        xyz_old=old.landmarks["xyz_mu"][landmark_old[fixed]],
-        xyz_new=new.landmarks["xyz_mu"][landmark_new[fixed]],
+        xyz_old=xyz_old[fixed],
+        xyz_new=xyz_new[fixed],
         covariance_old=covariance_old[fixed],
         covariance_new=covariance_new[fixed],
         first_keyframe=first,
@@ -170,18 +179,41 @@ def propose_correspondences(old: Submap, new: Submap, matcher: DescriptorMatcher
     )
 
 
-def landmark_covariances(submap: Submap, landmark_ids: IntArray) -> FloatArray:
-    """Return (L, 3, 3) covariances of landmarks given the poses of the keyframes that see them; NaN where not fixed."""
+def _views_of(submap: Submap, landmark_ids: IntArray, before: int | None) -> tuple[IntArray, IntArray]:
+    """Return the live observation rows of landmarks in the keyframes before one, and each row's place in the ids."""
     rows = submap.rows_of_landmarks(landmark_ids)
-    if len(rows) == 0:
-        return np.full((len(landmark_ids), 3, 3), np.nan)
+    if before is not None:
+        rows = rows[submap.observations["kf"][rows] < before]
     position = np.full(len(submap.landmarks), -1)
     position[landmark_ids] = np.arange(len(landmark_ids))
+    return rows, position[submap.observations["landmark"][rows]]
+
+
+def _covariances(submap: Submap, landmark_ids: IntArray, xyz: FloatArray, before: int | None) -> FloatArray:
+    """Return (L, 3, 3) covariances of points given the poses of the keyframes that see them; NaN where not fixed."""
+    rows, point = _views_of(submap, landmark_ids, before)
+    if len(rows) == 0:
+        return np.full((len(landmark_ids), 3, 3), np.nan)
     _, sigma = submap.observed_pixels(rows)
     ids, inverse = np.unique(submap.observations["kf"][rows], return_inverse=True)
     T_kf_submap = se3.inverse(submap.keyframe_poses(ids))[inverse]
-    xyz = submap.landmarks["xyz_mu"][landmark_ids]
-    return point_covariance(xyz, submap.K, position[submap.observations["landmark"][rows]], T_kf_submap, sigma)
+    return point_covariance(xyz, submap.K, point, T_kf_submap, sigma)
+
+
+def _place_anew(submap: Submap, landmark_ids: IntArray, before: int) -> FloatArray:
+    """Return the landmarks' points (L, 3) as the keyframes before one alone triangulate them; else NaN."""
+    rows, point = _views_of(submap, landmark_ids, before)
+    if len(rows) == 0:
+        return np.full((len(landmark_ids), 3), np.nan)
+    pixels, _ = submap.observed_pixels(rows)
+    ids, column = np.unique(submap.observations["kf"][rows], return_inverse=True)
+    uv, visible = np.zeros((len(landmark_ids), len(ids), 2)), np.zeros((len(landmark_ids), len(ids)), bool)
+    uv[point, column], visible[point, column] = pixels, True
+    xyz = np.full((len(landmark_ids), 3), np.nan)
+    enough = visible.sum(1) >= 2
+    T_kf_submap = se3.inverse(submap.keyframe_poses(ids))
+    xyz[enough] = triangulate_n_view(uv[enough], submap.K, T_kf_submap, visible[enough]).xyz
+    return xyz
 
 
 def _pixels(submap: Submap, keyframe: IntArray, feature: IntArray) -> tuple[FloatArray, FloatArray]:

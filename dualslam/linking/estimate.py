@@ -112,11 +112,20 @@ def estimate_link(
             return Failure(FailureReason.DEFORMED, detail, {"torn": float(tears_new[-1])})
     if np.count_nonzero(trusted) < config.min_keyframes:
         return _needs_older(int(np.count_nonzero(trusted)), config, onset)
-    # 3. The similarity on which the oldest of them agree, and how far it holds.
-    model = PairModel(pairs, old, new, config.deformation_sigma)
-    consensus = _oldest_consensus(model, trusted, config, rng, onset)
-    if isinstance(consensus, Failure):
-        return consensus
+    # 3. The similarity on which the oldest of them agree, and how far it holds. What lies beyond has moved landmarks of
+    #    the healthy part too: place those anew without it, and ask again.
+    all_pairs, limit, before = pairs, onset, pairs.keyframes[trusted]
+    while True:
+        if limit is not None:
+            pairs = propose_correspondences(old, new, matcher, limit)
+        model = PairModel(pairs, old, new, config.deformation_sigma)
+        has_say = pairs.count_by_keyframe(np.ones(len(pairs.view_pair), bool)) >= config.min_pairs_per_keyframe
+        consensus = _oldest_consensus(model, has_say & np.isin(pairs.keyframes, before), config, rng, limit)
+        if isinstance(consensus, Failure):
+            return consensus
+        if consensus.change is None:
+            break
+        limit, before = consensus.change, before[before < consensus.change]
     # 4. How far the maps' shapes differ beyond it: that is part of what is not known.
     S_old_new = consensus.estimate.S_dst_src
     shape = measure_shape(model, S_old_new, consensus.inliers, consensus.keyframes)
@@ -127,18 +136,23 @@ def estimate_link(
     refused = _verify(model, old, consensus, covariance, shape, config)
     if refused is not None:
         return refused
-    return _link(model, consensus, covariance, shape, onset, config)
+    whole = PairModel(all_pairs, old, new, config.deformation_sigma)
+    return _link(model, whole, consensus, covariance, shape, onset, limit, config)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Consensus:
-    """A similarity with the keyframes (K,) and pairs (M,) that it stands on; `seen`: the pairs that it was asked of."""
+    """A similarity with the keyframes (K,) and pairs (M,) that it stands on.
+
+    `seen`: the pairs that it was asked of; `change`: the first trusted keyframe that had to be left out.
+    """
 
     estimate: Sim3Estimate
     votes: KeyframeVotes
     keyframes: BoolArray
     seen: BoolArray
     inliers: BoolArray
+    change: int | None
 
     @property
     def inlier_ratio(self) -> float:
@@ -182,13 +196,13 @@ def _oldest_consensus(
         estimate = _fit(model, seen, config, rng)
         if isinstance(estimate, Failure):
             failure = estimate if failure is None else failure
-            rows = rows[: len(rows) // 2]
+            change, rows = int(ids[rows[len(rows) // 2]]), rows[: len(rows) // 2]
             continue
         votes = ask_keyframes(model, estimate.S_dst_src, config)
         agrees = votes.agrees[rows]
         n_run = leading_run(agrees, config.max_misfits)
         if n_run == len(rows):
-            return _Consensus(estimate, votes, chosen & votes.agrees, seen, estimate.inliers)
+            return _Consensus(estimate, votes, chosen & votes.agrees, seen, estimate.inliers, change)
         if n_run > 0:  # it holds for the oldest: keep those
             change, rows = int(ids[rows[n_run]]), rows[:n_run]
         elif agrees.any():  # it is that of newer keyframes: look before them
@@ -196,8 +210,8 @@ def _oldest_consensus(
             change, rows = int(ids[rows[first]]), rows[:first]
         else:
             failure = Failure(FailureReason.AGREEMENT, f"none of {len(rows)} keyframes agrees with the similarity")
-            rows = rows[: len(rows) // 2]
-    if change is None and failure is not None:
+            change, rows = int(ids[rows[len(rows) // 2]]), rows[: len(rows) // 2]
+    if failure is not None:
         return failure
     return _needs_older(len(rows), config, onset, change)
 
@@ -247,31 +261,37 @@ def _verify(
 
 def _link(
     model: PairModel,
+    whole: PairModel,
     consensus: _Consensus,
     covariance: FloatArray,
     shape: Shape,
     onset: int | None,
+    limit: int | None,
     config: LinkingConfig,
 ) -> LinkEstimate:
     """Pack a verified consensus."""
     c, estimate, votes = model.pairs, consensus.estimate, consensus.votes
     S = estimate.S_dst_src
-    later = np.flatnonzero(votes.has_say & (c.keyframes >= c.keyframes[consensus.keyframes][0]))
-    n_run = leading_run(votes.agrees[later], config.max_misfits)
-    change_point = int(c.keyframes[later[n_run]]) if n_run < len(later) else None
-    holds = votes.agrees.copy()
-    if change_point is not None:
-        holds &= c.keyframes < change_point
-    same = (model.mahalanobis2(S) < config.pair_chi2) & c.pairs_seen_in(holds)
+    # Beyond the keyframes that it stands on, all pairs are asked as the maps hold them.
+    every = whole.pairs
+    later = ask_keyframes(whole, S, config)
+    after = np.flatnonzero(later.has_say & (every.keyframes > c.keyframes[consensus.keyframes][-1]))
+    misfits = np.flatnonzero(~later.agrees[after])
+    change_point = int(every.keyframes[after[misfits[0]]]) if len(misfits) else None
+    if limit is not None and limit != onset:
+        change_point = limit if change_point is None else min(limit, change_point)
+    holds = np.isin(every.keyframes, c.keyframes[consensus.keyframes])
+    holds |= later.agrees & (every.keyframes < (np.inf if change_point is None else change_point))
+    same = (whole.mahalanobis2(S) < config.pair_chi2) & every.pairs_seen_in(holds)
     on = consensus.keyframes
     numbers = {
         "scale": float(sim3.scale(S)),
         **verify.sigma_numbers(model, S, covariance),
         "chi2": estimate.chi2_per_dof,
-        "n_pairs": float(len(c)),
-        "n_shared_pixel": float(c.shared_pixel.sum()),
+        "n_pairs": float(len(every)),
+        "n_shared_pixel": float(every.shared_pixel.sum()),
         "n_hypotheses": float(estimate.n_iterations),
-        "n_shared_keyframes": float(len(c.keyframes)),
+        "n_shared_keyframes": float(len(every.keyframes)),
         "n_agreeing_keyframes": float(on.sum()),
         "keyframe_rotation_deg": float(np.degrees(votes.rotation_rad[on]).max()),
         "keyframe_centre": float(votes.centre[on].max()),
@@ -284,7 +304,7 @@ def _link(
         covariance=covariance,
         n_matches=int(consensus.seen.sum()),
         n_inliers=int(consensus.inliers.sum()),
-        landmark_pairs=np.stack([c.landmark_old[same], c.landmark_new[same]], 1),
+        landmark_pairs=np.stack([every.landmark_old[same], every.landmark_new[same]], 1),
         agreeing_keyframes=c.keyframes[on],
         change_point=change_point,
         suspected_onset=onset,

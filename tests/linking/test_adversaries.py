@@ -115,7 +115,8 @@ def test_walk_back_over_a_corrupted_tail(layout, seed, ties):
     assert isinstance(result, LinkEstimate)
     assert oldest >= 5  # soon after there are enough keyframes (from 6 on)
     assert not is_wrong(case, result.S_old_new)
-    assert result.agreeing_keyframes.max() < adversaries.ONSET_ID
+    first_wrong = adversaries.ONSET_ID + (3 if seed % 4 == 2 else 0)  # a change of scale leaves its own camera right
+    assert result.agreeing_keyframes.max() < first_wrong
     assert result.change_point in (adversaries.ONSET_ID, adversaries.ONSET_ID + 3)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from dualslam.core.types import Keyframe
 from dualslam.linking import DescriptorMatcher, propose_correspondences
-from dualslam.linking.correspondences import landmark_covariances, shared_keyframes
+from dualslam.linking.correspondences import shared_keyframes
 from tests.linking.worlds import FRAME_STEP, Case, hamming, make_case, make_world
 
 MATCHER = DescriptorMatcher(hamming, 64.0)
@@ -149,7 +149,6 @@ def test_landmarks_that_their_views_do_not_fix_have_no_covariance(case):
     j = int(old.landmarks_of_keyframes(list(old.keyframes)[:1])[0])
     rows = old.rows_of_landmarks(np.array([j]))
     old.remove_observations(rows[1:])
-    assert np.isnan(landmark_covariances(old, np.array([j]))).all()
     pairs = propose_correspondences(old, case.new)
     assert j not in pairs.landmark_old
 
@@ -159,3 +158,17 @@ def test_nothing_in_common():
     pairs = propose_correspondences(a.old, a.new, MATCHER)
     assert len(pairs) == 0
     assert len(pairs.keyframes) == 0
+
+
+def test_points_placed_anew_leave_the_newer_keyframes_out():
+    """Where the older keyframes are right and the newer ones wrong, the older ones alone give the right points."""
+    case = make_case(LAYOUT, SEED, outliers=0.0, drift=0.0)
+    whole = propose_correspondences(case.old, case.new)
+    limit = int(whole.keyframes[6])
+    case.old.landmarks["xyz_mu"][:] += 1.0
+    anew = propose_correspondences(case.old, case.new, old_before=limit)
+    assert 100 < len(anew) < len(whole)
+    both = np.searchsorted(whole.landmark_old, anew.landmark_old)
+    off = np.linalg.norm(anew.xyz_old - whole.xyz_old[both], axis=1)
+    sigma = np.sqrt(np.trace(anew.covariance_old, axis1=1, axis2=2))
+    assert np.median(off / sigma) < 1.0
