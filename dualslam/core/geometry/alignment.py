@@ -78,17 +78,25 @@ class _Sim3Problem:
         return symmetric3.quadratic_inverse(covariance, residual)
 
     def normal_equations(self, S: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (H (7, 7), g (7,)) for right perturbations, covariances held at their value at `S`."""
+        """Return (H (7, 7), g (7,)) of half the summed squared Mahalanobis distances, for right perturbations.
+
+        Both sides are noisy, so the distance is that to the best true point x between the two matched ones, and its
+        exact gradient has the Jacobian at x. With the Jacobian at src and the covariance held, the scale is biased and
+        swapping the maps does not invert the estimate (errors in variables, regression dilution).
+        """
         A = S[:3, :3]
         residual = self.dst - (self.src @ A.T + S[:3, 3])
         covariance = self.cov_dst + A @ self.cov_src @ A.T
         adj, det = symmetric3.adjugate(symmetric3.planes(covariance))
         information = symmetric3.matrices(adj * (weight / det))
-        # S exp(xi) p - S p = A (w x p + u + l p).
-        J = np.empty((len(self.src), 3, 7))
-        J[:, :, :3] = A @ so3.hat(-self.src)
+        pull = (information @ residual[..., None])[..., 0]
+        unweighted = np.where(weight > 0, weight, 1.0)[:, None]
+        x = self.src + (self.cov_src @ A.T @ (pull / unweighted)[..., None])[..., 0]
+        # S exp(xi) x - S x = A (w x x + u + l x).
+        J = np.empty((len(x), 3, 7))
+        J[:, :, :3] = A @ so3.hat(-x)
         J[:, :, 3:6] = A
-        J[:, :, 6] = self.src @ A.T
+        J[:, :, 6] = x @ A.T
         WJ = (information @ J).reshape(-1, 7)
         H = J.reshape(-1, 7).T @ WJ
         return 0.5 * (H + H.T), WJ.T @ residual.reshape(-1)

@@ -213,7 +213,7 @@ def refine_pose(
     T_cam_w : (4, 4)
         Where to start: usually the motion model's prediction.
     xyz : (N, 3)
-        Points in w.
+        Points in w; these and the pixels must be finite.
     uv : (N, 2)
         Their rectified pixels.
     sigma : (N,)

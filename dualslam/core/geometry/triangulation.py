@@ -227,7 +227,7 @@ def _widest_parallax(x: FloatArray, seen: BoolArray, R_w_cam: FloatArray) -> Flo
     """Return the smallest cosine (N,) between any two rays of each point; x (N, V, 2) is normalised."""
     rays = (R_w_cam @ np.concatenate([x, np.ones_like(x[..., :1])], -1)[..., None])[..., 0]
     rays /= np.sqrt((rays * rays).sum(-1, keepdims=True))
-    both = seen[:, :, None] & seen[:, None, :]
+    both = seen[:, :, None] & seen[:, None, :] & ~np.eye(x.shape[1], dtype=bool)
     return np.asarray(np.where(both, rays @ rays.swapaxes(1, 2), 1.0).min((1, 2)), np.float64)
 
 

@@ -133,8 +133,8 @@ class HomographyPoses:
 def decompose_homography(H_b_a: FloatArray, K: FloatArray) -> HomographyPoses:
     """Return the poses and planes that a homography of pixels allows. Ma, section 5.3.3.
 
-    The sign of `H_b_a` is settled by its middle singular value being that of a plane seen from one side by both cameras
-    (positive determinant). Two of the four are left by the positive depth of the points, which `cheirality_vote` asks.
+    The sign of `H_b_a` is chosen so that its determinant is positive, which it is where both cameras are on the same
+    side of the plane. Two of the four poses are ruled out by the positive depth of the points: see `cheirality_vote`.
 
     Parameters
     ----------
