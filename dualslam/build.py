@@ -40,7 +40,7 @@ def build_system(config: Config, camera: Camera) -> System:
     size_px = (camera.width, camera.height)
     return System(
         Components(
-            view_of=lambda frame: view_of(frame, frontend, camera),
+            view_of=lambda frame: view_of(frame, frontend, camera, config.camera.model_sigma_px),
             new_starter=lambda: Initialiser(
                 frontend, bundle_adjust_arrays, config.initialiser, camera.K, size_px, config.seed
             ),
@@ -52,7 +52,7 @@ def build_system(config: Config, camera: Camera) -> System:
     )
 
 
-def view_of(frame: Frame, frontend: Frontend, camera: Camera) -> View | Failure:
+def view_of(frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: float) -> View | Failure:
     """Find a frame's features and take the lens distortion out of them."""
     if frame.image is None:
         return Failure(FailureReason.UNREADABLE, frame.error)
@@ -62,14 +62,14 @@ def view_of(frame: Frame, frontend: Frontend, camera: Camera) -> View | Failure:
             FailureReason.UNREADABLE,
             f"frame {frame.index} is {width}x{height}, the calibration is for {camera.width}x{camera.height}",
         )
-    return View(frame.index, frame.timestamp_s, rectify(frontend.extract(frame.image), camera))
+    return View(frame.index, frame.timestamp_s, rectify(frontend.extract(frame.image), camera, model_sigma_px))
 
 
-def rectify(features: Features, camera: Camera) -> Features:
+def rectify(features: Features, camera: Camera, model_sigma_px: float) -> Features:
     """Move features to the camera's pinhole equivalent; those that it cannot hold are dropped."""
     uv_rect_px, magnification = camera.rectify(features.uv_px)
     # In steps of an eighth of an octave: the graph shares one noise model among all pixels of one sigma.
-    sigma_px = 2.0 ** (np.rint(8.0 * np.log2(features.sigma_px * magnification)) / 8.0)
+    sigma_px = 2.0 ** (np.rint(8.0 * np.log2(np.hypot(features.sigma_px, model_sigma_px) * magnification)) / 8.0)
     rectified = replace(features, uv_rect_px=uv_rect_px, sigma_px=sigma_px)
     inside = np.isfinite(uv_rect_px).all(axis=1) & np.isfinite(magnification)
     return rectified if inside.all() else rectified.take(inside)
