@@ -12,6 +12,7 @@ from dualslam.core.camera import Camera
 from dualslam.core.config import Config
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Failure, FailureReason, Features, Frame, View
+from dualslam.linking import DescriptorMatcher, estimate_link
 from dualslam.system import Components, System
 from frontends.initialiser import Initialiser
 from frontends.registry import create_frontend
@@ -38,6 +39,7 @@ def build_system(config: Config, camera: Camera) -> System:
     """
     frontend = create_frontend(config.frontend)
     size_px = (camera.width, camera.height)
+    matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
     return System(
         Components(
             view_of=lambda frame: view_of(frame, frontend, camera, config.camera.model_sigma_px),
@@ -46,6 +48,9 @@ def build_system(config: Config, camera: Camera) -> System:
             ),
             new_graph=lambda: ISam2SubmapGraph(config.graph),
             new_odometry=lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px),
+            link=lambda old, new, onset: estimate_link(
+                old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
+            ),
             K=camera.K,
         ),
         config,
