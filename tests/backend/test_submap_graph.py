@@ -11,8 +11,9 @@ from dualslam.core.config import GraphConfig
 from dualslam.core.errors import SolverError
 from tests.backend.scenes import Feeder, make_scene, pose_errors
 
-OPTIMUM_MU, OPTIMUM_RAD = 5e-3, 2e-3
-"""How far iSAM2, which does not relinearise what moves little, may be from the batch optimum."""
+OPTIMUM_MU, OPTIMUM_RAD = 5e-3, 5e-3
+"""How far iSAM2, which does not relinearise what moves little, may be from the batch optimum: less than the standard
+deviation of the last pose, and nowhere more than one standard deviation of the same pose."""
 
 
 def apply(submap, estimate):
@@ -65,6 +66,9 @@ def test_estimate_is_near_the_batch_optimum_and_the_newest_fit():
     t, r = pose_errors(e.T_submap_kf, oracle.T_submap_kf)
     assert t.max() < OPTIMUM_MU
     assert r.max() < OPTIMUM_RAD
+    sigma = np.sqrt([np.diag(graph.pose_covariance(int(k))) for k in e.keyframe_ids[1:]])
+    assert (r[1:] < np.linalg.norm(sigma[:, :3], axis=1)).all()
+    assert (t[1:] < np.linalg.norm(sigma[:, 3:], axis=1)).all()
     # Another solver entry, with the second pose fixed instead of a distance, agrees as well.
     by_id = np.argsort(batch.keyframe_ids)
     t, r = pose_errors(e.T_submap_kf, batch.result.T_submap_kf[by_id])
@@ -96,7 +100,9 @@ def test_outliers_are_reported_and_borne():
     assert t.max() < 0.05
     obs = feeder.submap.observations
     found = set(zip(obs["kf"][e.outlier_rows].tolist(), obs["feature"][e.outlier_rows].tolist(), strict=True))
-    present = wrong & set(zip(obs["kf"].tolist(), obs["feature"].tolist(), strict=True))
+    # A landmark enters the graph with its third view: what only two keyframes saw is not judged.
+    judged = np.isin(obs["landmark"], e.landmark_ids)
+    present = wrong & set(zip(obs["kf"][judged].tolist(), obs["feature"][judged].tolist(), strict=True))
     assert len(found & present) > 0.9 * len(present)
     assert len(found - present) < 0.08 * len(obs)
 

@@ -40,7 +40,7 @@ def test_dump_explains_every_field() -> None:
         at = next(i for i, line in enumerate(lines) if line.startswith(f"{name}:"))
         assert lines[at - 1].startswith("# ")
     assert all(len(line) <= 120 for line in lines)
-    at = lines.index("  n_features: 1500")
+    at = lines.index(f"  n_features: {Config().frontend.n_features}")
     assert lines[at - 1] == "  # Keypoints per image."
 
 

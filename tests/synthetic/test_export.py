@@ -36,7 +36,7 @@ def test_folder_round_trips(tmp_path: Path) -> None:
     # SOURCE.md is a recipe that works.
     code = (out / "SOURCE.md").read_text().split("```python\n")[1].split("render_to_folder(")[0]
     again: dict[str, object] = {}
-    exec(code + "\nimage = sequence.frame(5).image", {}, again)  # noqa: S102
+    exec(code + "\nimage = sequence.frame(5).image", {}, again)
     assert np.array_equal(again["image"], sequence.frame(5).image)
 
 
