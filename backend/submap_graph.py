@@ -93,7 +93,7 @@ class ISam2SubmapGraph:
         SolverError
             If the solver failed and the graph could not be made anew either.
         """
-        start = time.perf_counter()
+        start = time.thread_time()
         if self._solver is None:
             return self._remake(submap, start, rebuilt=False)
         if self._gauge is None or self._gauge.was_moved_in(submap):
@@ -119,14 +119,14 @@ class ISam2SubmapGraph:
         SolverError
             If that cannot be done.
         """
-        return self._remake(submap, time.perf_counter(), rebuilt=True)
+        return self._remake(submap, time.thread_time(), rebuilt=True)
 
     def full_estimate(self, submap: Submap) -> GraphEstimate:
         """Return the estimate of every keyframe and landmark in the graph as of the last update, without solving."""
         if self._solver is None:
             return self.update(submap)
         try:
-            return self._read(submap, time.perf_counter(), None, True, rebuilt=False)
+            return self._read(submap, time.thread_time(), None, True, rebuilt=False)
         except SolverFailure as failure:
             raise SolverError(f"graph of submap {submap.id}: {failure}; rebuild it") from failure
 
@@ -278,7 +278,7 @@ class ISam2SubmapGraph:
             outlier_rows=np.union1d(outliers, plan.refused) if plan is not None else outliers,
             chi2_newest=chi2_newest,
             rebuilt=rebuilt,
-            seconds=time.perf_counter() - start,
+            seconds=time.thread_time() - start,
         )
 
     # --- starting again

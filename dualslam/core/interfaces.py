@@ -79,6 +79,7 @@ class GraphEstimate:
     rebuilt : bool
         True where the solver threw and the graph was made anew from the submap's arrays.
     seconds : float
+        CPU time of the calling thread.
     """
 
     keyframe_ids: IntArray
@@ -170,7 +171,9 @@ class BundleResult:
 class BundleAdjuster(Protocol):
     """Batch bundle adjustment, robust. Raises `SolverError` where the solver fails."""
 
-    def __call__(self, problem: BundleProblem) -> BundleResult: ...
+    def __call__(self, problem: BundleProblem) -> BundleResult:
+        """Adjust all poses that are not fixed, and all points."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
