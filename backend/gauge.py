@@ -8,6 +8,7 @@ from typing import TypeGuard
 
 import numpy as np
 
+from dualslam.core.geometry import se3
 from dualslam.core.submap import Submap
 from dualslam.core.types import FloatArray
 
@@ -40,7 +41,7 @@ class Gauge:
         T = submap.T_submap_kf.get(self.first)
         if T is None:
             return False
-        off = np.linalg.inv(self.T_submap_first) @ T
+        off = se3.inverse(self.T_submap_first) @ T
         if np.abs(off[:3, :3] - np.eye(3)).max() > MOVED_TOLERANCE:
             return True
         if np.linalg.norm(off[:3, 3]) > MOVED_TOLERANCE * max(1.0, self.baseline_mu):

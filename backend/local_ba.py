@@ -21,7 +21,7 @@ from backend.solver import SolverFailure, optimise_batch
 from dualslam.core.errors import SolverError
 from dualslam.core.interfaces import BundleProblem, BundleResult
 from dualslam.core.submap import Submap
-from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.core.types import FloatArray, IntArray
 
 MAX_DEPTH_SIGMA = 1.0
 """A point whose distance is known no better than this (relative, one sigma) is not adjusted."""

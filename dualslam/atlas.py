@@ -7,6 +7,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from dualslam.core.geometry import sim3
 from dualslam.core.submap import Submap
 from dualslam.core.types import FloatArray
 
@@ -77,6 +78,6 @@ class Atlas:
                     found[link.b] = found[link.a] @ link.S_a_b
                     grown = True
                 elif link.b in found and link.a not in found:
-                    found[link.a] = found[link.b] @ np.linalg.inv(link.S_a_b)
+                    found[link.a] = found[link.b] @ sim3.inverse(link.S_a_b)
                     grown = True
         return found

@@ -1,8 +1,8 @@
 """Algorithm 1: walk back in time from a new submap until it overlaps a lost one so well that a Sim(3) links the two.
 
-The walk is the visual front end, given the buffered frames latest first. It sees images and features only, never the old
-map's poses or landmarks: a link must not confirm itself. What it takes from the old map is which frames were keyframes,
-so that both maps hold the same ones.
+The walk is the visual front end, given the buffered frames latest first. It sees images and features only, never the
+old map's poses or landmarks: a link must not confirm itself. What it takes from the old map is which frames were
+keyframes, so that both maps hold the same ones.
 """
 
 from __future__ import annotations

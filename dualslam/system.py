@@ -11,6 +11,7 @@ import numpy as np
 from dualslam.atlas import Atlas, Link, LinkKind
 from dualslam.core.config import Config
 from dualslam.core.events import EventKind, EventLog
+from dualslam.core.geometry import se3
 from dualslam.core.interfaces import MapStarter, SubmapGraph, VisualOdometry
 from dualslam.core.stage_timer import StageTimer
 from dualslam.core.submap import Submap
@@ -139,7 +140,7 @@ class System:
             start = self._starter.add(view)
         if isinstance(start, Failure):
             if start.reason is FailureReason.DOUBTFUL_INITIALISATION:
-                self._event(EventKind.INITIALISATION_REFUSED, view, reason=start.detail, **start.numbers)
+                self._event(EventKind.INITIALISATION_REFUSED, view, None, reason=start.detail, **start.numbers)
             return start
         return self._begin_submap(start, view)
 
@@ -155,17 +156,18 @@ class System:
         for k, keyframe in submap.keyframes.items():
             self._pose(FramePose(k, keyframe.timestamp_s, submap.id, k, np.eye(4)))
         self._event(kind, view, submap.id, first_view=start.views[0].index, **start.numbers)
-        self._walk_back(submap, graph, view)
+        with self.timer.measure("walk back"):
+            self._walk_back(submap, graph, view)
         self._live = self._parts.new_odometry(submap, graph)
         self._live.start_at(view.index)
         self._buffer.thaw()
         n = int((submap.landmark_of[view.index] >= 0).sum())
-        T_cam_submap = np.linalg.inv(submap.T_submap_kf[view.index])
+        T_cam_submap = se3.inverse(submap.T_submap_kf[view.index])
         ids = submap.landmark_of[view.index]
         return Track(view, T_cam_submap, T_cam_submap, ids, n, n, n, 1.0, False, np.zeros((6, 6)))
 
     def _walk_back(self, submap: Submap, graph: SubmapGraph, newest: View) -> None:
-        """Run the front end back in time: over the frames without a pose, then on into a lost submap to link with it."""
+        """Run the front end back in time: over the frames without a pose, then on into a lost submap, to link them."""
         started = time.perf_counter()
         recovery = self._config.recovery
         onsets = self._onsets if recovery.enabled else {}
@@ -249,8 +251,10 @@ class System:
         self._event(EventKind.FUSED, view, submap.id, old_submap=old_id, bypassed=n_bypassed)
 
     def _was_lost(self, index: int, old_id: int) -> bool:
-        return self.poses[index].submap_id != old_id and self.rows[index].status is FrameStatus.TRACKED and (
-            index >= self._onsets[old_id]
+        return (
+            self.poses[index].submap_id != old_id
+            and self.rows[index].status is FrameStatus.TRACKED
+            and (index >= self._onsets[old_id])
         )
 
     def _judge(self, track: Track | Failure) -> Track | Failure:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.atlas import Atlas
-from dualslam.core.types import FloatArray
+from dualslam.core.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +33,7 @@ class Trajectory:
     T_world_cam : (N, 4, 4) float64
     """
 
-    index: FloatArray
+    index: IntArray
     timestamp_s: FloatArray
     T_world_cam: FloatArray
 

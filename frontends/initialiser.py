@@ -180,7 +180,7 @@ class Initialiser:
         if not support or min(support) < config.min_support:
             detail = f"the frames between confirm {numbers['support']:.0%} of the points"
             return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers)
-        views = [v for v, keep in zip(views, keep_views, strict=True) if keep]
+        views = [views[v] for v in np.flatnonzero(keep_views)]
         return self._adjust(views, T_first_cam[keep_views], xyz, feature[keep_views], numbers)
 
     def _confirm(self, witness: View, first: View, feature: IntArray, xyz: FloatArray) -> _Witness | Failure:
@@ -245,9 +245,7 @@ class Initialiser:
         return Start(views, T, result.xyz_mu[keep] / depth, feature[:, keep], numbers)
 
 
-def direction_sigma_deg(
-    problem: BundleProblem, T_w_cam: FloatArray, xyz: FloatArray, inlier: BoolArray
-) -> float:
+def direction_sigma_deg(problem: BundleProblem, T_w_cam: FloatArray, xyz: FloatArray, inlier: BoolArray) -> float:
     """Standard deviation of the direction from the first to the last camera, by the two views' Hessian, degrees.
 
     The points are eliminated by the Schur complement; the scale, which two views cannot tell, is held by its own prior.
@@ -281,7 +279,7 @@ def direction_sigma_deg(
 
 
 def _jacobians(K: FloatArray, T_w_cam: FloatArray, xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """d uv / d (left perturbation of T_cam_w) and d uv / d point, (N, 2, 6) and (N, 2, 3)."""
+    """Derivatives of the pixels by a left perturbation of T_cam_w and by the point, (N, 2, 6) and (N, 2, 3)."""
     T_cam_w = se3.inverse(T_w_cam)
     p = xyz @ T_cam_w[:3, :3].T + T_cam_w[:3, 3]
     J_uv = np.zeros((len(p), 2, 3))

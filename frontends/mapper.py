@@ -51,9 +51,7 @@ def spread_choice(uv_px: FloatArray, priority: IntArray, n: int, size_px: tuple[
 class Mapper:
     """Extends a submap by keyframes; knows nothing of the order in which they come."""
 
-    def __init__(
-        self, frontend: Frontend, config: MappingConfig, submap: Submap, size_px: tuple[int, int]
-    ) -> None:
+    def __init__(self, frontend: Frontend, config: MappingConfig, submap: Submap, size_px: tuple[int, int]) -> None:
         self._frontend = frontend
         self._config = config
         self._submap = submap
@@ -174,9 +172,7 @@ class Mapper:
         if not self._wide_enough(other, baseline) or len(rows_a) == 0 or len(rows_b) == 0:
             return np.zeros(0, np.int64)
         T_b_a = se3.inverse(T_submap_b) @ T_submap_a
-        matches = match_epipolar(
-            self._frontend, a, b, rows_a, rows_b, fundamental_from_pose(submap.K, T_b_a)
-        )
+        matches = match_epipolar(self._frontend, a, b, rows_a, rows_b, fundamental_from_pose(submap.K, T_b_a))
         fa, fb = matches.index[:, 0], matches.index[:, 1]
         points = triangulate_two_view(a.uv_rect_px[fa], b.uv_rect_px[fb], submap.K, T_submap_a, T_submap_b)
         ok = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +106,7 @@ def match_projected(
     grid: FeatureGrid,
     features: Features,
     uv_pred: FloatArray,
-    radius_px: FloatArray,
+    radius_px: NDArray[np.floating[Any]],
     descriptors: NDArray[np.generic],
     *,
     octave: IntArray | FloatArray | None = None,
@@ -147,7 +148,7 @@ def match_projected(
     Matches
         Rows of `uv_pred` (ascending), rows of `features`.
     """
-    query, feature = grid.within(uv_pred, radius_px)
+    query, feature = grid.within(uv_pred, np.asarray(radius_px, np.float64))
     usable = np.ones(len(query), np.bool_)
     if octave is not None:
         usable &= np.abs(features.octave[feature] - octave[query]) <= octave_tolerance

@@ -226,9 +226,7 @@ class Tracker:
 
     def _predict_local(self, local: LocalMap, T_cam_submap: FloatArray) -> Prediction:
         frontend = self._frontend
-        return local.predict(
-            T_cam_submap, self._submap.K, self._size_px, frontend.scale_factor, frontend.n_octaves
-        )
+        return local.predict(T_cam_submap, self._submap.K, self._size_px, frontend.scale_factor, frontend.n_octaves)
 
     def _local_map(self, landmark_ids: IntArray) -> LocalMap:
         keyframe_ids, _ = self._submap.covisible(landmark_ids)

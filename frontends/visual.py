@@ -71,9 +71,7 @@ class VisualFrontEnd:
         """Make the frame a keyframe: extend the map, solve its graph, drop what the solution contradicts."""
         mapping = self._mapper.insert(track)
         estimate = self.graph.update(self.submap)
-        self.submap.apply_estimate(
-            estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu
-        )
+        self.submap.apply_estimate(estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu)
         self._mapper.remove_outliers(estimate.outlier_rows)
         self._meet(track.view.index)
         culled = self._cull_keyframe()

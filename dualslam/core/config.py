@@ -48,7 +48,7 @@ class InitialiserConfig(StrictModel):
     min_support: float = Field(0.6, gt=0, le=1)
     """Share of the points that the frames between the two views must confirm by their own pixels."""
     homography_ratio: float = Field(0.45, gt=0, lt=1)
-    """Share of the homography's score in both models' above which the scene counts as planar or the motion as a turn."""
+    """Share of the homography's score in both models' above which the scene is planar, or the motion as a turn."""
     max_views: int = Field(120, ge=5)
     """How many recent frames are kept as possible first views."""
 
@@ -215,8 +215,8 @@ class LinkingConfig(StrictModel):
     """Relative difference between near (10 %) and far (90 %) agreeing landmarks' depths in the shared keyframes: less
     than triangulation itself scatters is a single depth, which cannot tell scale from motion along the axis."""
     max_scale: float = Field(50.0, gt=1)
-    """Largest scale, and inverse of the smallest: submaps start with a median depth of 1, so that the scale is the ratio
-    of the depths at their starts."""
+    """Largest scale, and inverse of the smallest: submaps start with a median depth of 1, so that the scale is the
+    ratio of the depths at their starts."""
     max_scale_sigma: float = Field(0.0167, gt=0)
     """Largest standard deviation of the scale (relative)."""
     max_rotation_sigma_deg: float = Field(1.0, gt=0)

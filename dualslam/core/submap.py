@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.geometry import se3
 from dualslam.core.tables import Table
 from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe, Start
 
@@ -106,7 +107,7 @@ class Submap:
         """Cull a keyframe: its observations die, its pose lives on relative to `anchor_id`."""
         rows = np.flatnonzero((self.observations["kf"] == keyframe_id) & self.observations["alive"])
         self.remove_observations(rows)
-        T_kf_cam = np.linalg.inv(self.T_submap_kf[anchor_id]) @ self.T_submap_kf[keyframe_id]
+        T_kf_cam = se3.inverse(self.T_submap_kf[anchor_id]) @ self.T_submap_kf[keyframe_id]
         self.anchors[keyframe_id] = Anchor(anchor_id, T_kf_cam)
         del self.keyframes[keyframe_id], self.T_submap_kf[keyframe_id], self.landmark_of[keyframe_id]
 
@@ -197,7 +198,7 @@ class Submap:
         n = len(feature)
         rows = self.observations.append(n, kf=kf, feature=feature, landmark=landmark, alive=True)
         if np.ndim(kf) == 0:
-            self.landmark_of[int(kf)][feature] = landmark  # type: ignore[arg-type]
+            self.landmark_of[int(kf)][feature] = landmark
         else:
             for k, f, j in zip(np.asarray(kf).tolist(), feature.tolist(), landmark.tolist(), strict=True):
                 self.landmark_of[k][f] = j
@@ -294,5 +295,3 @@ class Submap:
         twin.landmarks = Table.from_columns(self.landmarks.columns())
         twin.observations = Table.from_columns(self.observations.columns())
         return twin
-
-

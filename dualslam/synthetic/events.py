@@ -160,7 +160,7 @@ def disturbance(events: Iterable[Event], index: int) -> Disturbance:
 
 
 def yaw_offset_rad(events: Iterable[Event], index: float) -> float:
-    """Return how far rotation events turn the camera aside at the (fractional) frame `index`: out and back, smoothly."""
+    """Return how far rotation events turn the camera at the (fractional) frame `index`: out and back, smoothly."""
     total = 0.0
     for event in events:
         if event.kind is EventKind.ROTATION:

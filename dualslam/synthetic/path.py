@@ -32,6 +32,7 @@ class Sway:
         self._phase = rng.uniform(0, 2 * np.pi, (len(amplitudes), n_waves))
 
     def __call__(self, t_s: float) -> FloatArray:
+        """Return the sum of the waves at a time."""
         return np.asarray((self._scale * np.sin(self._omega * t_s + self._phase)).sum(1))
 
 

@@ -96,6 +96,7 @@ class GroundTile:
     z_m: float
 
     def __call__(self, p: Painter) -> None:
+        """Paint the piece."""
         grain = p.anchored_noise(round(self.x_m * p.px_per_m), round(-self.z_m * p.px_per_m))
         # Stones and specks of a few centimetres, which fractal noise alone lacks.
         grain += 0.9 * p.rng.standard_normal(p.image.shape, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""The room scene: walls, floor and ceiling, furniture along the walls, a laid table in the middle, things everywhere."""
+"""The room scene: walls, floor and ceiling, furniture along the walls, a laid table in the middle, and many things."""
 
 from __future__ import annotations
 

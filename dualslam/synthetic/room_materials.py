@@ -1,4 +1,4 @@
-"""What the room's surfaces look like. Each function paints one kind of surface on a `Painter`, differently each time."""
+"""What the room's surfaces look like: each function paints a kind of surface on a `Painter`, new each time."""
 
 from __future__ import annotations
 
