@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.atlas import Atlas, Link, LinkKind
+from dualslam.calibration import Calibration
 from dualslam.core.config import Config
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.interfaces import MapStarter, SubmapGraph, VisualOdometry
@@ -29,7 +30,12 @@ class Components:
     new_starter: Callable[[], MapStarter]
     new_graph: Callable[[], SubmapGraph]
     new_odometry: Callable[[Submap, SubmapGraph], VisualOdometry]
-    K: FloatArray
+    calibration: Calibration
+
+    @property
+    def K(self) -> FloatArray:
+        """(3, 3) intrinsics of the rectified pixels, as they are known now."""
+        return self.calibration.camera.K
 
 
 @dataclass(slots=True)
@@ -183,6 +189,8 @@ class System:
         track = self._track_with(live, view)
         if track:
             self._lost = []
+            if live.reference_id == view.index and self._parts.calibration.is_due(live.submap):
+                self._calibrate(live, view)
             if len(live.submap.keyframes) >= self._config.graph.max_keyframes:
                 self._roll_over(live, view)
             return track
@@ -214,6 +222,20 @@ class System:
             FramePose(view.index, view.timestamp_s, odometry.submap.id, reference, odometry.relative_pose(track)), track
         )
         return track
+
+    def _calibrate(self, live: VisualOdometry, view: View) -> None:
+        """Ask the submap about its camera. Where the answer is clear, submap, graph and buffer change to it."""
+        calibration = self._parts.calibration
+        with self.timer.measure("calibration"):
+            refined = calibration.refine(live.submap, self._parts.new_graph())
+            if isinstance(refined, Failure):
+                self._event(
+                    EventKind.CALIBRATION_KEPT, view, live.submap.id, reason=refined.detail, **refined.numbers
+                )
+                return
+            live.adopt(refined.graph)
+            self._buffer.map(calibration.rectified)
+        self._event(EventKind.CALIBRATED, view, live.submap.id, **refined.numbers)
 
     # --- failure
 

@@ -13,6 +13,7 @@ from dualslam.core.types import BoolArray, Failure, Features, FloatArray, Frame,
 
 if TYPE_CHECKING:
     from dualslam.core.camera import Camera
+    from dualslam.core.corrected_camera import LensCorrection
     from dualslam.core.submap import Submap
 
 
@@ -173,6 +174,52 @@ class BundleAdjuster(Protocol):
     def __call__(self, problem: BundleProblem) -> BundleResult: ...
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationEstimate:
+    """What a submap's observations say about the camera that took them.
+
+    Attributes
+    ----------
+    correction : LensCorrection
+        Of the calibration that was given.
+    covariance : (5, 5)
+        Of ``correction.vector``, inflated for the correlation of neighbouring observations.
+    free : (5,) bool
+        Which parameters the observations fix; the others were held at zero.
+    distance2 : float
+        Squared Mahalanobis distance from the correction that the submap was made with.
+    accepted : bool
+        Whether it is significantly better than that.
+    cost_before, cost_after : float
+        Sum of the Huber losses; before: poses and points as they were.
+    n_keyframes, n_observations : int
+    seconds : float
+    """
+
+    correction: LensCorrection
+    covariance: FloatArray
+    free: BoolArray
+    distance2: float
+    accepted: bool
+    cost_before: float
+    cost_after: float
+    n_keyframes: int
+    n_observations: int
+    seconds: float
+
+
+class SelfCalibrator(Protocol):
+    """Asks a submap about its camera, which is the one that rectified its features. The submap is not changed."""
+
+    def __call__(self, submap: Submap, camera: Camera) -> CalibrationEstimate | Failure: ...
+
+
+class SubmapAdjuster(Protocol):
+    """Refines all poses and points of a submap in place, in batch. Raises `SolverError` where the solver fails."""
+
+    def __call__(self, submap: Submap) -> None: ...
+
+
 @dataclass(frozen=True, slots=True)
 class MappingReport:
     """What one keyframe added and removed."""
@@ -218,6 +265,10 @@ class VisualOdometry(Protocol):
 
     def start_at(self, keyframe_id: int) -> None:
         """Begin at a keyframe of the submap, at rest."""
+        ...
+
+    def adopt(self, graph: SubmapGraph) -> None:
+        """Go on with another graph of the same submap, whose poses and points have moved."""
         ...
 
     def track(self, view: View) -> Track | Failure:
