@@ -10,7 +10,7 @@ from dualslam.core.camera import Camera
 from dualslam.core.config import CalibrationConfig
 from dualslam.core.corrected_camera import correct
 from dualslam.core.errors import InputError, SolverError
-from dualslam.core.interfaces import CalibrationEstimate, SelfCalibrator, SubmapAdjuster, SubmapGraph
+from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Features, View
 
@@ -26,11 +26,14 @@ class Refinement:
     ----------
     graph : SubmapGraph
         Made from the changed submap.
+    before : Submap
+        A copy of the submap as it was.
     numbers : dict
         For the event log.
     """
 
     graph: SubmapGraph
+    before: Submap
     numbers: dict[str, float]
 
 
@@ -82,7 +85,7 @@ class Calibration:
             if estimate.reason is FailureReason.DEGENERATE:
                 self._due_at[submap.id] = n + RETRY_KEYFRAMES
             return estimate
-        numbers = _numbers(estimate)
+        numbers = estimate.numbers
         if not estimate.accepted:
             return Failure(FailureReason.CHI_SQUARE, "no significant change", numbers)
         try:
@@ -94,10 +97,11 @@ class Calibration:
         except (InputError, SolverError) as error:
             return Failure(FailureReason.SOLVER, str(error), numbers)
         changed.apply_estimate(solved.keyframe_ids, solved.T_submap_kf, solved.landmark_ids, solved.xyz_mu)
+        before = submap.copy()
         submap.K, submap.keyframes = changed.K, changed.keyframes
         submap.T_submap_kf, submap.landmarks = changed.T_submap_kf, changed.landmarks
         self._camera = camera
-        return Refinement(graph, numbers)
+        return Refinement(graph, before, numbers)
 
     def rectified(self, view: View) -> View:
         """Return a view with the pixels that the present camera gives it."""
@@ -130,17 +134,3 @@ def _change_camera(submap: Submap, camera: Camera) -> None:
     for k, keyframe in submap.keyframes.items():
         submap.keyframes[k] = replace(keyframe, features=_rectified_again(keyframe.features, camera))
 
-
-def _numbers(estimate: CalibrationEstimate) -> dict[str, float]:
-    names = ("log_focal", "du_px", "dv_px", "k1", "k2")
-    sigmas = np.sqrt(np.diag(estimate.covariance))
-    numbers = {name: float(v) for name, v in zip(names, estimate.correction.vector, strict=True)}
-    numbers |= {f"{name}_sigma": float(v) for name, v in zip(names, sigmas, strict=True)}
-    return numbers | {
-        "distance2": estimate.distance2,
-        "cost_before": estimate.cost_before,
-        "cost_after": estimate.cost_after,
-        "keyframes": float(estimate.n_keyframes),
-        "observations": float(estimate.n_observations),
-        "seconds": estimate.seconds,
-    }

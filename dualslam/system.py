@@ -10,6 +10,7 @@ import numpy as np
 
 from dualslam.atlas import Atlas, Link, LinkKind
 from dualslam.calibration import Calibration
+from dualslam.carried_poses import carry_poses
 from dualslam.core.config import Config
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.interfaces import MapStarter, SubmapGraph, VisualOdometry
@@ -235,6 +236,8 @@ class System:
                 return
             live.adopt(refined.graph)
             self._buffer.map(calibration.rectified)
+            for pose in carry_poses(self.poses.values(), refined.before, live.submap):
+                self.poses[pose.index] = pose
         self._event(EventKind.CALIBRATED, view, live.submap.id, **refined.numbers)
 
     # --- failure

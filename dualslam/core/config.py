@@ -166,7 +166,7 @@ class CalibrationConfig(StrictModel):
     """Prior of the log of both focal lengths. A chequerboard gives 0.003, the depth camera's focal length taken for the
     colour camera's 0.1, a data sheet 0.05. It need not be tight: where the motion does not fix the focal length, nothing
     is changed at all."""
-    principal_point_sigma: float = Field(0.01, gt=0)
+    principal_point_sigma: float = Field(0.015, gt=0)
     """Prior of the principal point, relative to the image's width: what lenses are off the middle."""
     k1_sigma: float = Field(0.03, gt=0)
     """Prior of the radial distortion that is left in the rectified image: the displacement at 45 degrees from the axis
@@ -174,11 +174,10 @@ class CalibrationConfig(StrictModel):
     k2_sigma: float = Field(0.03, gt=0)
     """The same for the term with the fourth power of the radius."""
     inflation: float = Field(3.0, ge=1)
-    """Factor on the estimate's sigmas, because neighbouring observations err alike. With the exact camera (rendered
+    """How much larger than their sigmas the errors of the pixels are taken to be, because neighbouring ones err alike. With the exact camera (rendered
     images) corrections came out up to 2.4 times as far from zero as the Hessian's sigmas say."""
     max_sigma_ratio: float = Field(0.4, gt=0, le=1)
-    """A parameter counts as observed where its sigma is below this share of its prior's; without the focal length
-    nothing is changed, any other parameter is held at zero."""
+    """The focal length counts as observed where its sigma is below this share of its prior's; else nothing changes."""
     min_distance2: float = Field(20.5, gt=0)
     """Squared Mahalanobis distance from the present calibration above which the new one is taken: chi-square, 5 degrees
     of freedom, 99.9 %."""

@@ -184,8 +184,6 @@ class CalibrationEstimate:
         Of the calibration that was given.
     covariance : (5, 5)
         Of ``correction.vector``, inflated for the correlation of neighbouring observations.
-    free : (5,) bool
-        Which parameters the observations fix; the others were held at zero.
     distance2 : float
         Squared Mahalanobis distance from the correction that the submap was made with.
     accepted : bool
@@ -198,7 +196,6 @@ class CalibrationEstimate:
 
     correction: LensCorrection
     covariance: FloatArray
-    free: BoolArray
     distance2: float
     accepted: bool
     cost_before: float
@@ -206,6 +203,22 @@ class CalibrationEstimate:
     n_keyframes: int
     n_observations: int
     seconds: float
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """All of it by name, for the event log."""
+        names = ("log_focal", "du_px", "dv_px", "k1", "k2")
+        sigmas = np.sqrt(np.diag(self.covariance)).tolist()
+        return {
+            **dict(zip(names, self.correction.vector.tolist(), strict=True)),
+            **{f"{name}_sigma": sigma for name, sigma in zip(names, sigmas, strict=True)},
+            "distance2": self.distance2,
+            "cost_before": self.cost_before,
+            "cost_after": self.cost_after,
+            "keyframes": self.n_keyframes,
+            "observations": self.n_observations,
+            "seconds": self.seconds,
+        }
 
 
 class SelfCalibrator(Protocol):
