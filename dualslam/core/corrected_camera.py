@@ -59,12 +59,11 @@ class LensCorrection:
         corrected[1, 2] += self.dv_px
         return corrected
 
-    def displacement_px(self, K: FloatArray, uv_px: FloatArray) -> FloatArray:
-        """Return how far (N, 2) it moves the rays of given rectified pixels (N, 2); turns and all, see `size_px`."""
-        xy = (uv_px - K[:2, 2]) / (K[0, 0], K[1, 1])
+    def distort_px(self, K: FloatArray, xy: FloatArray) -> FloatArray:
+        """Return where rays (x, y, 1) of an (N, 2) array are seen, in the given camera's rectified pixels (N, 2)."""
         moved = self.intrinsics(K)
-        xy = distortion.distort_radtan(xy, (self.k1, self.k2), 0.0, 0.0)
-        return np.asarray(xy * (moved[0, 0], moved[1, 1]) + moved[:2, 2] - uv_px, np.float64)
+        bent = distortion.distort_radtan(xy, (self.k1, self.k2), 0.0, 0.0)
+        return np.asarray(bent * (moved[0, 0], moved[1, 1]) + moved[:2, 2], np.float64)
 
 
 @dataclass(frozen=True)
@@ -160,9 +159,8 @@ class CorrectedCamera(Camera):
         xy = p_cam[:, :2] / np.where(p_cam[:, 2] > 0, p_cam[:, 2], np.nan)[:, None]
         k = (self.correction.k1, self.correction.k2)
         xy = np.where(((xy * xy).sum(1) < distortion.radial_limit(k) ** 2)[:, None], xy, np.nan)
-        base, K = self.base.K, self.K
-        uv = distortion.distort_radtan(xy, k, 0.0, 0.0) * (K[0, 0], K[1, 1]) + K[:2, 2]
-        plane = (uv - base[:2, 2]) / (base[0, 0], base[1, 1])
+        base = self.base.K
+        plane = (self.correction.distort_px(base, xy) - base[:2, 2]) / (base[0, 0], base[1, 1])
         return self.base._distort(np.concatenate([plane, np.ones((len(plane), 1))], 1))
 
     def _undistort(self, xy_distorted: FloatArray) -> FloatArray:
