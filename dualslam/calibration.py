@@ -14,8 +14,8 @@ from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Features, View
 
-RETRY_KEYFRAMES = 10
-"""Where the motion said nothing yet, a submap is asked again so many keyframes later."""
+RETRY_KEYFRAMES, RETRY_SHARE = 10, 0.25
+"""Where the motion said nothing yet, a submap is asked again after so many more keyframes, or this share more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +83,7 @@ class Calibration:
         estimate = self._estimate(submap, self._camera)
         if isinstance(estimate, Failure):
             if estimate.reason is FailureReason.DEGENERATE:
-                self._due_at[submap.id] = n + RETRY_KEYFRAMES
+                self._due_at[submap.id] = n + max(RETRY_KEYFRAMES, int(RETRY_SHARE * n))
             return estimate
         numbers = estimate.numbers
         if not estimate.accepted:

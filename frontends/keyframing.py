@@ -25,9 +25,7 @@ def keyframe_due(track: Track, submap: Submap, reference_id: int, config: Keyfra
         return False
     if track.n_inliers < config.weak_landmarks:
         return True
-    reference = submap.landmark_of[reference_id]
-    n_reference = int((reference >= 0).sum())
-    tracked_ratio = track.n_inliers / max(n_reference, 1)
+    tracked_ratio = tracked_share(track, submap, reference_id)
     parallax = parallax_deg(track, submap, reference_id)
     if parallax > config.max_parallax_deg:
         return True
@@ -35,6 +33,13 @@ def keyframe_due(track: Track, submap: Submap, reference_id: int, config: Keyfra
         # A turn in place reveals nothing that could be triangulated, until half of what was known is out of view.
         return tracked_ratio < 0.5 * config.max_tracked_ratio
     return tracked_ratio < config.max_tracked_ratio or abs(track.view.index - reference_id) >= config.max_frames
+
+
+def tracked_share(track: Track, submap: Submap, reference_id: int) -> float:
+    """Share of a keyframe's landmarks that the frame still sees."""
+    reference = submap.landmark_of[reference_id]
+    reference = reference[reference >= 0]
+    return float(np.isin(reference, track.landmark_ids).mean()) if len(reference) else 0.0
 
 
 def parallax_deg(track: Track, submap: Submap, reference_id: int) -> float:

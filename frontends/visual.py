@@ -18,6 +18,7 @@ from frontends.mapper import Mapper
 from frontends.tracker import Tracker
 
 CULL_BEHIND = 2  # the newest keyframes are not judged redundant: the next ones may need them
+N_CULL_CANDIDATES = 10  # of the covisible keyframes, the nearest in what they see
 
 
 class VisualFrontEnd:
@@ -91,9 +92,14 @@ class VisualFrontEnd:
 
     def _cull_keyframe(self) -> int | None:
         """Cull at most one keyframe that has become redundant; those of the gauge stay."""
-        candidates = [k for k in self._path[-CULL_BEHIND - 3 : -CULL_BEHIND] if k not in self.submap.gauge]
+        submap = self.submap
+        ids = submap.landmark_of[self._reference_id]
+        covisible, _ = submap.covisible(ids[ids >= 0])
+        kept = {*submap.gauge, *self._path[-CULL_BEHIND:]}
+        candidates = [k for k in covisible.tolist() if k not in kept][:N_CULL_CANDIDATES]
         culled = self._mapper.redundant_keyframe(candidates)
         if culled is not None:
-            self._path.remove(culled)
-            self.submap.remove_keyframe(culled, self._path[-1])
+            if culled in self._path:
+                self._path.remove(culled)
+            submap.remove_keyframe(culled, self._reference_id)
         return culled

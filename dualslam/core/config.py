@@ -18,7 +18,7 @@ class FrontendConfig(StrictModel):
 
     name: str = "orb"
     """Which front end: `orb`, or one that another package offers as an entry point of `dualslam.frontends`."""
-    n_features: int = Field(1500, ge=50, le=20000)
+    n_features: int = Field(1000, ge=50, le=20000)
     """Keypoints per image."""
     options: dict[str, Any] = Field(default_factory=dict)
     """Settings of the chosen front end alone; it checks their names itself."""
@@ -147,6 +147,65 @@ class GraphConfig(StrictModel):
     """Batch iterations at most when a graph is made anew."""
 
 
+class LinkingConfig(StrictModel):
+    """When two submaps that saw the same frames are linked by a similarity.
+
+    A wrong link is one that is off by more than 5 % in scale, 3 degrees or 5 % in position: the bounds on sigmas below
+    are a third of that.
+    """
+
+    deformation_sigma: float = Field(0.01, gt=0, le=0.1)
+    """Relative deformation (standard deviation: drift in scale, bending in radians) that two healthy maps may have
+    against each other over the length of their overlap, beyond their pixels' noise. It is the noise model of all gates
+    that compare parts of the maps with each other."""
+    gate_sigmas: float = Field(3.0, gt=0)
+    """Standard deviations at which such a comparison fails."""
+    pair_chi2: float = Field(11.345, gt=0)
+    """Gate of a matched pair's squared Mahalanobis distance: chi-square, 3 degrees of freedom, 99 %."""
+    pixel_chi2: float = Field(9.210, gt=0)
+    """Gate of a squared whitened reprojection residual: chi-square, 2 degrees of freedom, 99 %."""
+    strain_chi2: float = Field(20.515, gt=0)
+    """Gate of the stretching and shearing between the maps: chi-square, 5 degrees of freedom, 99.9 %."""
+    min_majority: float = Field(0.5, gt=0, lt=1)
+    """Share of the matched landmarks (over all, in a keyframe, in a map's own pixels) that must agree. Below a half
+    the pairs that disagree could hold a second similarity with more support."""
+    min_inliers: int = Field(20, ge=6)
+    """Matched landmarks that must agree."""
+    min_keyframes: int = Field(4, ge=2)
+    """Shared keyframes older than the suspected onset of corruption that must agree one by one. A rigid corrupted tail
+    passes every other gate: two keyframes fix it, so evidence starts with the third."""
+    min_pairs_per_keyframe: int = Field(8, ge=4)
+    """Matched landmarks that a keyframe must hold to have a say (four fix a similarity with one to spare)."""
+    max_misfits: int = Field(1, ge=0)
+    """Keyframes in a row that may disagree before this counts as a change point: one can be wrong by itself."""
+    descriptor_radius_px: float = Field(3.0, gt=0)
+    """Distance in the same image within which two keypoints can be the same point: the detector's own scatter."""
+    min_ties: int = Field(10, ge=3)
+    """Landmarks that keyframes on both sides of a place in the old map must see in agreement with their pixels; with
+    fewer the old map is broken there, and what is newer counts as suspected."""
+    tie_window: int = Field(5, ge=1)
+    """Keyframes on either side that are searched for ties."""
+    look_back: int = Field(10, ge=0)
+    """Keyframes of the old map, older than the oldest shared one, among which a break is still looked for."""
+    min_image_spread: float = Field(0.25, ge=0, le=1)
+    """Share of the image, along either axis, that the agreeing landmarks must cover (5 % to 95 % of them, against the
+    keypoints of the same keyframes)."""
+    min_depth_spread: float = Field(0.05, ge=0)
+    """Relative difference between near (10 %) and far (90 %) agreeing landmarks' depths in the shared keyframes: less
+    than triangulation itself scatters is a single depth, which cannot tell scale from motion along the axis."""
+    max_scale: float = Field(50.0, gt=1)
+    """Largest scale, and inverse of the smallest: submaps start with a median depth of 1, so that the scale is the ratio
+    of the depths at their starts."""
+    max_scale_sigma: float = Field(0.0167, gt=0)
+    """Largest standard deviation of the scale (relative)."""
+    max_rotation_sigma_deg: float = Field(1.0, gt=0)
+    """Largest standard deviation of the rotation about any axis."""
+    max_position_sigma: float = Field(0.0167, gt=0)
+    """Largest standard deviation of the position of the matched landmarks' centre, relative to their median depth."""
+    max_hypotheses: int = Field(512, ge=16)
+    """Triplets that RANSAC draws at most."""
+
+
 class CalibrationConfig(StrictModel):
     """Self-calibration: when a submap is asked about its camera, and when the answer counts."""
 
@@ -197,4 +256,5 @@ class Config(StrictModel):
     health: HealthConfig = HealthConfig()
     buffer: BufferConfig = BufferConfig()
     graph: GraphConfig = GraphConfig()
+    linking: LinkingConfig = LinkingConfig()
     calibration: CalibrationConfig = CalibrationConfig()

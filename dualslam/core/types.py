@@ -217,6 +217,9 @@ class FailureReason(StrEnum):
     SCALE = "scale"
     SPREAD = "spread"
     AGREEMENT = "agreement"
+    REPROJECTION = "reprojection"
+    DEFORMED = "deformed"
+    NEEDS_OLDER_KEYFRAMES = "needs_older_keyframes"
     TIMEOUT = "timeout"
 
 

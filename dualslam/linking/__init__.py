@@ -1,0 +1,11 @@
+"""3D-3D matches across two submaps that saw the same frames -> a verified Sim(3) link, or why there is none.
+
+In reading order: `correspondences` (which landmarks are the same), `estimate` (the decision, step by step), `timeline`
+(what the keyframes say one by one, in order of time), `shape` (how the maps differ beyond a similarity), `verify` (the
+gates); below them `pairs`, the matches as measurements.
+"""
+
+from dualslam.linking.correspondences import Correspondences, DescriptorMatcher, propose_correspondences
+from dualslam.linking.estimate import LinkEstimate, estimate_link
+
+__all__ = ["Correspondences", "DescriptorMatcher", "LinkEstimate", "estimate_link", "propose_correspondences"]
