@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -167,9 +168,7 @@ def make_problem(
     xyz = submap.landmarks["xyz_mu"]
     res = compute_residuals(submap.K, T, kf, xyz[landmark], uv, sigma)
     ok = np.isfinite(res.chi2)
-    depth_sigmas = compute_depth_sigmas(
-        submap.K, T, kf[ok], res.xyz_cam[ok], sigma[ok], landmark[ok], n_landmarks
-    )
+    depth_sigmas = compute_depth_sigmas(submap.K, T, kf[ok], res.xyz_cam[ok], sigma[ok], landmark[ok], n_landmarks)
     n_views = np.bincount(landmark[ok], minlength=n_landmarks)
     good = np.flatnonzero((n_views >= MIN_VIEWS) & (depth_sigmas < MAX_DEPTH_SIGMA))
     good = np.random.default_rng(seed).permutation(good)
@@ -204,7 +203,7 @@ def prior_sigmas(problem: BundleProblem, width_px: int, config: CalibrationConfi
 
 def _rotation_steps(submap: Submap, ids: IntArray) -> FloatArray:
     R = submap.keyframe_poses(ids)[:, :3, :3]
-    return np.array([np.linalg.norm(so3.log(a.T @ b)) for a, b in zip(R[:-1], R[1:], strict=True)])
+    return np.array([np.linalg.norm(so3.log(a.T @ b)) for a, b in pairwise(R)])
 
 
 def _mask(ids: IntArray, size: int) -> BoolArray:

@@ -133,4 +133,3 @@ def _change_camera(submap: Submap, camera: Camera) -> None:
     submap.K = camera.K
     for k, keyframe in submap.keyframes.items():
         submap.keyframes[k] = replace(keyframe, features=_rectified_again(keyframe.features, camera))
-

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -230,9 +231,7 @@ class System:
         with self.timer.measure("calibration"):
             refined = calibration.refine(live.submap, self._parts.new_graph())
             if isinstance(refined, Failure):
-                self._event(
-                    EventKind.CALIBRATION_KEPT, view, live.submap.id, reason=refined.detail, **refined.numbers
-                )
+                self._event(EventKind.CALIBRATION_KEPT, view, live.submap.id, reason=refined.detail, **refined.numbers)
                 return
             live.adopt(refined.graph)
             self._buffer.map(calibration.rectified)
@@ -305,7 +304,7 @@ class System:
         if track is not None:
             row.n_matches, row.n_inliers = track.n_matches, track.n_inliers
 
-    def _event(self, kind: EventKind, view: View, submap_id: int | None = None, **data: object) -> None:
+    def _event(self, kind: EventKind, view: View, submap_id: int | None = None, **data: Any) -> None:
         self.events.add(kind, view.index, view.timestamp_s, submap_id, **data)
 
     def _result(self, frame: Frame, outcome: Track | Failure, seconds: float) -> FrameResult:

@@ -222,9 +222,9 @@ class CalibrationConfig(StrictModel):
     max_observations: int = Field(15000, ge=1000)
     """Observations that go into the estimate: they bound its time (about 1 s)."""
     log_focal_sigma: float = Field(0.05, gt=0)
-    """Prior of the log of both focal lengths. A chequerboard gives 0.003, the depth camera's focal length taken for the
-    colour camera's 0.1, a data sheet 0.05. It need not be tight: where the motion does not fix the focal length, nothing
-    is changed at all."""
+    """Prior of the log of both focal lengths. A chequerboard gives 0.003, a data sheet 0.05, the depth camera's focal
+    length taken for the colour camera's 0.1. It need not be tight: where the motion does not fix the focal length,
+    nothing is changed at all."""
     principal_point_sigma: float = Field(0.015, gt=0)
     """Prior of the principal point, relative to the image's width: what lenses are off the middle."""
     k1_sigma: float = Field(0.03, gt=0)

@@ -224,13 +224,17 @@ class CalibrationEstimate:
 class SelfCalibrator(Protocol):
     """Asks a submap about its camera, which is the one that rectified its features. The submap is not changed."""
 
-    def __call__(self, submap: Submap, camera: Camera) -> CalibrationEstimate | Failure: ...
+    def __call__(self, submap: Submap, camera: Camera) -> CalibrationEstimate | Failure:
+        """Estimate the correction of the calibration that was given, or say why it cannot be had."""
+        ...
 
 
 class SubmapAdjuster(Protocol):
     """Refines all poses and points of a submap in place, in batch. Raises `SolverError` where the solver fails."""
 
-    def __call__(self, submap: Submap) -> None: ...
+    def __call__(self, submap: Submap) -> None:
+        """Refine."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -95,7 +95,14 @@ class TestEstimate:
         xy = (problem.uv_px - problem.K[:2, 2]) / problem.K[0, 0]
         uv = bent.distort_px(problem.K, xy)
         bent_problem = BundleProblem(
-            problem.K, problem.T_submap_kf, problem.fixed, problem.xyz_mu, problem.kf, problem.point, uv, problem.sigma_px
+            problem.K,
+            problem.T_submap_kf,
+            problem.fixed,
+            problem.xyz_mu,
+            problem.kf,
+            problem.point,
+            uv,
+            problem.sigma_px,
         )
         estimate = estimate_correction(bent_problem, WIDTH, LensCorrection(), CONFIG)
         assert estimate
@@ -106,7 +113,8 @@ class TestEstimate:
         camera = wrong_camera()
         submap = make_submap(camera, turning=True, n=12)
         a, b = (estimate_calibration(submap, camera, CONFIG, seed=3) for _ in range(2))
-        assert a and b
+        assert a
+        assert b
         assert np.array_equal(a.correction.vector, b.correction.vector)
         assert np.array_equal(a.covariance, b.covariance)
 

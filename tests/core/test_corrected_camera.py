@@ -34,7 +34,7 @@ class TestCorrectedCamera:
         pinhole = p @ camera.K.T
         np.testing.assert_allclose(uv, pinhole[:, :2] / pinhole[:, 2:], atol=1e-6)
         raw, step = camera.project(p), 1e-4
-        du, dv = (camera.rectify(raw + d)[0] - camera.rectify(raw - d)[0] for d in (np.array([step, 0]), np.array([0, step])))
+        du, dv = (camera.rectify(raw + d)[0] - camera.rectify(raw - d)[0] for d in step * np.eye(2))
         area = (du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]) / (4 * step * step)
         np.testing.assert_allclose(magnification**2, area, rtol=1e-5)
 
