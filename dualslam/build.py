@@ -49,7 +49,7 @@ def build_system(config: Config, camera: Camera) -> System:
     )
     return System(
         Components(
-            view_of=lambda frame: view_of(frame, frontend, calibration.camera),
+            view_of=lambda frame: view_of(frame, frontend, calibration.camera, config.camera.model_sigma_px),
             new_starter=lambda: Initialiser(
                 frontend, bundle_adjust_arrays, config.initialiser, calibration.camera.K, size_px, config.seed
             ),
@@ -61,7 +61,7 @@ def build_system(config: Config, camera: Camera) -> System:
     )
 
 
-def view_of(frame: Frame, frontend: Frontend, camera: Camera) -> View | Failure:
+def view_of(frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: float) -> View | Failure:
     """Find a frame's features and take the lens distortion out of them."""
     if frame.image is None:
         return Failure(FailureReason.UNREADABLE, frame.error)
@@ -71,7 +71,7 @@ def view_of(frame: Frame, frontend: Frontend, camera: Camera) -> View | Failure:
             FailureReason.UNREADABLE,
             f"frame {frame.index} is {width}x{height}, the calibration is for {camera.width}x{camera.height}",
         )
-    return View(frame.index, frame.timestamp_s, rectify(frontend.extract(frame.image), camera))
+    return View(frame.index, frame.timestamp_s, rectify(frontend.extract(frame.image), camera, model_sigma_px))
 
 
 def adjust_submap(submap: Submap, robust_k: float) -> None:

@@ -9,6 +9,8 @@ from dualslam.core.geometry import se3
 from dualslam.core.submap import Submap
 from dualslam.core.types import Track
 
+ESTABLISHED = 3  # views of a landmark from which on its loss says that the scene has changed
+
 
 def keyframe_due(track: Track, submap: Submap, reference_id: int, config: KeyframeConfig) -> bool:
     """Decide by what is still tracked of the last keyframe and by how far the camera has moved since.
@@ -36,9 +38,11 @@ def keyframe_due(track: Track, submap: Submap, reference_id: int, config: Keyfra
 
 
 def tracked_share(track: Track, submap: Submap, reference_id: int) -> float:
-    """Share of a keyframe's landmarks that the frame still sees."""
+    """Share of a keyframe's established landmarks that the frame still sees."""
     reference = submap.landmark_of[reference_id]
     reference = reference[reference >= 0]
+    established = submap.n_observations(reference) >= min(ESTABLISHED, len(submap.keyframes))
+    reference = reference[established]
     return float(np.isin(reference, track.landmark_ids).mean()) if len(reference) else 0.0
 
 

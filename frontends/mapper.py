@@ -15,8 +15,37 @@ from frontends.local_map import LocalMap
 from frontends.matching import FeatureGrid, match_epipolar, match_projected
 
 FUSE_RADIUS_PX = 3.0  # about 3 sigma of a well-posed landmark's pixel at the finest octave
+CELLS_ACROSS = 16  # cells of the image's width by which observations are spread
 YOUNG_KEYFRAMES = 3  # a landmark is on probation for this many keyframes
 N_OTHERS = 3  # views by others that make an observation redundant
+
+
+def spread_choice(uv_px: FloatArray, priority: IntArray, n: int, size_px: tuple[int, int]) -> BoolArray:
+    """Choose up to `n` features, evenly from all cells of the image, the highest priority in each cell first.
+
+    Parameters
+    ----------
+    uv_px : (N, 2) float64
+    priority : (N,) int64
+    n : int
+    size_px : (width, height)
+
+    Returns
+    -------
+    (N,) bool
+    """
+    chosen = np.ones(len(uv_px), bool)
+    if len(uv_px) <= n:
+        return chosen
+    column = np.clip(uv_px[:, 0] * CELLS_ACROSS / size_px[0], 0, CELLS_ACROSS - 1).astype(np.int64)
+    row = np.clip(uv_px[:, 1] * CELLS_ACROSS / size_px[0], 0, None).astype(np.int64)
+    cell = row * CELLS_ACROSS + column
+    order = np.lexsort((np.arange(len(cell)), -priority, cell))
+    ordered = cell[order]
+    rank = np.empty(len(cell), np.int64)
+    rank[order] = np.arange(len(cell)) - np.searchsorted(ordered, ordered)
+    chosen[np.lexsort((np.arange(len(cell)), -priority, rank))[n:]] = False
+    return chosen
 
 
 class Mapper:
@@ -31,6 +60,7 @@ class Mapper:
         self._size_px = size_px
         self._young: list[tuple[int, IntArray]] = []  # keyframe count at birth, landmark ids
         self._n_inserted = 0
+        self._known: BoolArray = np.zeros(0, bool)
 
     def insert(self, track: Track) -> MappingReport:
         """Make a tracked frame a keyframe and grow the map about it (poses stay as they are: solving comes after)."""
@@ -38,11 +68,16 @@ class Mapper:
         T_submap_kf = se3.inverse(track.T_cam_submap)
         submap.add_keyframe(Keyframe(view.index, view.timestamp_s, view.features), T_submap_kf)
         feature = np.flatnonzero(track.landmark_ids >= 0)
+        n_seen = submap.n_observations(track.landmark_ids[feature])
+        kept = spread_choice(view.features.uv_rect_px[feature], n_seen, self._config.max_observations, self._size_px)
+        feature = feature[kept]
         submap.add_observations(view.index, feature, track.landmark_ids[feature])
+        # Features whose landmark was left out are no candidates for a new one.
+        self._known = track.landmark_ids >= 0
         self._n_inserted += 1
         n_culled = self._cull_young()
         neighbours = self._neighbours(view.index)
-        n_extended, n_merged = self._search_neighbour_landmarks(view.index, neighbours)
+        n_extended, n_merged = self._search_neighbour_landmarks(view.index, neighbours, track.landmark_ids)
         new = self._triangulate(view.index, neighbours)
         self._search_new_in_neighbours(new, neighbours)
         self._young.append((self._n_inserted, new))
@@ -84,12 +119,11 @@ class Mapper:
         self._young = kept
         return n_culled
 
-    def _search_neighbour_landmarks(self, k: int, neighbours: list[int]) -> tuple[int, int]:
-        """Look for the neighbours' landmarks in the new keyframe: new observations, or duplicates to merge."""
+    def _search_neighbour_landmarks(self, k: int, neighbours: list[int], tracked: IntArray) -> tuple[int, int]:
+        """Look for neighbours' landmarks that tracking missed: new observations, or duplicates to merge."""
         submap = self._submap
-        own = submap.landmark_of[k]
         others = submap.landmarks_of_keyframes(neighbours)
-        local = LocalMap.of_landmarks(submap, others[~np.isin(others, own)])
+        local = LocalMap.of_landmarks(submap, others[~np.isin(others, tracked)])
         return self._observe_in(k, local)
 
     def _observe_in(self, k: int, local: LocalMap) -> tuple[int, int]:
@@ -133,7 +167,7 @@ class Mapper:
     def _triangulate_pair(self, k: int, other: int) -> IntArray:
         submap, config = self._submap, self._config
         a, b = submap.keyframes[k].features, submap.keyframes[other].features
-        rows_a = np.flatnonzero(submap.landmark_of[k] == NO_LANDMARK)
+        rows_a = np.flatnonzero((submap.landmark_of[k] == NO_LANDMARK) & ~self._known)
         rows_b = np.flatnonzero(submap.landmark_of[other] == NO_LANDMARK)
         T_submap_a, T_submap_b = submap.T_submap_kf[k], submap.T_submap_kf[other]
         baseline = float(np.linalg.norm(T_submap_a[:3, 3] - T_submap_b[:3, 3]))

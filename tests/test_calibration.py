@@ -142,7 +142,7 @@ class PointWorld:
         n = int(seen.sum())
         one = np.ones(n)
         features = Features(uv[seen], uv[seen], 0.5 * one, one, 0 * one.astype(int), 0 * one, self.descriptors[seen])
-        return View(frame.index, frame.timestamp_s, rectify(features, calibration.camera))
+        return View(frame.index, frame.timestamp_s, rectify(features, calibration.camera, 0.0))
 
 
 def run_point_world(refine: bool) -> System:

@@ -24,6 +24,14 @@ class FrontendConfig(StrictModel):
     """Settings of the chosen front end alone; it checks their names itself."""
 
 
+class CameraConfig(StrictModel):
+    """What is known of the camera beyond its calibration file."""
+
+    model_sigma_px: float = Field(0.8, ge=0)
+    """Error of the camera model itself at a pixel (one sigma), beside the noise of the features: chequerboard
+    calibrations and rectified data sets are off by half a pixel to a pixel towards the rim of the image."""
+
+
 class InitialiserConfig(StrictModel):
     """How a submap starts: two views, a first bundle adjustment, and a check after it."""
 
@@ -65,7 +73,7 @@ class TrackingConfig(StrictModel):
 class KeyframeConfig(StrictModel):
     """When a frame becomes a keyframe."""
 
-    max_tracked_ratio: float = Field(0.8, gt=0, le=1)
+    max_tracked_ratio: float = Field(0.6, gt=0, le=1)
     """A keyframe is due when fewer than this share of the last keyframe's landmarks is still tracked."""
     min_parallax_deg: float = Field(0.5, ge=0)
     """...and the camera has moved enough to see the scene's median depth under this angle (or tracking is weak)."""
@@ -86,6 +94,8 @@ class MappingConfig(StrictModel):
     """Smallest angle between the two rays of a new landmark."""
     reprojection_chi2: float = Field(5.991, gt=0)
     """Gate of a new landmark's squared whitened residual in each view: chi-square, 2 degrees of freedom, 95 %."""
+    max_observations: int = Field(250, ge=50)
+    """Known landmarks that a keyframe holds on to, spread over its image: more make the solver slower, not better."""
     min_found_ratio: float = Field(0.25, ge=0, le=1)
     """A young landmark that tracking finds in fewer of the frames that should see it is culled."""
     min_observations: int = Field(3, ge=2)
@@ -249,6 +259,7 @@ class Config(StrictModel):
     seed: int = Field(0, ge=0)
     """Seed of every random choice of the run."""
     frontend: FrontendConfig = FrontendConfig()
+    camera: CameraConfig = CameraConfig()
     initialiser: InitialiserConfig = InitialiserConfig()
     tracking: TrackingConfig = TrackingConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
