@@ -7,10 +7,11 @@ questions. Do the data fix the focal length, or does the prior? Is the whole too
 chance? All parameters are estimated together and those that the data say little about are left to their priors: holding
 them at zero was tried, and gave the focal length what was theirs (7-Scenes: 4 % instead of 8 %).
 
-The noise of neighbouring observations is correlated (a landmark is matched to the same patch again and again), so the
-Hessian's covariance is too small. On rendered images with the exact camera the squared Mahalanobis distance of the
-correction from zero was 10 to 28 with five degrees of freedom: the noise is therefore taken to be
-`CalibrationConfig.inflation` times as large. With KITTI's and 7-Scenes' calibrations that distance was 190 to 730.
+The noise is that of the residuals in the map as it is, whatever sigmas the submap was made with. Neighbouring
+observations err alike (a landmark is matched to the same patch again and again), so the Hessian's covariance is too small: on
+rendered images with the exact camera the squared Mahalanobis distance of the correction from zero was 5 to 71 with five
+degrees of freedom, so the noise is taken to be `CalibrationConfig.inflation` times as large. Where the camera is wrong,
+that distance was 990 to 1450 (7-Scenes' colour camera) and 2700 to 3300 (KITTI 03 in its turn).
 """
 
 from __future__ import annotations
@@ -44,6 +45,9 @@ MIN_OBSERVATIONS = 1000
 MAX_PRIOR_SIGMAS = 6.0
 """A correction farther from the given calibration than this says that something else is wrong."""
 ASPECT_SIGMA, SKEW_SIGMA, TANGENTIAL_SIGMA = 1e-4, 1e-7, 1e-7
+MEDIAN_CHI2_2DOF = 1.386
+MIN_NOISE_RATIO = 0.05
+"""Residuals smaller than this share of their sigmas would be an exact simulation."""
 CALIBRATION_KEY = 1 << 60
 MAX_ITERATIONS, TOLERANCE = 25, 1e-5
 
@@ -159,7 +163,11 @@ def choose_window(submap: Submap, max_keyframes: int) -> IntArray:
 def make_problem(
     submap: Submap, window: IntArray, camera: Camera, max_observations: int, seed: int = 0
 ) -> BundleProblem:
-    """Collect the window's observations, as many landmarks as fit, in the pixels of the camera as it was given."""
+    """Collect the window's observations, as many landmarks as fit, in the pixels of the camera as it was given.
+
+    Sigmas are brought to the level of the residuals in the map as it is: those of the submap allow for the error of the
+    camera model itself, which is what is asked for here.
+    """
     obs, n_landmarks = submap.observations, len(submap.landmarks)
     rows = np.flatnonzero(obs["alive"] & np.isin(obs["kf"], window))
     T = submap.keyframe_poses(window)
@@ -178,6 +186,8 @@ def make_problem(
     raw = np.concatenate([submap.keyframes[k].features.uv_px for k in window.tolist()])
     offset = np.cumsum([0, *(len(submap.keyframes[k].features) for k in window.tolist())])
     uv_given, _ = given.rectify(raw[offset[kf[chosen]] + obs["feature"][rows[chosen]]])
+    typical = float(np.median(res.chi2[chosen])) if len(chosen) else MEDIAN_CHI2_2DOF
+    sigma *= max(MIN_NOISE_RATIO, math.sqrt(typical / MEDIAN_CHI2_2DOF))
     finite = np.isfinite(uv_given).all(1)
     chosen, uv_given = chosen[finite], uv_given[finite]
     return BundleProblem(

@@ -242,10 +242,10 @@ class CalibrationConfig(StrictModel):
     (or at the image's corner, if that is farther out), relative to the radius."""
     k2_sigma: float = Field(0.03, gt=0)
     """The same for the term with the fourth power of the radius."""
-    inflation: float = Field(3.0, ge=1)
-    """How much larger than their sigmas the errors of the pixels are taken to be, because neighbouring ones err alike.
-    With the exact camera (rendered images) corrections came out up to 2.4 times as far from zero as the Hessian's
-    sigmas say."""
+    inflation: float = Field(4.0, ge=1)
+    """How much larger than the residuals say the errors of the pixels are taken to be, because neighbouring ones err
+    alike. With the exact camera (rendered images) corrections came out up to 3.8 times as far from zero as the
+    Hessian's sigmas say."""
     max_sigma_ratio: float = Field(0.4, gt=0, le=1)
     """The focal length counts as observed where its sigma is below this share of its prior's; else nothing changes."""
     min_distance2: float = Field(20.5, gt=0)
