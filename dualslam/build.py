@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from backend.local_ba import bundle_adjust, bundle_adjust_arrays
 from backend.self_calibration import estimate_calibration
 from backend.submap_graph import ISam2SubmapGraph
@@ -11,6 +13,7 @@ from dualslam.core.config import Config
 from dualslam.core.interfaces import Frontend
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Frame, View
+from dualslam.linking import DescriptorMatcher, estimate_link
 from dualslam.system import Components, System
 from frontends.initialiser import Initialiser
 from frontends.registry import create_frontend
@@ -47,6 +50,7 @@ def build_system(config: Config, camera: Camera) -> System:
         ),
         adjust=lambda submap: adjust_submap(submap, config.graph.robust_k),
     )
+    matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
     return System(
         Components(
             view_of=lambda frame: view_of(frame, frontend, calibration.camera, config.camera.model_sigma_px),
@@ -56,6 +60,9 @@ def build_system(config: Config, camera: Camera) -> System:
             new_graph=lambda: ISam2SubmapGraph(config.graph),
             new_odometry=lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px),
             calibration=calibration,
+            link=lambda old, new, onset: estimate_link(
+                old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
+            ),
         ),
         config,
     )

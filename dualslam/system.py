@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,8 @@ from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, Start, Track, View
 from dualslam.frame_buffer import FrameBuffer
 from dualslam.health import judge_track
+from dualslam.linking import LinkEstimate
+from dualslam.recovery import LinkAttempt, Relinker, walk_back
 from dualslam.rollover import next_submap
 from dualslam.trajectory import FramePose
 
@@ -32,6 +34,7 @@ class Components:
     new_starter: Callable[[], MapStarter]
     new_graph: Callable[[], SubmapGraph]
     new_odometry: Callable[[Submap, SubmapGraph], VisualOdometry]
+    link: Callable[[Submap, Submap, int | None], LinkEstimate | Failure]
     calibration: Calibration
 
     @property
@@ -100,6 +103,7 @@ class System:
         self._live: VisualOdometry | None = None
         self._starter = components.new_starter()
         self._lost: list[View] = []
+        self._onsets: dict[int, int] = {}  # lost submaps that are not linked yet, and the frame of their loss
 
     @property
     def live(self) -> VisualOdometry | None:
@@ -169,21 +173,96 @@ class System:
         return Track(view, T_cam_submap, T_cam_submap, ids, n, n, n, 1.0, False, np.zeros((6, 6)))
 
     def _walk_back(self, submap: Submap, graph: SubmapGraph, newest: View) -> None:
-        """Run the front end in the other direction of time, from the newest view to the last frame that has a pose."""
+        """Run the front end back in time: over the frames without a pose, then on into a lost submap to link with it."""
+        started = time.perf_counter()
+        recovery = self._config.recovery
+        onsets = self._onsets if recovery.enabled else {}
+        relinker = Relinker(self.atlas, submap, onsets, self._parts.link, recovery)
+        unposed = {i for i, row in self.rows.items() if i not in self.poses}
+        if onsets:
+            self._event(EventKind.RECOVERY_STARTED, newest, submap.id, lost=sorted(onsets), frames=len(self._buffer))
         walker = self._parts.new_odometry(submap, graph)
         walker.start_at(newest.index)
-        n_failed = 0
+        walked: list[FramePose] = []
+        linked = None
+        views = self._views_before(newest, submap, stop_at_posed=not onsets)
+        for step in walk_back(walker, views, self._judge, relinker.keyframe_ids, recovery.max_leap_frames):
+            walked.append(self._frame_pose(walker, step.view, step.track))
+            if step.view.index in unposed:
+                self._pose(walked[-1], step.track)
+            if step.view.index not in submap.keyframes:
+                continue
+            for attempt in relinker.attempts(step.view.index):
+                self._report_attempt(attempt, step.view, submap)
+                if linked is None and not isinstance(attempt.result, Failure):
+                    linked = attempt.old_id, attempt.result
+            if linked is not None:
+                break
+        if linked is not None:
+            self._fuse(linked[0], submap, linked[1], walked, newest, time.perf_counter() - started)
+
+    def _views_before(self, newest: View, submap: Submap, stop_at_posed: bool) -> Iterator[View]:
         for view in self._buffer.backwards_from(newest.index):
             posed = self.poses.get(view.index)
-            if posed is not None and posed.submap_id != submap.id:
-                break
-            track = self._track_with(walker, view)
-            if not track:
-                n_failed += 1
-                if n_failed > self._config.tracking.max_lost_frames:
-                    break
+            if stop_at_posed and posed is not None and posed.submap_id != submap.id:
+                return
+            yield view
+
+    def _report_attempt(self, attempt: LinkAttempt, view: View, submap: Submap) -> None:
+        result = attempt.result
+        verdict = result.detail if isinstance(result, Failure) else "linked"
+        reason = str(result.reason) if isinstance(result, Failure) else "linked"
+        kind = EventKind.LINK_REFUSED if isinstance(result, Failure) else EventKind.RECOVERY_ATTEMPT
+        self._event(
+            kind,
+            view,
+            submap.id,
+            old_submap=attempt.old_id,
+            shared_keyframes=attempt.n_shared,
+            verdict=verdict,
+            reason=reason,
+            **result.numbers,
+        )
+
+    def _fuse(
+        self, old_id: int, submap: Submap, link: LinkEstimate, walked: list[FramePose], view: View, seconds: float
+    ) -> None:
+        """Join the two submaps by the link; frames of the old map's end take their pose from the new one."""
+        self.atlas.link(Link(old_id, submap.id, link.S_old_new, link.covariance, LinkKind.RECOVERY))
+        self._event(
+            EventKind.LINKED,
+            view,
+            submap.id,
+            old_submap=old_id,
+            matches=link.n_matches,
+            inliers=link.n_inliers,
+            agreeing_keyframes=[int(k) for k in link.agreeing_keyframes],
+            change_point=link.change_point,
+            seconds=seconds,
+            **link.numbers,
+        )
+        handover = int(max(link.agreeing_keyframes))
+        n_bypassed = 0
+        for pose in walked:
+            # The newest part of the old map, beyond the keyframes that agree, is by-passed.
+            if pose.index <= handover or self.poses[pose.index].submap_id == submap.id:
                 continue
-            n_failed = 0
+            self._pose(pose)
+            self.rows[pose.index].status = FrameStatus.BYPASSED
+            n_bypassed += 1
+        for pose in walked:
+            if self._was_lost(pose.index, old_id):
+                self.rows[pose.index].status = FrameStatus.RECOVERED
+        self._onsets.pop(old_id)
+        self._event(EventKind.FUSED, view, submap.id, old_submap=old_id, bypassed=n_bypassed)
+
+    def _was_lost(self, index: int, old_id: int) -> bool:
+        return self.poses[index].submap_id != old_id and self.rows[index].status is FrameStatus.TRACKED and (
+            index >= self._onsets[old_id]
+        )
+
+    def _judge(self, track: Track | Failure) -> Track | Failure:
+        return judge_track(track, self._config.health)
 
     # --- tracking
 
@@ -208,7 +287,7 @@ class System:
     def _track_with(self, odometry: VisualOdometry, view: View) -> Track | Failure:
         """Pose a frame, judge it, record it, and make it a keyframe where one is due."""
         with self.timer.measure("tracking"):
-            track = judge_track(odometry.track(view), self._config.health)
+            track = self._judge(odometry.track(view))
         if isinstance(track, Failure):
             return track
         if track.wide:
@@ -219,11 +298,14 @@ class System:
             self.timer.add("graph (in mapping)", report.estimate.seconds)
             if report.estimate.rebuilt:
                 self._event(EventKind.GRAPH_REBUILT, view, odometry.submap.id)
-        reference = odometry.reference_id
-        self._pose(
-            FramePose(view.index, view.timestamp_s, odometry.submap.id, reference, odometry.relative_pose(track)), track
-        )
+        self._pose(self._frame_pose(odometry, view, track), track)
         return track
+
+    @staticmethod
+    def _frame_pose(odometry: VisualOdometry, view: View, track: Track) -> FramePose:
+        return FramePose(
+            view.index, view.timestamp_s, odometry.submap.id, odometry.reference_id, odometry.relative_pose(track)
+        )
 
     def _calibrate(self, live: VisualOdometry, view: View) -> None:
         """Ask the submap about its camera. Where the answer is clear, submap, graph and buffer change to it."""
@@ -253,6 +335,7 @@ class System:
             **failure.numbers,
         )
         self._archive(live, "track lost")
+        self._onsets[live.submap.id] = self._lost[0].index
         self._live = None
         self._starter = self._parts.new_starter()
         for lost in self._lost:

@@ -115,6 +115,17 @@ class HealthConfig(StrictModel):
     """Mean squared whitened residual per degree of freedom of the agreeing landmarks (1 is expected)."""
 
 
+class RecoveryConfig(StrictModel):
+    """The walk back in time that joins a new submap to the one that was lost."""
+
+    enabled: bool = True
+    """Off: a lost track ends the submap, and the next one stays apart from it."""
+    max_leap_frames: int = Field(30, ge=0)
+    """Frames in a row that the walk may leap, because none of its keyframes can be matched in them."""
+    min_shared_keyframes: int = Field(4, ge=2)
+    """Keyframes that both maps must hold before a link is tried."""
+
+
 class BufferConfig(StrictModel):
     """The frames that a walk back in time can still read."""
 
@@ -266,6 +277,7 @@ class Config(StrictModel):
     mapping: MappingConfig = MappingConfig()
     health: HealthConfig = HealthConfig()
     buffer: BufferConfig = BufferConfig()
+    recovery: RecoveryConfig = RecoveryConfig()
     graph: GraphConfig = GraphConfig()
     linking: LinkingConfig = LinkingConfig()
     calibration: CalibrationConfig = CalibrationConfig()
