@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from backend.local_ba import bundle_adjust_arrays
+from backend.local_ba import bundle_adjust, bundle_adjust_arrays
+from backend.self_calibration import estimate_calibration
 from backend.submap_graph import ISam2SubmapGraph
+from dualslam.calibration import Calibration, rectify
 from dualslam.core.camera import Camera
 from dualslam.core.config import Config
 from dualslam.core.interfaces import Frontend
-from dualslam.core.types import Failure, FailureReason, Features, Frame, View
+from dualslam.core.submap import Submap
+from dualslam.core.types import Failure, FailureReason, Frame, View
 from dualslam.linking import DescriptorMatcher, estimate_link
 from dualslam.system import Components, System
 from frontends.initialiser import Initialiser
 from frontends.registry import create_frontend
 from frontends.visual import VisualFrontEnd
+
+ADJUST_ITERATIONS = 20
 
 
 def build_system(config: Config, camera: Camera) -> System:
@@ -39,19 +42,27 @@ def build_system(config: Config, camera: Camera) -> System:
     """
     frontend = create_frontend(config.frontend)
     size_px = (camera.width, camera.height)
+    calibration = Calibration(
+        camera,
+        config.calibration,
+        estimate=lambda submap, camera: estimate_calibration(
+            submap, camera, config.calibration, config.graph.robust_k, config.seed
+        ),
+        adjust=lambda submap: adjust_submap(submap, config.graph.robust_k),
+    )
     matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
     return System(
         Components(
-            view_of=lambda frame: view_of(frame, frontend, camera, config.camera.model_sigma_px),
+            view_of=lambda frame: view_of(frame, frontend, calibration.camera, config.camera.model_sigma_px),
             new_starter=lambda: Initialiser(
-                frontend, bundle_adjust_arrays, config.initialiser, camera.K, size_px, config.seed
+                frontend, bundle_adjust_arrays, config.initialiser, calibration.camera.K, size_px, config.seed
             ),
             new_graph=lambda: ISam2SubmapGraph(config.graph),
             new_odometry=lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px),
+            calibration=calibration,
             link=lambda old, new, onset: estimate_link(
                 old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
             ),
-            K=camera.K,
         ),
         config,
     )
@@ -70,11 +81,8 @@ def view_of(frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: fl
     return View(frame.index, frame.timestamp_s, rectify(frontend.extract(frame.image), camera, model_sigma_px))
 
 
-def rectify(features: Features, camera: Camera, model_sigma_px: float) -> Features:
-    """Move features to the camera's pinhole equivalent; those that it cannot hold are dropped."""
-    uv_rect_px, magnification = camera.rectify(features.uv_px)
-    # In steps of an eighth of an octave: the graph shares one noise model among all pixels of one sigma.
-    sigma_px = 2.0 ** (np.rint(8.0 * np.log2(np.hypot(features.sigma_px, model_sigma_px) * magnification)) / 8.0)
-    rectified = replace(features, uv_rect_px=uv_rect_px, sigma_px=sigma_px)
-    inside = np.isfinite(uv_rect_px).all(axis=1) & np.isfinite(magnification)
-    return rectified if inside.all() else rectified.take(inside)
+def adjust_submap(submap: Submap, robust_k: float) -> None:
+    """Refine all of a submap in batch."""
+    keyframe_ids = list(submap.keyframes)
+    bundle = bundle_adjust(submap, keyframe_ids[1:], keyframe_ids[:1], robust_k, ADJUST_ITERATIONS)
+    submap.apply_estimate(*bundle.estimate)

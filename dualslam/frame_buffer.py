@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from dualslam.core.types import View
 
@@ -40,6 +40,10 @@ class FrameBuffer:
     def thaw(self) -> None:
         """Let the buffer be a queue again."""
         self._frozen = False
+
+    def map(self, change: Callable[[View], View]) -> None:
+        """Put what `change` makes of it into the place of each view."""
+        self._views = deque((change(view) for view in self._views), self._views.maxlen)
 
     def backwards_from(self, index: int) -> Iterator[View]:
         """Yield the views that came before frame `index`, the latest first."""

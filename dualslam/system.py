@@ -5,10 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from dualslam.atlas import Atlas, Link, LinkKind
+from dualslam.calibration import Calibration
+from dualslam.carried_poses import carry_poses
 from dualslam.core.config import Config
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.geometry import se3
@@ -33,7 +36,12 @@ class Components:
     new_graph: Callable[[], SubmapGraph]
     new_odometry: Callable[[Submap, SubmapGraph], VisualOdometry]
     link: Callable[[Submap, Submap, int | None], LinkEstimate | Failure]
-    K: FloatArray
+    calibration: Calibration
+
+    @property
+    def K(self) -> FloatArray:
+        """(3, 3) intrinsics of the rectified pixels, as they are known now."""
+        return self.calibration.camera.K
 
 
 @dataclass(slots=True)
@@ -266,6 +274,8 @@ class System:
         track = self._track_with(live, view)
         if track:
             self._lost = []
+            if live.reference_id == view.index and self._parts.calibration.is_due(live.submap):
+                self._calibrate(live, view)
             if len(live.submap.keyframes) >= self._config.graph.max_keyframes:
                 self._roll_over(live, view)
             return track
@@ -300,6 +310,20 @@ class System:
         return FramePose(
             view.index, view.timestamp_s, odometry.submap.id, odometry.reference_id, odometry.relative_pose(track)
         )
+
+    def _calibrate(self, live: VisualOdometry, view: View) -> None:
+        """Ask the submap about its camera. Where the answer is clear, submap, graph and buffer change to it."""
+        calibration = self._parts.calibration
+        with self.timer.measure("calibration"):
+            refined = calibration.refine(live.submap, self._parts.new_graph())
+            if isinstance(refined, Failure):
+                self._event(EventKind.CALIBRATION_KEPT, view, live.submap.id, reason=refined.detail, **refined.numbers)
+                return
+            live.adopt(refined.graph)
+            self._buffer.map(calibration.rectified)
+            for pose in carry_poses(self.poses.values(), refined.before, live.submap):
+                self.poses[pose.index] = pose
+        self._event(EventKind.CALIBRATED, view, live.submap.id, **refined.numbers)
 
     # --- failure
 
@@ -367,7 +391,7 @@ class System:
         if track is not None:
             row.n_matches, row.n_inliers = track.n_matches, track.n_inliers
 
-    def _event(self, kind: EventKind, view: View, submap_id: int | None = None, **data: object) -> None:
+    def _event(self, kind: EventKind, view: View, submap_id: int | None = None, **data: Any) -> None:
         self.events.add(kind, view.index, view.timestamp_s, submap_id, **data)
 
     def _result(self, frame: Frame, outcome: Track | Failure, seconds: float) -> FrameResult:

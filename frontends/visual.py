@@ -52,6 +52,11 @@ class VisualFrontEnd:
         self._reference_id = keyframe_id
         self._path = [keyframe_id]
 
+    def adopt(self, graph: SubmapGraph) -> None:
+        """Go on with another graph of the same submap, whose poses and points have moved."""
+        self.graph = graph
+        self._tracker.refresh()
+
     def track(self, view: View) -> Track | Failure:
         """Pose a frame against the submap."""
         track = self._tracker.track(view)

@@ -382,7 +382,11 @@ def camera_from_dict(values: Mapping[str, Any]) -> Camera:
     InputError
         Names the field that is missing, unknown or senseless.
     """
+    from dualslam.core.corrected_camera import CorrectedCamera  # it stands on this module
+
     name = values.get("model")
+    if name == CorrectedCamera.model:
+        return CorrectedCamera.from_dict(values)
     if not isinstance(name, str) or name not in MODELS:
         raise InputError(f"camera: field 'model' is {name!r}, it must be one of {', '.join(MODELS)}")
     return MODELS[name].from_dict(values)

@@ -19,6 +19,8 @@ class EventKind(StrEnum):
     REINITIALISED = "reinitialised"
     ROLLED_OVER = "rolled_over"
     GRAPH_REBUILT = "graph_rebuilt"
+    CALIBRATED = "calibrated"
+    CALIBRATION_KEPT = "calibration_kept"
     UNREADABLE = "unreadable"
     RECOVERY_STARTED = "recovery_started"
     RECOVERY_ATTEMPT = "recovery_attempt"

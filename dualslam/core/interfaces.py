@@ -13,6 +13,7 @@ from dualslam.core.types import BoolArray, Failure, Features, FloatArray, Frame,
 
 if TYPE_CHECKING:
     from dualslam.core.camera import Camera
+    from dualslam.core.corrected_camera import LensCorrection
     from dualslam.core.submap import Submap
 
 
@@ -176,6 +177,69 @@ class BundleAdjuster(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationEstimate:
+    """What a submap's observations say about the camera that took them.
+
+    Attributes
+    ----------
+    correction : LensCorrection
+        Of the calibration that was given.
+    covariance : (5, 5)
+        Of ``correction.vector``, inflated for the correlation of neighbouring observations.
+    distance2 : float
+        Squared Mahalanobis distance from the correction that the submap was made with.
+    accepted : bool
+        Whether it is significantly better than that.
+    cost_before, cost_after : float
+        Sum of the Huber losses; before: poses and points as they were.
+    n_keyframes, n_observations : int
+    seconds : float
+    """
+
+    correction: LensCorrection
+    covariance: FloatArray
+    distance2: float
+    accepted: bool
+    cost_before: float
+    cost_after: float
+    n_keyframes: int
+    n_observations: int
+    seconds: float
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """All of it by name, for the event log."""
+        names = ("log_focal", "du_px", "dv_px", "k1", "k2")
+        sigmas = np.sqrt(np.diag(self.covariance)).tolist()
+        return {
+            **dict(zip(names, self.correction.vector.tolist(), strict=True)),
+            **{f"{name}_sigma": sigma for name, sigma in zip(names, sigmas, strict=True)},
+            "distance2": self.distance2,
+            "cost_before": self.cost_before,
+            "cost_after": self.cost_after,
+            "keyframes": self.n_keyframes,
+            "observations": self.n_observations,
+            "seconds": self.seconds,
+        }
+
+
+class SelfCalibrator(Protocol):
+    """Asks a submap about its camera, which is the one that rectified its features. The submap is not changed."""
+
+    def __call__(self, submap: Submap, camera: Camera) -> CalibrationEstimate | Failure:
+        """Estimate the correction of the calibration that was given, or say why it cannot be had."""
+        ...
+
+
+class SubmapAdjuster(Protocol):
+    """Refines all poses and points of a submap in place, in batch. Raises `SolverError` where the solver fails."""
+
+    def __call__(self, submap: Submap) -> None:
+        """Refine."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class MappingReport:
     """What one keyframe added and removed."""
@@ -221,6 +285,10 @@ class VisualOdometry(Protocol):
 
     def start_at(self, keyframe_id: int) -> None:
         """Begin at a keyframe of the submap, at rest."""
+        ...
+
+    def adopt(self, graph: SubmapGraph) -> None:
+        """Go on with another graph of the same submap, whose poses and points have moved."""
         ...
 
     def track(self, view: View) -> Track | Failure:

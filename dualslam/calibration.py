@@ -1,0 +1,135 @@
+"""The camera as it is known now: when a submap is asked about it, and what changes with the answer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dualslam.core.camera import Camera
+from dualslam.core.config import CalibrationConfig
+from dualslam.core.corrected_camera import correct
+from dualslam.core.errors import InputError, SolverError
+from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph
+from dualslam.core.submap import Submap
+from dualslam.core.types import Failure, FailureReason, Features, View
+
+RETRY_KEYFRAMES, RETRY_SHARE = 10, 0.25
+"""Where the motion said nothing yet, a submap is asked again after so many more keyframes, or this share more."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refinement:
+    """A submap's change to a better calibration.
+
+    Attributes
+    ----------
+    graph : SubmapGraph
+        Made from the changed submap.
+    before : Submap
+        A copy of the submap as it was.
+    numbers : dict
+        For the event log.
+    """
+
+    graph: SubmapGraph
+    before: Submap
+    numbers: dict[str, float]
+
+
+class Calibration:
+    """The camera that features are rectified by, from the one that was given to the best one known.
+
+    Parameters
+    ----------
+    camera : Camera
+        As it was given.
+    config : CalibrationConfig
+    estimate : SelfCalibrator
+    adjust : SubmapAdjuster
+    """
+
+    def __init__(
+        self, camera: Camera, config: CalibrationConfig, estimate: SelfCalibrator, adjust: SubmapAdjuster
+    ) -> None:
+        self._camera = camera
+        self._config = config
+        self._estimate = estimate
+        self._adjust = adjust
+        self._due_at: dict[int, int] = {}
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that the frames to come are rectified by."""
+        return self._camera
+
+    def is_due(self, submap: Submap) -> bool:
+        """Whether it is time to ask this submap."""
+        due_at = self._due_at.get(submap.id, self._config.first_keyframes)
+        return self._config.refine and len(submap.keyframes) >= due_at
+
+    def refine(self, submap: Submap, graph: SubmapGraph) -> Refinement | Failure:
+        """Ask a submap about its camera and, where the answer is clear, change the submap to it.
+
+        Parameters
+        ----------
+        submap : Submap
+            Keeps its ids. Only where the whole change succeeds, it gets other intrinsics, pixels, poses and points.
+        graph : SubmapGraph
+            A new one, for the changed submap.
+        """
+        n = len(submap.keyframes)
+        self._due_at[submap.id] = int(np.ceil(self._config.growth * n))
+        estimate = self._estimate(submap, self._camera)
+        if isinstance(estimate, Failure):
+            if estimate.reason is FailureReason.DEGENERATE:
+                self._due_at[submap.id] = n + max(RETRY_KEYFRAMES, int(RETRY_SHARE * n))
+            return estimate
+        numbers = estimate.numbers
+        if not estimate.accepted:
+            return Failure(FailureReason.CHI_SQUARE, "no significant change", numbers)
+        try:
+            camera = correct(self._camera, estimate.correction)
+            changed = submap.copy()
+            _change_camera(changed, camera)
+            self._adjust(changed)
+            solved = graph.rebuild(changed)
+        except (InputError, SolverError) as error:
+            return Failure(FailureReason.SOLVER, str(error), numbers)
+        changed.apply_estimate(solved.keyframe_ids, solved.T_submap_kf, solved.landmark_ids, solved.xyz_mu)
+        before = submap.copy()
+        submap.K, submap.keyframes = changed.K, changed.keyframes
+        submap.T_submap_kf, submap.landmarks = changed.T_submap_kf, changed.landmarks
+        self._camera = camera
+        return Refinement(graph, before, numbers)
+
+    def rectified(self, view: View) -> View:
+        """Return a view with the pixels that the present camera gives it."""
+        return replace(view, features=_rectified_again(view.features, self._camera))
+
+
+def rectify(features: Features, camera: Camera, model_sigma_px: float) -> Features:
+    """Move features to the camera's pinhole equivalent; those that it cannot hold are dropped."""
+    uv_rect_px, magnification = camera.rectify(features.uv_px)
+    # In steps of an eighth of an octave: the graph shares one noise model among all pixels of one sigma.
+    sigma_px = 2.0 ** (np.rint(8.0 * np.log2(np.hypot(features.sigma_px, model_sigma_px) * magnification)) / 8.0)
+    rectified = replace(features, uv_rect_px=uv_rect_px, sigma_px=sigma_px)
+    inside = np.isfinite(uv_rect_px).all(axis=1) & np.isfinite(magnification)
+    return rectified if inside.all() else rectified.take(inside)
+
+
+def _rectified_again(features: Features, camera: Camera) -> Features:
+    """Return features with their pixels under another camera. None is dropped (observations name them by their row),
+    and sigmas stay: a correction changes them by a few per cent.
+    """
+    uv_rect_px, _ = camera.rectify(features.uv_px)
+    lost = ~np.isfinite(uv_rect_px).all(axis=1)
+    if lost.any():
+        raise InputError(f"camera: {int(lost.sum())} features have no place in the corrected image")
+    return replace(features, uv_rect_px=uv_rect_px)
+
+
+def _change_camera(submap: Submap, camera: Camera) -> None:
+    submap.K = camera.K
+    for k, keyframe in submap.keyframes.items():
+        submap.keyframes[k] = replace(keyframe, features=_rectified_again(keyframe.features, camera))
