@@ -31,9 +31,9 @@ import numpy as np
 from backend import convert
 from dualslam.core.types import FloatArray, IntArray
 
-POSE_THRESHOLDS = (0.002, 0.01)
+POSE_THRESHOLDS = (0.0005, 0.0025)
 """Relinearise a pose that moved by more: rotation in rad, translation in submap units (median initial depth 1)."""
-POINT_THRESHOLD_MU = 0.1
+POINT_THRESHOLD_MU = 0.005
 N_LAST = 30
 """So many of the newest poses are eliminated last."""
 GTSAM_ERRORS = (RuntimeError, ValueError, IndexError)
