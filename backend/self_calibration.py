@@ -153,7 +153,7 @@ def _weigh(best: _Optimum, prior: FloatArray, inflation: float) -> tuple[FloatAr
     """
     of_prior = np.diag(prior**-2.0)
     of_both = np.linalg.inv(best.covariance)
-    covariance = np.linalg.inv((of_both - of_prior) / inflation**2 + of_prior)
+    covariance = np.asarray(np.linalg.inv((of_both - of_prior) / inflation**2 + of_prior), np.float64)
     return covariance @ of_both @ best.correction / inflation**2, covariance
 
 
