@@ -7,11 +7,12 @@ questions. Do the data fix the focal length, or does the prior? Is the whole too
 chance? All parameters are estimated together and those that the data say little about are left to their priors: holding
 them at zero was tried, and gave the focal length what was theirs (7-Scenes: 4 % instead of 8 %).
 
-The noise is that of the residuals in the map as it is, whatever sigmas the submap was made with. Neighbouring
-observations err alike (a landmark is matched to the same patch again and again), so the Hessian's covariance is too small: on
-rendered images with the exact camera the squared Mahalanobis distance of the correction from zero was 5 to 71 with five
-degrees of freedom, so the noise is taken to be `CalibrationConfig.inflation` times as large. Where the camera is wrong,
-that distance was 990 to 1450 (7-Scenes' colour camera) and 2700 to 3300 (KITTI 03 in its turn).
+The noise is that of the residuals, whatever sigmas the submap was made with: those allow for the error of the camera
+model itself, which is what is asked for here. Neighbouring observations err alike (a landmark is matched to the same
+patch again and again), so the Hessian's covariance is too small: on rendered images with the exact camera the squared
+Mahalanobis distance of the correction from zero was 5 to 71 with five degrees of freedom, so the noise is taken to be
+`CalibrationConfig.inflation` times as large. Where the camera is wrong, that distance was 990 to 1450 (7-Scenes' colour
+camera) and 2700 to 3300 (KITTI 03 in its turn).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import numpy as np
 
 from backend import convert
 from backend.factors import baseline_factor, pose_prior
-from backend.membership import compute_depth_sigmas, compute_residuals
+from backend.membership import MIN_DEPTH_MU, compute_depth_sigmas, compute_residuals
 from backend.noise import PixelNoise
 from backend.solver import GTSAM_ERRORS
 from dualslam.core.camera import Camera
@@ -56,6 +57,7 @@ MAX_ITERATIONS, TOLERANCE = 25, 1e-5
 class _Optimum:
     correction: FloatArray  # (5,)
     covariance: FloatArray  # (5, 5)
+    noise_ratio: float  # of the residuals to their sigmas
     cost_before: float
     cost_after: float
 
@@ -119,16 +121,15 @@ def estimate_correction(
     start = time.perf_counter()
     prior = prior_sigmas(problem, width_px, config)
     try:
-        # Noise `inflation` times as large and a prior that much tighter have the same optimum.
-        best = _optimise(problem, present.vector, prior / config.inflation, robust_k)
-    except GTSAM_ERRORS as error:
+        best = _optimise(problem, present.vector, prior, robust_k)
+        correction, covariance = _weigh(best, prior, config.inflation * best.noise_ratio)
+    except (*GTSAM_ERRORS, np.linalg.LinAlgError) as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         return Failure(FailureReason.SOLVER, " ".join(lines[:2])[:200])
-    covariance = config.inflation**2 * best.covariance
-    off = best.correction - present.vector
+    off = correction - present.vector
     distance2 = float(off @ np.linalg.solve(covariance, off))
     estimate = CalibrationEstimate(
-        LensCorrection.of_vector(best.correction),
+        LensCorrection.of_vector(correction),
         covariance,
         distance2,
         distance2 > config.min_distance2,
@@ -140,9 +141,20 @@ def estimate_correction(
     )
     if math.sqrt(covariance[0, 0]) > config.max_sigma_ratio * prior[0]:
         return Failure(FailureReason.DEGENERATE, "the motion does not fix the focal length", estimate.numbers)
-    if (np.abs(best.correction) > MAX_PRIOR_SIGMAS * prior).any():
+    if (np.abs(correction) > MAX_PRIOR_SIGMAS * prior).any():
         return Failure(FailureReason.SCALE, "the calibration would be too far from the given one", estimate.numbers)
     return estimate
+
+
+def _weigh(best: _Optimum, prior: FloatArray, inflation: float) -> tuple[FloatArray, FloatArray]:
+    """Return the correction and its covariance, had the sigmas of all pixels been `inflation` times as large.
+
+    Only the calibration has a prior, so that the information in its marginal is the sum of the data's and the prior's.
+    """
+    of_prior = np.diag(prior**-2.0)
+    of_both = np.linalg.inv(best.covariance)
+    covariance = np.asarray(np.linalg.inv((of_both - of_prior) / inflation**2 + of_prior), np.float64)
+    return covariance @ of_both @ best.correction / inflation**2, covariance
 
 
 # --- what goes in
@@ -163,11 +175,7 @@ def choose_window(submap: Submap, max_keyframes: int) -> IntArray:
 def make_problem(
     submap: Submap, window: IntArray, camera: Camera, max_observations: int, seed: int = 0
 ) -> BundleProblem:
-    """Collect the window's observations, as many landmarks as fit, in the pixels of the camera as it was given.
-
-    Sigmas are brought to the level of the residuals in the map as it is: those of the submap allow for the error of the
-    camera model itself, which is what is asked for here.
-    """
+    """Collect the window's observations, as many landmarks as fit, in the pixels of the camera as it was given."""
     obs, n_landmarks = submap.observations, len(submap.landmarks)
     rows = np.flatnonzero(obs["alive"] & np.isin(obs["kf"], window))
     T = submap.keyframe_poses(window)
@@ -186,8 +194,6 @@ def make_problem(
     raw = np.concatenate([submap.keyframes[k].features.uv_px for k in window.tolist()])
     offset = np.cumsum([0, *(len(submap.keyframes[k].features) for k in window.tolist())])
     uv_given, _ = given.rectify(raw[offset[kf[chosen]] + obs["feature"][rows[chosen]]])
-    typical = float(np.median(res.chi2[chosen])) if len(chosen) else MEDIAN_CHI2_2DOF
-    sigma *= max(MIN_NOISE_RATIO, math.sqrt(typical / MEDIAN_CHI2_2DOF))
     finite = np.isfinite(uv_given).all(1)
     chosen, uv_given = chosen[finite], uv_given[finite]
     return BundleProblem(
@@ -257,7 +263,18 @@ def _optimise(problem: BundleProblem, start: FloatArray, prior: FloatArray, robu
     found = np.asarray(result.atCal3DS2(CALIBRATION_KEY).vector())
     correction, J = _from_cal3_ds2(found, p.K)
     marginal = np.asarray(gtsam.Marginals(graph, result).marginalCovariance(CALIBRATION_KEY))
-    return _Optimum(correction, J @ marginal @ J.T, before, float(optimizer.error()))
+    noise_ratio = _noise_ratio(p, convert.poses_of(result), convert.points_of(result), correction)
+    return _Optimum(correction, J @ marginal @ J.T, noise_ratio, before, float(optimizer.error()))
+
+
+def _noise_ratio(problem: BundleProblem, T: FloatArray, xyz: FloatArray, correction: FloatArray) -> float:
+    """Return the ratio of the typical residual to its sigma."""
+    p = problem
+    p_cam = np.einsum("rji,rj->ri", T[p.kf, :3, :3], xyz[p.point] - T[p.kf, :3, 3])
+    front = p_cam[:, 2] > MIN_DEPTH_MU
+    uv = LensCorrection.of_vector(correction).distort_px(p.K, p_cam[front, :2] / p_cam[front, 2:])
+    chi2 = ((uv - p.uv_px[front]) ** 2).sum(1) / p.sigma_px[front] ** 2
+    return max(MIN_NOISE_RATIO, math.sqrt(float(np.median(chi2)) / MEDIAN_CHI2_2DOF))
 
 
 def _to_cal3_ds2(K: FloatArray, correction: FloatArray) -> gtsam.Cal3DS2:
