@@ -214,3 +214,17 @@ def test_scripts_are_read_from_plain_mappings() -> None:
 def test_wrong_parameters_are_refused(wrong: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         make_sequence(**wrong)  # type: ignore[arg-type]
+
+
+def test_noise_is_new_in_each_frame() -> None:
+    """Else a covered lens shows a world of its own: a plane of noise, which features match and a map is made of."""
+    sequence = make_sequence("street", seed=3, events=[Event(EventKind.BLACKOUT, 0, 3)], **SMALL)
+    spectra = []
+    for index in range(3):
+        noise = sequence.frame(index).image.astype(np.float64)
+        noise -= noise.mean(axis=0)
+        spectra.append(np.fft.rfft2(noise / noise.std()))
+    for a, b in ((0, 1), (1, 2), (0, 2)):
+        # At any shift: the largest of N values of variance 1 / N is expected at about sqrt(2 ln N / N).
+        correlation = np.fft.irfft2(spectra[a] * spectra[b].conj()) / (160 * 120)
+        assert np.abs(correlation).max() < 6 / np.sqrt(160 * 120)
