@@ -222,6 +222,9 @@ class ISam2SubmapGraph:
         factors = np.empty(len(changes.order), np.int64)
         factors[changes.order] = indices[projections:]
         self._ledger.commit(plan, factors)
+        # One Gauss-Newton step leaves the newest landmarks short of their optimum, and good rows look like outliers.
+        for _ in range(self._config.extra_iterations):
+            solver.iterate(newest)
 
     def _n_rows(self, submap: Submap, plan: Plan, keyframe_id: int) -> int:
         kf = submap.observations["kf"]

@@ -164,6 +164,8 @@ class GraphConfig(StrictModel):
     """Keyframes (the last inserted ones, and their landmarks) whose estimate is read after each update; 0 reads all."""
     read_all_every: int = Field(10, ge=1)
     """Each so-many-th update reads the whole estimate."""
+    extra_iterations: int = Field(1, ge=0, le=10)
+    """Further Gauss-Newton steps of the incremental solver after each keyframe."""
     rebuild_iterations: int = Field(8, ge=1)
     """Batch iterations at most when a graph is made anew."""
 
