@@ -68,12 +68,20 @@ class Atlas:
         return [[m for m in sorted(self.submaps) if component[m] == root] for root in roots]
 
     def S_world_submap(self, component: list[int]) -> dict[int, FloatArray]:
-        """Return the transform of each submap of a linked set into the frame of its first one."""
+        """Return the transform of each submap of a linked set into the frame of its first one.
+
+        Parameters
+        ----------
+        component : list of int
+            Submap ids; links that lead out of it are not followed.
+        """
         found: dict[int, FloatArray] = {component[0]: np.eye(4)}
         grown = True
         while grown:
             grown = False
             for link in self.links:
+                if link.a not in component or link.b not in component:
+                    continue
                 if link.a in found and link.b not in found:
                     found[link.b] = found[link.a] @ link.S_a_b
                     grown = True

@@ -1,0 +1,200 @@
+"""The state machine on scenes of points: every frame accounted for, whatever happens to it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dualslam.core.events import EventKind
+from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.results import frame_rows, trajectories_of
+from dualslam.system import System
+from tests.point_world import PointWorld, cloud, hand_held, path, pose_errors, system_in
+
+POSITION_M, ROTATION_RAD = 0.06, 0.01
+
+
+def run(world: PointWorld, **settings: object) -> System:
+    system = system_in(world, **settings)
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    return system
+
+
+def main_trajectory(system: System) -> tuple[list[int], FloatArray]:
+    main = trajectories_of(system).main
+    return main.index.tolist(), main.T_world_cam
+
+
+def assert_right(indices: list[int], T: FloatArray, world: PointWorld) -> None:
+    translation, rotation = pose_errors(T, world.T_world_cam[indices])
+    assert translation.max() < POSITION_M
+    assert rotation.max() < ROTATION_RAD
+
+
+def kinds(system: System) -> list[EventKind]:
+    return [event.event for event in system.events]
+
+
+@pytest.fixture(scope="module")
+def world() -> PointWorld:
+    return PointWorld(cloud(), hand_held(70))
+
+
+@pytest.fixture(scope="module")
+def plain(world: PointWorld) -> System:
+    return run(world)
+
+
+def test_all_frames_are_posed_and_right(plain: System, world: PointWorld) -> None:
+    indices, T = main_trajectory(plain)
+    assert indices == list(range(70))
+    assert_right(indices, T, world)
+    assert kinds(plain).count(EventKind.INITIALISED) == 1
+    assert kinds(plain)[-1] is EventKind.ARCHIVED
+    assert not plain.events.of_kind(EventKind.FAILED, EventKind.GRAPH_REBUILT)
+
+
+def test_the_frames_before_the_start_are_posed_by_walking_back() -> None:
+    """The camera stands still first: the start comes late, and none of the frames before it is lost."""
+    still = np.repeat(np.eye(4)[None], 15, 0)
+    world = PointWorld(cloud(), np.concatenate([still, path(25, np.array([0.08, 0, 0.02]), np.array([0, -0.005, 0]))]))
+    system = system_in(world)
+    results = [system.step(frame) for frame in world.frames()]
+    assert all(r.status is FrameStatus.INITIALISING and r.T_submap_cam is None for r in results[:15])
+    started = next(i for i, r in enumerate(results) if r.status is FrameStatus.TRACKED)
+    assert started > 15
+    assert all(system.rows[i].status is FrameStatus.TRACKED for i in range(40))
+    indices, T = main_trajectory(system)
+    assert indices == list(range(40))
+    assert_right(indices, T, world)
+
+
+def test_the_same_seed_gives_the_same_trajectory_bit_for_bit(plain: System, world: PointWorld) -> None:
+    again = run(world)
+    assert np.array_equal(main_trajectory(plain)[1], main_trajectory(again)[1])
+    assert [e.as_dict() for e in plain.events] == [e.as_dict() for e in again.events]
+
+
+def test_results_tell_the_pose_of_the_moment(world: PointWorld) -> None:
+    system = system_in(world)
+    for frame in world.frames()[:30]:
+        result = system.step(frame)
+    assert result.T_submap_cam is not None
+    assert result.n_inliers > 50
+    assert result.failure is None
+    assert system.live is not None
+    np.testing.assert_allclose(main_trajectory(system)[1][-1], result.T_submap_cam, atol=1e-12)
+
+
+def test_unreadable_frames_have_their_row_and_tracking_goes_on(world: PointWorld) -> None:
+    torn = frozenset({0, 20, 21, 40})
+    system = run(PointWorld(world.xyz, world.T_world_cam, unreadable=torn))
+    rows = frame_rows(system, trajectories_of(system).main)
+    assert [row.index for row in rows] == list(range(70))
+    assert {row.index for row in rows if row.status is FrameStatus.UNREADABLE} == torn
+    assert {row.index for row in rows if not row.in_main_map} == torn
+    assert len(system.events.of_kind(EventKind.UNREADABLE)) == len(torn)
+    assert len(system.atlas.submaps) == 1
+
+
+def test_a_short_loss_is_bridged(world: PointWorld) -> None:
+    gap = frozenset(range(30, 35))
+    system = run(PointWorld(world.xyz, world.T_world_cam, covered=gap))
+    assert len(system.atlas.submaps) == 1
+    assert {i for i, row in system.rows.items() if row.status is FrameStatus.LOST} == gap
+    assert not system.events.of_kind(EventKind.FAILED)
+    indices, T = main_trajectory(system)
+    assert_right(indices, T, world)
+
+
+@pytest.fixture(scope="module")
+def parted(world: PointWorld) -> System:
+    return run(PointWorld(world.xyz, world.T_world_cam, covered=frozenset(range(35, 50))))
+
+
+def test_a_long_loss_ends_the_submap_and_the_next_one_starts(parted: System, world: PointWorld) -> None:
+    assert len(parted.atlas.submaps) == 2
+    order = [k for k in kinds(parted) if k not in (EventKind.INITIALISATION_REFUSED, EventKind.RELOCALISED)]
+    assert order == [
+        EventKind.INITIALISED,
+        EventKind.FAILED,
+        EventKind.ARCHIVED,
+        EventKind.REINITIALISED,
+        EventKind.ARCHIVED,
+    ]
+    (failed,) = parted.events.of_kind(EventKind.FAILED)
+    assert failed.data["lost_since"] == 35
+    assert failed.frame == 35 + 8
+    found = trajectories_of(parted)
+    assert found.main_submaps == [0]
+    assert found.main.index.tolist() == list(range(35))
+    assert found.unlinked[1].index.tolist() == list(range(50, 70))
+    for posed in (found.main, found.unlinked[1]):
+        assert_right(posed.index.tolist(), posed.T_world_cam, world)
+
+
+def test_every_frame_of_a_parted_run_has_its_row(parted: System) -> None:
+    rows = frame_rows(parted, trajectories_of(parted).main)
+    assert [row.index for row in rows] == list(range(70))
+    for row in rows:
+        assert row.in_main_map == (row.index < 35)
+        if 35 <= row.index < 50:
+            assert row.submap is None
+            assert row.status in (FrameStatus.LOST, FrameStatus.INITIALISING)
+        else:
+            assert row.status is FrameStatus.TRACKED
+            assert row.submap == int(row.index >= 50)
+
+
+def test_the_main_map_is_the_one_with_most_frames(world: PointWorld) -> None:
+    system = run(PointWorld(world.xyz, world.T_world_cam, covered=frozenset(range(18, 32))))
+    found = trajectories_of(system)
+    assert found.main_submaps == [1]
+    assert found.main.index.tolist() == list(range(32, 70))
+    assert list(found.unlinked) == [0]
+
+
+def test_rolling_over_loses_nothing(world: PointWorld) -> None:
+    settings = {
+        "graph": {"max_keyframes": 20, "rollover_keyframes": 6},
+        "keyframes": {"max_parallax_deg": 1.0},
+        "mapping": {"redundant_ratio": 1.0},
+    }
+    system = run(world, **settings)
+    assert len(system.atlas.submaps) > 1
+    assert not system.events.of_kind(EventKind.FAILED)
+    assert len(system.events.of_kind(EventKind.ROLLED_OVER)) == len(system.atlas.links)
+    found = trajectories_of(system)
+    assert found.main_submaps == sorted(system.atlas.submaps)
+    assert not found.unlinked
+    assert found.main.index.tolist() == list(range(70))
+    assert_right(found.main.index.tolist(), found.main.T_world_cam, world)
+
+
+def test_frames_may_come_in_reverse(world: PointWorld) -> None:
+    system = system_in(world)
+    for frame in reversed(world.frames()):
+        system.step(frame)
+    system.finish()
+    indices, T = main_trajectory(system)
+    assert indices == list(range(70))
+    assert_right(indices, T, world)
+    assert [row.index for row in frame_rows(system, trajectories_of(system).main)] == list(range(69, -1, -1))
+
+
+def test_nothing_to_see_gives_no_map() -> None:
+    world = PointWorld(cloud(), hand_held(12), covered=frozenset(range(12)))
+    system = run(world)
+    assert not system.atlas.submaps
+    assert all(row.status is FrameStatus.INITIALISING for row in system.rows.values())
+    found = trajectories_of(system)
+    assert len(found.main) == 0
+    assert found.main_submaps == []
+
+
+def test_cpu_times_of_the_stages_are_kept(plain: System) -> None:
+    stages = plain.timer.stages
+    assert {"features", "initialisation", "tracking", "mapping", "graph (in mapping)"} <= set(stages)
+    assert stages["graph (in mapping)"].seconds <= stages["mapping"].seconds
