@@ -107,7 +107,7 @@ class Calibration:
         return Refinement(graph, before, numbers)
 
     def rectified(self, view: View) -> View:
-        """Return a view with the pixels that the present camera gives it; features without a place keep their old one."""
+        """Return a view with the pixels of the present camera; features without a place there keep their old one."""
         features = view.features
         uv_rect_px, _ = self._camera.rectify(features.uv_px)
         lost = ~np.isfinite(uv_rect_px).all(axis=1)
