@@ -57,6 +57,7 @@ class Calibration:
         self._estimate = estimate
         self._adjust = adjust
         self._due_at: dict[int, int] = {}
+        self._refined_in: int | None = None
 
     @property
     def camera(self) -> Camera:
@@ -65,6 +66,8 @@ class Calibration:
 
     def is_due(self, submap: Submap) -> bool:
         """Whether it is time to ask this submap."""
+        if self._refined_in not in (None, submap.id):
+            return False  # what a longer submap said of the lens is not put at risk by a shorter one
         due_at = self._due_at.get(submap.id, self._config.first_keyframes)
         return self._config.refine and len(submap.keyframes) >= due_at
 
@@ -100,12 +103,16 @@ class Calibration:
         before = submap.copy()
         submap.K, submap.keyframes = changed.K, changed.keyframes
         submap.T_submap_kf, submap.landmarks = changed.T_submap_kf, changed.landmarks
-        self._camera = camera
+        self._camera, self._refined_in = camera, submap.id
         return Refinement(graph, before, numbers)
 
     def rectified(self, view: View) -> View:
-        """Return a view with the pixels that the present camera gives it."""
-        return replace(view, features=_rectified_again(view.features, self._camera))
+        """Return a view with the pixels of the present camera; features without a place there keep their old one."""
+        features = view.features
+        uv_rect_px, _ = self._camera.rectify(features.uv_px)
+        lost = ~np.isfinite(uv_rect_px).all(axis=1)
+        uv_rect_px[lost] = features.uv_rect_px[lost]
+        return replace(view, features=replace(features, uv_rect_px=uv_rect_px))
 
 
 def rectify(features: Features, camera: Camera, model_sigma_px: float) -> Features:

@@ -348,7 +348,8 @@ class System:
 
     def _archive(self, live: VisualOdometry, why: str) -> None:
         submap = live.submap
-        last = max(self.poses[i].index for i in self.poses if self.poses[i].submap_id == submap.id)
+        # A submap that rolled over and was lost at once has no frame of its own: its newest keyframe stands for it.
+        last = max([p.index for p in self.poses.values() if p.submap_id == submap.id], default=max(submap.keyframes))
         self.events.add(
             EventKind.ARCHIVED,
             last,
