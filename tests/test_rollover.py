@@ -59,7 +59,9 @@ class Chain:
 
     def add(self, k: int) -> None:
         points, uv = self.corridor.seen(k)
-        features = make_features(uv, np.full(len(uv), 0.5), np.zeros(len(uv), np.int64), np.zeros((len(uv), 1), np.uint8))
+        features = make_features(
+            uv, np.full(len(uv), 0.5), np.zeros(len(uv), np.int64), np.zeros((len(uv), 1), np.uint8)
+        )
         T = self.corridor.T[k]
         if k > 3:  # predicted: the step is known to a few percent
             step = se3.inverse(self.corridor.T[k - 1]) @ T

@@ -234,5 +234,3 @@ def test_resection_needs_no_guess(share_wrong: float) -> None:
     assert np.linalg.norm(error[3:]) < POSITION_M
     assert np.linalg.norm(error[:3]) < ROTATION_RAD
     assert np.array_equal(T_cam_w, resect(CAMERA.K, SIZE_PX, uv, xyz, 0.5, 0))
-
-
