@@ -26,19 +26,20 @@ if TYPE_CHECKING:
     from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError, SolverError
     from dualslam.core.threads import limit_threads
     from dualslam.core.types import Frame
+    from dualslam.frame_records import FrameResult
     from dualslam.map_store import load_atlas, save_atlas
     from dualslam.results import trajectories_of
     from dualslam.runner import run_sequence
     from dualslam.session import run_to_folder
     from dualslam.sources import open_source
-    from dualslam.system import FrameResult, System
+    from dualslam.system import System
 
 _WHERE = {
     "Config": "core.config",
     "ConfigError": "core.errors",
     "DualSlamError": "core.errors",
     "Frame": "core.types",
-    "FrameResult": "system",
+    "FrameResult": "frame_records",
     "InputError": "core.errors",
     "OutputError": "core.errors",
     "SolverError": "core.errors",

@@ -16,7 +16,7 @@ from typing import Protocol
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame
-from dualslam.system import FrameResult
+from dualslam.frame_records import FrameResult
 
 
 class Steppable(Protocol):

@@ -15,12 +15,13 @@ from dualslam.core.config_io import dump_config
 from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Sequence
+from dualslam.frame_records import FrameResult
 from dualslam.io.run_folder import RunFolder, RunRecord
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.map_store import save_atlas
 from dualslam.results import frame_rows, summarise, trajectories_of
 from dualslam.runner import RunReport, run_sequence
-from dualslam.system import FrameResult, System
+from dualslam.system import System
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,6 +20,7 @@ from dualslam.core.stage_timer import StageTimer
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, Start, Track, View
 from dualslam.frame_buffer import FrameBuffer
+from dualslam.frame_records import FrameResult, FrameRow
 from dualslam.health import judge_track
 from dualslam.linking import LinkEstimate
 from dualslam.recovery import LinkAttempt, Relinker, walk_back
@@ -42,41 +43,6 @@ class Components:
     def K(self) -> FloatArray:
         """(3, 3) intrinsics of the rectified pixels, as they are known now."""
         return self.calibration.camera.K
-
-
-@dataclass(slots=True)
-class FrameRow:
-    """What became of one frame so far; a later walk back in time may still pose it."""
-
-    index: int
-    timestamp_s: float
-    status: FrameStatus
-    submap_id: int | None = None
-    n_matches: int = 0
-    n_inliers: int = 0
-    latency_ms: float = 0.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FrameResult:
-    """What one step found out about its frame.
-
-    Attributes
-    ----------
-    T_submap_cam : (4, 4) float64 or None
-        In the unit and frame of submap `submap_id`, as known now; later frames refine it.
-    failure : Failure or None
-        Why the frame has no pose.
-    """
-
-    index: int
-    status: FrameStatus
-    submap_id: int | None
-    T_submap_cam: FloatArray | None
-    n_matches: int
-    n_inliers: int
-    latency_ms: float
-    failure: Failure | None
 
 
 class System:

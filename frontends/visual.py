@@ -12,7 +12,7 @@ from dualslam.core.config import Config
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend, KeyframeReport, SubmapGraph
 from dualslam.core.submap import Submap
-from dualslam.core.types import Failure, FloatArray, IntArray, Track, View
+from dualslam.core.types import Failure, FloatArray, Track, View
 from frontends.keyframing import keyframe_due
 from frontends.mapper import Mapper
 from frontends.tracker import Tracker
@@ -33,7 +33,6 @@ class VisualFrontEnd:
         self._tracker = Tracker(frontend, config.tracking, submap, size_px, config.seed)
         self._mapper = Mapper(frontend, config.mapping, submap, size_px)
         self._reference_id = -1
-        self._suspects: IntArray = np.zeros(0, np.int64)
         self._path: list[int] = []  # keyframes in the order in which this front end met them
 
     @property
@@ -78,14 +77,11 @@ class VisualFrontEnd:
         mapping = self._mapper.insert(track)
         estimate = self.graph.update(self.submap)
         self.submap.apply_estimate(estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu)
-        # A row must be contradicted twice: the first time its landmark may just not be at its optimum yet.
-        outliers = np.intersect1d(estimate.outlier_rows, self._suspects)
-        self._suspects = estimate.outlier_rows
-        self._mapper.remove_outliers(outliers)
+        self._mapper.remove_outliers(estimate.outlier_rows)
         self._meet(track.view.index)
         culled = self._cull_keyframe()
         self._tracker.refresh()
-        return KeyframeReport(mapping, estimate, len(outliers), culled)
+        return KeyframeReport(mapping, estimate, len(estimate.outlier_rows), culled)
 
     def _meet(self, keyframe_id: int) -> None:
         if keyframe_id != self._reference_id:

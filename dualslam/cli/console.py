@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dualslam.core.interfaces import Sequence
+from dualslam.frame_records import FrameResult
 from dualslam.session import Outcome
-from dualslam.system import FrameResult
 
 
 @contextmanager

@@ -20,7 +20,7 @@ def execute(args: argparse.Namespace) -> int:
     """Run, and say in one line what came of it."""
     config = config_of(args)
     if args.workers:
-        log.info("--workers %d: there is no recovery yet that could use them", args.workers)
+        log.info("--workers %d: recovery runs in the tracking process as yet", args.workers)
     sequence = open_source(
         args.source,
         camera_file=args.camera,

@@ -140,8 +140,9 @@ class GraphConfig(StrictModel):
 
     robust_k: float = Field(1.345, gt=0)
     """Huber threshold in sigmas: 1.345 keeps 95 % efficiency under Gaussian noise."""
-    outlier_chi2: float = Field(5.991, gt=0)
-    """Squared whitened residual above which an observation is an outlier: chi-square, 2 degrees of freedom, 95 %."""
+    outlier_chi2: float = Field(9.210, gt=0)
+    """Squared whitened residual above which an observation is an outlier: chi-square, 2 degrees of freedom, 99 %, since
+    what is dropped here is dropped for good."""
     max_keyframes: int = Field(500, ge=20, le=1000)
     """Keyframes at which a submap rolls over into the next (the solver's Cholesky rejects much longer chains)."""
     rollover_keyframes: int = Field(12, ge=3, le=19)

@@ -13,7 +13,7 @@ from dualslam.core.events import EventKind, EventLog
 from dualslam.core.stage_timer import StageTimer
 from dualslam.core.submap import Submap
 from dualslam.core.types import Features, FloatArray, Frame, FrameStatus, Keyframe
-from dualslam.system import FrameResult, FrameRow
+from dualslam.frame_records import FrameResult, FrameRow
 from dualslam.trajectory import FramePose
 
 NO_FEATURES = Features(

@@ -1,0 +1,42 @@
+"""What became of each frame: the row that stays and grows, and the result that a step hands out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dualslam.core.types import Failure, FloatArray, FrameStatus
+
+
+@dataclass(slots=True)
+class FrameRow:
+    """What became of one frame so far; a later walk back in time may still pose it."""
+
+    index: int
+    timestamp_s: float
+    status: FrameStatus
+    submap_id: int | None = None
+    n_matches: int = 0
+    n_inliers: int = 0
+    latency_ms: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameResult:
+    """What one step found out about its frame.
+
+    Attributes
+    ----------
+    T_submap_cam : (4, 4) float64 or None
+        In the unit and frame of submap `submap_id`, as known now; later frames refine it.
+    failure : Failure or None
+        Why the frame has no pose.
+    """
+
+    index: int
+    status: FrameStatus
+    submap_id: int | None
+    T_submap_cam: FloatArray | None
+    n_matches: int
+    n_inliers: int
+    latency_ms: float
+    failure: Failure | None

@@ -1,0 +1,107 @@
+"""Failure, the walk back, the link: on scenes of points, with the truth known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dualslam.atlas import LinkKind
+from dualslam.core.events import EventKind
+from dualslam.core.geometry import se3
+from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.results import frame_rows, trajectories_of
+from dualslam.system import System
+from tests.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
+
+COVERED = frozenset(range(35, 50))
+POSITION_M, ROTATION_RAD = 0.08, 0.01
+SCALE = 0.01  # share by which the link may miss the true ratio of the two units
+
+
+def run(recovery: bool) -> tuple[System, PointWorld]:
+    world = PointWorld(cloud(), hand_held(70), covered=COVERED)
+    system = system_in(world, recovery={"enabled": recovery})
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    return system, world
+
+
+@pytest.fixture(scope="module")
+def recovered() -> tuple[System, PointWorld]:
+    return run(recovery=True)
+
+
+def true_unit_m(system: System, world: PointWorld, submap_id: int) -> float:
+    """Metres in one unit of a submap, by the extent of its keyframes."""
+    submap = system.atlas.submaps[submap_id]
+    ids = list(submap.keyframes)
+    est, true = submap.keyframe_poses(ids)[:, :3, 3], world.T_world_cam[ids][:, :3, 3]
+    extent = [float(np.linalg.norm(p - p.mean(0))) for p in (true, est)]
+    return extent[0] / extent[1]
+
+
+def test_both_sides_of_a_black_out_end_in_one_map(recovered: tuple[System, PointWorld]) -> None:
+    system, world = recovered
+    main = trajectories_of(system).main
+    assert set(main.index.tolist()) == set(range(70)) - COVERED
+    translation, rotation = pose_errors(main.T_world_cam, world.T_world_cam[main.index])
+    assert translation.max() < POSITION_M
+    assert rotation.max() < ROTATION_RAD
+
+
+def test_the_link_has_the_true_scale(recovered: tuple[System, PointWorld]) -> None:
+    system, world = recovered
+    (link,) = system.atlas.links
+    assert link.kind is LinkKind.RECOVERY
+    scale = float(np.cbrt(np.linalg.det(link.S_a_b[:3, :3])))
+    true_scale = true_unit_m(system, world, link.b) / true_unit_m(system, world, link.a)
+    assert abs(scale / true_scale - 1) < SCALE
+    assert np.all(np.linalg.eigvalsh(link.covariance) > 0)
+
+
+def test_the_events_tell_the_recovery_in_order(recovered: tuple[System, PointWorld]) -> None:
+    system, _ = recovered
+    told = (
+        EventKind.FAILED,
+        EventKind.REINITIALISED,
+        EventKind.RECOVERY_STARTED,
+        EventKind.RECOVERY_ATTEMPT,
+        EventKind.LINKED,
+        EventKind.FUSED,
+    )
+    assert [event.event for event in system.events.of_kind(*told)] == list(told)
+    (linked,) = system.events.of_kind(EventKind.LINKED)
+    assert linked.data["old_submap"] == 0
+    assert linked.data["inliers"] <= linked.data["matches"]
+    assert max(linked.data["agreeing_keyframes"]) < min(COVERED)
+
+
+def test_rows_and_summary_agree_with_the_map(recovered: tuple[System, PointWorld]) -> None:
+    system, _ = recovered
+    trajectories = trajectories_of(system)
+    rows = {row.index: row for row in frame_rows(system, trajectories.main)}
+    assert all(rows[i].in_main_map == (i not in COVERED) for i in rows)
+    assert all(rows[i].status is FrameStatus.RECOVERED for i in range(50, 52))
+    assert system.poses[60].submap_id == 1
+
+
+def test_without_recovery_the_maps_stay_apart() -> None:
+    system, _ = run(recovery=False)
+    assert system.atlas.components() == [[0], [1]]
+    assert not system.events.of_kind(EventKind.RECOVERY_STARTED, EventKind.LINKED)
+
+
+def test_the_walk_never_reads_the_old_map(recovered: tuple[System, PointWorld]) -> None:
+    """The two maps measured the shared frames on their own: their poses there agree through the link alone."""
+    system, _ = recovered
+    (link,) = system.atlas.links
+    old, new = system.atlas.submaps[link.a], system.atlas.submaps[link.b]
+    shared = sorted(old.keyframes.keys() & new.keyframes.keys())
+    assert len(shared) >= 2  # the others became redundant and were culled since
+    moved = [link.S_a_b @ new.T_submap_kf[k] for k in shared]
+    difference: FloatArray = np.array(
+        [np.linalg.norm(m[:3, 3] - old.T_submap_kf[k][:3, 3]) for m, k in zip(moved, shared, strict=True)]
+    )
+    assert 0 < difference.max() < 0.05
+    assert not any(np.array_equal(se3.inverse(new.T_submap_kf[k]), se3.inverse(old.T_submap_kf[k])) for k in shared)
