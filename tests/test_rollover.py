@@ -16,8 +16,8 @@ from tests.point_world import CAMERA, SIZE_PX, make_features
 
 N_KEYFRAMES = 5000
 N_SHARED = 12
-PER_KEYFRAME = 5
-"""Points that come into view with each keyframe; each is seen by those of about 2 m, which is 20 keyframes."""
+PER_KEYFRAME = 3
+"""Points that come into view with each keyframe; each is seen by those less than 1.2 m away, 12 on either side."""
 
 
 class Corridor:
@@ -37,7 +37,7 @@ class Corridor:
         self.rng = rng
 
     def seen(self, k: int) -> tuple[np.ndarray, FloatArray]:
-        near = np.arange(max(0, PER_KEYFRAME * (k - 20)), min(len(self.xyz), PER_KEYFRAME * (k + 20)))
+        near = np.arange(max(0, PER_KEYFRAME * (k - 12)), min(len(self.xyz), PER_KEYFRAME * (k + 12)))
         p = (self.xyz[near] - self.T[k, :3, 3]) @ self.T[k, :3, :3]
         uv = CAMERA.project(p) + self.noise_px * self.rng.normal(size=(len(near), 2))
         inside = (uv > 0).all(1) & (uv < SIZE_PX).all(1)
@@ -59,9 +59,8 @@ class Chain:
 
     def add(self, k: int) -> None:
         points, uv = self.corridor.seen(k)
-        features = make_features(
-            uv, np.full(len(uv), 0.5), np.zeros(len(uv), np.int64), np.zeros((len(uv), 1), np.uint8)
-        )
+        n = len(uv)
+        features = make_features(uv, np.full(n, 0.5), np.zeros(n, np.int64), np.zeros((n, 1), np.uint8))
         T = self.corridor.T[k]
         if k > 3:  # predicted: the step is known to a few percent
             step = se3.inverse(self.corridor.T[k - 1]) @ T
