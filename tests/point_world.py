@@ -90,11 +90,10 @@ def cloud(n: int = 900, seed: int = 0, length_m: float = 0.0) -> FloatArray:
     return rng.uniform([-8, -5, 3], [8 + length_m, 5, 12], (int(n * (1 + length_m / 16)), 3))
 
 
-def path(n: int, step_m: FloatArray, turn_rad: FloatArray, start_m: FloatArray | None = None) -> FloatArray:
+def path(n: int, step_m: FloatArray, turn_rad: FloatArray) -> FloatArray:
     """Steady motion: so much a frame, in world axes."""
     i = np.arange(n)[:, None]
-    start = np.zeros(3) if start_m is None else start_m
-    return se3.from_parts(so3.exp(i * np.asarray(turn_rad, float)), start + i * np.asarray(step_m, float))
+    return se3.from_parts(so3.exp(i * np.asarray(turn_rad, float)), i * np.asarray(step_m, float))
 
 
 def hand_held(n: int) -> FloatArray:
