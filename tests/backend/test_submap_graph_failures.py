@@ -130,12 +130,12 @@ class Saboteur:
         self.failures = list(failures)
         original = IncrementalSolver.update
 
-        def update(solver, *args):
+        def update(solver, *args, **options):
             if self.failures:
                 failure = self.failures.pop(0)
                 if failure is not None:
                     raise failure
-            return original(solver, *args)
+            return original(solver, *args, **options)
 
         monkeypatch.setattr(IncrementalSolver, "update", update)
 
