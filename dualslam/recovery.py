@@ -7,15 +7,19 @@ keyframes, so that both maps hold the same ones.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 from dualslam.atlas import Atlas
 from dualslam.core.config import RecoveryConfig
+from dualslam.core.errors import SolverError
 from dualslam.core.interfaces import KeyframeReport, VisualOdometry
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, Track, View
 from dualslam.linking import LinkEstimate
+
+log = logging.getLogger(__name__)
 
 Judge = Callable[[Track | Failure], Track | Failure]
 Linker = Callable[[Submap, Submap, int | None], LinkEstimate | Failure]
@@ -67,7 +71,13 @@ def walk_back(
             continue
         n_failed = 0
         wanted = view.index in keyframe_ids and view.index not in walker.submap.keyframes
-        report = walker.insert_keyframe(track) if wanted or walker.keyframe_due(track) else None
+        report = None
+        if wanted or walker.keyframe_due(track):
+            try:
+                report = walker.insert_keyframe(track)
+            except SolverError as error:
+                log.warning("the walk back ends at frame %d: %s", view.index, error)
+                return
         yield WalkStep(view, track, report)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from dualslam.atlas import Atlas, Link, LinkKind
 from dualslam.calibration import Calibration
 from dualslam.carried_poses import carry_poses
 from dualslam.core.config import Config
+from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import MapStarter, SubmapGraph, VisualOdometry
@@ -26,6 +28,8 @@ from dualslam.linking import LinkEstimate
 from dualslam.recovery import LinkAttempt, Relinker, walk_back
 from dualslam.rollover import next_submap
 from dualslam.trajectory import FramePose
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +126,11 @@ class System:
         """Make a submap of a start, and pose the frames before and between by walking back in time over the buffer."""
         submap = Submap.from_start(start, len(self.atlas.submaps), self._parts.K)
         graph = self._parts.new_graph()
-        with self.timer.measure("graph"):
-            estimate = graph.update(submap)
+        try:
+            with self.timer.measure("graph"):
+                estimate = graph.update(submap)
+        except SolverError as error:
+            return Failure(FailureReason.SOLVER, str(error), start.numbers)
         submap.apply_estimate(estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu)
         kind = EventKind.INITIALISED if not self.atlas.submaps else EventKind.REINITIALISED
         self.atlas.add(submap)
@@ -250,7 +257,7 @@ class System:
         self.rows[view.index].status = FrameStatus.LOST
         if len(self._lost) == 1:
             self._buffer.freeze()
-        if len(self._lost) > self._config.tracking.max_lost_frames:
+        if len(self._lost) > self._config.tracking.max_lost_frames or track.reason is FailureReason.SOLVER:
             self._give_up(live, view, track)
         return track
 
@@ -263,8 +270,11 @@ class System:
         if track.wide:
             self._event(EventKind.RELOCALISED, view, odometry.submap.id, n_inliers=track.n_inliers)
         if odometry.keyframe_due(track):
-            with self.timer.measure("mapping"):
-                report = odometry.insert_keyframe(track)
+            try:
+                with self.timer.measure("mapping"):
+                    report = odometry.insert_keyframe(track)
+            except SolverError as error:
+                return Failure(FailureReason.SOLVER, str(error))
             self.timer.add("graph (in mapping)", report.estimate.seconds)
             if report.estimate.rebuilt:
                 self._event(EventKind.GRAPH_REBUILT, view, odometry.submap.id)
@@ -314,6 +324,11 @@ class System:
 
     def _archive(self, live: VisualOdometry, why: str) -> None:
         submap = live.submap
+        try:
+            final = live.graph.full_estimate(submap)
+            submap.apply_estimate(final.keyframe_ids, final.T_submap_kf, final.landmark_ids, final.xyz_mu)
+        except SolverError:
+            log.warning("submap %d is archived as it stands: its graph gives no estimate", submap.id)
         # A submap that rolled over and was lost at once has no frame of its own: its newest keyframe stands for it.
         last = max([p.index for p in self.poses.values() if p.submap_id == submap.id], default=max(submap.keyframes))
         self.events.add(
@@ -341,7 +356,11 @@ class System:
         """Go on in a new submap that shares its first keyframes with the full one: exact link, no failure."""
         submap = next_submap(live.submap, len(self.atlas.submaps), self._config.graph.rollover_keyframes)
         graph = self._parts.new_graph()
-        graph.rebuild(submap)
+        try:
+            graph.rebuild(submap)
+        except SolverError as error:
+            log.warning("submap %d stays open beyond its cap: %s", live.submap.id, error)
+            return
         self.atlas.add(submap)
         self.atlas.link(Link(live.submap.id, submap.id, np.eye(4), np.zeros((7, 7)), LinkKind.ROLLOVER))
         self._event(EventKind.ROLLED_OVER, view, submap.id, from_submap=live.submap.id)

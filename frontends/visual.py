@@ -33,6 +33,7 @@ class VisualFrontEnd:
         self._tracker = Tracker(frontend, config.tracking, submap, size_px, config.seed)
         self._mapper = Mapper(frontend, config.mapping, submap, size_px)
         self._reference_id = -1
+        self._since_rebuild = 0
         self._path: list[int] = []  # keyframes in the order in which this front end met them
 
     @property
@@ -75,13 +76,22 @@ class VisualFrontEnd:
     def insert_keyframe(self, track: Track) -> KeyframeReport:
         """Make the frame a keyframe: extend the map, solve its graph, drop what the solution contradicts."""
         mapping = self._mapper.insert(track)
-        estimate = self.graph.update(self.submap)
+        estimate = self.graph.rebuild(self.submap) if self._rebuild_due(track) else self.graph.update(self.submap)
         self.submap.apply_estimate(estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu)
         self._mapper.remove_outliers(estimate.outlier_rows)
         self._meet(track.view.index)
         culled = self._cull_keyframe()
         self._tracker.refresh()
         return KeyframeReport(mapping, estimate, len(estimate.outlier_rows), culled)
+
+    def _rebuild_due(self, track: Track) -> bool:
+        """Whether the frame contradicts the map so much that the incremental estimate is to be made anew in batch."""
+        self._since_rebuild += 1
+        doubtful = track.n_inliers < self._config.graph.rebuild_inlier_ratio * track.n_matches
+        if not doubtful or self._since_rebuild < self._config.graph.rebuild_spacing:
+            return False
+        self._since_rebuild = 0
+        return True
 
     def _meet(self, keyframe_id: int) -> None:
         if keyframe_id != self._reference_id:

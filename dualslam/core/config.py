@@ -167,6 +167,11 @@ class GraphConfig(StrictModel):
     """Each so-many-th update reads the whole estimate."""
     extra_iterations: int = Field(1, ge=0, le=10)
     """Further Gauss-Newton steps of the incremental solver after each keyframe."""
+    rebuild_inlier_ratio: float = Field(0.65, ge=0, le=1)
+    """Share of a keyframe's matches that must agree with its pose, or the graph is made anew in batch: the incremental
+    estimate has then fallen behind its optimum, and good observations would be dropped as outliers."""
+    rebuild_spacing: int = Field(8, ge=1)
+    """Keyframes at least between two such batches."""
     rebuild_iterations: int = Field(8, ge=1)
     """Batch iterations at most when a graph is made anew."""
 

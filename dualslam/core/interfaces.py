@@ -104,6 +104,10 @@ class SubmapGraph(Protocol):
         """Throw the solver's state away and make it anew from the submap's arrays."""
         ...
 
+    def full_estimate(self, submap: Submap) -> GraphEstimate:
+        """Return the estimate of everything in the graph as of the last update, without solving."""
+        ...
+
     def pose_covariance(self, keyframe_id: int) -> FloatArray:
         """(6, 6) marginal covariance of `T_submap_kf`, tangent order rotation, translation, in the keyframe's frame."""
         ...
