@@ -107,7 +107,7 @@ class ISam2SubmapGraph:
             everything = self._n_updates % self._config.read_all_every == 0
             return self._read(submap, start, plan, everything, rebuilt=False)
         except SolverFailure as failure:
-            logger.warning("graph of submap %d: %s; rebuilding it", submap.id, failure)
+            logger.info("graph of submap %d: %s; rebuilding it", submap.id, failure)
             self._blame(failure, submap)
         return self._remake(submap, start, rebuilt=True)
 
@@ -314,7 +314,7 @@ class ISam2SubmapGraph:
                 return self._read(submap, start, plan, True, rebuilt)
             except SolverFailure as failure:
                 message = str(failure)
-                logger.warning("graph of submap %d, attempt %d to make it: %s", submap.id, attempt + 1, failure)
+                logger.info("graph of submap %d, attempt %d to make it: %s", submap.id, attempt + 1, failure)
                 self._blame(failure, submap)
         self._reset()
         raise SolverError(f"graph of submap {submap.id} could not be made in {REBUILD_ATTEMPTS} attempts: {message}")
