@@ -34,7 +34,7 @@ def run(sequence: SyntheticSequence) -> System:
     ids=["street", "room"],
 )
 def test_trajectory_is_right(scene: str, n_frames: int, size: dict[str, int], share: float) -> None:
-    """Positions to a share of the path, or of the scene's depth where that is longer; scale and turn drift are in it."""
+    """Positions to a share of the path, or of the scene's depth where that is longer, all drift included."""
     sequence = make_sequence(scene, n_frames, seed=2, **size)
     system = run(sequence)
     main = trajectories_of(system).main
