@@ -109,6 +109,18 @@ def test_a_short_loss_is_bridged(world: PointWorld) -> None:
     assert_right(indices, T, world)
 
 
+def test_frames_since_a_loss_wait_for_the_next_map_however_short_the_buffer() -> None:
+    """After the loss the camera stands still, elsewhere: no map can start, and no frame may be forgotten meanwhile."""
+    before, after = path(20, np.array([0.08, 0, 0]), np.zeros(3)), path(15, np.array([0.08, 0, 0.02]), np.zeros(3))
+    still = np.repeat(after[:1], 25, 0)
+    turned = path(2, np.zeros(3), np.array([0, np.pi, 0]))[1]
+    T = np.concatenate([before, turned @ still, turned @ after])
+    both_sides = np.concatenate([cloud(), cloud(seed=1) * (1, 1, -1)])
+    system = run(PointWorld(both_sides, T), buffer={"duration_s": 0.3})
+    assert len(system.atlas.submaps) == 2
+    assert {i: row.submap_id for i, row in system.rows.items()} == {i: int(i >= 20) for i in range(60)}
+
+
 @pytest.fixture(scope="module")
 def parted(world: PointWorld) -> System:
     return run(PointWorld(world.xyz, world.T_world_cam, covered=frozenset(range(35, 50))))

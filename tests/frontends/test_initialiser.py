@@ -113,6 +113,29 @@ def test_witnesses_that_disagree_refuse_the_start() -> None:
     assert refusal.numbers["support"] == 0
 
 
+def test_direction_is_known_as_well_as_is_said() -> None:
+    errors, sigmas = [], []
+    for seed in range(8):
+        world = PointWorld(cloud(seed=seed), path(9, np.array([0.06, 0, 0.02]), np.zeros(3)), noise_px=1.0, seed=seed)
+        starter = initialiser()
+        for view in world.views():
+            starter.collect(view)
+        start = starter.try_pair(0, 8)
+        assert isinstance(start, Start)
+        t, t_true = start.T_first_cam[-1, :3, 3], world.T_world_cam[8, :3, 3]
+        cosine = t @ t_true / np.linalg.norm(t) / np.linalg.norm(t_true)
+        errors.append(np.degrees(np.arccos(min(cosine, 1.0))))
+        sigmas.append(start.numbers["direction_sigma_deg"])
+    # The sigma is that of the worse of two axes.
+    assert 0.3 < np.sqrt(np.mean(np.square(errors))) / np.mean(sigmas) < 1.6
+    strict = initialiser(max_direction_sigma_deg=0.5 * min(sigmas))
+    for view in world.views():
+        strict.collect(view)
+    refusal = strict.try_pair(0, 8)
+    assert isinstance(refusal, Failure)
+    assert "direction of translation" in refusal.detail
+
+
 def test_collected_views_can_be_first_views() -> None:
     """What a lost track collected starts the next map as soon as one more frame comes."""
     world = PointWorld(cloud(), path(12, np.array([0.12, 0, 0]), np.zeros(3)))

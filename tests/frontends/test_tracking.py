@@ -70,7 +70,12 @@ class TestTracker:
     @pytest.mark.parametrize("order", [range(9, 26), range(15, 0, -1)], ids=["forwards", "backwards"])
     def test_poses_are_right(self, world: PointWorld, order: range) -> None:
         live = front_end(world, [0, 4, 8, 12, 16], start_at=8 if order.step > 0 else 16)
-        T = np.stack([se3.inverse(tracked(live, world.view(i)).T_cam_submap) for i in order])
+        tracks = [tracked(live, world.view(i)) for i in order]
+        assert not any(track.wide for track in tracks)
+        np.testing.assert_allclose(
+            se3.inverse(tracks[0].T_predicted), world.T_world_cam[order.start - order.step], atol=1e-9
+        )
+        T = np.stack([se3.inverse(track.T_cam_submap) for track in tracks])
         error = se3.log(se3.inverse(T) @ world.T_world_cam[list(order)])
         assert np.linalg.norm(error[:, 3:], axis=1).max() < POSITION_M
         assert np.linalg.norm(error[:, :3], axis=1).max() < ROTATION_RAD
