@@ -136,6 +136,8 @@ class System:
         self.atlas.add(submap)
         for k, keyframe in submap.keyframes.items():
             self._pose(FramePose(k, keyframe.timestamp_s, submap.id, k, np.eye(4)))
+            row = self.rows[k]
+            row.n_matches = row.n_inliers = int((submap.landmark_of[k] >= 0).sum())
         self._event(kind, view, submap.id, first_view=start.views[0].index, **start.numbers)
         with self.timer.measure("walk back"):
             self._walk_back(submap, graph, view)
