@@ -144,8 +144,8 @@ class GraphConfig(StrictModel):
     """Squared whitened residual above which an observation is an outlier: chi-square, 2 degrees of freedom, 99 %, since
     what is dropped here is dropped for good."""
     max_keyframes: int = Field(150, ge=20, le=1000)
-    """Keyframes at which a submap rolls over into the next: an update's cost grows with the map (65 ms at 150 keyframes,
-    140 ms at 380, measured on a road), and the solver's Cholesky rejects chains of more than about 1,000."""
+    """Keyframes at which a submap rolls over into the next: an update's cost grows with the map (on a road 65 ms on
+    average with this cap, 140 ms without), and the solver's Cholesky rejects chains of more than about 1,000."""
     rollover_keyframes: int = Field(12, ge=3, le=19)
     """Keyframes that a submap shares with the one that it rolls over into."""
     max_depth_sigma: float = Field(0.25, gt=0)
