@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.atlas import Atlas
+from dualslam.core.geometry import sim3
 from dualslam.core.types import FloatArray, IntArray
 
 
@@ -55,14 +56,7 @@ def compose(poses: Iterable[FramePose], atlas: Atlas, S_world_submap: dict[int, 
     T_world_cam = np.empty((len(kept), 4, 4))
     for i, pose in enumerate(kept):
         T_submap_cam = atlas.submaps[pose.submap_id].resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
-        T_world_cam[i] = _act_on_pose(S_world_submap[pose.submap_id], T_submap_cam)
+        T_world_cam[i] = sim3.act_on_pose(S_world_submap[pose.submap_id], T_submap_cam)
     return Trajectory(
         np.array([p.index for p in kept], np.int64), np.array([p.timestamp_s for p in kept], float), T_world_cam
     )
-
-
-def _act_on_pose(S_a_b: FloatArray, T_b_cam: FloatArray) -> FloatArray:
-    """Move a camera by a similarity: rotation and centre move, the camera itself has no scale."""
-    T = S_a_b @ T_b_cam
-    T[:3, :3] /= np.cbrt(np.linalg.det(S_a_b[:3, :3]))
-    return T

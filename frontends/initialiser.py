@@ -14,7 +14,7 @@ import numpy as np
 from dualslam.core.config import InitialiserConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
-from dualslam.core.geometry.projection import refine_pose
+from dualslam.core.geometry.projection import projection_jacobians, refine_pose
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.interfaces import BundleAdjuster, BundleProblem, Frontend
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray, Matches, Start, View
@@ -219,12 +219,7 @@ class Initialiser:
         # A point must agree with both ends, and may miss at most one witness.
         ends_ok = np.ones(len(xyz), bool)
         ends_ok[point_of[~inlier & ((view_of == 0) | (view_of == len(views) - 1))]] = False
-        in_front = np.all(
-            np.einsum("vij,nj->vni", _rotations_cam(result.T_submap_kf), result.xyz_mu)[..., 2]
-            + _translations_cam(result.T_submap_kf)[:, None, 2]
-            > 0,
-            axis=0,
-        )
+        in_front = np.all(se3.act(se3.inverse(result.T_submap_kf), result.xyz_mu)[..., 2] > 0, axis=0)
         keep = ends_ok & (n_bad <= 1) & in_front & result.adjusted
         numbers["n_points"] = float(keep.sum())
         if keep.sum() < self._config.min_points or keep.mean() < self._config.min_support:
@@ -258,9 +253,9 @@ def direction_sigma_deg(problem: BundleProblem, T_w_cam: FloatArray, xyz: FloatA
     sigma = problem.sigma_px[rows]
     H_pp = np.zeros((len(rows), 3, 3))
     for v in (0, last):
-        _, J_point = _jacobians(problem.K, T_w_cam[v], points)
+        _, J_point = projection_jacobians(problem.K, se3.inverse(T_w_cam[v]), points)
         H_pp += np.einsum("nki,nkj->nij", J_point, J_point) / sigma[:, None, None] ** 2
-    J_pose, J_point = _jacobians(problem.K, T_w_cam[last], points)
+    J_pose, J_point = projection_jacobians(problem.K, se3.inverse(T_w_cam[last]), points)
     weight = 1 / sigma[:, None, None] ** 2
     H_cp = np.einsum("nki,nkj->nij", J_pose, J_point) * weight
     H_cc = (np.einsum("nki,nkj->nij", J_pose, J_pose) * weight).sum(0)
@@ -276,31 +271,6 @@ def direction_sigma_deg(problem: BundleProblem, T_w_cam: FloatArray, xyz: FloatA
     across = np.eye(3) - np.outer(along[3:], along[3:])
     variance = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
     return float(np.degrees(np.sqrt(max(variance, 0.0)) / np.linalg.norm(t_cam)))
-
-
-def _jacobians(K: FloatArray, T_w_cam: FloatArray, xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of the pixels by a left perturbation of T_cam_w and by the point, (N, 2, 6) and (N, 2, 3)."""
-    T_cam_w = se3.inverse(T_w_cam)
-    p = xyz @ T_cam_w[:3, :3].T + T_cam_w[:3, 3]
-    J_uv = np.zeros((len(p), 2, 3))
-    J_uv[:, 0, 0] = K[0, 0] / p[:, 2]
-    J_uv[:, 1, 1] = K[1, 1] / p[:, 2]
-    J_uv[:, 0, 2] = -K[0, 0] * p[:, 0] / p[:, 2] ** 2
-    J_uv[:, 1, 2] = -K[1, 1] * p[:, 1] / p[:, 2] ** 2
-    J_p = np.zeros((len(p), 3, 6))
-    J_p[:, 0, 1], J_p[:, 0, 2] = p[:, 2], -p[:, 1]
-    J_p[:, 1, 0], J_p[:, 1, 2] = -p[:, 2], p[:, 0]
-    J_p[:, 2, 0], J_p[:, 2, 1] = p[:, 1], -p[:, 0]
-    J_p[:, :, 3:] = np.eye(3)
-    return J_uv @ J_p, J_uv @ T_cam_w[:3, :3]
-
-
-def _rotations_cam(T_w_cam: FloatArray) -> FloatArray:
-    return np.swapaxes(T_w_cam[:, :3, :3], 1, 2)
-
-
-def _translations_cam(T_w_cam: FloatArray) -> FloatArray:
-    return -np.einsum("vji,vj->vi", T_w_cam[:, :3, :3], T_w_cam[:, :3, 3])
 
 
 def _direction_angle_deg(T_1: FloatArray, T_2: FloatArray) -> float:

@@ -11,6 +11,7 @@ from dualslam.core.geometry.two_view import fundamental_from_pose
 from dualslam.core.interfaces import Frontend, MappingReport
 from dualslam.core.submap import NO_LANDMARK, Submap
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Keyframe, Track
+from frontends.groups import rank_in_runs
 from frontends.local_map import LocalMap
 from frontends.matching import FeatureGrid, match_epipolar, match_projected
 
@@ -41,9 +42,8 @@ def spread_choice(uv_px: FloatArray, priority: IntArray, n: int, size_px: tuple[
     row = np.clip(uv_px[:, 1] * CELLS_ACROSS / size_px[0], 0, None).astype(np.int64)
     cell = row * CELLS_ACROSS + column
     order = np.lexsort((np.arange(len(cell)), -priority, cell))
-    ordered = cell[order]
     rank = np.empty(len(cell), np.int64)
-    rank[order] = np.arange(len(cell)) - np.searchsorted(ordered, ordered)
+    rank[order] = rank_in_runs(cell[order])
     chosen[np.lexsort((np.arange(len(cell)), -priority, rank))[n:]] = False
     return chosen
 
@@ -58,7 +58,6 @@ class Mapper:
         self._size_px = size_px
         self._young: list[tuple[int, IntArray]] = []  # keyframe count at birth, landmark ids
         self._n_inserted = 0
-        self._known: BoolArray = np.zeros(0, bool)
 
     def insert(self, track: Track) -> MappingReport:
         """Make a tracked frame a keyframe and grow the map about it (poses stay as they are: solving comes after)."""
@@ -70,13 +69,12 @@ class Mapper:
         kept = spread_choice(view.features.uv_rect_px[feature], n_seen, self._config.max_observations, self._size_px)
         feature = feature[kept]
         submap.add_observations(view.index, feature, track.landmark_ids[feature])
-        # Features whose landmark was left out are no candidates for a new one.
-        self._known = track.landmark_ids >= 0
         self._n_inserted += 1
         n_culled = self._cull_young()
         neighbours = self._neighbours(view.index)
         n_extended, n_merged = self._search_neighbour_landmarks(view.index, neighbours, track.landmark_ids)
-        new = self._triangulate(view.index, neighbours)
+        # Features whose landmark was left out are no candidates for a new one.
+        new = self._triangulate(view.index, neighbours, candidates=track.landmark_ids == NO_LANDMARK)
         self._search_new_in_neighbours(new, neighbours)
         self._young.append((self._n_inserted, new))
         self._refresh_descriptions(view.index)
@@ -154,18 +152,15 @@ class Mapper:
         submap.merge_landmarks(np.where(swap, ids, there), np.where(swap, there, ids))
         return int(free.sum()), len(ids)
 
-    def _triangulate(self, k: int, neighbours: list[int]) -> IntArray:
+    def _triangulate(self, k: int, neighbours: list[int], candidates: BoolArray) -> IntArray:
         """Triangulate the keyframe's free features against several older keyframes."""
-        created = []
-        for other in neighbours:
-            ids = self._triangulate_pair(k, other)
-            created.append(ids)
+        created = [self._triangulate_pair(k, other, candidates) for other in neighbours]
         return np.concatenate(created) if created else np.zeros(0, np.int64)
 
-    def _triangulate_pair(self, k: int, other: int) -> IntArray:
+    def _triangulate_pair(self, k: int, other: int, candidates: BoolArray) -> IntArray:
         submap, config = self._submap, self._config
         a, b = submap.keyframes[k].features, submap.keyframes[other].features
-        rows_a = np.flatnonzero((submap.landmark_of[k] == NO_LANDMARK) & ~self._known)
+        rows_a = np.flatnonzero((submap.landmark_of[k] == NO_LANDMARK) & candidates)
         rows_b = np.flatnonzero(submap.landmark_of[other] == NO_LANDMARK)
         T_submap_a, T_submap_b = submap.T_submap_kf[k], submap.T_submap_kf[other]
         baseline = float(np.linalg.norm(T_submap_a[:3, 3] - T_submap_b[:3, 3]))

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import poselib
 
 from dualslam.core.types import FloatArray
+
+
+def poselib_camera(K: FloatArray, size_px: tuple[int, int]) -> dict[str, Any]:
+    """Return the pinhole camera of rectified pixels as PoseLib takes it."""
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    return {"model": "PINHOLE", "width": size_px[0], "height": size_px[1], "params": params}
 
 
 def resect(
@@ -28,12 +36,7 @@ def resect(
     (4, 4) float64
         ``T_cam_w``.
     """
-    camera = {
-        "model": "PINHOLE",
-        "width": size_px[0],
-        "height": size_px[1],
-        "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
-    }
+    camera = poselib_camera(K, size_px)
     options = {"max_reproj_error": 3.0 * sigma_px, "max_iterations": 1000, "min_iterations": 50, "seed": seed}
     pose, _ = poselib.estimate_absolute_pose(uv_px, xyz, camera, options, {})
     T_cam_w = np.eye(4)

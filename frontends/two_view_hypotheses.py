@@ -14,6 +14,7 @@ from dualslam.core.geometry.two_view import (
     sampson_error,
 )
 from dualslam.core.types import FloatArray
+from frontends.resection import poselib_camera
 
 CHI2_1 = 3.841  # chi-square, 1 degree of freedom, 95 %: distance to an epipolar line
 CHI2_2 = 5.991  # chi-square, 2 degrees of freedom, 95 %: distance to a point
@@ -49,12 +50,7 @@ def propose_relative_poses(
     The scores are truncated sums of squared whitened residuals, as in ORB-SLAM (Mur-Artal et al. 2015, Sec. IV): with
     both counted up to the same bound, the model with the larger sum explains more of the matches.
     """
-    camera = {
-        "model": "PINHOLE",
-        "width": size_px[0],
-        "height": size_px[1],
-        "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
-    }
+    camera = poselib_camera(K, size_px)
     sigma = float(np.median(sigma_px))
     options = {"max_epipolar_error": 2.0 * sigma, "max_iterations": 1000, "min_iterations": 100, "seed": seed}
     pose, _ = poselib.estimate_relative_pose(uv_a_px, uv_b_px, camera, camera, options, {})
