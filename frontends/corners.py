@@ -63,6 +63,13 @@ def select_spread(xy: IntArray, response: FloatArray, n_wanted: int) -> IntArray
 
     The cells are as many as the corners wanted, over the corners' bounding box.
 
+    Parameters
+    ----------
+    xy : (N, 2) int64
+    response : (N,) float64
+        Strength, whole numbers below 256.
+    n_wanted : int
+
     Returns
     -------
     (min(N, n_wanted),) int64

@@ -34,10 +34,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dualslam.core.config import StrictModel
-from dualslam.core.errors import InputError
 from dualslam.core.types import Features, FloatArray, IntArray, Matches
 from frontends.corners import detect_corners, refine_corners, select_spread, share_out
 from frontends.groups import consistent_rotation, mutual_best
+from frontends.images import to_grey
 from frontends.registry import parse_options
 
 PATCH_RADIUS_PX = 15
@@ -112,7 +112,7 @@ class OrbFrontend:
         InputError
             The array is no such image.
         """
-        levels = self._pyramid(_to_grey(image))
+        levels = self._pyramid(to_grey(image))
         corners = self._corners(levels)
         # As many per octave as its side is long: fine corners are the more accurate, coarse ones live the longer.
         weights = self.scale_factor ** -np.arange(len(levels), dtype=np.float64)
@@ -192,15 +192,6 @@ def _patches(level: NDArray[np.uint8], xy: IntArray) -> NDArray[np.uint8]:
         return np.empty((0, PATCH_SIDE_PX, PATCH_SIDE_PX), np.uint8)
     windows = sliding_window_view(level, (PATCH_SIDE_PX, PATCH_SIDE_PX))
     return windows[xy[:, 1] - PATCH_RADIUS_PX, xy[:, 0] - PATCH_RADIUS_PX]
-
-
-def _to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The image as contiguous (H, W) uint8."""
-    if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)) or image.size == 0:
-        raise InputError(f"an image must be (H, W) or (H, W, 3) uint8, not {image.shape} {image.dtype}")
-    if image.ndim == 3:
-        return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), np.uint8)
-    return np.ascontiguousarray(image)
 
 
 def _moment_weights() -> NDArray[np.float32]:

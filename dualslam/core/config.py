@@ -17,7 +17,7 @@ class FrontendConfig(StrictModel):
     """Features and their comparison."""
 
     name: str = "orb"
-    """Which front end: `orb`, or one that another package offers as an entry point of `dualslam.frontends`."""
+    """Which front end: `orb`, `sift`, or one that another package offers as an entry point of `dualslam.frontends`."""
     n_features: int = Field(1000, ge=50, le=20000)
     """Keypoints per image."""
     options: dict[str, Any] = Field(default_factory=dict)

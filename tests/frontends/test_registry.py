@@ -51,7 +51,7 @@ def offer(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
 
 def test_entry_points_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     offer(monkeypatch, theirs="frontends.orb:OrbFrontend", orb="nowhere:Nothing")
-    assert registry.known_frontends() == ["orb", "theirs"]
+    assert registry.known_frontends() == sorted([*registry.BUILT_IN, "theirs"])
     assert isinstance(registry.create_frontend(FrontendConfig(name="theirs")), OrbFrontend)
     assert isinstance(registry.create_frontend(FrontendConfig(name="orb")), OrbFrontend)
 

@@ -1,0 +1,28 @@
+"""What every front end does first with an image."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.errors import InputError
+
+
+def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image as contiguous (H, W) uint8.
+
+    Parameters
+    ----------
+    image : (H, W) or (H, W, 3) RGB uint8
+
+    Raises
+    ------
+    InputError
+        The array is no such image.
+    """
+    if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)) or image.size == 0:
+        raise InputError(f"an image must be (H, W) or (H, W, 3) uint8, not {image.shape} {image.dtype}")
+    if image.ndim == 3:
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), np.uint8)
+    return np.ascontiguousarray(image)
