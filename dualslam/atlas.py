@@ -32,6 +32,9 @@ class Link:
         ``[[s R, t], [0, 1]]``.
     covariance : (7, 7) float64
         Tangent order rotation, translation, log-scale; zero for a link that is exact by construction.
+    kind : LinkKind
+    keyframes : tuple of int
+        Shared keyframes that it stands on, ascending; none for an exact link.
     """
 
     a: int
@@ -39,6 +42,7 @@ class Link:
     S_a_b: FloatArray
     covariance: FloatArray
     kind: LinkKind
+    keyframes: tuple[int, ...] = ()
 
 
 class Atlas:

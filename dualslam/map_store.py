@@ -62,7 +62,8 @@ def save_atlas(folder: str | Path, atlas: Atlas, poses: dict[int, FramePose]) ->
         "keyframe": np.array([p.keyframe_id for p in ordered], np.int64),
         "T_kf_cam": np.array([p.T_kf_cam for p in ordered], np.float64).reshape(-1, 4, 4),
     }
-    save_map(folder, groups, {"link_kinds": [str(link.kind) for link in links]})
+    metadata = {"link_kinds": [str(link.kind) for link in links], "link_keyframes": [link.keyframes for link in links]}
+    save_map(folder, groups, metadata)
 
 
 def load_atlas(folder: str | Path) -> StoredMap:
@@ -82,10 +83,11 @@ def load_atlas(folder: str | Path) -> StoredMap:
         for name in sorted(groups.keys() - {LINKS, FRAMES}):
             atlas.add(submap_from_arrays(groups[name]))
         links, frames = groups[LINKS], groups[FRAMES]
-        for (a, b), S_a_b, covariance, kind in zip(
-            links["ab"].tolist(), links["S_a_b"], links["covariance"], metadata["link_kinds"], strict=True
+        kinds, keyframes = metadata["link_kinds"], metadata["link_keyframes"]
+        for (a, b), S_a_b, covariance, kind, ids in zip(
+            links["ab"].tolist(), links["S_a_b"], links["covariance"], kinds, keyframes, strict=True
         ):
-            atlas.link(Link(a, b, S_a_b, covariance, LinkKind(kind)))
+            atlas.link(Link(a, b, S_a_b, covariance, LinkKind(kind), tuple(ids)))
         columns = (frames[name].tolist() for name in ("index", "timestamp_s", "submap", "keyframe"))
         rows = zip(*columns, frames["T_kf_cam"], strict=True)
         poses = {index: FramePose(index, t, m, k, T_kf_cam) for index, t, m, k, T_kf_cam in rows}

@@ -205,7 +205,8 @@ class System:
         self, old_id: int, submap: Submap, link: LinkEstimate, walked: list[FramePose], view: View, seconds: float
     ) -> None:
         """Join the two submaps by the link; frames of the old map's end take their pose from the new one."""
-        self.atlas.link(Link(old_id, submap.id, link.S_old_new, link.covariance, LinkKind.RECOVERY))
+        agreeing = tuple(int(k) for k in link.agreeing_keyframes)
+        self.atlas.link(Link(old_id, submap.id, link.S_old_new, link.covariance, LinkKind.RECOVERY, agreeing))
         self._event(
             EventKind.LINKED,
             view,

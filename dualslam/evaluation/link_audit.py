@@ -1,0 +1,174 @@
+"""Is an accepted link true? Each similarity between two submaps against the one that ground truth gives.
+
+A monocular map drifts, so that no single similarity takes the whole of it to the truth. What a link claims is local:
+how the two maps lie to each other at their seam. Truth is taken there, from the frames of either map near it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from dualslam.atlas import Atlas, Link, LinkKind
+from dualslam.core.geometry import sim3, so3
+from dualslam.core.submap import Submap
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
+from dualslam.evaluation.trajectory_metrics import MAX_DT_S
+from dualslam.io.trajectory_files import Trajectory, associate
+from dualslam.trajectory import FramePose
+
+WRONG_SCALE, WRONG_ROTATION_DEG, WRONG_POSITION = 0.05, 3.0, 0.05
+"""Beyond any of these a link is wrong: relative, degrees, relative to the path that it links."""
+MIN_FRAMES = 5
+"""Fewer frames of a map with ground truth say nothing about it."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkAudit:
+    """How far a link is from the truth.
+
+    Attributes
+    ----------
+    old, new : int
+        Submaps.
+    scale : float
+        Relative error: link over truth, less one.
+    rotation_deg : float
+    position_m : float
+        Largest distance between where the link and where the truth puts the new map's frames near the seam.
+    path_m : float
+        Length of the true path over the frames that truth was taken from.
+    scale_sigma, rotation_sigma_deg : float
+        How well those frames fix the true similarity: an error that is no larger is none.
+    n_old, n_new : int
+        Frames of either map that truth was taken from.
+    """
+
+    old: int
+    new: int
+    scale: float
+    rotation_deg: float
+    position_m: float
+    path_m: float
+    scale_sigma: float
+    rotation_sigma_deg: float
+    n_old: int
+    n_new: int
+
+    @property
+    def position(self) -> float:
+        """Error of position relative to the path."""
+        return self.position_m / max(self.path_m, 1e-9)
+
+    @property
+    def wrong(self) -> bool:
+        """Whether the link is one that should never have been made."""
+        return abs(self.scale) > WRONG_SCALE or self.rotation_deg > WRONG_ROTATION_DEG or self.position > WRONG_POSITION
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all fields, with `position` and `wrong`."""
+        return {**asdict(self), "position": self.position, "wrong": self.wrong}
+
+
+def audit_links(
+    atlas: Atlas, poses: Iterable[FramePose], truth: Mapping[int, FloatArray], reach: int = 40
+) -> list[LinkAudit | Failure]:
+    """Audit all recovery links of an atlas, in order.
+
+    Parameters
+    ----------
+    atlas : Atlas
+    poses : iterable of FramePose
+    truth : mapping of int to (4, 4)
+        True ``T_world_cam`` by frame index, for the frames that have it.
+    reach : int
+        So many frames of either map with ground truth, nearest to the seam in time, give the truth there.
+    """
+    posed = list(poses)
+    return [audit_link(atlas, link, posed, truth, reach) for link in atlas.links if link.kind is LinkKind.RECOVERY]
+
+
+def audit_link(
+    atlas: Atlas, link: Link, poses: list[FramePose], truth: Mapping[int, FloatArray], reach: int = 40
+) -> LinkAudit | Failure:
+    """Audit one link; a failure where ground truth says too little about either map. Parameters: see `audit_links`."""
+    if not link.keyframes:
+        return Failure(FailureReason.TOO_FEW_MATCHES, f"link {link.a}-{link.b} names no keyframes")
+    handover = max(link.keyframes)
+    sides = []
+    for submap, last in ((atlas.submaps[link.a], handover), (atlas.submaps[link.b], None)):
+        T_est = _poses_in(submap, poses, last)
+        near = sorted((i for i in T_est if i in truth), key=lambda i: (abs(i - handover), i))[:reach]
+        if len(near) < MIN_FRAMES:
+            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(near)} frames of submap {submap.id} have a true pose")
+        ids = np.array(sorted(near), np.int64)
+        sides.append((ids, _align(np.array([T_est[int(i)] for i in ids]), np.array([truth[int(i)] for i in ids]))))
+    (ids_a, a), (ids_b, b) = sides
+    S_true = sim3.inverse(a.S_world_submap) @ b.S_world_submap
+    S_link = link.S_a_b
+    # In metres, where the truth of the old map puts them.
+    moved = [sim3.act(a.S_world_submap @ S, b.centres) for S in (S_link, S_true)]
+    R = sim3.rotation(S_true).T @ sim3.rotation(S_link)
+    both = np.array([truth[int(i)][:3, 3] for i in np.union1d(ids_a, ids_b)])
+    return LinkAudit(
+        link.a,
+        link.b,
+        scale=float(sim3.scale(S_link) / sim3.scale(S_true)) - 1.0,
+        rotation_deg=math.degrees(float(so3.rotation_angle(R))),
+        position_m=float(np.linalg.norm(moved[0] - moved[1], axis=1).max()),
+        path_m=float(np.linalg.norm(np.diff(both, axis=0), axis=1).sum()),
+        scale_sigma=math.hypot(a.scale_sigma, b.scale_sigma),
+        rotation_sigma_deg=math.degrees(math.hypot(a.rotation_sigma_rad, b.rotation_sigma_rad)),
+        n_old=len(ids_a),
+        n_new=len(ids_b),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Alignment:
+    """A map laid upon the truth: the similarity, the map's centres (N, 3), and how well they fix it."""
+
+    S_world_submap: FloatArray
+    centres: FloatArray
+    scale_sigma: float
+    rotation_sigma_rad: float
+
+
+def _poses_in(submap: Submap, poses: list[FramePose], last: int | None) -> dict[int, FloatArray]:
+    """Return ``T_submap_cam`` of all frames that a submap knows, keyframes first of all; none after `last`."""
+    found = {p.index: submap.resolve_anchor(p.keyframe_id, p.T_kf_cam) for p in poses if p.submap_id == submap.id}
+    found |= {k: submap.resolve_anchor(k, np.eye(4)) for k in (*submap.anchors, *submap.keyframes)}
+    return {i: T for i, T in found.items() if last is None or i <= last}
+
+
+def _align(T_submap_cam: FloatArray, T_world_cam: FloatArray) -> _Alignment:
+    """Lay cameras (N, 4, 4) upon true ones: the turn from their orientations, since a straight path leaves it open."""
+    turns = T_world_cam[:, :3, :3] @ T_submap_cam[:, :3, :3].swapaxes(1, 2)
+    R = so3.orthonormalise(turns.sum(0))
+    off = so3.rotation_angle(R.T @ turns)
+    est, true = T_submap_cam[:, :3, 3], T_world_cam[:, :3, 3]
+    p, q = (est - est.mean(0)) @ R.T, true - true.mean(0)
+    spread2 = max(float((p * p).sum()), 1e-300)
+    s = float((p * q).sum()) / spread2
+    if s <= 0:
+        s = 1e-9  # a map that runs against the truth: any link with it comes out wrong
+    error2 = float(((q - s * p) ** 2).sum())
+    n = len(est)
+    return _Alignment(
+        sim3.from_parts(s, R, true.mean(0) - s * R @ est.mean(0)),
+        est,
+        math.sqrt(error2 / max(3 * n - 4, 1) / spread2) / s,
+        math.sqrt(float((off**2).mean()) / n),
+    )
+
+
+def truth_by_frame(
+    index: IntArray, timestamp_s: FloatArray, truth: Trajectory, max_dt_s: float = MAX_DT_S
+) -> dict[int, FloatArray]:
+    """Return the true pose of each frame (its index and time, (N,) each) that has one near in time."""
+    row, near = associate(truth.timestamps_s, timestamp_s, max_dt_s)
+    return {int(i): truth.T_world_cam[r] for i, r in zip(index[near], row[near], strict=True)}
