@@ -11,7 +11,6 @@ from dualslam.core.submap import Submap
 from dualslam.core.types import FloatArray, IntArray
 
 VIEW_COSINE_MIN = 0.5  # a patch seen from more than 60 degrees off its mean direction does not look the same
-SCALE_MARGIN = 1.2  # one octave beyond the pyramid at either end
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,6 +93,7 @@ class LocalMap:
         cosine = np.einsum("ij,ij->i", to_camera, self.normal[rows]) / np.maximum(distance, 1e-12)
         scale = self.reference_mu[rows] / np.maximum(distance, 1e-12)
         coarsest = scale_factor ** (n_octaves - 1)
-        ok = (cosine > VIEW_COSINE_MIN) & (scale > 1 / SCALE_MARGIN) & (scale < coarsest * SCALE_MARGIN)
+        # One octave beyond the pyramid at either end.
+        ok = (cosine > VIEW_COSINE_MIN) & (scale > 1 / scale_factor) & (scale < coarsest * scale_factor)
         octave = np.clip(np.rint(np.log(scale[ok]) / np.log(scale_factor)), 0, n_octaves - 1).astype(np.int64)
         return Prediction(rows[ok], uv[rows[ok]], octave)

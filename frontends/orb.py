@@ -84,6 +84,8 @@ class OrbFrontend:
     """
 
     name = "orb"
+    max_turn_deg = 180.0
+    max_zoom = 1.7
 
     def __init__(self, n_features: int = 1500, options: OrbOptions | None = None) -> None:
         self.options = options or OrbOptions()
@@ -141,6 +143,10 @@ class OrbFrontend:
         found = mutual_best(_hamming_matrix(a.descriptors, b.descriptors), self.options.ratio, self.max_distance_strict)
         kept = consistent_rotation(b.angle_rad[found.index[:, 1]] - a.angle_rad[found.index[:, 0]])
         return Matches(found.index[kept], found.distance[kept])
+
+    def nearest(self, a: Features, b: Features) -> IntArray:
+        """Row in b of the feature nearest to each of a, (N,), the first of equals."""
+        return np.asarray(_hamming_matrix(a.descriptors, b.descriptors).argmin(axis=1), np.int64)
 
     def _pyramid(self, grey: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
         """Levels from the image itself down to the last that is wider than two rims."""

@@ -84,6 +84,8 @@ class SiftFrontend:
     """
 
     name = "sift"
+    max_turn_deg = 180.0
+    max_zoom = 2.0
 
     def __init__(self, n_features: int = 1500, options: SiftOptions | None = None) -> None:
         self.options = options or SiftOptions()

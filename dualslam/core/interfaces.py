@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,20 +18,29 @@ if TYPE_CHECKING:
 
 
 class Frontend(Protocol):
-    """Features and how they are compared. Nothing outside a front end knows what its descriptors are made of.
+    """Features, how they are compared, and how far to trust them; guided searches need nothing but this.
+
+    Nothing outside a front end knows what its descriptors are made of. They are rows of one array, of one type and
+    length, that can be stored, sent to another process and handed back for comparison. The same image gives the same
+    features, whatever came before: a front end has no state. `frontends.conformance` checks all that is said here.
 
     Attributes
     ----------
     name : str
         The word that selects it in the config.
     scale_factor : float
-        Ratio of the patch sizes of neighbouring octaves.
+        Ratio of the patch sizes of neighbouring octaves. A feature is recognised one octave off, so that this is also
+        the change of size that a descriptor bears by itself: a front end with one octave states that.
     n_octaves : int
         Number of pyramid levels.
     max_distance : float
         Descriptor distance above which two features are not views of the same point.
     max_distance_strict : float
         The same for searches without a geometric guide.
+    max_turn_deg : float
+        Rotation of the camera about its axis between two views that `match_wide` bears; 180: any.
+    max_zoom : float
+        Ratio of sizes between two views that `match_wide` bears, in either direction.
     """
 
     name: str
@@ -39,17 +48,40 @@ class Frontend(Protocol):
     n_octaves: int
     max_distance: float
     max_distance_strict: float
+    max_turn_deg: float
+    max_zoom: float
 
     def extract(self, image: NDArray[np.uint8]) -> Features:
-        """Detect and describe; `uv_rect_px` equals `uv_px` (the caller rectifies), `sigma_px` is set."""
+        """Detect and describe, in any image: a flat or a tiny one has no features.
+
+        `uv_rect_px` equals `uv_px` (the caller rectifies). `sigma_px` is the noise model: the right matches' residuals
+        are to be explained by it. Octaves are in [0, n_octaves), `scale` about ``scale_factor ** octave``. A front end
+        without orientations leaves `angle_rad` at zero.
+        """
         ...
 
     def distance(self, a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
-        """Distance of paired descriptors (N, D), (N, D) -> (N,) float."""
+        """Distance of paired descriptors (N, D), (N, D) -> (N,) float.
+
+        Zero for equal ones, symmetric, and of a scale on which a ratio of best to second best says something (a norm of
+        the difference, a count of differing bits).
+        """
         ...
 
     def match_wide(self, a: Features, b: Features) -> Matches:
-        """Match without a geometric guide, one to one."""
+        """Match without a geometric guide, one to one; `distance` is that of the descriptors."""
+        ...
+
+
+@runtime_checkable
+class NearestSearch(Protocol):
+    """What a front end with quickly compared descriptors offers besides: the raw material of motion statistics."""
+
+    def nearest(self, a: Features, b: Features) -> IntArray:
+        """Row in b of the feature nearest to each of a, (N,), by descriptor alone and without any test.
+
+        Several may share one. At least one feature in b.
+        """
         ...
 
 
