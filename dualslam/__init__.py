@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError, SolverError
     from dualslam.core.threads import limit_threads
     from dualslam.core.types import Frame
+    from dualslam.evaluation.failure_lab import corrupted
     from dualslam.frame_records import FrameResult
     from dualslam.map_store import load_atlas, save_atlas
     from dualslam.results import trajectories_of
@@ -46,6 +47,7 @@ _WHERE = {
     "System": "system",
     "build_system": "build",
     "config_from_dict": "core.config_io",
+    "corrupted": "evaluation.failure_lab",
     "dump_config": "core.config_io",
     "limit_threads": "core.threads",
     "load_atlas": "map_store",
@@ -70,6 +72,7 @@ __all__ = [
     "__version__",
     "build_system",
     "config_from_dict",
+    "corrupted",
     "dump_config",
     "limit_threads",
     "load_atlas",

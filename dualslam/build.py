@@ -13,6 +13,7 @@ from dualslam.core.config import Config
 from dualslam.core.interfaces import Frontend
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Frame, View
+from dualslam.evaluation.failure_lab import FaultScript
 from dualslam.linking import DescriptorMatcher, estimate_link
 from dualslam.system import Components, System
 from frontends.initialiser import Initialiser
@@ -51,14 +52,19 @@ def build_system(config: Config, camera: Camera) -> System:
         adjust=lambda submap: adjust_submap(submap, config.graph.robust_k),
     )
     matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
+    faults = FaultScript(config.corruptions)
     return System(
         Components(
-            view_of=lambda frame: view_of(frame, frontend, calibration.camera, config.camera.model_sigma_px),
+            view_of=faults.around_views(
+                lambda frame: view_of(frame, frontend, calibration.camera, config.camera.model_sigma_px)
+            ),
             new_starter=lambda: Initialiser(
                 frontend, bundle_adjust_arrays, config.initialiser, calibration.camera.K, size_px, config.seed
             ),
             new_graph=lambda: ISam2SubmapGraph(config.graph),
-            new_odometry=lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px),
+            new_odometry=faults.around_odometry(
+                lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px)
+            ),
             calibration=calibration,
             link=lambda old, new, onset: estimate_link(
                 old, new, config.linking, np.random.default_rng(config.seed), onset, matcher

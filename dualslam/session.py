@@ -15,6 +15,7 @@ from dualslam.core.config_io import dump_config
 from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Sequence
+from dualslam.evaluation.failure_lab import corrupted
 from dualslam.frame_records import FrameResult
 from dualslam.io.run_folder import RunFolder, RunRecord
 from dualslam.io.trajectory_files import Trajectory
@@ -65,7 +66,8 @@ def run_to_folder(
     ----------
     config : Config
     sequence : Sequence
-        With ground truth (an attribute `ground_truth`), the summary holds the errors.
+        As it is recorded: the config's corruptions are put on it here. With ground truth (an attribute
+        `ground_truth`), the summary holds the errors.
     out : path
     overwrite, realtime : bool
     on_frame : callable, optional
@@ -77,6 +79,7 @@ def run_to_folder(
     ------
     ConfigError, InputError, OutputError
     """
+    sequence = corrupted(sequence, config.corruptions)
     system = (build or build_system)(config, sequence.camera)
     with RunFolder(out, overwrite=overwrite) as folder:
         folder.write_config(dump_config(config))

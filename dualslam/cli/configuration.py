@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
+from typing import Any
 
+from dualslam.core import strict_yaml
 from dualslam.core.config import Config
 from dualslam.core.config_io import Override, load_config
+from dualslam.core.errors import ConfigError
 
 
 def config_of(args: argparse.Namespace) -> Config:
-    """Resolve ``--config``, ``--set`` and the options that stand for single fields, the latter last.
+    """Resolve ``--config``, ``--set``, ``--corrupt`` and the options that stand for single fields, the latter last.
 
     Raises
     ------
@@ -20,7 +24,24 @@ def config_of(args: argparse.Namespace) -> Config:
         overrides.append(Override(("frontend", "name"), args.frontend, f"--frontend {args.frontend}"))
     if args.seed is not None:
         overrides.append(Override(("seed",), args.seed, f"--seed {args.seed}"))
+    corrupt: Path | None = getattr(args, "corrupt", None)
+    if corrupt is not None:
+        overrides.append(Override(("corruptions",), _read_corruptions(corrupt), f"--corrupt {corrupt}"))
     # A configuration without that section has no recovery to switch off.
     if args.no_recovery and "recovery" in Config.model_fields:
         overrides.append(Override(("recovery", "enabled"), False, "--no-recovery"))
     return load_config(args.config, overrides)
+
+
+def _read_corruptions(path: Path) -> list[Any]:
+    try:
+        items = strict_yaml.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"--corrupt {path}: the file cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise ConfigError(f"--corrupt {path}: {error}") from error
+    if not isinstance(items, list):
+        raise ConfigError(
+            f"--corrupt {path}: corruptions are a list, such as - {{kind: blackout, start: 100, length: 10}}"
+        )
+    return items

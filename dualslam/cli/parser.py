@@ -75,6 +75,12 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
     talk.add_argument("--profile", action="store_true", help="print where the time went, stage by stage")
     _add_configuration(parser)
     _add_selection(parser)
+    parser.add_argument_group("failure lab").add_argument(
+        "--corrupt",
+        metavar="FILE",
+        type=Path,
+        help="YAML list of corruptions and faults for this run (corruptions), as - {kind: blur, start: 50, length: 9}",
+    )
     camera = parser.add_argument_group("camera").add_mutually_exclusive_group()
     camera.add_argument("--camera", metavar="FILE", type=Path, help="calibration, instead of the source's own")
     camera.add_argument("--fov", metavar="DEGREES", type=_angle, help="horizontal field of view, without a calibration")

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-
-class StrictModel(BaseModel):
-    """A frozen section of the config that refuses unknown fields."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+from dualslam.core.corruption import Corruption
+from dualslam.core.strict_model import StrictModel as StrictModel  # part of this module, too
 
 
 class FrontendConfig(StrictModel):
@@ -290,3 +287,5 @@ class Config(StrictModel):
     graph: GraphConfig = GraphConfig()
     linking: LinkingConfig = LinkingConfig()
     calibration: CalibrationConfig = CalibrationConfig()
+    corruptions: tuple[Corruption, ...] = ()
+    """What the failure lab does to the run on purpose, for example [{kind: blackout, start: 100, length: 10}]."""
