@@ -10,12 +10,14 @@ from backend.submap_graph import ISam2SubmapGraph
 from dualslam.calibration import Calibration, rectify
 from dualslam.core.camera import Camera
 from dualslam.core.config import Config
+from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Frame, View
 from dualslam.evaluation.failure_lab import FaultScript
 from dualslam.linking import DescriptorMatcher, estimate_link
 from dualslam.system import Components, System
+from frontends.images import to_grey
 from frontends.initialiser import Initialiser
 from frontends.registry import create_frontend
 from frontends.visual import VisualFrontEnd
@@ -56,7 +58,9 @@ def build_system(config: Config, camera: Camera) -> System:
     return System(
         Components(
             view_of=faults.around_views(
-                lambda frame: view_of(frame, frontend, calibration.camera, config.camera.model_sigma_px)
+                lambda frame: view_of(
+                    frame, frontend, calibration.camera, config.camera.model_sigma_px, config.recovery.enabled
+                )
             ),
             new_starter=lambda: Initialiser(
                 frontend, bundle_adjust_arrays, config.initialiser, calibration.camera.K, size_px, config.seed
@@ -74,7 +78,9 @@ def build_system(config: Config, camera: Camera) -> System:
     )
 
 
-def view_of(frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: float) -> View | Failure:
+def view_of(
+    frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: float, keep_image: bool = False
+) -> View | Failure:
     """Find a frame's features and take the lens distortion out of them."""
     if frame.image is None:
         return Failure(FailureReason.UNREADABLE, frame.error)
@@ -84,7 +90,9 @@ def view_of(frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: fl
             FailureReason.UNREADABLE,
             f"frame {frame.index} is {width}x{height}, the calibration is for {camera.width}x{camera.height}",
         )
-    return View(frame.index, frame.timestamp_s, rectify(frontend.extract(frame.image), camera, model_sigma_px))
+    features = rectify(frontend.extract(frame.image), camera, model_sigma_px)
+    image = GreyImage.of(to_grey(frame.image)) if keep_image else None
+    return View(frame.index, frame.timestamp_s, features, image)
 
 
 def adjust_submap(submap: Submap, robust_k: float) -> None:

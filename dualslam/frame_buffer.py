@@ -1,11 +1,28 @@
-"""The frames that a walk back in time can still read: features of the last seconds, in both directions of time."""
+"""The frames that a walk back in time can still read: features and grey images, in both directions of time.
+
+K = k + k_r frames: the last k while all is well, and all that came since while the live submap is lost. Memory has a
+hard bound, which k frames and a short loss stay far below. A long loss (a lens that stays covered) reaches it, and then
+the frames of the loss give way, not those before it: a recovery needs the k frames before the loss, which the old map
+saw, and the newest, with which the new map starts; what it cannot use of the stretch between, it leaps. In order:
+
+1. images are packed (`GreyImage.pack`), the oldest first: nothing is lost but time;
+2. images of the stretch are dropped, each time the one whose neighbours stay closest together, so that what is left
+   thins out evenly and a walk through it takes ever longer, but even, steps;
+3. then whole frames of the stretch, in the same way;
+4. where the bound does not even hold the rest, the oldest images, and at last the oldest frames.
+"""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
 
 from dualslam.core.types import View
+
+MB = 2**20
 
 
 class FrameBuffer:
@@ -15,27 +32,52 @@ class FrameBuffer:
     ----------
     duration_s : float
         Video time that is kept (the paper's k frames).
-    max_views : int
-        Hard bound on the number of views; beyond it the oldest go, also while frozen.
+    max_mb : float
+        Hard bound on the memory of features and images, mebibytes, also while frozen.
+
+    Attributes
+    ----------
+    nbytes, peak_bytes : int
+        Memory of features and images, now and at most so far.
     """
 
-    def __init__(self, duration_s: float, max_views: int) -> None:
+    def __init__(self, duration_s: float, max_mb: float) -> None:
+        self.nbytes = 0
+        self.peak_bytes = 0
         self._duration_s = duration_s
-        self._views: deque[View] = deque(maxlen=max_views)
+        self._max_bytes = max_mb * MB
+        self._views: deque[View] = deque()
         self._frozen = False
+        self._before_loss: int | None = None  # the newest frame that came before it
 
     def __len__(self) -> int:
         return len(self._views)
 
+    def __iter__(self) -> Iterator[View]:
+        """From the oldest to the newest."""
+        return iter(self._views)
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """What it holds, for the event log."""
+        images = sum(view.image is not None for view in self._views)
+        return {"frames": len(self._views), "images": images, "buffer_mb": self.nbytes / MB}
+
     def append(self, view: View) -> None:
         """Take the newest view in and, unless frozen, let go of those that are older than the buffer's duration."""
         self._views.append(view)
-        while not self._frozen and abs(view.timestamp_s - self._views[0].timestamp_s) > self._duration_s:
-            self._views.popleft()
+        self.nbytes += view.nbytes
+        while not self._frozen and self._age_s(self._views[0]) > self._duration_s:
+            self.nbytes -= self._views.popleft().nbytes
+        if self.nbytes > self._max_bytes:
+            self._make_room()
+        self.peak_bytes = max(self.peak_bytes, self.nbytes)
 
     def freeze(self) -> None:
-        """Stop letting go of old views (a track was lost): K = k + k_r."""
-        self._frozen = True
+        """Stop letting go of old views: the newest one was lost. K = k + k_r."""
+        if not self._frozen:
+            self._frozen = True
+            self._before_loss = self._views[-2].index if len(self._views) > 1 else None
 
     def thaw(self) -> None:
         """Let the buffer be a queue again."""
@@ -43,7 +85,8 @@ class FrameBuffer:
 
     def map(self, change: Callable[[View], View]) -> None:
         """Put what `change` makes of it into the place of each view."""
-        self._views = deque((change(view) for view in self._views), self._views.maxlen)
+        self._views = deque(change(view) for view in self._views)
+        self.nbytes = sum(view.nbytes for view in self._views)
 
     def backwards_from(self, index: int) -> Iterator[View]:
         """Yield the views that came before frame `index`, the latest first."""
@@ -52,3 +95,70 @@ class FrameBuffer:
             if seen:
                 yield view
             seen = seen or view.index == index
+
+    # --- the bound
+
+    def _age_s(self, view: View) -> float:
+        # Absolute: time may run either way.
+        return abs(self._views[-1].timestamp_s - view.timestamp_s)
+
+    def _make_room(self) -> None:
+        """Give up what is needed least until the bound holds; the newest view always stays whole."""
+        views = list(self._views)
+        self._pack(views)
+        stretch = self._stretch(views)
+        for drop in (_without_image, _without_view):
+            while self.nbytes > self._max_bytes and (place := _densest(views, stretch, drop)) is not None:
+                self._put(views, place, drop(views[place]))
+                if drop is _without_view:
+                    stretch = range(stretch.start, stretch.stop - 1)
+        for drop in (_without_image, _without_view):
+            place = 0
+            while self.nbytes > self._max_bytes and place < len(views) - 1:
+                n = len(views)
+                self._put(views, place, drop(views[place]))
+                place += len(views) == n
+        self._views = deque(views)
+
+    def _pack(self, views: list[View]) -> None:
+        for place, view in enumerate(views[:-1]):
+            if self.nbytes <= self._max_bytes:
+                return
+            if view.image is not None:
+                self._put(views, place, replace(view, image=view.image.pack()))
+
+    def _put(self, views: list[View], place: int, view: View | None) -> None:
+        """Put a view, or nothing, into the place of another."""
+        self.nbytes -= views[place].nbytes
+        if view is None:
+            del views[place]
+        else:
+            views[place] = view
+            self.nbytes += view.nbytes
+
+    def _stretch(self, views: list[View]) -> range:
+        """Places of the frames since the loss that are older than the newest `duration_s`."""
+        if not self._frozen:
+            return range(0)
+        start = next((i + 1 for i, view in enumerate(views) if view.index == self._before_loss), 0)
+        recent = next((i for i, view in enumerate(views) if self._age_s(view) <= self._duration_s), len(views))
+        return range(start, max(start, recent))
+
+
+def _without_image(view: View) -> View | None:
+    return replace(view, image=None)
+
+
+def _without_view(view: View) -> View | None:
+    return None
+
+
+def _densest(views: list[View], stretch: range, drop: Callable[[View], View | None]) -> int | None:
+    """Place of the view of the stretch whose neighbours, counting those that have what is dropped, are closest."""
+    have = [i for i, view in enumerate(views) if drop is _without_view or view.image is not None]
+    inner = [n for n in range(1, len(have) - 1) if have[n] in stretch]
+    if not inner:
+        return None
+    time_s = np.array([views[i].timestamp_s for i in have])
+    gap_s = [abs(time_s[n + 1] - time_s[n - 1]) for n in inner]
+    return have[inner[int(np.argmin(gap_s))]]

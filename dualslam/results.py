@@ -15,6 +15,7 @@ from dualslam.core.config import Config
 from dualslam.core.events import EventKind
 from dualslam.core.types import FrameStatus
 from dualslam.evaluation.trajectory_metrics import score_trajectory
+from dualslam.frame_buffer import MB
 from dualslam.io.run_folder import FrameRow, PosedFrames
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.runner import RunReport
@@ -108,6 +109,7 @@ def summarise(
             event.data["seconds"] for event in system.events.of_kind(EventKind.LINKED) if "seconds" in event.data
         ],
         "peak_rss_mb": report.peak_rss_mb,
+        "peak_buffer_mb": system.buffer.peak_bytes / MB,
         "stages_cpu_s": {name: stage.seconds for name, stage in system.timer.stages.items()},
         "versions": versions(),
     }

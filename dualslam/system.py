@@ -60,6 +60,7 @@ class System:
     poses : dict of int to FramePose
     events : EventLog
     timer : StageTimer
+    buffer : FrameBuffer
     """
 
     def __init__(self, components: Components, config: Config) -> None:
@@ -70,7 +71,7 @@ class System:
         self.timer = StageTimer()
         self._parts = components
         self._config = config
-        self._buffer = FrameBuffer(config.buffer.duration_s, config.buffer.max_views)
+        self.buffer = FrameBuffer(config.buffer.duration_s, config.buffer.max_mb)
         self._live: VisualOdometry | None = None
         self._starter = components.new_starter()
         self._lost: list[View] = []
@@ -101,7 +102,7 @@ class System:
         if isinstance(view, Failure):
             outcome: Track | Failure = self._unusable(frame, view)
         else:
-            self._buffer.append(view)
+            self.buffer.append(view)
             # 2. Without a live submap, try to start one; with one, track.
             outcome = self._initialise(view) if self._live is None else self._track(self._live, view)
         return self._result(frame, outcome, time.perf_counter() - started)
@@ -143,7 +144,7 @@ class System:
             self._walk_back(submap, graph, view)
         self._live = self._parts.new_odometry(submap, graph)
         self._live.start_at(view.index)
-        self._buffer.thaw()
+        self.buffer.thaw()
         n = int((submap.landmark_of[view.index] >= 0).sum())
         T_cam_submap = se3.inverse(submap.T_submap_kf[view.index])
         ids = submap.landmark_of[view.index]
@@ -157,7 +158,7 @@ class System:
         relinker = Relinker(self.atlas, submap, onsets, self._parts.link, recovery)
         unposed = {i for i, row in self.rows.items() if i not in self.poses}
         if onsets:
-            self._event(EventKind.RECOVERY_STARTED, newest, submap.id, lost=sorted(onsets), frames=len(self._buffer))
+            self._event(EventKind.RECOVERY_STARTED, newest, submap.id, lost=sorted(onsets), **self.buffer.numbers)
         walker = self._parts.new_odometry(submap, graph)
         walker.start_at(newest.index)
         walked: list[FramePose] = []
@@ -179,7 +180,7 @@ class System:
             self._fuse(linked[0], submap, linked[1], walked, newest, time.perf_counter() - started)
 
     def _views_before(self, newest: View, submap: Submap, stop_at_posed: bool) -> Iterator[View]:
-        for view in self._buffer.backwards_from(newest.index):
+        for view in self.buffer.backwards_from(newest.index):
             posed = self.poses.get(view.index)
             if stop_at_posed and posed is not None and posed.submap_id != submap.id:
                 return
@@ -250,6 +251,7 @@ class System:
         track = self._track_with(live, view)
         if track:
             self._lost = []
+            self.buffer.thaw()
             if live.reference_id == view.index and self._parts.calibration.is_due(live.submap):
                 self._calibrate(live, view)
             if len(live.submap.keyframes) >= self._config.graph.max_keyframes:
@@ -259,7 +261,7 @@ class System:
         self._lost.append(view)
         self.rows[view.index].status = FrameStatus.LOST
         if len(self._lost) == 1:
-            self._buffer.freeze()
+            self.buffer.freeze()
         if len(self._lost) > self._config.tracking.max_lost_frames or track.reason is FailureReason.SOLVER:
             self._give_up(live, view, track)
         return track
@@ -299,7 +301,7 @@ class System:
                 self._event(EventKind.CALIBRATION_KEPT, view, live.submap.id, reason=refined.detail, **refined.numbers)
                 return
             live.adopt(refined.graph)
-            self._buffer.map(calibration.rectified)
+            self.buffer.map(calibration.rectified)
             for pose in carry_poses(self.poses.values(), refined.before, live.submap):
                 self.poses[pose.index] = pose
         self._event(EventKind.CALIBRATED, view, live.submap.id, **refined.numbers)

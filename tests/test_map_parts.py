@@ -12,7 +12,6 @@ from dualslam.core.config import HealthConfig
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Keyframe, Track, View
-from dualslam.frame_buffer import FrameBuffer
 from dualslam.health import judge_track
 from dualslam.trajectory import FramePose, compose
 from tests.point_world import path, random_features
@@ -104,33 +103,6 @@ class TestComposition:
         for k in made.keyframes:
             made.T_submap_kf[k] = moved @ made.T_submap_kf[k]
         np.testing.assert_allclose(compose(poses, atlas, {0: np.eye(4)}).T_world_cam, moved @ T, atol=1e-12)
-
-
-class TestFrameBuffer:
-    def test_it_keeps_the_last_seconds(self) -> None:
-        buffer = FrameBuffer(1.0, 1000)
-        for i in range(50):
-            buffer.append(view(i))
-        assert [v.index for v in buffer.backwards_from(49)] == list(range(48, 38, -1))
-        assert [v.index for v in buffer.backwards_from(45)] == list(range(44, 38, -1))
-        assert list(buffer.backwards_from(7)) == []
-
-    def test_frozen_it_grows_up_to_its_bound(self) -> None:
-        buffer = FrameBuffer(1.0, 40)
-        for i in range(60):
-            if i == 20:
-                buffer.freeze()
-            buffer.append(view(i))
-        assert len(buffer) == 40
-        buffer.thaw()
-        buffer.append(view(60))
-        assert len(buffer) == 11
-
-    def test_time_may_run_backwards(self) -> None:
-        buffer = FrameBuffer(1.0, 1000)
-        for i in range(50, 0, -1):
-            buffer.append(view(i))
-        assert [v.index for v in buffer.backwards_from(1)] == list(range(2, 12))
 
 
 def track(n_matches: int = 100, n_inliers: int = 90, chi2: float = 1.0) -> Track:

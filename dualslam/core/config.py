@@ -128,8 +128,10 @@ class BufferConfig(StrictModel):
 
     duration_s: float = Field(10.0, gt=0)
     """Seconds of video that are kept (the paper's k)."""
-    max_views: int = Field(3000, ge=50)
-    """Hard bound on the frames kept while no submap is live; beyond it the oldest go."""
+    max_mb: float = Field(256.0, gt=0)
+    """Hard bound on the memory of the kept features and images, mebibytes. Ten seconds of KITTI are 56, of 640 x 480 at
+    30 Hz 120. A long loss reaches it; then images are packed, and the stretch between the frames before the loss and
+    the newest ones thins out: first its images, then its frames. A bound too small for the rest costs the oldest."""
 
 
 class GraphConfig(StrictModel):

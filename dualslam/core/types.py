@@ -13,6 +13,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.grey_image import GreyImage
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -85,6 +87,12 @@ class Features:
     def __len__(self) -> int:
         return len(self.uv_px)
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays; one that serves as two is counted once."""
+        arrays = (self.uv_px, self.uv_rect_px, self.sigma_px, self.scale, self.octave, self.angle_rad, self.descriptors)
+        return sum({id(array): array.nbytes for array in arrays}.values())
+
     def take(self, rows: NDArray[np.generic]) -> Features:
         """Return the features at `rows` (indices or a mask)."""
         return Features(
@@ -100,11 +108,27 @@ class Features:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A frame as the system sees it once its features are found: what the frame buffer keeps."""
+    """A frame as the system sees it once its features are found: what the frame buffer keeps.
+
+    Attributes
+    ----------
+    index : int
+    timestamp_s : float
+    features : Features
+        Of the live front end.
+    image : GreyImage or None
+        For attempts at recovery that need other features; None where it was given up.
+    """
 
     index: int
     timestamp_s: float
     features: Features
+    image: GreyImage | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of features and image."""
+        return self.features.nbytes + (self.image.nbytes if self.image is not None else 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
