@@ -17,7 +17,18 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians, refine_pose
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.interfaces import BundleAdjuster, BundleProblem, Frontend
-from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray, Matches, Start, View
+from dualslam.core.types import (
+    BoolArray,
+    Failure,
+    FailureReason,
+    Features,
+    FloatArray,
+    IntArray,
+    Matches,
+    Start,
+    View,
+)
+from frontends.motion_statistics import match_by_motion, nearest_search
 from frontends.resection import resect
 from frontends.two_view_hypotheses import CHI2_2, propose_relative_poses
 
@@ -61,6 +72,8 @@ class Initialiser:
         seed: int,
     ) -> None:
         self._frontend = frontend
+        if config.matching == "gms":
+            nearest_search(frontend)  # a front end without it is told so before the first frame
         self._adjuster = adjuster
         self._config = config
         self._K = K
@@ -93,7 +106,7 @@ class Initialiser:
     def try_pair(self, first: int, last: int) -> Start | Failure:
         """Try to start from two of the collected views (positions in the list)."""
         a, b = self._views[first], self._views[last]
-        matches = self._frontend.match_wide(a.features, b.features)
+        matches = self._match(a.features, b.features)
         if len(matches) < self._config.min_matches:
             return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(matches)} matches, {self._config.min_matches} needed")
         pair = self._best_pose(a, b, matches)
@@ -103,6 +116,12 @@ class Initialiser:
         return self._verify(pair, views)
 
     # --- two views
+
+    def _match(self, a: Features, b: Features) -> Matches:
+        """Match the two views; the frames between them have few points to find, too few for motion statistics."""
+        if self._config.matching == "gms":
+            return match_by_motion(self._frontend, a, b)
+        return self._frontend.match_wide(a, b)
 
     def _best_pose(self, a: View, b: View, matches: Matches) -> _Pair | Failure:
         fa, fb = matches.index[:, 0], matches.index[:, 1]

@@ -84,8 +84,8 @@ class OrbFrontend:
     """
 
     name = "orb"
-    max_turn_deg = 180.0
-    max_zoom = 1.7
+    max_turn_deg: float = 180.0
+    max_zoom: float = 1.7
 
     def __init__(self, n_features: int = 1500, options: OrbOptions | None = None) -> None:
         self.options = options or OrbOptions()

@@ -16,7 +16,11 @@ from dualslam.core.interfaces import Frontend
 ENTRY_POINT_GROUP = "dualslam.frontends"
 """A package offers a front end by ``[project.entry-points."dualslam.frontends"] name = "module:Class"``."""
 
-BUILT_IN: Mapping[str, str] = {"orb": "frontends.orb:OrbFrontend", "sift": "frontends.sift:SiftFrontend"}
+BUILT_IN: Mapping[str, str] = {
+    "orb": "frontends.orb:OrbFrontend",
+    "sift": "frontends.sift:SiftFrontend",
+    "gms": "frontends.gms:GmsFrontend",
+}
 """Name to ``module:attribute``; the module is imported only when its name is asked for."""
 
 OptionsT = TypeVar("OptionsT", bound=BaseModel)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -14,7 +14,8 @@ class FrontendConfig(StrictModel):
     """Features and their comparison."""
 
     name: str = "orb"
-    """Which front end: `orb`, `sift`, or one that another package offers as an entry point of `dualslam.frontends`."""
+    """Which front end: `orb`, `sift`, `gms`, or one that another package offers as an entry point of
+    `dualslam.frontends`."""
     n_features: int = Field(1000, ge=50, le=20000)
     """Keypoints per image."""
     options: dict[str, Any] = Field(default_factory=dict)
@@ -32,6 +33,9 @@ class CameraConfig(StrictModel):
 class InitialiserConfig(StrictModel):
     """How a submap starts: two views, a first bundle adjustment, and a check after it."""
 
+    matching: Literal["ratio", "gms"] = "ratio"
+    """How the two views are matched: by the front end's own wide matching, or by grid-based motion statistics, which
+    any front end with binary descriptors supports (`orb` with `gms` is the paper's Dual-SLAM+)."""
     min_matches: int = Field(60, ge=20)
     """Matches between the two views below which no model is tried."""
     min_points: int = Field(50, ge=15)
