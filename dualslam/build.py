@@ -15,7 +15,10 @@ from dualslam.core.interfaces import Frontend
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Frame, View
 from dualslam.evaluation.failure_lab import FaultScript
+from dualslam.health import judge_track
 from dualslam.linking import DescriptorMatcher, estimate_link
+from dualslam.recoveries import InlineExecutor
+from dualslam.recovery import RecoveryParts
 from dualslam.system import Components, System
 from frontends.images import to_grey
 from frontends.initialiser import Initialiser
@@ -53,7 +56,6 @@ def build_system(config: Config, camera: Camera) -> System:
         ),
         adjust=lambda submap: adjust_submap(submap, config.graph.robust_k),
     )
-    matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
     faults = FaultScript(config.corruptions)
     return System(
         Components(
@@ -70,11 +72,24 @@ def build_system(config: Config, camera: Camera) -> System:
                 lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px)
             ),
             calibration=calibration,
-            link=lambda old, new, onset: estimate_link(
-                old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
-            ),
+            recovery=InlineExecutor(recovery_parts(config, size_px)),
         ),
         config,
+    )
+
+
+def recovery_parts(config: Config, size_px: tuple[int, int]) -> RecoveryParts:
+    """Build what a walk back in time is made of, for images of this width and height."""
+    frontend = create_frontend(config.frontend)
+    matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
+    return RecoveryParts(
+        new_graph=lambda: ISam2SubmapGraph(config.graph),
+        new_odometry=lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px),
+        link=lambda old, new, onset: estimate_link(
+            old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
+        ),
+        judge=lambda track: judge_track(track, config.health),
+        config=config.recovery,
     )
 
 

@@ -101,8 +101,7 @@ class Calibration:
             return Failure(FailureReason.SOLVER, str(error), numbers)
         changed.apply_estimate(solved.keyframe_ids, solved.T_submap_kf, solved.landmark_ids, solved.xyz_mu)
         before = submap.copy()
-        submap.K, submap.keyframes = changed.K, changed.keyframes
-        submap.T_submap_kf, submap.landmarks = changed.T_submap_kf, changed.landmarks
+        submap.take_over(changed)
         self._camera, self._refined_in = camera, submap.id
         return Refinement(graph, before, numbers)
 

@@ -9,33 +9,30 @@ import numpy as np
 
 from dualslam.core.geometry import se3
 from dualslam.core.submap import Anchor, Submap
-from dualslam.core.types import FloatArray
+from dualslam.core.types import FloatArray, IntArray
 from dualslam.trajectory import FramePose
 
 
 def carry_poses(poses: Iterable[FramePose], before: Submap, after: Submap) -> list[FramePose]:
-    """Move the frames of a submap with it: a change of calibration bends the whole map.
+    """Move the frames of a submap with it: a solution or a change of calibration bends the whole map.
 
     A pose relative to one keyframe would follow that keyframe rigidly, though lengths and turns have changed as well.
     Each frame is therefore carried by the keyframes before and after it in time, in proportion to its distance from
-    them. Culled keyframes (`Submap.anchors`) of `after` are carried likewise.
+    them.
 
     Parameters
     ----------
     poses : iterable of FramePose
         Those of other submaps are passed over.
     before, after : Submap
-        With the same keyframes.
+        Two states of the submap, in about the same frame.
 
     Returns
     -------
     list of FramePose
-        Of the frames that are no keyframes, posed against a keyframe of `after`.
+        Posed against keyframes of `after`; those that are keyframes there are left out.
     """
-    keyframe_ids = np.array(sorted(after.keyframes), np.int64)
-    for k, anchor in list(after.anchors.items()):
-        T_submap_cam = before.resolve_anchor(anchor.keyframe_id, anchor.T_kf_cam)
-        after.anchors[k] = Anchor(*_carry(k, T_submap_cam, keyframe_ids, before, after))
+    keyframe_ids = _in_both(before, after)
     carried = []
     for pose in poses:
         if pose.submap_id != after.id or pose.index in after.keyframes:
@@ -46,8 +43,20 @@ def carry_poses(poses: Iterable[FramePose], before: Submap, after: Submap) -> li
     return carried
 
 
+def carry_anchors(before: Submap, after: Submap) -> None:
+    """Move the culled keyframes of `after` in the same way."""
+    keyframe_ids = _in_both(before, after)
+    for k, anchor in list(after.anchors.items()):
+        T_submap_cam = before.resolve_anchor(anchor.keyframe_id, anchor.T_kf_cam)
+        after.anchors[k] = Anchor(*_carry(k, T_submap_cam, keyframe_ids, before, after))
+
+
+def _in_both(before: Submap, after: Submap) -> IntArray:
+    return np.array(sorted(before.keyframes.keys() & after.keyframes.keys()), np.int64)
+
+
 def _carry(
-    index: int, T_submap_cam: FloatArray, keyframe_ids: np.ndarray, before: Submap, after: Submap
+    index: int, T_submap_cam: FloatArray, keyframe_ids: IntArray, before: Submap, after: Submap
 ) -> tuple[int, FloatArray]:
     """Return the keyframe and the pose against it of a frame that was at `T_submap_cam`."""
     here = int(np.searchsorted(keyframe_ids, index))

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from dualslam.core.config import TrackingConfig
-from dualslam.core.geometry import se3
+from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.projection import refine_pose
 from dualslam.core.interfaces import Frontend
 from dualslam.core.submap import NO_LANDMARK, Submap
@@ -59,6 +59,16 @@ class Tracker:
             ids = submap.landmark_of[last.view.index].copy()
         self._last = replace(last, landmark_ids=ids, T_cam_submap=T_cam_submap)
         self._local = self._local_map(ids[ids >= 0])
+
+    def follow(self, S_now_then: FloatArray) -> None:
+        """Take in that the map has moved as a whole where the last frame is: its pose and the motion move along."""
+        assert self._last is not None
+        T_submap_cam = sim3.act_on_pose(S_now_then, se3.inverse(self._last.T_cam_submap))
+        self._last = replace(self._last, T_cam_submap=se3.inverse(T_submap_cam))
+        if self._velocity is not None:  # a motion in the camera's frame: a change of frame shows in its unit only
+            xi, dt = self._velocity
+            self._velocity = (np.concatenate([xi[:3], float(sim3.scale(S_now_then)) * xi[3:]]), dt)
+        self.refresh()
 
     def track(self, view: View) -> Track | Failure:
         """Pose a frame. A failure leaves the tracker as it was, so that the next frame may succeed."""

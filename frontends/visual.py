@@ -12,6 +12,7 @@ from dualslam.core.config import Config
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend, KeyframeReport, SubmapGraph
 from dualslam.core.submap import Submap
+from dualslam.core.submap_change import change_of_frame
 from dualslam.core.types import Failure, FloatArray, Track, View
 from frontends.keyframing import keyframe_due
 from frontends.mapper import Mapper
@@ -53,10 +54,10 @@ class VisualFrontEnd:
         self._reference_id = keyframe_id
         self._path = [keyframe_id]
 
-    def adopt(self, graph: SubmapGraph) -> None:
-        """Go on with another graph of the same submap, whose poses and points have moved."""
+    def adopt(self, graph: SubmapGraph, before: Submap) -> None:
+        """Go on with another graph of the same submap, whose poses and points have moved since it was `before`."""
         self.graph = graph
-        self._tracker.refresh()
+        self._tracker.follow(change_of_frame(before, self.submap, [self._reference_id]))
 
     def track(self, view: View) -> Track | Failure:
         """Pose a frame against the submap."""

@@ -10,7 +10,7 @@ import pytest
 from backend.submap_graph import ISam2SubmapGraph
 from dualslam.build import adjust_submap, build_system
 from dualslam.calibration import Calibration, rectify
-from dualslam.carried_poses import carry_poses
+from dualslam.carried_poses import carry_anchors, carry_poses
 from dualslam.core.camera import Camera
 from dualslam.core.config import CalibrationConfig, Config, GraphConfig
 from dualslam.core.corrected_camera import LensCorrection, correction_of
@@ -113,6 +113,7 @@ def test_frames_between_keyframes_follow_a_map_that_bends() -> None:
     for k in after.keyframes:
         after.T_submap_kf[k] = bend[k] @ truth[k]
     carried = {p.index: p for p in carry_poses(poses, before, after)}
+    carry_anchors(before, after)
     assert sorted(carried) == [1, 3, 5, 7, 9]
     for k, pose in carried.items():
         assert pose.keyframe_id in after.keyframes

@@ -24,6 +24,8 @@ class EventKind(StrEnum):
     UNREADABLE = "unreadable"
     RECOVERY_STARTED = "recovery_started"
     RECOVERY_ATTEMPT = "recovery_attempt"
+    RECOVERY_FAILED = "recovery_failed"
+    RECOVERY_ENDED = "recovery_ended"
     LINKED = "linked"
     LINK_REFUSED = "link_refused"
     FUSED = "fused"

@@ -323,8 +323,8 @@ class VisualOdometry(Protocol):
         """Begin at a keyframe of the submap, at rest."""
         ...
 
-    def adopt(self, graph: SubmapGraph) -> None:
-        """Go on with another graph of the same submap, whose poses and points have moved."""
+    def adopt(self, graph: SubmapGraph, before: Submap) -> None:
+        """Go on with another graph of the same submap, whose poses and points have moved since it was `before`."""
         ...
 
     def track(self, view: View) -> Track | Failure:

@@ -295,3 +295,10 @@ class Submap:
         twin.landmarks = Table.from_columns(self.landmarks.columns())
         twin.observations = Table.from_columns(self.observations.columns())
         return twin
+
+    def take_over(self, changed: Submap) -> None:
+        """Become what a copy of this submap was changed to."""
+        self.K, self.gauge = changed.K, changed.gauge
+        self.keyframes, self.T_submap_kf = changed.keyframes, changed.T_submap_kf
+        self.landmark_of, self.anchors = changed.landmark_of, changed.anchors
+        self.landmarks, self.observations = changed.landmarks, changed.observations

@@ -1,0 +1,269 @@
+"""The lost submaps that wait for a link, the walks that look for it, and how their results come into the live map."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Protocol
+
+from dualslam.atlas import Link, LinkKind
+from dualslam.calibration import Calibration
+from dualslam.carried_poses import carry_poses
+from dualslam.core.config import RecoveryConfig
+from dualslam.core.errors import SolverError
+from dualslam.core.events import EventKind
+from dualslam.core.geometry import sim3
+from dualslam.core.interfaces import SubmapGraph, VisualOdometry
+from dualslam.core.submap import Submap
+from dualslam.core.submap_change import change_of_frame
+from dualslam.core.types import Failure, FloatArray, FrameStatus, Keyframe, View
+from dualslam.frame_buffer import FrameBuffer
+from dualslam.merging import Merged, carry_links, merge_recovery
+from dualslam.record import Moment, Record
+from dualslam.recovery import FoundLink, RecoveryJob, RecoveryParts, RecoveryResult, WalkedFrame, run_recovery
+
+Outcome = tuple[RecoveryJob, RecoveryResult | Failure]
+
+
+class RecoveryExecutor(Protocol):
+    """Runs jobs, somewhere: the system neither knows where nor waits for them."""
+
+    def submit(self, job: RecoveryJob) -> None:
+        """Take a job on."""
+        ...
+
+    def poll(self) -> list[Outcome]:
+        """Return what has ended since the last call."""
+        ...
+
+
+class InlineExecutor:
+    """Runs each job when it is submitted: one process, deterministic."""
+
+    def __init__(self, parts: RecoveryParts) -> None:
+        self._parts = parts
+        self._done: list[Outcome] = []
+
+    def submit(self, job: RecoveryJob) -> None:
+        """Run the job."""
+        self._done.append((job, run_recovery(job, self._parts)))
+
+    def poll(self) -> list[Outcome]:
+        """Return what has run since the last call."""
+        done, self._done = self._done, []
+        return done
+
+
+class Recoveries:
+    """Starts a walk back for each new submap, and merges what it found at a frame boundary.
+
+    Parameters
+    ----------
+    record : Record
+    buffer : FrameBuffer
+    executor : RecoveryExecutor
+    new_graph : callable
+    calibration : Calibration
+    config : RecoveryConfig
+    """
+
+    def __init__(
+        self,
+        record: Record,
+        buffer: FrameBuffer,
+        executor: RecoveryExecutor,
+        new_graph: Callable[[], SubmapGraph],
+        calibration: Calibration,
+        config: RecoveryConfig,
+    ) -> None:
+        self._record = record
+        self._buffer = buffer
+        self._executor = executor
+        self._new_graph = new_graph
+        self._calibration = calibration
+        self._config = config
+        self._onsets: dict[int, int] = {}  # lost submaps that are not linked yet, and the frame of their loss
+        self._began: dict[int, tuple[View, float]] = {}  # by the new submap's id
+
+    def declare_lost(self, submap_id: int, onset: int) -> None:
+        """Let the walks to come look for a submap that was lost at frame `onset`."""
+        if self._config.enabled:
+            self._onsets[submap_id] = onset
+
+    def start(self, submap: Submap, newest: View) -> None:
+        """Start the walk back from a new submap: over the frames without a pose, then on into the lost submaps."""
+        atlas, onsets = self._record.atlas, dict(self._onsets)
+        if onsets:
+            numbers = self._buffer.numbers
+            self._record.event(EventKind.RECOVERY_STARTED, newest, submap.id, lost=sorted(onsets), **numbers)
+        job = RecoveryJob(
+            submap=submap.copy(),
+            newest_id=newest.index,
+            lost={m: atlas.submaps[m].copy() for m in onsets},
+            onsets=onsets,
+            views=tuple(self._views_before(newest, submap, stop_at_posed=not onsets)),
+            camera=self._calibration.camera,
+        )
+        self._began[submap.id] = newest, time.perf_counter()
+        self._executor.submit(job)
+
+    def collect(self, live: VisualOdometry | None, now: Moment) -> None:
+        """Merge the walks that have ended. `live` goes on in its submap as it is after that."""
+        for job, result in self._executor.poll():
+            began, started_s = self._began.pop(job.submap.id)
+            if isinstance(result, Failure):
+                self._failed(job, began, result)
+                continue
+            self._record.timer.add("walk back", result.cpu_s)
+            with self._record.timer.measure("merging"):
+                self._take_in(job, result, live, now, started_s)
+
+    def _views_before(self, newest: View, submap: Submap, stop_at_posed: bool) -> Iterator[View]:
+        for view in self._buffer.backwards_from(newest.index):
+            posed = self._record.poses.get(view.index)
+            if stop_at_posed and posed is not None and posed.submap_id != submap.id:
+                return
+            yield view
+
+    def _failed(self, job: RecoveryJob, view: View, failure: Failure) -> None:
+        numbers = {"reason": str(failure.reason), "detail": failure.detail, **failure.numbers}
+        self._record.event(EventKind.RECOVERY_FAILED, view, job.submap.id, **numbers)
+
+    # --- taking a result in
+
+    def _take_in(
+        self, job: RecoveryJob, result: RecoveryResult, live: VisualOdometry | None, now: Moment, started_s: float
+    ) -> None:
+        """Merge a result into its submap, live or archived by now; solve it; pose and link by what came of it."""
+        submap = self._record.atlas.submaps[job.submap.id]
+        merged = merge_recovery(submap, job.submap, result.submap, self._rectifier(job, submap))
+        unsolved, graph = merged.submap.copy(), self._new_graph()
+        try:
+            solve(merged.submap, graph)
+        except SolverError as error:
+            self._record.event(EventKind.RECOVERY_FAILED, now, submap.id, reason="solver", detail=str(error))
+            return
+        before = submap.copy()
+        submap.take_over(merged.submap)
+        carry_links(self._record.atlas, before, submap)
+        if live is not None and live.submap is submap:
+            live.adopt(graph, before)
+        for event in result.events:
+            self._record.events.add(event.event, event.frame, event.timestamp_s, event.submap, **event.data)
+        walked = self._pose_frames(result, merged, submap)
+        seconds = time.perf_counter() - started_s
+        if job.onsets:
+            self._record.event(
+                EventKind.RECOVERY_ENDED,
+                now,
+                submap.id,
+                linked=result.link is not None,
+                frames=len(walked),
+                keyframes=len(result.submap.keyframes.keys() - job.submap.keyframes.keys()),
+                walk_s=result.seconds,
+                seconds=seconds,
+            )
+        if result.link is not None:
+            estimate = result.link.estimate
+            S_now_then = change_of_frame(unsolved, submap, estimate.agreeing_keyframes.tolist()) @ merged.S_live_grown
+            self._fuse(job, result.link, S_now_then, walked, now, seconds)
+
+    def _rectifier(self, job: RecoveryJob, submap: Submap) -> Callable[[Keyframe], Keyframe]:
+        """Return what gives the walk's keyframes the pixels of the camera that the submap has now."""
+
+        def rectify(keyframe: Keyframe) -> Keyframe:
+            if (submap.K == job.submap.K).all():
+                return keyframe
+            view = View(keyframe.id, keyframe.timestamp_s, keyframe.features)
+            return replace(keyframe, features=self._calibration.rectified(view).features)
+
+        return rectify
+
+    def _pose_frames(self, result: RecoveryResult, merged: Merged, submap: Submap) -> list[WalkedFrame]:
+        """Carry the frames of the walk into the solved submap, and enter those that had no pose."""
+        scale = float(sim3.scale(merged.S_live_grown))
+        scaled = [replace(frame.pose, T_kf_cam=_scaled(frame.pose.T_kf_cam, scale)) for frame in result.frames]
+        carried = {pose.index: pose for pose in carry_poses(scaled, merged.moved, submap)}
+        walked = []
+        for frame, pose in zip(result.frames, scaled, strict=True):
+            walked.append(replace(frame, pose=carried.get(pose.index, pose)))
+            if pose.index not in self._record.poses:
+                self._record.pose(walked[-1].pose, frame.n_matches, frame.n_inliers)
+        return walked
+
+    def _fuse(
+        self,
+        job: RecoveryJob,
+        found: FoundLink,
+        S_now_then: FloatArray,
+        walked: list[WalkedFrame],
+        now: Moment,
+        seconds: float,
+    ) -> None:
+        """Join the two submaps by the link; frames of the old map's end take their pose from the new one.
+
+        The link was measured between a copy of the old submap and the new one at the end of the walk. Both may have
+        moved since, and the link with them.
+        """
+        record, link, new_id = self._record, found.estimate, job.submap.id
+        agreeing = link.agreeing_keyframes.tolist()
+        S_old_now_then = change_of_frame(job.lost[found.old_id], record.atlas.submaps[found.old_id], agreeing)
+        S_old_new = S_old_now_then @ link.S_old_new @ sim3.inverse(S_now_then)
+        Ad = sim3.adjoint(S_now_then)
+        covariance = Ad @ link.covariance @ Ad.T
+        record.atlas.link(Link(found.old_id, new_id, S_old_new, covariance, LinkKind.RECOVERY, tuple(agreeing)))
+        record.event(
+            EventKind.LINKED,
+            now,
+            new_id,
+            old_submap=found.old_id,
+            matches=link.n_matches,
+            inliers=link.n_inliers,
+            agreeing_keyframes=agreeing,
+            change_point=link.change_point,
+            seconds=seconds,
+            **link.numbers,
+        )
+        n_bypassed = self._bypass(walked, new_id, handover=max(agreeing))
+        for frame in walked:
+            if self._was_lost(frame.pose.index, found.old_id, job.onsets[found.old_id]):
+                record.rows[frame.pose.index].status = FrameStatus.RECOVERED
+        self._onsets.pop(found.old_id, None)
+        record.event(EventKind.FUSED, now, new_id, old_submap=found.old_id, bypassed=n_bypassed)
+
+    def _bypass(self, walked: list[WalkedFrame], new_id: int, handover: int) -> int:
+        """Let the now part of the old map, beyond the keyframes that agree, take its poses from the new one."""
+        poses, n_bypassed = self._record.poses, 0
+        for frame in walked:
+            i = frame.pose.index
+            if i <= handover or poses[i].submap_id == new_id:
+                continue
+            self._record.pose(frame.pose)
+            self._record.rows[i].status = FrameStatus.BYPASSED
+            n_bypassed += 1
+        return n_bypassed
+
+    def _was_lost(self, index: int, old_id: int, onset: int) -> bool:
+        tracked = self._record.rows[index].status is FrameStatus.TRACKED
+        return self._record.poses[index].submap_id != old_id and tracked and index >= onset
+
+
+def solve(submap: Submap, graph: SubmapGraph) -> None:
+    """Solve a merged submap in a new graph and drop what the solution contradicts.
+
+    Raises
+    ------
+    SolverError
+    """
+    estimate = graph.rebuild(submap)
+    submap.apply_estimate(estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu)
+    touched = submap.observations["landmark"][estimate.outlier_rows]
+    submap.remove_observations(estimate.outlier_rows)
+    submap.remove_landmarks(touched[submap.n_observations(touched) < 2])
+
+
+def _scaled(T: FloatArray, scale: float) -> FloatArray:
+    scaled = T.copy()
+    scaled[:3, 3] *= scale
+    return scaled

@@ -1,0 +1,149 @@
+"""A walk back that ends late: what it found comes into a map that has gone on, by any schedule."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dualslam.core.events import EventKind
+from dualslam.core.types import FrameStatus
+from dualslam.recoveries import Outcome, RecoveryExecutor
+from dualslam.recovery import RecoveryJob
+from dualslam.results import trajectories_of
+from dualslam.system import System
+from tests.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
+
+COVERED = frozenset(range(35, 50))
+POSITION_M, ROTATION_RAD = 0.08, 0.01
+
+
+class LateExecutor:
+    """Gives each result out only after so many more polls (there is one with each frame)."""
+
+    def __init__(self, inner: RecoveryExecutor, polls: int) -> None:
+        self.inner, self.polls = inner, polls
+        self.waiting: list[tuple[int, Outcome]] = []
+        self.n_polls = 0
+
+    def submit(self, job: RecoveryJob) -> None:
+        self.inner.submit(job)
+        self.waiting += [(self.n_polls + self.polls, outcome) for outcome in self.inner.poll()]
+
+    def poll(self) -> list[Outcome]:
+        self.n_polls += 1
+        due = [outcome for at, outcome in self.waiting if at < self.n_polls]
+        self.waiting = [(at, outcome) for at, outcome in self.waiting if at >= self.n_polls]
+        return due
+
+
+def late_system(world: PointWorld, polls: int, **settings: object) -> System:
+    system = system_in(world, **({"recovery": {"enabled": True}} | settings))
+    system._recoveries._executor = LateExecutor(system._recoveries._executor, polls)
+    return system
+
+
+def run(world: PointWorld, polls: int, **settings: object) -> System:
+    system = late_system(world, polls, **settings)
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    return system
+
+
+def assert_one_right_map(system: System, world: PointWorld, missing: frozenset[int]) -> None:
+    found = trajectories_of(system)
+    assert set(found.main.index.tolist()) == set(range(len(world.T_world_cam))) - missing
+    translation, rotation = pose_errors(found.main.T_world_cam, world.T_world_cam[found.main.index])
+    assert translation.max() < POSITION_M
+    assert rotation.max() < ROTATION_RAD
+
+
+@pytest.fixture(scope="module")
+def world() -> PointWorld:
+    return PointWorld(cloud(), hand_held(90), covered=COVERED)
+
+
+@pytest.mark.parametrize("polls", [1, 12, 30])
+def test_the_live_map_has_grown_meanwhile(world: PointWorld, polls: int) -> None:
+    system = run(world, polls)
+    (ended,) = system.events.of_kind(EventKind.RECOVERY_ENDED)
+    (again,) = system.events.of_kind(EventKind.REINITIALISED)
+    assert ended.frame == again.frame + polls
+    assert_one_right_map(system, world, COVERED)
+    assert not system.events.of_kind(EventKind.RECOVERY_FAILED)
+    # Tracking went on as if nothing had happened.
+    assert all(system.rows[i].status is FrameStatus.TRACKED for i in range(again.frame, 90))
+    assert not system.events.of_kind(EventKind.RELOCALISED)
+
+
+def test_the_live_map_has_rolled_over_meanwhile() -> None:
+    world = PointWorld(cloud(), hand_held(110), covered=COVERED)
+    settings = {
+        "graph": {"max_keyframes": 20, "rollover_keyframes": 6},
+        "keyframes": {"max_parallax_deg": 0.6},
+        "mapping": {"redundant_ratio": 1.0},
+    }
+    system = run(world, 50, **settings)
+    (ended,) = system.events.of_kind(EventKind.RECOVERY_ENDED)
+    assert system.rows[ended.frame].submap_id != ended.submap
+    assert_one_right_map(system, world, COVERED)
+
+
+DENSE = {"keyframes": {"max_parallax_deg": 2.0}, "mapping": {"redundant_ratio": 1.0}}
+
+
+@pytest.fixture(scope="module")
+def twice_lost() -> PointWorld:
+    return PointWorld(cloud(), hand_held(120), covered=COVERED | frozenset(range(68, 80)))
+
+
+def test_the_live_map_has_been_lost_meanwhile(twice_lost: PointWorld) -> None:
+    """The result goes into the archived map, before the next one starts."""
+    system = run(twice_lost, 25, **DENSE)
+    first, second = system.events.of_kind(EventKind.RECOVERY_ENDED)
+    _, failed = system.events.of_kind(EventKind.FAILED)
+    assert failed.frame < first.frame < system.events.of_kind(EventKind.REINITIALISED)[1].frame
+    assert (first.submap, second.submap) == (1, 2)
+    assert_one_right_map(system, twice_lost, twice_lost.covered)
+
+
+def test_two_walks_overlap(twice_lost: PointWorld) -> None:
+    """The second starts from a copy of the lost map that the first one's result is not in yet."""
+    system = run(twice_lost, 33, **DENSE)
+    first, second = system.events.of_kind(EventKind.RECOVERY_ENDED)
+    assert system.events.of_kind(EventKind.RECOVERY_STARTED)[1].frame < first.frame < second.frame
+    assert system.events.of_kind(EventKind.RECOVERY_STARTED)[1].data["lost"] == [0, 1]
+    assert_one_right_map(system, twice_lost, twice_lost.covered)
+
+
+def test_what_the_live_map_knew_stays_as_it_was(world: PointWorld) -> None:
+    """Ids and history of the live map outlast the merge; the walk's keyframes stand before them."""
+    system = late_system(world, 20)
+    frames = iter(world.frames())
+    while not system.events.of_kind(EventKind.REINITIALISED):
+        system.step(next(frames))
+    for _ in range(19):
+        system.step(next(frames))
+    submap = system.atlas.submaps[1]
+    before = submap.copy()
+    result = system.step(next(frames))
+    assert system.events.of_kind(EventKind.RECOVERY_ENDED)
+    assert result.status is FrameStatus.TRACKED
+    n = len(before.landmarks)
+    assert len(submap.landmarks) > n
+    assert np.array_equal(submap.landmarks["first_kf"][:n], before.landmarks["first_kf"])
+    n_rows = len(before.observations)
+    for name in ("kf", "feature", "landmark"):
+        assert np.array_equal(submap.observations[name][:n_rows], before.observations[name])
+    added = submap.keyframes.keys() - before.keyframes.keys()
+    assert added
+    assert list(submap.keyframes)[len(added) :] == list(before.keyframes)
+    assert max(added) < min(before.keyframes)
+    assert submap.gauge == before.gauge
+    # Each feature's landmark and the observations tell the same.
+    obs = submap.observations
+    rows = np.flatnonzero(obs["alive"])
+    seen = zip(*(obs[name][rows].tolist() for name in ("kf", "feature", "landmark")), strict=True)
+    assert all(submap.landmark_of[k][f] == j for k, f, j in seen)
+    assert submap.landmarks["alive"][obs["landmark"][rows]].all()
+    assert len(np.unique(np.stack([obs["kf"][rows], obs["landmark"][rows]]), axis=1).T) == len(rows)
