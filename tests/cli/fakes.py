@@ -13,6 +13,7 @@ from dualslam.core.events import EventKind, EventLog
 from dualslam.core.stage_timer import StageTimer
 from dualslam.core.submap import Submap
 from dualslam.core.types import Features, FloatArray, Frame, FrameStatus, Keyframe
+from dualslam.frame_buffer import FrameBuffer
 from dualslam.frame_records import FrameResult, FrameRow
 from dualslam.trajectory import FramePose
 
@@ -41,6 +42,7 @@ class FakeSystem:
         self.poses: dict[int, FramePose] = {}
         self.events = EventLog()
         self.timer = StageTimer()
+        self.buffer = FrameBuffer(1.0, 1.0)
         self.n_finished = 0
         self._truth, self._lost, self._before_step = truth, lost, before_step
         self._submap: Submap | None = None
