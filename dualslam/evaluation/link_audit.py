@@ -75,7 +75,7 @@ class LinkAudit:
 
 
 def audit_links(
-    atlas: Atlas, poses: Iterable[FramePose], truth: Mapping[int, FloatArray], reach: int = 40
+    atlas: Atlas, poses: Iterable[FramePose], truth: Mapping[int, FloatArray], reach: int = 20
 ) -> list[LinkAudit | Failure]:
     """Audit all recovery links of an atlas, in order.
 
@@ -86,23 +86,24 @@ def audit_links(
     truth : mapping of int to (4, 4)
         True ``T_world_cam`` by frame index, for the frames that have it.
     reach : int
-        So many frames of either map with ground truth, nearest to the seam in time, give the truth there.
+        Truth is taken from the frames of either map among the keyframes that a link stands on, and so many before and
+        after them (in counts of the source's index): what lies farther off has drifted away from the seam.
     """
     posed = list(poses)
     return [audit_link(atlas, link, posed, truth, reach) for link in atlas.links if link.kind is LinkKind.RECOVERY]
 
 
 def audit_link(
-    atlas: Atlas, link: Link, poses: list[FramePose], truth: Mapping[int, FloatArray], reach: int = 40
+    atlas: Atlas, link: Link, poses: list[FramePose], truth: Mapping[int, FloatArray], reach: int = 20
 ) -> LinkAudit | Failure:
     """Audit one link; a failure where ground truth says too little about either map. Parameters: see `audit_links`."""
     if not link.keyframes:
         return Failure(FailureReason.TOO_FEW_MATCHES, f"link {link.a}-{link.b} names no keyframes")
-    handover = max(link.keyframes)
+    first, handover = min(link.keyframes) - reach, max(link.keyframes)
     sides = []
-    for submap, last in ((atlas.submaps[link.a], handover), (atlas.submaps[link.b], None)):
-        T_est = _poses_in(submap, poses, last)
-        near = sorted((i for i in T_est if i in truth), key=lambda i: (abs(i - handover), i))[:reach]
+    for submap, last in ((atlas.submaps[link.a], handover), (atlas.submaps[link.b], handover + reach)):
+        T_est = _poses_in(submap, poses)
+        near = [i for i in T_est if first <= i <= last and i in truth]
         if len(near) < MIN_FRAMES:
             return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(near)} frames of submap {submap.id} have a true pose")
         ids = np.array(sorted(near), np.int64)
@@ -138,11 +139,10 @@ class _Alignment:
     rotation_sigma_rad: float
 
 
-def _poses_in(submap: Submap, poses: list[FramePose], last: int | None) -> dict[int, FloatArray]:
-    """Return ``T_submap_cam`` of all frames that a submap knows, keyframes first of all; none after `last`."""
+def _poses_in(submap: Submap, poses: list[FramePose]) -> dict[int, FloatArray]:
+    """Return ``T_submap_cam`` of all frames that a submap knows, keyframes first of all."""
     found = {p.index: submap.resolve_anchor(p.keyframe_id, p.T_kf_cam) for p in poses if p.submap_id == submap.id}
-    found |= {k: submap.resolve_anchor(k, np.eye(4)) for k in (*submap.anchors, *submap.keyframes)}
-    return {i: T for i, T in found.items() if last is None or i <= last}
+    return found | {k: submap.resolve_anchor(k, np.eye(4)) for k in (*submap.anchors, *submap.keyframes)}
 
 
 def _align(T_submap_cam: FloatArray, T_world_cam: FloatArray) -> _Alignment:

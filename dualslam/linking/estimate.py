@@ -10,6 +10,7 @@ to the refinement, where they would count twice.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,7 @@ from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
 from dualslam.core.submap import Submap
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking import verify
-from dualslam.linking.correspondences import DescriptorMatcher, propose_correspondences
+from dualslam.linking.correspondences import Correspondences, DescriptorMatcher, propose_correspondences
 from dualslam.linking.pairs import PairModel
 from dualslam.linking.shape import Shape, deformation_covariance, measure_shape
 from dualslam.linking.timeline import KeyframeVotes, ask_keyframes, find_tears, leading_run
@@ -112,12 +113,58 @@ def estimate_link(
             return Failure(FailureReason.DEFORMED, detail, {"torn": float(tears_new[-1])})
     if np.count_nonzero(trusted) < config.min_keyframes:
         return _needs_older(int(np.count_nonzero(trusted)), config, onset)
-    # 3. The similarity on which the oldest of them agree, and how far it holds. What lies beyond has moved landmarks of
-    #    the healthy part too: place those anew without it, and ask again.
-    all_pairs, limit, before = pairs, onset, pairs.keyframes[trusted]
+    # 3. All of them, or the parts of a long overlap on which both maps have the same shape.
+    overlap = _Overlap(old, new, pairs, matcher, onset, config)
+    refused = link = _link_over(overlap, pairs.keyframes[trusted], rng)
+    for before in _parts(pairs.keyframes[trusted], config) if _is_bent(refused) else ():
+        link = _link_over(overlap, before, rng)
+        if link:
+            return link
+    return refused
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Overlap:
+    """What both maps hold of the same frames. `onset`: keyframes from there on are not trusted."""
+
+    old: Submap
+    new: Submap
+    pairs: Correspondences
+    matcher: DescriptorMatcher | None
+    onset: int | None
+    config: LinkingConfig
+
+
+def _is_bent(refused: LinkEstimate | Failure) -> bool:
+    """Whether an overlap was refused because the two maps differ in shape there: parts of it may not."""
+    reasons = (FailureReason.SCALE, FailureReason.DEGENERATE, FailureReason.DEFORMED)
+    return isinstance(refused, Failure) and refused.reason in reasons
+
+
+def _parts(keyframes: IntArray, config: LinkingConfig) -> Iterator[IntArray]:
+    """Yield runs of neighbouring keyframes: the longer ones and of these the older ones first.
+
+    None is shorter than twice what a link must stand on: of many short ones some pass by chance.
+    """
+    for share in (2, 3):
+        n = len(keyframes) // share
+        if n < 2 * config.min_keyframes:
+            return
+        for start in range(0, len(keyframes) - n + 1, (n + 2) // 3):
+            yield keyframes[start : start + n]
+
+
+def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstimate | Failure:
+    """Estimate the link on some of the trusted keyframes, `before` (ids), and pass it through the gates."""
+    old, new, config, onset = overlap.old, overlap.new, overlap.config, overlap.onset
+    oldest = before[0]
+    # The similarity on which the oldest of them agree, and how far it holds. What lies beyond has moved landmarks of
+    # the healthy part too: place those anew without it, and ask again.
+    all_pairs = pairs = overlap.pairs
+    limit = onset
     while True:
         if limit is not None:
-            pairs = propose_correspondences(old, new, matcher, limit)
+            pairs = propose_correspondences(old, new, overlap.matcher, limit)
         model = PairModel(pairs, old, new, config.deformation_sigma)
         has_say = pairs.count_by_keyframe(np.ones(len(pairs.view_pair), bool)) >= config.min_pairs_per_keyframe
         consensus = _oldest_consensus(model, has_say & np.isin(pairs.keyframes, before), config, rng, limit)
@@ -126,13 +173,16 @@ def estimate_link(
         if consensus.change is None:
             break
         limit, before = consensus.change, before[before < consensus.change]
-    # 4. How far the maps' shapes differ beyond it: that is part of what is not known.
+    contradicted = ~consensus.votes.agrees[has_say & (pairs.keyframes < oldest)]
+    if np.count_nonzero(contradicted) > config.max_misfits:
+        return Failure(FailureReason.AGREEMENT, f"{np.count_nonzero(contradicted)} older keyframes disagree")
+    # How far the maps' shapes differ beyond it: that is part of what is not known.
     S_old_new = consensus.estimate.S_dst_src
     shape = measure_shape(model, S_old_new, consensus.inliers, consensus.keyframes)
     if isinstance(shape, Failure):
         return shape
     covariance = consensus.estimate.covariance + deformation_covariance(model, shape.deformation(config))
-    # 5. The gates.
+    # The gates.
     refused = _verify(model, old, consensus, covariance, shape, config)
     if refused is not None:
         return refused

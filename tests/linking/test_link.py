@@ -7,7 +7,7 @@ from dualslam.core.config import LinkingConfig
 from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure, FailureReason
 from dualslam.linking import DescriptorMatcher, LinkEstimate, estimate_link
-from tests.linking.worlds import FRAME_STEP, Case, hamming, link_error, make_case
+from tests.linking.worlds import FRAME_STEP, Case, hamming, link_error, make_bent_case, make_case
 
 CONFIG = LinkingConfig()
 MATCHER = DescriptorMatcher(hamming, 64.0)
@@ -114,3 +114,16 @@ def test_outliers_and_noise_do_not_keep_maps_apart():
     errors = [link_error(c, e.S_old_new) for c, e in zip(cases, estimates, strict=True) if isinstance(e, LinkEstimate)]
     assert np.median(errors, axis=0)[0] < SCALE_MEDIAN
     assert np.max(errors, axis=0)[1] < ROTATION_WORST_DEG
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_maps_that_bend_apart_are_linked_where_they_have_the_same_shape(seed):
+    """The oldest of 22 shared keyframes drift in the new map: the whole overlap fixes no scale, a part does."""
+    case = make_bent_case("street", seed, n_bent=8, stretch=1.02)
+    estimate = link(case)
+    assert isinstance(estimate, LinkEstimate)
+    assert np.all(np.array(link_error(case, estimate.S_old_new)) < [SCALE_WORST, ROTATION_WORST_DEG, POSITION_WORST])
+    assert 2 * CONFIG.min_keyframes <= len(estimate.agreeing_keyframes) < 22
+    whole = link(case, config=CONFIG.model_copy(update={"min_keyframes": 12}))  # no part is long enough
+    assert isinstance(whole, Failure)
+    assert whole.reason is FailureReason.SCALE

@@ -206,6 +206,18 @@ def finish(old: Submap, new: Submap, rng: np.random.Generator) -> Case:
     return Case(old, new, S_old_w @ sim3.inverse(S_new_w), extent)
 
 
+def make_bent_case(layout: str, seed: int, n_bent: int, stretch: float, n_shared: int = 22) -> Case:
+    """Make a new map whose oldest steps grow: each of the `n_bent` oldest is `stretch` times as long as the next."""
+    rng = np.random.default_rng(4000 + seed)
+    world = make_world(layout, seed)
+    old = build(world, Recipe(list(range(n_shared)), n_shared), 0, rng)
+    poses = drifted_poses(world, n_shared, rng, 0.002)
+    for f in range(n_bent, 0, -1):
+        poses[:f, :3, 3] = poses[f, :3, 3] + stretch * (poses[:f, :3, 3] - poses[f, :3, 3])
+    new = build(world, Recipe(list(reversed(range(24))), n_shared), 1, rng, poses)
+    return finish(old, new, np.random.default_rng(5000 + seed))
+
+
 def make_tail_case(
     layout: str,
     seed: int,
