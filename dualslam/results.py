@@ -14,10 +14,10 @@ from dualslam.atlas import LinkKind
 from dualslam.core.config import Config
 from dualslam.core.events import EventKind
 from dualslam.core.types import FrameStatus
-from dualslam.evaluation.trajectory_metrics import score_trajectory
+from dualslam.evaluation.trajectory_metrics import MAX_DT_S, score_trajectory
 from dualslam.frame_buffer import MB
 from dualslam.io.run_folder import FrameRow, PosedFrames
-from dualslam.io.trajectory_files import Trajectory
+from dualslam.io.trajectory_files import Trajectory, associate
 from dualslam.runner import RunReport
 from dualslam.system import System
 from dualslam.trajectory import compose
@@ -116,6 +116,13 @@ def summarise(
     if truth is not None:
         summary |= _errors(system, main, truth, report)
     return summary
+
+
+def truth_of_frames(truth: Trajectory, rows: Iterable[FrameRow]) -> Trajectory:
+    """Return the true poses that are nearest to the frames in time, each once, on the truth's own clock."""
+    pose, near = associate(truth.timestamps_s, np.array([row.timestamp_s for row in rows]), MAX_DT_S)
+    chosen = np.unique(pose[near])
+    return Trajectory(truth.timestamps_s[chosen], truth.T_world_cam[chosen])
 
 
 def versions() -> dict[str, str]:

@@ -15,12 +15,14 @@ from dualslam.core.config_io import dump_config
 from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Sequence
+from dualslam.core.types import Frame
 from dualslam.evaluation.failure_lab import corrupted
 from dualslam.frame_records import FrameResult
 from dualslam.io.run_folder import RunFolder, RunRecord
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.map_store import save_atlas
-from dualslam.results import frame_rows, summarise, trajectories_of
+from dualslam.report import SampleKeeper, read_run, report_page
+from dualslam.results import frame_rows, summarise, trajectories_of, truth_of_frames
 from dualslam.runner import RunReport, run_sequence
 from dualslam.system import System
 
@@ -91,7 +93,8 @@ def run_to_folder(
             if on_frame is not None:
                 on_frame(result)
 
-        report = run_sequence(system, sequence, realtime=realtime, on_frame=after_frame)
+        watched = _Watched(system, SampleKeeper(folder.write_sample))
+        report = run_sequence(watched, sequence, realtime=realtime, on_frame=after_frame)
         if report.interrupted and system.rows:
             last = next(reversed(system.rows.values()))
             system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap_id)
@@ -101,10 +104,29 @@ def run_to_folder(
         summary = {"sequence": sequence.name} | summarise(system, report, trajectories, config, truth)
         rows = frame_rows(system, trajectories.main, report.dropped)
         folder.write(RunRecord(rows, trajectories.main, trajectories.unlinked, summary))
+        if truth is not None:
+            folder.write_truth(truth_of_frames(truth, rows))
         save_atlas(folder.map_path, system.atlas, system.poses)
+        folder.write_report(report_page(read_run(folder.path)))
     if report.error is not None:
         raise InputError(f"{report.error} What was found until then is in {out}.")
     return Outcome(Path(out), summary, report, system)
+
+
+class _Watched:
+    """A system whose frames are looked at for sample pictures."""
+
+    def __init__(self, system: System, samples: SampleKeeper) -> None:
+        self._system, self._samples = system, samples
+
+    def step(self, frame: Frame) -> FrameResult:
+        result = self._system.step(frame)
+        self._samples.take(frame, result.status)
+        return result
+
+    def finish(self) -> None:
+        self._samples.finish()
+        self._system.finish()
 
 
 def _write_new_events(system: System, folder: RunFolder, n_written: int) -> int:

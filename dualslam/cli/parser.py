@@ -41,6 +41,7 @@ def _build_parser() -> _Parser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
     _add_run(commands)
     _add_eval(commands)
+    _add_compare(commands)
     _add_render(commands)
     _add_config(commands)
     _add_demo(commands)
@@ -100,6 +101,15 @@ def _add_eval(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument("run", metavar="RUN", type=Path, help="a run folder, or a trajectory in TUM format")
     parser.add_argument("sequence", metavar="SEQUENCE", help="the sequence with its ground truth")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def _add_compare(commands: argparse._SubParsersAction[_Parser]) -> None:
+    parser, _ = _command(commands, "compare", "Put runs side by side: a table here, and a page with their pictures.")
+    parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help="run folders")
+    parser.add_argument(
+        "--out", metavar="FILE", type=Path, default=Path("compare.html"), help="page to write (default: compare.html)"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace the page that is there")
 
 
 def _add_render(commands: argparse._SubParsersAction[_Parser]) -> None:

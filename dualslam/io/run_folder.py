@@ -18,7 +18,7 @@ import yaml
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.events import Event
 from dualslam.core.types import FloatArray, FrameStatus, IntArray
-from dualslam.io.atomic import write_text
+from dualslam.io.atomic import atomic_file, write_text
 from dualslam.io.map_files import to_plain
 from dualslam.io.trajectory_files import Trajectory, read_text, write_kitti, write_tum
 
@@ -32,12 +32,15 @@ EVENTS = "events.jsonl"
 SUMMARY = "summary.json"
 CONFIG = "config.yaml"
 REPORT = "report.html"
+GROUND_TRUTH = "groundtruth.txt"
 SUBMAPS = "submaps"
+SAMPLES = "samples"
 MAP = "map"
 
 FRAME_COLUMNS = ("index", "timestamp_s", "status", "submap", "in_main_map", "n_matches", "n_inliers", "latency_ms")
-_FILES = (TRAJECTORY, TRAJECTORY_KITTI, TRAJECTORY_KITTI_FRAMES, FRAMES, EVENTS, SUMMARY, CONFIG, REPORT)
+_FILES = (TRAJECTORY, TRAJECTORY_KITTI, TRAJECTORY_KITTI_FRAMES, FRAMES, EVENTS, SUMMARY, CONFIG, REPORT, GROUND_TRUTH)
 _SUBMAP_NAME = re.compile(r"\d+\.txt")
+_SAMPLE_NAME = re.compile(r"\d+\.jpg")
 _MAP_NAME = re.compile(r"[\w.-]+\.(npz|json)")
 
 
@@ -141,11 +144,6 @@ class RunFolder:
         """Where the map belongs."""
         return self.path / MAP
 
-    @property
-    def report_path(self) -> Path:
-        """Where the report belongs."""
-        return self.path / REPORT
-
     def write_config(self, config: str | Mapping[str, Any]) -> None:
         """Write the resolved configuration: YAML text, or a mapping to be dumped."""
         text = config if isinstance(config, str) else yaml.safe_dump(to_plain(config), sort_keys=False)
@@ -160,6 +158,19 @@ class RunFolder:
             self._events.flush()
         except OSError as e:
             raise OutputError(f"{self.path / EVENTS} cannot be written: {e.strerror or e}.") from e
+
+    def write_truth(self, truth: Trajectory) -> None:
+        """Write the true poses that belong to the run's frames, so that the folder can be judged by itself."""
+        write_tum(self.path / GROUND_TRUTH, truth)
+
+    def write_sample(self, index: int, jpeg: bytes) -> None:
+        """Write a small picture of a frame."""
+        with atomic_file(self.path / SAMPLES / f"{index:06d}.jpg") as file:
+            file.write(jpeg)
+
+    def write_report(self, page: str) -> None:
+        """Write ``report.html``."""
+        write_text(self.path / REPORT, page)
 
     def write(self, record: RunRecord) -> None:
         """Write frames, trajectories and the summary. May be called again as the run goes on: the last word holds."""
@@ -257,9 +268,15 @@ def unlinked_submaps(run: str | Path) -> dict[int, Path]:
     return {int(file.stem): file for file in sorted(_named(Path(run) / SUBMAPS, _SUBMAP_NAME))}
 
 
+def read_samples(run: str | Path) -> dict[int, bytes]:
+    """Return the small pictures that a run kept, as JPEG, by frame index."""
+    return {int(file.stem): file.read_bytes() for file in _named(Path(run) / SAMPLES, _SAMPLE_NAME)}
+
+
 def _run_files(folder: Path) -> list[Path]:
     found = [folder / name for name in _FILES if (folder / name).exists()]
-    return [*found, *_named(folder / SUBMAPS, _SUBMAP_NAME), *_named(folder / MAP, _MAP_NAME)]
+    named = ((SUBMAPS, _SUBMAP_NAME), (SAMPLES, _SAMPLE_NAME), (MAP, _MAP_NAME))
+    return found + [file for name, pattern in named for file in _named(folder / name, pattern)]
 
 
 def _named(folder: Path, pattern: re.Pattern[str]) -> list[Path]:

@@ -1,0 +1,34 @@
+"""`dualslam compare`: several runs side by side."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+from dualslam.core.errors import OutputError
+from dualslam.io.atomic import write_text
+from dualslam.report import comparison_page, comparison_table, read_run
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Print a table of the runs' numbers, and write the page."""
+    if args.out.exists() and not args.overwrite:
+        raise OutputError(f"{args.out} is there already; name another with --out, or give --overwrite.")
+    runs = [read_run(path) for path in args.runs]
+    write_text(args.out, comparison_page(runs))
+    if not args.quiet:
+        print(table_text(comparison_table(runs)))
+        print(f"page in {args.out}", flush=True)
+    return 0
+
+
+def table_text(rows: Sequence[Sequence[str]]) -> str:
+    """Return rows of words as aligned columns, the first one to the left."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        first, *rest = (
+            cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))
+        )
+        lines.append("  ".join([first, *rest]).rstrip())
+    return "\n".join(lines)

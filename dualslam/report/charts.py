@@ -1,0 +1,79 @@
+"""Small figures and tables of numbers: the latency histogram and where the time went."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dualslam.core.types import FrameStatus
+from dualslam.report.markup import Markup, join, number, tag
+from dualslam.report.run_data import RunData
+
+BINS_PER_DECADE = 8
+
+
+def latency_histogram(run: RunData) -> Markup:
+    """Return how the frames' wall times are spread, in bins of equal ratio."""
+    latency = np.array([row.latency_ms for row in run.rows if row.status is not FrameStatus.DROPPED])
+    latency = latency[latency > 0]
+    if not len(latency):
+        return tag("p", "No frame was looked at.", cls="empty")
+    low, high = np.floor(np.log10(latency.min())), np.ceil(np.log10(latency.max()) + 1e-9)
+    high = max(high, low + 1)
+    n_bins = int(BINS_PER_DECADE * (high - low))
+    counts, edges = np.histogram(np.log10(latency), bins=n_bins, range=(low, high))
+    bars = [
+        tag(
+            "rect",
+            tag("title", f"{number(10**a)} to {number(10**b)} ms: {c} frames"),
+            x=float(i) + 0.06,
+            y=float(100 * (1 - c / counts.max())),
+            width=0.88,
+            height=float(100 * c / counts.max()),
+            cls="bar",
+        )
+        for i, (c, a, b) in enumerate(zip(counts.tolist(), edges[:-1], edges[1:], strict=True))
+        if c
+    ]
+    words = [
+        tag("span", f"{number(10.0**d)} ms", cls=f"at tick{side}", style=f"left:{100 * (d - low) / (high - low):.2f}%")
+        for d in np.arange(low, high + 1)
+        for side in (" inward-right" if d == low else " inward-left" if d == high else "",)
+    ]
+    marks = []
+    for name, share in (("median", 50), ("95 %", 95), ("max", 100)):
+        value = float(np.percentile(latency, share))
+        left = 100 * (np.log10(value) - low) / (high - low)
+        title = f"{name}: {number(value)} ms"
+        marks.append(tag("span", cls="at rule", style=f"left:{left:.2f}%", title=title))
+    svg = tag(
+        "svg",
+        tag("title", "Histogram of the frames' latency"),
+        bars,
+        viewBox=f"0 0 {n_bins} 100",
+        preserveAspectRatio="none",
+        role="img",
+        aria_label="Histogram of the frames' latency",
+    )
+    median, p95, most = (number(float(np.percentile(latency, q))) for q in (50, 95, 100))
+    caption = f"Median {median} ms, 95 % of the frames below {p95} ms, longest {most} ms (upright lines)."
+    return tag("figure", tag("div", svg, marks, words, cls="histogram"), tag("figcaption", caption))
+
+
+def stage_table(run: RunData) -> Markup:
+    """Return CPU time a frame of each stage."""
+    stages = run.summary.get("stages_cpu_s") or {}
+    looked_at = sum(row.status is not FrameStatus.DROPPED for row in run.rows)
+    if not stages or not looked_at:
+        return join(None)
+    longest = max(stages.values())
+    rows = [
+        tag(
+            "tr",
+            tag("th", name, scope="row"),
+            tag("td", f"{number(1e3 * seconds / looked_at)} ms", cls="num"),
+            tag("td", tag("i", style=f"width:{100 * seconds / max(longest, 1e-12):.1f}%"), cls="meter"),
+        )
+        for name, seconds in sorted(stages.items(), key=lambda item: -item[1])
+    ]
+    note = "A stage named (in x) is part of x."
+    return tag("table", tag("caption", f"CPU time a frame, by stage. {note}"), tag("tbody", rows), cls="plain stages")

@@ -1,0 +1,159 @@
+"""`report.html`: one run on one page, made from its run folder alone, and asking for nothing outside itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dualslam.core.config import Config
+from dualslam.core.types import FrameStatus
+from dualslam.report.charts import latency_histogram, stage_table
+from dualslam.report.failures import failures_section, stories
+from dualslam.report.markup import Markup, document, join, number, tag
+from dualslam.report.run_data import RunData
+from dualslam.report.statuses import WITHOUT_POSE, count
+from dualslam.report.timeline import timeline
+from dualslam.report.top_view import top_view
+
+_EVENT_FIELDS = frozenset({"event", "frame", "timestamp_s", "submap"})
+
+
+def report_page(run: RunData) -> str:
+    """Return the whole page."""
+    sequence = run.summary.get("sequence", run.name)
+    body = [
+        tag("header", tag("h1", str(sequence)), tag("p", headline(run), cls="lead"), _warnings(run), _tiles(run)),
+        _section("Trajectory", top_view(run)),
+        _section("Every frame", timeline(run)),
+        _section("Failures and recoveries", failures_section(run)),
+        _section("Time", [latency_histogram(run), stage_table(run)]),
+        _section("Configuration", _configuration(run)),
+        _section("All events", _events(run)),
+        _footer(run),
+    ]
+    return document(f"{sequence} - dualslam report", body)
+
+
+def headline(run: RunData) -> str:
+    """Say in one sentence what came of the run."""
+    n = len(run.rows)
+    if not len(run.main):
+        return f"No map: none of {count(n, 'frame')} has a pose."
+    posed = f"{100 * len(run.main) / max(n, 1):.1f} % of {count(n, 'frame')} are posed in the main map"
+    told = stories(run)
+    if not told:
+        failures = "Tracking never failed"
+    else:
+        linked = sum(story.linked is not None for story in told)
+        failures = f"Tracking failed {count(len(told), 'time')}; {linked} of {len(told)} linked by a recovery"
+    apart = f"; {count(len(run.unlinked), 'submap')} stayed apart" if run.unlinked else ""
+    return f"{failures}; {posed}{apart}."
+
+
+def _warnings(run: RunData) -> Markup:
+    words = []
+    if run.summary.get("interrupted"):
+        words.append("This run was interrupted: the page shows what it had found by then.")
+    unreadable, dropped = run.count(FrameStatus.UNREADABLE), run.count(FrameStatus.DROPPED)
+    if unreadable:
+        words.append(f"{count(unreadable, 'image')} could not be read.")
+    if dropped:
+        words.append(f"{count(dropped, 'frame')} came too late to be looked at (real time).")
+    return join([tag("p", f"⚠ {sentence}", cls="warning") for sentence in words])
+
+
+def _tiles(run: RunData) -> Markup:
+    s = run.summary
+    latency = s.get("latency_ms") or {}
+    rpe = s.get("rpe") or {}
+    unposed = sum(run.count(status) for status in WITHOUT_POSE)
+    tiles = [
+        _tile("coverage", f"{100 * s.get('coverage', 0):.1f} %", f"{s.get('posed', 0)} of {len(run.rows)} frames"),
+        _tile("failures", str(s.get("failures", 0)), f"{count(unposed, 'frame')} without a pose"),
+        _tile("recoveries", str(s.get("recoveries", 0)), _recovery_words(s)),
+        _tile(
+            "submaps", str(s.get("submaps", 0)), f"{s.get('keyframes', 0)} keyframes, {s.get('landmarks', 0)} landmarks"
+        ),
+    ]
+    if s.get("ate_rmse_m") is not None:
+        tiles.append(_tile("ATE", f"{number(s['ate_rmse_m'])} m", "RMSE of the main map, Sim(3)-aligned"))
+    if rpe.get("rotation_deg_median") is not None:
+        translation = rpe.get("translation_pct_median")
+        rest = "" if translation is None else f", {number(translation)} % of the way"
+        tiles.append(_tile("error over 1 s", f"{number(rpe['rotation_deg_median'])}°", f"median rotation{rest}"))
+    if latency:
+        words = f"median; 95 % below {number(latency['p95'])} ms"
+        tiles.append(_tile("latency", f"{number(latency['median'])} ms", words))
+    tiles.append(_tile("speed", f"{number(s.get('fps'))} fps", f"peak memory {number(s.get('peak_rss_mb'), 4)} MB"))
+    return tag("dl", tiles, cls="tiles")
+
+
+def _recovery_words(summary: dict[str, Any]) -> str:
+    seconds = sorted(summary.get("recovery_s") or [])
+    if not seconds:
+        return "links made by a walk back in time"
+    return f"links made; {number(seconds[len(seconds) // 2])} s each (median)"
+
+
+def _tile(name: str, value: str, words: str) -> Markup:
+    return tag("div", tag("dt", name), tag("dd", value), tag("dd", words, cls="note"))
+
+
+def _section(title: str, content: object) -> Markup:
+    return tag("section", tag("h2", title), content)
+
+
+def _configuration(run: RunData) -> Markup:
+    default = Config().model_dump(mode="json")
+    changed = _differences(run.config, default)
+    rows = [
+        tag("tr", tag("th", name, scope="row"), tag("td", str(value)), tag("td", str(was)))
+        for name, value, was in changed
+    ]
+    head = tag("tr", [tag("th", words, scope="col") for words in ("field", "here", "default")])
+    table = tag("div", tag("table", tag("thead", head), tag("tbody", rows), cls="plain"), cls="scroll")
+    words = tag("p", "All fields have their default values.", cls="empty")
+    whole = tag("details", tag("summary", "The whole configuration"), tag("pre", run.config_text))
+    return join([table if rows else words, whole])
+
+
+def _differences(here: dict[str, Any], default: dict[str, Any], prefix: str = "") -> list[tuple[str, Any, Any]]:
+    found = []
+    for name, value in here.items():
+        was = default.get(name)
+        if isinstance(value, dict) and isinstance(was, dict):
+            found += _differences(value, was, f"{prefix}{name}.")
+        elif value != was:
+            found.append((prefix + name, value, was))
+    return found
+
+
+def _events(run: RunData) -> Markup:
+    if not run.events:
+        return tag("p", "Nothing happened.", cls="empty")
+    rows = [
+        tag(
+            "tr",
+            tag("td", str(event.get("frame", "")), data_label="frame", cls="num"),
+            tag("td", f"{event.get('timestamp_s', 0.0):.2f} s", data_label="time", cls="num"),
+            tag("td", str(event.get("event", "")).replace("_", " "), data_label="event"),
+            tag("td", "-" if event.get("submap") is None else str(event["submap"]), data_label="submap", cls="num"),
+            tag("td", _event_words(event), data_label="what belongs to it", cls="words"),
+        )
+        for event in run.events
+    ]
+    head = tag("tr", [tag("th", w, scope="col") for w in ("frame", "time", "event", "submap", "what belongs to it")])
+    table = tag("table", tag("thead", head), tag("tbody", rows), cls="cards")
+    return tag("details", tag("summary", count(len(run.events), "event")), tag("div", table, cls="scroll"))
+
+
+def _event_words(event: dict[str, Any]) -> str:
+    def shown(value: object) -> str:
+        return number(value, 4) if isinstance(value, float) else str(value)
+
+    return ", ".join(f"{k} {shown(v)}" for k, v in event.items() if k not in _EVENT_FIELDS and v is not None)
+
+
+def _footer(run: RunData) -> Markup:
+    versions = run.summary.get("versions") or {}
+    words = ", ".join(f"{name} {version}" for name, version in versions.items())
+    return tag("footer", tag("p", f"Run folder {run.name}, seed {run.summary.get('seed', 'to')}. {words}."))

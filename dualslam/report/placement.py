@@ -1,0 +1,157 @@
+"""Where the trajectories of a run lie on paper: aligned to the truth where there is one, and seen from above."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.core.geometry import sim3
+from dualslam.core.geometry.umeyama import umeyama
+from dualslam.core.types import Failure, FloatArray, IntArray
+from dualslam.report.run_data import PosedRows, RunData
+
+MIN_ALIGNED = 3
+MIN_UPRIGHT = 0.3
+"""Length of the mean of all cameras' downward axes, under which the camera was held at all angles."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A trajectory in the frame of a drawing.
+
+    Attributes
+    ----------
+    submap : int or None
+        None for the main map.
+    row : (N,) int64
+    xyz : (N, 3) float64
+    error : (N,) float64
+        Distance from the true position, NaN where there is none.
+    """
+
+    submap: int | None
+    row: IntArray
+    xyz: FloatArray
+    error: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """All that one drawing shows, in one frame.
+
+    Attributes
+    ----------
+    placed : list of Placed
+        The main map first, where there is one.
+    apart : list of Placed
+        Submaps that nothing places in this frame: each has a frame and a unit of its own.
+    truth_row : (T,) int64, truth_xyz : (T, 3) float64
+    points : (P, 3) float64
+    unit : str
+        ``m``, or empty where a monocular map's own unit is all there is.
+    down : (3,) float64
+        Mean of the cameras' downward axes (as unit vectors).
+    note : str
+        What was done to bring it all together.
+    """
+
+    placed: list[Placed]
+    apart: list[Placed]
+    truth_row: IntArray
+    truth_xyz: FloatArray
+    points: FloatArray
+    unit: str
+    down: FloatArray
+    note: str
+
+
+def place(run: RunData) -> Scene:
+    """Bring the trajectories of a run into one frame: the truth's, or the main map's own."""
+    maps: list[tuple[int | None, PosedRows]] = [(None, run.main)] if len(run.main) else []
+    maps += list(run.unlinked.items())
+    if not len(run.truth):
+        apart = [_unplaced(m, posed) for m, posed in maps[1:]]
+        placed = [_unplaced(m, posed) for m, posed in maps[:1]]
+        down = run.main.T_map_cam[:, :3, 1].mean(axis=0) if len(run.main) else np.zeros(3)
+        return Scene(placed, apart, *_no_truth(), run.points, "", down, "No ground truth: in the map's own unit.")
+    placed, apart, points = [], [], np.zeros((0, 3))
+    for m, posed in maps:
+        S_truth_map = align(posed, run.truth)
+        if isinstance(S_truth_map, Failure):
+            apart.append(_unplaced(m, posed))
+            continue
+        placed.append(_placed(m, posed, S_truth_map, run.truth))
+        if m is None:
+            points = act(S_truth_map, run.points)
+    note = "Each map is aligned to the truth by one similarity, as for the ATE."
+    if apart:
+        note += " A map with too little motion to be aligned is drawn apart."
+    down = run.truth.T_map_cam[:, :3, 1].mean(axis=0)
+    return Scene(placed, apart, run.truth.row, run.truth.xyz, points, "m", down, note)
+
+
+def align(posed: PosedRows, truth: PosedRows) -> FloatArray | Failure:
+    """Return the similarity (4, 4) that takes a map nearest to the truth."""
+    _, a, b = np.intersect1d(posed.row, truth.row, return_indices=True)
+    alignment = umeyama(posed.xyz[a], truth.xyz[b])
+    return alignment.S_dst_src if not isinstance(alignment, Failure) else alignment
+
+
+def act(S: FloatArray, xyz: FloatArray) -> FloatArray:
+    """Apply a similarity to points (N, 3)."""
+    return np.asarray(xyz @ S[:3, :3].T + S[:3, 3], np.float64)
+
+
+def plane_from_above(xyz: FloatArray, down: FloatArray) -> tuple[FloatArray, str]:
+    """Return (2, 3) axes of the paper, right and up, with the longest extent to the right, and what is looked along.
+
+    Parameters
+    ----------
+    xyz : (N, 3)
+        What is drawn.
+    down : (3,)
+        Mean of the cameras' downward axes; short where the camera was held at all angles.
+    """
+    centred = xyz - xyz.mean(axis=0)
+    _, _, principal = np.linalg.svd(centred, full_matrices=False) if len(xyz) >= 3 else (0, 0, np.eye(3))
+    if np.linalg.norm(down) >= MIN_UPRIGHT:
+        up, view = -down / np.linalg.norm(down), "seen from above (against the mean of the cameras' downward axes)"
+    else:
+        up, view = principal[2], "seen along the direction of least extent (the camera was held at all angles)"
+    flat = centred - np.outer(centred @ up, up)
+    _, _, principal = np.linalg.svd(np.vstack([flat, 1e-9 * np.eye(3)]), full_matrices=False)
+    right = principal[0] - (principal[0] @ up) * up
+    right /= np.linalg.norm(right)
+    # From left to right in time, so that the eye follows.
+    if (centred[-1] - centred[0]) @ right < 0:
+        right = -right
+    return np.stack([right, np.cross(up, right)]), view
+
+
+def _placed(submap: int | None, posed: PosedRows, S_truth_map: FloatArray, truth: PosedRows) -> Placed:
+    xyz = act(S_truth_map, posed.xyz)
+    error = np.full(len(posed), np.nan)
+    _, a, b = np.intersect1d(posed.row, truth.row, return_indices=True)
+    error[a] = np.linalg.norm(xyz[a] - truth.xyz[b], axis=1)
+    return Placed(submap, posed.row, xyz, error)
+
+
+def _unplaced(submap: int | None, posed: PosedRows) -> Placed:
+    return Placed(submap, posed.row, posed.xyz, np.full(len(posed), np.nan))
+
+
+def _no_truth() -> tuple[IntArray, FloatArray]:
+    return np.zeros(0, np.int64), np.zeros((0, 3))
+
+
+def relative_scale(S: FloatArray) -> float:
+    """Return the scale of a similarity."""
+    return float(sim3.scale(S))
+
+
+def extent(parts: Sequence[FloatArray]) -> FloatArray:
+    """Return (2, D) lowest and highest coordinates of point sets (N, D) together."""
+    every = np.concatenate([part for part in parts if len(part)])
+    return np.stack([every.min(axis=0), every.max(axis=0)])

@@ -1,0 +1,192 @@
+"""A run folder, read: what the pages are made from. Nothing else is needed, so a page can be made again at any time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from dualslam.atlas import Atlas, Link, LinkKind
+from dualslam.core.errors import InputError
+from dualslam.core.types import FloatArray, FrameStatus, IntArray
+from dualslam.io import run_folder
+from dualslam.io.map_files import METADATA
+from dualslam.io.run_folder import FrameRow, read_events, read_frames, unlinked_submaps
+from dualslam.io.trajectory_files import Trajectory, associate, nearest_in_time, read_text, read_tum
+
+MAX_TRUTH_DT_S = 0.02
+"""Largest gap in time between a frame and its true pose, as in the evaluation."""
+MAX_POINTS = 2500
+MAX_VIEW_DISTANCE_MU = 8.0
+"""Landmarks farther from the camera that made them (the start's median depth is 1) are left out of the pictures."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedRows:
+    """Rows of ``frames.csv`` with a pose, N of them, in one map.
+
+    Attributes
+    ----------
+    row : (N,) int64
+        Ascending.
+    T_map_cam : (N, 4, 4) float64
+    """
+
+    row: IntArray
+    T_map_cam: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    @property
+    def xyz(self) -> FloatArray:
+        """(N, 3) camera centres."""
+        return self.T_map_cam[:, :3, 3]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunData:
+    """What a run left behind.
+
+    Attributes
+    ----------
+    path : Path
+    rows : list of FrameRow
+        Every input frame, in the order in which they came.
+    events : list of dict
+    summary : dict
+    config : dict
+        The resolved configuration, nested.
+    config_text : str
+        The same as it was written, with its comments.
+    main : PosedRows
+    unlinked : dict of int to PosedRows
+        Submaps that are not linked to the main map, each in its own unit.
+    truth : PosedRows
+        True poses of the frames that have one; empty where there is no ground truth.
+    points : (P, 3) float64
+        Some of the main map's landmarks.
+    samples : dict of int to bytes
+        Small JPEGs of frames around the gaps, by frame index.
+    """
+
+    path: Path
+    rows: list[FrameRow]
+    events: list[dict[str, Any]]
+    summary: dict[str, Any]
+    config: dict[str, Any]
+    config_text: str
+    main: PosedRows
+    unlinked: dict[int, PosedRows]
+    truth: PosedRows
+    points: FloatArray
+    samples: dict[int, bytes]
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.path.resolve().name
+
+    @property
+    def row_of(self) -> dict[int, int]:
+        """Where each frame stands among the rows, by its index in the source."""
+        return {row.index: i for i, row in enumerate(self.rows)}
+
+    def events_of(self, *kinds: str) -> list[dict[str, Any]]:
+        """Return the events of some kinds, in order."""
+        return [event for event in self.events if event.get("event") in kinds]
+
+    def count(self, status: FrameStatus) -> int:
+        """Return how many frames have a status."""
+        return sum(row.status is status for row in self.rows)
+
+
+def read_run(path: str | Path) -> RunData:
+    """Read a run folder.
+
+    Raises
+    ------
+    InputError
+        If it is none, or the run did not come to its end.
+    """
+    path = Path(path)
+    if not (path / run_folder.SUMMARY).is_file():
+        missing = f"it has no {run_folder.SUMMARY}" if path.is_dir() else "there is no such folder"
+        raise InputError(f"{path} is not the folder of a finished run: {missing}.")
+    rows = read_frames(path / run_folder.FRAMES)
+    times = np.array([row.timestamp_s for row in rows])
+    summary = json.loads(read_text(path / run_folder.SUMMARY))
+    config_text = read_text(path / run_folder.CONFIG)
+    truth_file = path / run_folder.GROUND_TRUTH
+    return RunData(
+        path=path,
+        rows=rows,
+        events=read_events(path / run_folder.EVENTS),
+        summary=summary,
+        config=yaml.safe_load(config_text) or {},
+        config_text=config_text,
+        main=_on_rows(read_tum(path / run_folder.TRAJECTORY, allow_empty=True), times),
+        unlinked={m: _on_rows(read_tum(file), times) for m, file in unlinked_submaps(path).items()},
+        truth=_truth_on_rows(read_tum(truth_file, allow_empty=True), times) if truth_file.exists() else _no_rows(),
+        points=_map_points(path / run_folder.MAP, {row.submap for row in rows if row.in_main_map}),
+        samples=run_folder.read_samples(path),
+    )
+
+
+def _no_rows() -> PosedRows:
+    return PosedRows(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
+
+
+def _on_rows(trajectory: Trajectory, times_s: FloatArray) -> PosedRows:
+    """Give each pose its row: their times were written from the same numbers."""
+    if not len(trajectory):
+        return _no_rows()
+    order = np.argsort(times_s, kind="stable")
+    row = order[nearest_in_time(times_s[order], trajectory.timestamps_s)]
+    ascending = np.argsort(row, kind="stable")
+    return PosedRows(row[ascending], trajectory.T_world_cam[ascending])
+
+
+def _truth_on_rows(truth: Trajectory, times_s: FloatArray) -> PosedRows:
+    pose, near = associate(truth.timestamps_s, times_s, MAX_TRUTH_DT_S)
+    return PosedRows(np.flatnonzero(near), truth.T_world_cam[pose[near]])
+
+
+def _map_points(folder: Path, submap_ids: set[int | None]) -> FloatArray:
+    """Read landmarks of the main map in its frame: the arrays that are needed, of the many that a map holds."""
+    ids = sorted(m for m in submap_ids if m is not None)
+    if not ids or not (folder / METADATA).is_file():
+        return np.zeros((0, 3))
+    component, S_world_submap = _gauge(folder, ids)
+    clouds = [np.zeros((0, 3))]
+    for m in component:
+        with np.load(folder / f"submap_{m:02d}.npz", allow_pickle=False) as arrays:
+            near = arrays["landmarks_distance_mu"] < MAX_VIEW_DISTANCE_MU
+            xyz = arrays["landmarks_xyz_mu"][arrays["landmarks_alive"] & near]
+        S = S_world_submap[m]
+        clouds.append(xyz @ S[:3, :3].T + S[:3, 3])
+    points = np.concatenate(clouds)
+    return points[:: max(1, len(points) // MAX_POINTS)]
+
+
+def _gauge(folder: Path, ids: list[int]) -> tuple[list[int], Mapping[int, FloatArray]]:
+    """Return the main map's submaps, and the transform of each into its world."""
+    atlas = Atlas()
+    document = json.loads(read_text(folder / METADATA))
+    with np.load(folder / "links.npz", allow_pickle=False) as arrays:
+        kinds = document["metadata"]["link_kinds"]
+        for (a, b), S_a_b, C, kind in zip(
+            arrays["ab"].tolist(), arrays["S_a_b"], arrays["covariance"], kinds, strict=True
+        ):
+            atlas.link(Link(a, b, S_a_b, C, LinkKind(kind)))
+    stored = {int(name.removeprefix("submap_")) for name in document["groups"] if name.startswith("submap_")}
+    component = {ids[0]}
+    while grown := {m for link in atlas.links for m in (link.a, link.b) if {link.a, link.b} & component} - component:
+        component |= grown
+    ordered = sorted(component & stored)
+    return ordered, atlas.S_world_submap(ordered)

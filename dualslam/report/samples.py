@@ -1,0 +1,75 @@
+"""Sample frames: small pictures of the frames around each gap in the tracking, chosen while the run goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.types import Frame, FrameStatus
+
+MAX_GAPS = 12
+"""Gaps of which frames are kept: what a person looks at, and a bound on the size of the report."""
+MIN_GAP_FRAMES = 3
+"""Shorter gaps are a blink that tracking came back from."""
+WIDTH_PX = 320
+JPEG_QUALITY = 72
+POSED = frozenset({FrameStatus.TRACKED, FrameStatus.RECOVERED, FrameStatus.BYPASSED})
+
+
+class SampleKeeper:
+    """Watches a run, and keeps of each gap the last frame before it, its first and last one, and the first after it.
+
+    Parameters
+    ----------
+    keep : callable
+        Given the frame's index and a JPEG, as soon as a gap is over.
+    """
+
+    def __init__(self, keep: Callable[[int, bytes], None]) -> None:
+        self._keep = keep
+        self._n_gaps = 0
+        self._before: Frame | None = None
+        self._gap: list[Frame] | None = None
+        """First and latest frame of the gap that is open."""
+        self._gap_frames = 0
+
+    def take(self, frame: Frame, status: FrameStatus) -> None:
+        """Look at one frame and what became of it."""
+        if status not in POSED:
+            self._gap = [frame] if self._gap is None else [self._gap[0], frame]
+            self._gap_frames += 1
+            return
+        if self._gap is not None:
+            self._close(frame)
+        self._before = frame
+
+    def finish(self) -> None:
+        """End the run: a gap that is open now lasted to its end."""
+        if self._gap is not None:
+            self._close(None)
+
+    def _close(self, after: Frame | None) -> None:
+        assert self._gap is not None
+        frames = [self._before, *self._gap, after]
+        long_enough = self._gap_frames >= MIN_GAP_FRAMES or after is None
+        if long_enough and self._n_gaps < MAX_GAPS:
+            self._n_gaps += 1
+            for frame in frames:
+                if frame is not None and frame.image is not None:
+                    self._keep(frame.index, thumbnail(frame.image))
+        self._gap, self._gap_frames = None, 0
+
+
+def thumbnail(image: NDArray[np.uint8]) -> bytes:
+    """Return a small JPEG of an image (H, W) or (H, W, 3) RGB."""
+    height, width = image.shape[:2]
+    factor = min(1.0, WIDTH_PX / width)
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    if small.ndim == 3:
+        small = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
+    _, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return bytes(data)

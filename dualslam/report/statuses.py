@@ -1,0 +1,50 @@
+"""The statuses of frames in words and classes, and runs of equal ones. Never by colour alone: words and shapes too."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from dualslam.core.types import FrameStatus
+
+MEANING: dict[FrameStatus, str] = {
+    FrameStatus.TRACKED: "posed by the live front end",
+    FrameStatus.RECOVERED: "posed by the walk back in time",
+    FrameStatus.BYPASSED: "end of a lost map, posed in the new one",
+    FrameStatus.LOST: "no pose: the map could not explain the frame",
+    FrameStatus.INITIALISING: "no pose: there was no map",
+    FrameStatus.DROPPED: "came too late to be looked at",
+    FrameStatus.UNREADABLE: "the image could not be read",
+}
+WITHOUT_POSE = (FrameStatus.LOST, FrameStatus.INITIALISING, FrameStatus.DROPPED, FrameStatus.UNREADABLE)
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Neighbouring items ``start <= i < stop`` of equal value."""
+
+    value: object
+    start: int
+    stop: int
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+
+def stretches(values: Sequence[object]) -> Iterator[Stretch]:
+    """Yield the longest stretches of equal neighbours, in order."""
+    start = 0
+    for i in range(1, len(values) + 1):
+        if i == len(values) or values[i] != values[start]:
+            yield Stretch(values[start], start, i)
+            start = i
+
+
+def count(n: int, one: str, many: str | None = None) -> str:
+    """Return a number with its noun."""
+    return f"{n} {one if n == 1 else many or one + 's'}"
+
+
+def span(first: int, last: int) -> str:
+    """Return ``frame 3`` or ``frames 3 to 9``."""
+    return f"frame {first}" if first == last else f"frames {first} to {last}"

@@ -1,0 +1,212 @@
+"""The run over time, every frame of it: status lanes, submaps, events, and the numbers that decide between them.
+
+All lanes share one horizontal axis. They are SVG that stretches to the width of the page; words and marks are HTML over
+it, so that they keep their size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.report.canvas import ticks
+from dualslam.report.markup import Markup, coordinate, number, tag
+from dualslam.report.placement import Scene, place
+from dualslam.report.run_data import RunData
+from dualslam.report.statuses import MEANING, count, span, stretches
+from dualslam.report.top_view import failure_letter
+
+MAX_COLUMNS = 900
+"""Points along a curve: more than a screen has room for would only make the page heavy."""
+MIN_LABEL_PERCENT = 3.0
+_MARKS = {
+    "initialised": ("○", "mark", "a map begins"),
+    "reinitialised": ("○", "mark", "a new map begins"),
+    "relocalised": ("↺", "mark quiet", "found again by wide matching"),
+    "rolled_over": ("→", "mark quiet", "a full submap hands over to the next"),
+    "linked": ("◆", "mark good", "two submaps are linked"),
+    "loop_closed": ("◆", "mark good", "a loop is closed"),
+    "interrupted": ("■", "mark bad", "the run was interrupted"),
+}
+
+
+def timeline(run: RunData) -> Markup:
+    """Return the section."""
+    if not run.rows:
+        return tag("p", "The source gave no frame.", cls="empty")
+    lanes = [*_status_lanes(run), _submap_lane(run), _event_lane(run), _inlier_lane(run)]
+    error = _error_lane(run, place(run))
+    lanes += [lane for lane in (error, _latency_lane(run), _axis(run)) if lane is not None]
+    return tag("div", lanes, cls="lanes")
+
+
+# --- lanes
+
+
+def _status_lanes(run: RunData) -> list[Markup]:
+    """One lane for each status that occurs: the place tells it, not the colour alone."""
+    status = [row.status for row in run.rows]
+    found = [s for s in FrameStatus if s in status]
+    by_status: dict[FrameStatus, list[Markup]] = {s: [] for s in found}
+    for stretch in stretches(status):
+        value = status[stretch.start]
+        frames = span(run.rows[stretch.start].index, run.rows[stretch.stop - 1].index)
+        block = _block(stretch.start, len(stretch), f"{frames}: {value}", f"st-{value}")
+        by_status[value].append(block)
+    return [
+        _lane(str(s), count(run.count(s), "frame"), _stretched(len(status), by_status[s], f"{s}: {MEANING[s]}"))
+        for s in found
+    ]
+
+
+def _submap_lane(run: RunData) -> Markup:
+    n = len(run.rows)
+    shapes, words = [], []
+    owners = [(row.submap, row.in_main_map) for row in run.rows]
+    for stretch in stretches(owners):
+        submap, in_main = owners[stretch.start]
+        if submap is None:
+            continue
+        where = "in the main map" if in_main else "not linked to the main map"
+        frames = span(run.rows[stretch.start].index, run.rows[stretch.stop - 1].index)
+        shapes.append(_block(stretch.start, len(stretch), f"{frames}: submap {submap}, {where}", _owner_class(in_main)))
+        if 100 * len(stretch) / n >= MIN_LABEL_PERCENT:
+            centre = stretch.start + len(stretch) / 2
+            words.append(_at(100 * centre / n, str(submap) if in_main else f"({submap})", "on-block"))
+    note = "in brackets: not linked"
+    return _lane("submap", note if run.unlinked else "", _stretched(n, shapes, "Submap of each frame"), words)
+
+
+def _owner_class(in_main: bool) -> str:
+    return "owner" if in_main else "owner apart"
+
+
+def _event_lane(run: RunData) -> Markup:
+    marks = []
+    for event in run.events:
+        row, kind = run.row_of.get(event.get("frame", -1)), event.get("event")
+        if row is None or kind not in _MARKS:
+            continue
+        sign, cls, words = _MARKS[kind]
+        marks.append(_at(_percent(run, row), sign, cls, f"frame {event['frame']}: {words}"))
+    for i, event in enumerate(run.events_of("failed"), 1):
+        row = run.row_of.get(event.get("lost_since", event["frame"]))
+        if row is not None:
+            marks.append(_at(_percent(run, row), failure_letter(i), "break", f"failure {i}, lost since here"))
+    return _lane("events", "A failure, ○ new map, ◆ link", tag("div", cls="empty-lane"), marks)
+
+
+def _inlier_lane(run: RunData) -> Markup:
+    matches = np.array([row.n_matches for row in run.rows], float)
+    inliers = np.array([row.n_inliers for row in run.rows], float)
+    top = max(float(matches.max()), 1.0)
+    shapes = [_area(matches, top, "matches"), _area(inliers, top, "inliers")]
+    words = [tag("span", number(top), cls="y-max")]
+    threshold = (run.config.get("health") or {}).get("min_inliers")
+    note = "matched, and agreeing (dark)"
+    if isinstance(threshold, int) and threshold < top:
+        y = 100 * (1 - threshold / top)
+        shapes.append(tag("path", cls="threshold", d=f"M0 {coordinate(y)}H{len(run.rows)}"))
+        note += f"; dashed: {threshold} needed"
+    return _lane("landmarks", note, _stretched(len(run.rows), shapes, "Landmarks matched and agreeing", 100), words)
+
+
+def _error_lane(run: RunData, scene: Scene) -> Markup | None:
+    """Draw the distance from the true position, where there is a truth."""
+    error = np.full(len(run.rows), np.nan)
+    for placed in scene.placed:
+        error[placed.row] = placed.error
+    if not np.isfinite(error).any():
+        return None
+    top = float(np.nanmax(error))
+    note = "distance from the truth after alignment, each map by itself"
+    shape = _curve(error, max(top, 1e-12), "error")
+    words = [tag("span", f"{number(top)} m", cls="y-max")]
+    return _lane("error", note, _stretched(len(run.rows), shape, "Position error", 100), words)
+
+
+def _latency_lane(run: RunData) -> Markup:
+    latency = np.array([row.latency_ms for row in run.rows])
+    top = max(float(latency.max()), 1e-3)
+    words = [tag("span", f"{number(top)} ms", cls="y-max")]
+    svg = _stretched(len(latency), _area(latency, top, "latency"), "Latency of each frame", 100)
+    return _lane("latency", "wall time of each frame", svg, words)
+
+
+def _axis(run: RunData) -> Markup:
+    n, first, last = len(run.rows), run.rows[0].index, run.rows[-1].index
+    words = []
+    for value in ticks(min(first, last), max(first, last), 6):
+        share = (value - first) / (last - first) if last != first else 0.0
+        words.append(_at(100 * (share * (n - 1) + 0.5) / n, number(value, 6), "tick"))
+    seconds = abs(run.rows[-1].timestamp_s - run.rows[0].timestamp_s)
+    note = f"{n} frames, {number(seconds)} s"
+    return _lane("frame", note, tag("div", cls="empty-lane"), words, "axis")
+
+
+# --- pieces
+
+
+def _lane(name: str, note: str, drawing: Markup, words: Sequence[Markup] = (), cls: str = "") -> Markup:
+    head = tag("div", tag("b", name), " ", tag("small", note), cls="lane-name")
+    return tag("div", head, tag("div", drawing, words, cls="lane-body"), cls=f"lane {cls or name}")
+
+
+def _stretched(n: int, shapes: object, description: str, height: int = 1) -> Markup:
+    return tag(
+        "svg",
+        tag("title", description),
+        shapes,
+        viewBox=f"0 0 {n} {height}",
+        preserveAspectRatio="none",
+        role="img",
+        aria_label=description,
+    )
+
+
+def _block(start: int, length: int, title: str, cls: str) -> Markup:
+    return tag("rect", tag("title", title), cls=cls, x=start, y=0, width=length, height=1)
+
+
+def _at(percent: float, text: str, cls: str, title: str | None = None) -> Markup:
+    return tag("span", text, cls=f"at {cls}", style=f"left:{percent:.2f}%", title=title)
+
+
+def _percent(run: RunData, row: int) -> float:
+    return 100 * (row + 0.5) / len(run.rows)
+
+
+def _columns(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return positions and values, the highest of each column where there are more than a screen shows."""
+    n = len(values)
+    edges = np.unique(np.linspace(0, n, min(n, MAX_COLUMNS) + 1).astype(int))
+    highest = np.array([_highest(values[a:b]) for a, b in pairwise(edges)])
+    return (edges[:-1] + edges[1:]) / 2, highest
+
+
+def _highest(values: FloatArray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.max()) if len(finite) else float("nan")
+
+
+def _area(values: FloatArray, top: float, cls: str) -> Markup:
+    x, y = _columns(values)
+    points = "".join(f"L{coordinate(u)} {coordinate(100 * (1 - v / top))}" for u, v in zip(x, y, strict=True))
+    return tag("path", cls=cls, d=f"M0 100{points}L{len(values)} 100Z")
+
+
+def _curve(values: FloatArray, top: float, cls: str) -> Markup:
+    """Return a line that is broken where there is no value."""
+    x, y = _columns(values)
+    finite = np.isfinite(y).tolist()
+    pieces = []
+    for stretch in stretches(finite):
+        if stretch.value:
+            rows = range(stretch.start, stretch.stop)
+            pieces.append("M" + "L".join(f"{coordinate(x[i])} {coordinate(100 * (1 - y[i] / top))}" for i in rows))
+            if len(rows) == 1:
+                pieces.append("h0")
+    return tag("path", cls=cls, d="".join(pieces))

@@ -1,0 +1,171 @@
+"""The trajectory from above: what was tracked, recovered and by-passed, and where it broke."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.report.canvas import Canvas
+from dualslam.report.markup import Markup, join, tag
+from dualslam.report.placement import Placed, Scene, extent, place, plane_from_above
+from dualslam.report.run_data import RunData
+from dualslam.report.statuses import MEANING, count, span, stretches
+
+MIN_CLOSE_UP = 4
+LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+
+
+def top_view(run: RunData) -> Markup:
+    """Return the section with the trajectory, or with the reason why there is none."""
+    scene = place(run)
+    if not scene.placed and not scene.apart:
+        return tag("p", "No frame has a pose, so there is no trajectory to draw.", cls="empty")
+    parts = [tag("figure", _drawing(run, scene), tag("figcaption", _legend(run, scene)))] if scene.placed else []
+    for placed in scene.apart:
+        alone = Scene([placed], [], *_nothing(), np.zeros((0, 3)), "", scene.down * 0, "")
+        words = f"Submap {placed.submap}, not linked, in its own frame and unit: {count(len(placed.row), 'frame')}."
+        parts.append(tag("figure", _drawing(run, alone), tag("figcaption", tag("p", words)), cls="apart"))
+    return join(parts)
+
+
+def _nothing() -> tuple[np.ndarray, FloatArray]:
+    return np.zeros(0, np.int64), np.zeros((0, 3))
+
+
+def close_up(run: RunData, scene: Scene, rows: tuple[int, int], marked: Sequence[int]) -> Markup | None:
+    """Return the part of the drawing that some frames are in, or None where none of them has a place.
+
+    Parameters
+    ----------
+    rows : (first, last)
+    marked : sequence of int
+        Rows that get a mark: the keyframes on which a link rests.
+    """
+    near = [p.xyz[(p.row >= rows[0]) & (p.row <= rows[1])] for p in scene.placed]
+    near.append(scene.truth_xyz[(scene.truth_row >= rows[0]) & (scene.truth_row <= rows[1])])
+    if sum(len(xyz) for xyz in near) < MIN_CLOSE_UP:
+        return None
+    return _drawing(run, scene, near, marked)
+
+
+def _drawing(
+    run: RunData, scene: Scene, window: Sequence[FloatArray] | None = None, marked: Sequence[int] = ()
+) -> Markup:
+    drawn = [p.xyz for p in scene.placed] + [scene.truth_xyz]
+    every = np.concatenate(drawn)
+    axes, _ = plane_from_above(every, scene.down)
+    canvas = Canvas.around(*extent([xyz @ axes.T for xyz in window or drawn]))
+    shapes = [canvas.dots(scene.points @ axes.T, "landmarks") if len(scene.points) else None]
+    shapes += _truth(run, scene, canvas, axes)
+    words: list[Markup] = []
+    for placed in scene.placed:
+        shapes += _path(run, placed, canvas, axes)
+        if placed.submap is not None and len(placed.row) and window is None:
+            words.append(canvas.label(placed.xyz[len(placed.row) // 2] @ axes.T, f"submap {placed.submap}", "name"))
+        at = placed.xyz[np.isin(placed.row, marked)]
+        words += [canvas.label(uv, "◆", "agreeing", "keyframe that the link rests on") for uv in at @ axes.T]
+    words += _ends(scene, canvas, axes) if window is None else []
+    words += _breakages(run, scene, canvas, axes)
+    words.append(canvas.scale_bar(scene.unit, every @ axes.T))
+    return canvas.draw(shapes, words, _description(run, scene))
+
+
+def _description(run: RunData, scene: Scene) -> str:
+    n_failures = len(run.events_of("failed"))
+    n_posed = sum(len(p.row) for p in scene.placed)
+    truth = ", with the true path" if len(scene.truth_row) else ""
+    return f"Trajectory from above: {n_posed} posed frames{truth}; tracking failed {count(n_failures, 'time')}"
+
+
+def _path(run: RunData, placed: Placed, canvas: Canvas, axes: FloatArray) -> list[Markup]:
+    """Draw a trajectory, each stretch of one status by itself, joined to the frame before it."""
+    uv = placed.xyz @ axes.T
+    status = [run.rows[i].status for i in placed.row.tolist()]
+    # A line does not bridge frames without a pose.
+    break_before = np.diff(placed.row, prepend=placed.row[0]) > 1
+    keys = list(zip(status, np.cumsum(break_before).tolist(), strict=True))
+    loose = " loose" if placed.submap is not None else ""
+    shapes = []
+    for stretch in stretches(keys):
+        first = stretch.start - (stretch.start > 0 and not break_before[stretch.start])
+        value = status[stretch.start]
+        frames = span(run.rows[int(placed.row[stretch.start])].index, run.rows[int(placed.row[stretch.stop - 1])].index)
+        where = "main map" if placed.submap is None else f"submap {placed.submap}, not linked"
+        title = f"{frames}: {value}, {where}"
+        shapes.append(canvas.line(uv[first : stretch.stop], f"way st-{value}{loose}", title))
+    return shapes
+
+
+def _truth(run: RunData, scene: Scene, canvas: Canvas, axes: FloatArray) -> list[Markup]:
+    """Draw the true path, and on it where the run has no pose at all."""
+    if not len(scene.truth_row):
+        return []
+    uv = scene.truth_xyz @ axes.T
+    shapes = [canvas.line(uv, "truth", "true path")]
+    posed = np.zeros(len(run.rows), bool)
+    for placed in (*scene.placed, *scene.apart):
+        posed[placed.row] = True
+    for stretch in stretches(posed[scene.truth_row].tolist()):
+        if stretch.value:
+            continue
+        around = uv[max(stretch.start - 1, 0) : stretch.stop + 1]
+        rows = scene.truth_row[[stretch.start, stretch.stop - 1]].tolist()
+        frames = span(run.rows[rows[0]].index, run.rows[rows[1]].index)
+        shapes.append(canvas.line(around, "gap", f"{frames}: no pose"))
+    return shapes
+
+
+def _ends(scene: Scene, canvas: Canvas, axes: FloatArray) -> list[Markup]:
+    # The truth has both ends; without it the main map's first and last pose stand for them.
+    xyz = scene.truth_xyz if len(scene.truth_row) else scene.placed[0].xyz
+    uv = xyz[[0, -1]] @ axes.T
+    words = [canvas.label(uv[0], "start", "end-mark start", "first frame")]
+    if len(xyz) > 1:
+        words.append(canvas.label(uv[1], "end", "end-mark stop", "last frame"))
+    return words
+
+
+def _breakages(run: RunData, scene: Scene, canvas: Canvas, axes: FloatArray) -> list[Markup]:
+    """Mark where each failure began: at the last frame that had a pose before it."""
+    rows = np.concatenate([p.row for p in scene.placed])
+    xyz = np.concatenate([p.xyz for p in scene.placed])
+    if len(scene.truth_row):  # there the loss itself has a place
+        rows, xyz = scene.truth_row, scene.truth_xyz
+    marks = []
+    for i, event in enumerate(run.events_of("failed"), 1):
+        onset = run.row_of.get(event.get("lost_since", event["frame"]))
+        before = np.flatnonzero(rows <= onset) if onset is not None else np.zeros(0, np.int64)
+        if not len(before):
+            continue
+        at = before[np.argmax(rows[before])]
+        title = f"failure {i}: track lost at frame {event.get('lost_since', event['frame'])}"
+        marks.append(canvas.label(xyz[at] @ axes.T, failure_letter(i), "break", title))
+    return marks
+
+
+def failure_letter(i: int) -> str:
+    """Return the mark of the i-th failure, from 1."""
+    return LETTERS[i - 1] if i <= len(LETTERS) else str(i)
+
+
+def _legend(run: RunData, scene: Scene) -> list[Markup]:
+    drawn = {run.rows[i].status for placed in scene.placed for i in placed.row.tolist()}
+    items = [_key(f"way st-{s}", f"{s}: {MEANING[s]}") for s in FrameStatus if s in drawn]
+    if len(scene.truth_row):
+        items += [_key("truth", "true path"), _key("gap", "no pose (drawn on the true path)")]
+    if any(p.submap is not None for p in scene.placed):
+        items.append(_key("way st-tracked loose", "a submap that is not linked, aligned by itself"))
+    if len(scene.points):
+        items.append(_key("landmarks", "landmarks of the main map"))
+    if run.events_of("failed"):
+        items.append(tag("li", tag("span", "A", cls="break sample"), " where tracking failed"))
+    _, view = plane_from_above(np.concatenate([p.xyz for p in scene.placed]), scene.down)
+    return [tag("ul", items, cls="legend"), tag("p", f"{view[0].upper()}{view[1:]}. {scene.note}")]
+
+
+def _key(cls: str, words: str) -> Markup:
+    d = "M4 6h0m10 4h0m9 -5h0" if cls == "landmarks" else "M2 7h26"
+    svg = tag("svg", tag("path", cls=cls, d=d), viewBox="0 0 30 14", aria_hidden="true")
+    return tag("li", svg, " ", words)

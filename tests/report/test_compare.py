@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dualslam.cli import main
+from dualslam.report import comparison_page, comparison_table, read_run
+from dualslam.report.compare import run_names
+from tests.report.conftest import N_FRAMES, MakeRun
+from tests.report.test_report import Outline
+
+
+@pytest.fixture(scope="module")
+def pair(make_run: MakeRun) -> list[Path]:
+    return [make_run(name="base"), make_run(lost=(), name="dual")]
+
+
+def test_the_table_puts_the_numbers_side_by_side(pair: list[Path]) -> None:
+    table = {row[0]: row[1:] for row in comparison_table([read_run(path) for path in pair])}
+    assert table[""] == ["base", "dual"]
+    assert table["coverage"] == ["50.0 %", "100.0 %"]
+    assert table["failures"] == ["1", "0"]
+    assert all(cell.endswith(" m") for cell in table["ATE"])
+
+
+def test_the_command_prints_it_and_writes_a_page(
+    pair: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "both.html"
+    command = ["compare", *map(str, pair), "--out", str(out)]
+    assert main(command) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["base", "dual"]
+    assert ["coverage", "50.0", "%", "100.0", "%"] in [line.split() for line in lines]
+    found = Outline(out.read_text())
+    assert len(found.of_class("run0")) >= 1
+    assert len(found.of_class("run1")) >= 1
+    assert "All runs have the same configuration." in found.text
+    assert main(command) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main([*command, "--overwrite", "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_what_is_no_run_is_named(pair: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", str(pair[0]), str(tmp_path), "--out", str(tmp_path / "x.html")]) == 2
+    assert "is not the folder of a finished run" in capsys.readouterr().err
+    assert not (tmp_path / "x.html").exists()
+
+
+def test_without_truth_the_maps_are_laid_on_the_first(make_run: MakeRun) -> None:
+    runs = [read_run(make_run(truth=False, lost=lost, name="phone")) for lost in ((), (5, 6, 7), ())]
+    found = Outline(comparison_page(runs))
+    assert "aligned to the first one's" in found.text
+    for i in range(3):
+        assert found.of_class(f"run{i}")
+    assert len(set(run_names(runs))) == 3
+
+
+def test_runs_without_a_map_are_compared_all_the_same(make_run: MakeRun) -> None:
+    none = read_run(make_run(lost=tuple(range(N_FRAMES)), name="none"))
+    page = comparison_page([none, none])
+    assert "None of the runs has a map." in Outline(page).text
+    assert run_names([none, none]) == ["1 none", "2 none"]

@@ -1,0 +1,264 @@
+from __future__ import annotations
+
+import os
+import re
+import signal
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dualslam.core.errors import InputError
+from dualslam.core.geometry import se3, sim3, so3
+from dualslam.core.types import Frame, FrameStatus
+from dualslam.report import RunData, SampleKeeper, read_run, report_page
+from dualslam.report.canvas import Canvas, nice_step, ticks
+from dualslam.report.failures import stories
+from dualslam.report.markup import Markup, tag
+from dualslam.report.placement import place, plane_from_above
+from dualslam.report.run_data import PosedRows
+from dualslam.synthetic import SyntheticSequence
+from tests.report.conftest import LOST, N_FRAMES, MakeRun, with_events
+
+VOID = {"meta", "link", "img", "br"}
+
+
+class Outline(HTMLParser):
+    """Checks that elements are closed in order, and collects what is needed to judge a page."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.feed(page)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, name: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((name, dict(attrs)))
+        if name not in VOID:
+            self.open.append(name)
+
+    def handle_endtag(self, name: str) -> None:
+        assert self.open.pop() == name
+
+    def handle_data(self, data: str) -> None:
+        if self.open[-1:] != ["style"]:
+            self.text += data
+
+    def of_class(self, word: str) -> list[dict[str, str | None]]:
+        return [a for _, a in self.elements if word in (a.get("class") or "").split()]
+
+
+def outline(run: RunData) -> Outline:
+    return Outline(report_page(run))
+
+
+def test_every_run_leaves_a_report_that_needs_nothing_else(broken_run: RunData) -> None:
+    page = (broken_run.path / "report.html").read_text()
+    assert page == report_page(broken_run)
+    found = Outline(page)
+    assert not re.search(r"https?://|@import|url\(", page)
+    assert all(name != "script" for name, _ in found.elements)
+    for _, attributes in found.elements:
+        for key in ("src", "href"):
+            assert (attributes.get(key) or "data:").startswith("data:")
+
+
+def test_it_says_what_happened(broken_run: RunData) -> None:
+    text = outline(broken_run).text
+    assert "Tracking failed 1 time; 0 of 1 linked by a recovery; 50.0 % of 40 frames" in text
+    assert "Tracking was lost at frame 20" in text
+    assert "<b>0 features</b>" in text  # as words
+    assert "All 1 link that were tried were refused: too few inliers" in text
+    assert "refused: too few inliers - 9 inliers, 20 needed" in text
+    for words in ("31", "0.72 ± 0.21 %", "± 0.13°", "4 shared"):
+        assert words in text
+    assert "seed" in text
+
+
+def test_hostile_words_stay_words(broken_run: RunData) -> None:
+    hostile = "<script>alert('x')</script>\" onload=\"x"
+    run = with_events(broken_run, {"event": hostile, "frame": 1, "timestamp_s": 0.1, "submap": None, "detail": hostile})
+    run = replace(run, summary=run.summary | {"sequence": hostile}, config_text=hostile, config={hostile: hostile})
+    found = outline(run)
+    assert all(name != "script" and "onload" not in attributes for name, attributes in found.elements)
+    assert hostile in found.text
+
+
+def test_each_map_is_laid_on_the_truth_by_itself(broken_run: RunData) -> None:
+    turned = sim3.from_parts(3.0, so3.exp(np.array([0.4, -1.0, 0.2])), np.array([5.0, 6.0, 7.0]))
+    (m, posed), main = next(iter(broken_run.unlinked.items())), broken_run.main
+    moved = PosedRows(posed.row, np.stack([sim3.act_on_pose(turned, T) for T in posed.T_map_cam]))
+    bent = main.T_map_cam.copy()
+    bent[0, :3, 3] += [0.0, 0.0, 0.5]
+    scene = place(replace(broken_run, unlinked={m: moved}, main=PosedRows(main.row, bent)))
+    assert [p.submap for p in scene.placed] == [None, m]
+    assert scene.unit == "m"
+    assert np.nanmax(scene.placed[1].error) < 1e-6
+    assert 0.2 < scene.placed[0].error[0] < 0.6
+    assert np.argmax(scene.placed[0].error) == 0
+
+
+def test_above_is_against_the_cameras_down(world: SyntheticSequence) -> None:
+    T = np.asarray(world.ground_truth_T_world_cam)
+    turned = se3.from_parts(so3.exp(np.array([1.0, 0.5, -0.3])), np.zeros(3)) @ T
+    for poses in (T, turned):
+        xyz, down = poses[:, :3, 3], poses[:, :3, 1].mean(axis=0)
+        axes, view = plane_from_above(xyz, down)
+        assert np.allclose(axes @ axes.T, np.eye(2), atol=1e-9)
+        assert np.allclose(np.cross(axes[0], axes[1]), -down / np.linalg.norm(down), atol=1e-6)
+        assert "from above" in view
+        flat = (xyz - xyz[0]) @ axes.T
+        assert flat[-1, 0] > abs(flat[-1, 1])  # the way goes to the right
+    _, view = plane_from_above(T[:, :3, 3], np.zeros(3))
+    assert "all angles" in view
+
+
+def test_a_failure_is_marked_on_the_path_and_in_time(broken_run: RunData) -> None:
+    found = outline(broken_run)
+    marks = [a for a in found.of_class("break") if a.get("style")]
+    (lane,) = [a for a in marks if "top" not in str(a["style"])]
+    assert lane["style"] == f"left:{100 * (LOST[0] + 0.5) / N_FRAMES:.2f}%"
+    assert len([a for a in marks if "top" in str(a["style"])]) >= 1
+    lost = found.of_class("st-lost")
+    assert [(a["x"], a["width"]) for a in lost] == [(str(LOST[0]), str(len(LOST)))]
+    assert {"gap", "truth"} <= {c for _, a in found.elements for c in (a.get("class") or "").split()}
+
+
+def test_no_status_is_told_by_colour_alone(broken_run: RunData) -> None:
+    found = outline(broken_run)
+    for status in {row.status for row in broken_run.rows}:
+        assert str(status) in found.text
+    for name, attributes in found.elements:
+        if name == "svg":
+            assert attributes.get("aria-label") or attributes.get("aria-hidden") == "true"
+        if name == "img":
+            assert attributes.get("alt")
+
+
+def test_the_frames_around_a_gap_are_kept(broken_run: RunData) -> None:
+    assert sorted(broken_run.samples) == [LOST[0] - 1, LOST[0], LOST[-1], LOST[-1] + 1]
+    assert len([a for name, a in outline(broken_run).elements if name == "img"]) == 4
+    for jpeg in broken_run.samples.values():
+        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert image.shape == (120, 160)
+
+
+def test_samples_are_bounded_and_a_blink_leaves_none() -> None:
+    kept: list[int] = []
+    keeper = SampleKeeper(lambda index, jpeg: kept.append(index))
+    image = np.zeros((40, 60), np.uint8)
+    statuses = ([FrameStatus.TRACKED] * 5 + [FrameStatus.LOST] * 2) * 3
+    for i, status in enumerate(statuses):
+        keeper.take(Frame(i, i / 10, image), status)
+    assert kept == []
+    for i in range(1000):
+        status = FrameStatus.LOST if i % 10 < 5 else FrameStatus.TRACKED
+        keeper.take(Frame(100 + i, i / 10, image), status)
+    keeper.finish()
+    assert 30 < len(kept) < 60
+    assert len(set(kept)) == len(kept)
+
+
+def test_colour_frames_are_kept_in_their_colours() -> None:
+    kept: dict[int, bytes] = {}
+    keeper = SampleKeeper(kept.__setitem__)
+    red = np.zeros((40, 60, 3), np.uint8)
+    red[..., 0] = 255
+    keeper.take(Frame(0, 0.0, red), FrameStatus.INITIALISING)
+    keeper.take(Frame(1, 0.1, None, "torn"), FrameStatus.UNREADABLE)
+    keeper.finish()
+    assert list(kept) == [0]
+    blue, _, red_again = cv2.imdecode(np.frombuffer(kept[0], np.uint8), cv2.IMREAD_COLOR).mean(axis=(0, 1))
+    assert red_again > 240
+    assert blue < 15
+
+
+def test_a_run_without_truth_draws_its_maps_apart(make_run: MakeRun) -> None:
+    run = read_run(make_run(truth=False))
+    assert not (run.path / "groundtruth.txt").exists()
+    text = outline(run).text
+    assert "No ground truth" in text
+    assert "Submap 1, not linked, in its own frame and unit: 14 frames." in text
+    assert "ATE" not in text.split("Trajectory")[0]
+
+
+def test_a_run_without_a_map_says_so(make_run: MakeRun) -> None:
+    run = read_run(make_run(lost=tuple(range(N_FRAMES))))
+    found = outline(run)
+    assert "No map: none of 40 frames has a pose." in found.text
+    assert "never began" in found.text
+    assert len([name for name, _ in found.elements if name == "img"]) == 2  # the first frame and the last
+
+
+def test_an_interrupted_run_says_so(make_run: MakeRun) -> None:
+    def interrupt(frame: Frame) -> None:
+        if frame.index == 9:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    run = read_run(make_run(lost=(), before_step=interrupt))
+    assert "This run was interrupted" in outline(run).text
+    assert len(run.rows) == 10
+
+
+def test_a_link_tells_its_numbers(broken_run: RunData) -> None:
+    linked = {
+        "event": "linked",
+        "frame": 26,
+        "timestamp_s": 2.6,
+        "submap": 1,
+        "old_submap": 0,
+        "matches": 440,
+        "inliers": 394,
+        "agreeing_keyframes": [12, 15, 18],
+        "seconds": 0.29,
+        "scale": 0.7203,
+        "sigma_scale": 0.0053,
+    }
+    run = with_events(broken_run, linked, {"event": "fused", "frame": 26, "submap": 1, "old_submap": 0, "bypassed": 2})
+    (story,) = stories(run)
+    assert story.linked is not None
+    text = outline(run).text
+    assert "the recovery linked it in 0.29 s after 1 refused link: scale 0.7203 ± 0.53 %" in text
+    assert "394 of 440 landmark pairs agree; keyframes 12, 15, 18 agree one by one" in text
+    assert "By-passed at the lost map's end: 2 frames." in text
+    assert len(outline(run).of_class("agreeing")) == 3
+
+
+def test_a_folder_that_is_no_run_is_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no summary\.json"):
+        read_run(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):
+        read_run(tmp_path / "nowhere")
+
+
+def test_markup_escapes_what_is_not_markup() -> None:
+    assert tag("p", "a < b", Markup("<br>"), [1, None], title='"') == '<p title="&quot;">a &lt; b<br>1</p>'
+    with pytest.raises(TypeError):
+        tag("p", object())
+
+
+def test_ticks_are_round_and_inside() -> None:
+    assert ticks(0, 100, 6) == [0, 20, 40, 60, 80, 100]
+    assert ticks(3, 3.9, 4)[0] >= 3
+    assert nice_step(0.7) == 0.5
+    for low, high in ((0, 1), (17, 801), (-3.2, 0.1)):
+        found = ticks(low, high, 6)
+        assert 2 <= len(found) <= 7
+        assert min(found) >= low - 1e-9
+        assert max(found) <= high + 1e-9
+
+
+def test_a_canvas_holds_what_it_is_drawn_around() -> None:
+    rng = np.random.default_rng(0)
+    for scale in ([1, 1], [100, 0.1], [0.01, 3], [0, 0]):
+        uv = rng.normal(size=(50, 2)) * scale
+        canvas = Canvas.around(uv.min(0), uv.max(0))
+        xy = canvas.to_svg(uv)
+        assert (xy >= 0).all()
+        assert (xy <= [1000, canvas.height]).all()
