@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from backend.local_ba import bundle_adjust, bundle_adjust_arrays
@@ -17,9 +19,10 @@ from dualslam.core.types import Failure, FailureReason, Frame, View
 from dualslam.evaluation.failure_lab import FaultScript
 from dualslam.health import judge_track
 from dualslam.linking import DescriptorMatcher, estimate_link
-from dualslam.recoveries import InlineExecutor
+from dualslam.recoveries import InlineExecutor, RecoveryExecutor
 from dualslam.recovery import RecoveryParts
 from dualslam.system import Components, System
+from dualslam.worker import WorkerExecutor
 from frontends.images import to_grey
 from frontends.initialiser import Initialiser
 from frontends.registry import create_frontend
@@ -72,10 +75,19 @@ def build_system(config: Config, camera: Camera) -> System:
                 lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px)
             ),
             calibration=calibration,
-            recovery=InlineExecutor(recovery_parts(config, size_px)),
+            recovery=recovery_executor(config, size_px),
         ),
         config,
     )
+
+
+def recovery_executor(config: Config, size_px: tuple[int, int]) -> RecoveryExecutor:
+    """Build what runs walks back in time: in this process, or in workers, which are started at once."""
+    recovery = config.recovery
+    if recovery.workers == 0:
+        return InlineExecutor(recovery_parts(config, size_px))
+    make_parts = partial(recovery_parts, config, size_px)
+    return WorkerExecutor(make_parts, recovery.workers, recovery.time_limit_s, recovery.finish_wait_s)
 
 
 def recovery_parts(config: Config, size_px: tuple[int, int]) -> RecoveryParts:

@@ -17,7 +17,7 @@ from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.submap import Submap
 from dualslam.core.submap_change import change_of_frame
-from dualslam.core.types import Failure, FloatArray, FrameStatus, Keyframe, View
+from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus, Keyframe, View
 from dualslam.frame_buffer import FrameBuffer
 from dualslam.merging import Merged, carry_links, merge_recovery
 from dualslam.record import Moment, Record
@@ -37,6 +37,10 @@ class RecoveryExecutor(Protocol):
         """Return what has ended since the last call."""
         ...
 
+    def finish(self) -> list[Outcome]:
+        """Take no more jobs, and return what came of all that are left."""
+        ...
+
 
 class InlineExecutor:
     """Runs each job when it is submitted: one process, deterministic."""
@@ -53,6 +57,10 @@ class InlineExecutor:
         """Return what has run since the last call."""
         done, self._done = self._done, []
         return done
+
+    def finish(self) -> list[Outcome]:
+        """Return what has run since the last call."""
+        return self.poll()
 
 
 class Recoveries:
@@ -84,7 +92,7 @@ class Recoveries:
         self._calibration = calibration
         self._config = config
         self._onsets: dict[int, int] = {}  # lost submaps that are not linked yet, and the frame of their loss
-        self._began: dict[int, tuple[View, float]] = {}  # by the new submap's id
+        self._began: dict[int, float] = {}  # when, by the new submap's id
 
     def declare_lost(self, submap_id: int, onset: int) -> None:
         """Let the walks to come look for a submap that was lost at frame `onset`."""
@@ -105,15 +113,22 @@ class Recoveries:
             views=tuple(self._views_before(newest, submap, stop_at_posed=not onsets)),
             camera=self._calibration.camera,
         )
-        self._began[submap.id] = newest, time.perf_counter()
+        self._began[submap.id] = time.perf_counter()
         self._executor.submit(job)
 
     def collect(self, live: VisualOdometry | None, now: Moment) -> None:
         """Merge the walks that have ended. `live` goes on in its submap as it is after that."""
-        for job, result in self._executor.poll():
-            began, started_s = self._began.pop(job.submap.id)
+        self._take(self._executor.poll(), live, now)
+
+    def finish(self, live: VisualOdometry | None, now: Moment) -> None:
+        """Merge the walks that are under way at the end of the run, if they end soon."""
+        self._take(self._executor.finish(), live, now)
+
+    def _take(self, outcomes: list[Outcome], live: VisualOdometry | None, now: Moment) -> None:
+        for job, result in outcomes:
+            started_s = self._began.pop(job.submap.id)
             if isinstance(result, Failure):
-                self._failed(job, began, result)
+                self._failed(job, now, result, time.perf_counter() - started_s)
                 continue
             self._record.timer.add("walk back", result.cpu_s)
             with self._record.timer.measure("merging"):
@@ -126,9 +141,16 @@ class Recoveries:
                 return
             yield view
 
-    def _failed(self, job: RecoveryJob, view: View, failure: Failure) -> None:
-        numbers = {"reason": str(failure.reason), "detail": failure.detail, **failure.numbers}
-        self._record.event(EventKind.RECOVERY_FAILED, view, job.submap.id, **numbers)
+    def _failed(self, job: RecoveryJob, now: Moment, failure: Failure, seconds: float) -> None:
+        self._record.event(
+            EventKind.RECOVERY_FAILED,
+            now,
+            job.submap.id,
+            lost=sorted(job.onsets),
+            reason=str(failure.reason),
+            detail=failure.detail,
+            seconds=seconds,
+        )
 
     # --- taking a result in
 
@@ -142,7 +164,8 @@ class Recoveries:
         try:
             solve(merged.submap, graph)
         except SolverError as error:
-            self._record.event(EventKind.RECOVERY_FAILED, now, submap.id, reason="solver", detail=str(error))
+            failure = Failure(FailureReason.SOLVER, str(error))
+            self._failed(job, now, failure, time.perf_counter() - started_s)
             return
         before = submap.copy()
         submap.take_over(merged.submap)

@@ -46,7 +46,7 @@ class RunReport:
     wall_s, cpu_s : float
         From the first frame to the end; user and system time of this process and of the children that have ended.
     peak_rss_mb : float
-        Highest resident memory of the process since it started.
+        Highest resident memory of the process since it started, and of the largest of its children that have ended.
     interrupted : bool
         True where a signal ended the run early.
     error : InputError or None
@@ -207,5 +207,5 @@ def _cpu_s() -> float:
 
 
 def _peak_rss_mb() -> float:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    peak = sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10

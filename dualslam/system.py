@@ -110,9 +110,9 @@ class System:
         return self._result(frame, outcome, time.perf_counter() - started)
 
     def finish(self) -> None:
-        """End the run: take in the walks back that have ended, and archive what is live."""
+        """End the run: wait for walks back that are under way, for so long and no longer; archive what is live."""
         if self.rows:
-            self._recoveries.collect(self._live, next(reversed(self.rows.values())))
+            self._recoveries.finish(self._live, next(reversed(self.rows.values())))
         if self._live is not None:
             self._archive(self._live, "end of sequence")
 

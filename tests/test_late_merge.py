@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dualslam.core.events import EventKind
-from dualslam.core.types import FrameStatus
+from dualslam.core.types import Failure, FailureReason, FrameStatus
 from dualslam.recoveries import Outcome, RecoveryExecutor
 from dualslam.recovery import RecoveryJob
 from dualslam.results import trajectories_of
@@ -34,6 +34,17 @@ class LateExecutor:
         due = [outcome for at, outcome in self.waiting if at < self.n_polls]
         self.waiting = [(at, outcome) for at, outcome in self.waiting if at >= self.n_polls]
         return due
+
+    def finish(self) -> list[Outcome]:
+        return [outcome for _, outcome in self.waiting]
+
+
+class FailingExecutor(LateExecutor):
+    """One whose jobs all fail."""
+
+    def poll(self) -> list[Outcome]:
+        lost = Failure(FailureReason.WORKER, "the recovery process ended with exit code -9")
+        return [(job, lost) for job, _ in super().poll()]
 
 
 def late_system(world: PointWorld, polls: int, **settings: object) -> System:
@@ -114,6 +125,27 @@ def test_two_walks_overlap(twice_lost: PointWorld) -> None:
     assert system.events.of_kind(EventKind.RECOVERY_STARTED)[1].frame < first.frame < second.frame
     assert system.events.of_kind(EventKind.RECOVERY_STARTED)[1].data["lost"] == [0, 1]
     assert_one_right_map(system, twice_lost, twice_lost.covered)
+
+
+def test_the_run_ends_meanwhile(world: PointWorld) -> None:
+    system = run(world, 1000)
+    (ended,) = system.events.of_kind(EventKind.RECOVERY_ENDED)
+    assert ended.frame == 89
+    assert_one_right_map(system, world, COVERED)
+
+
+def test_a_recovery_that_fails_costs_its_link_only(world: PointWorld) -> None:
+    system = system_in(world, recovery={"enabled": True})
+    system._recoveries._executor = FailingExecutor(system._recoveries._executor, 5)
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    _, failed = system.events.of_kind(EventKind.RECOVERY_FAILED)
+    assert (failed.submap, failed.data["lost"], failed.data["reason"]) == (1, [0], "worker")
+    assert system.atlas.components() == [[0], [1]]
+    (again,) = system.events.of_kind(EventKind.REINITIALISED)
+    assert all(system.rows[i].status is FrameStatus.TRACKED for i in range(again.frame, 90))
+    assert not system.events.of_kind(EventKind.LINKED)
 
 
 def test_what_the_live_map_knew_stays_as_it_was(world: PointWorld) -> None:

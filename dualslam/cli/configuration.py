@@ -19,11 +19,18 @@ def config_of(args: argparse.Namespace) -> Config:
     ------
     ConfigError
     """
-    overrides = [Override.parse(text) for text in args.set]
+    overrides = []
+    if getattr(args, "realtime", False):  # before --set, which may say otherwise
+        overrides.append(Override(("recovery", "workers"), 1, "--realtime"))
+    overrides += [Override.parse(text) for text in args.set]
     if args.frontend is not None:
         overrides.append(Override(("frontend", "name"), args.frontend, f"--frontend {args.frontend}"))
     if args.seed is not None:
         overrides.append(Override(("seed",), args.seed, f"--seed {args.seed}"))
+    if getattr(args, "inline", False):
+        overrides.append(Override(("recovery", "workers"), 0, "--inline"))
+    elif getattr(args, "workers", None) is not None:
+        overrides.append(Override(("recovery", "workers"), args.workers, f"--workers {args.workers}"))
     corrupt: Path | None = getattr(args, "corrupt", None)
     if corrupt is not None:
         overrides.append(Override(("corruptions",), _read_corruptions(corrupt), f"--corrupt {corrupt}"))

@@ -92,8 +92,13 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
         help="frames come at the source's rate and are dropped when late; otherwise every frame, as fast as it goes",
     )
     processes = mode.add_mutually_exclusive_group()
-    processes.add_argument("--inline", action="store_true", help="one process, deterministic: the same as --workers 0")
-    processes.add_argument("--workers", metavar="N", type=_count, help="processes that recover beside the tracking")
+    processes.add_argument("--inline", action="store_true", help="one process, deterministic: --workers 0, the default")
+    processes.add_argument(
+        "--workers",
+        metavar="N",
+        type=_count,
+        help="processes that recover beside the tracking (recovery.workers; with --realtime the default is 1)",
+    )
 
 
 def _add_eval(commands: argparse._SubParsersAction[_Parser]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import logging
 
 from dualslam.cli import logs
 from dualslam.cli.configuration import config_of
@@ -11,16 +10,12 @@ from dualslam.cli.console import final_line, progress, stage_table
 from dualslam.session import Outcome, run_to_folder
 from dualslam.sources import open_source
 
-log = logging.getLogger(__name__)
-
 EXIT_DONE, EXIT_NO_MAP, EXIT_INTERRUPTED = 0, 1, 130
 
 
 def execute(args: argparse.Namespace) -> int:
     """Run, and say in one line what came of it."""
     config = config_of(args)
-    if args.workers:
-        log.info("--workers %d: recovery runs in the tracking process as yet", args.workers)
     sequence = open_source(
         args.source,
         camera_file=args.camera,

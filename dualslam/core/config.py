@@ -125,6 +125,14 @@ class RecoveryConfig(StrictModel):
     """Frames in a row that the walk may leap, because none of its keyframes can be matched in them."""
     min_shared_keyframes: int = Field(4, ge=2)
     """Keyframes that both maps must hold before a link is tried."""
+    workers: int = Field(0, ge=0, le=16)
+    """Processes in which walks back run beside the tracking, which never waits for them (`--workers`). 0: inline, in
+    the tracking process, which waits: the only way in which the same seed gives the same trajectory."""
+    time_limit_s: float = Field(120.0, gt=0)
+    """Time after which a worker counts as hung, and its recovery as failed. A walk over a full buffer of 10 s takes
+    about a tenth of it on a free core."""
+    finish_wait_s: float = Field(30.0, ge=0)
+    """How long the end of the run waits for walks that are still under way."""
 
 
 class BufferConfig(StrictModel):

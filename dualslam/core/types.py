@@ -245,6 +245,7 @@ class FailureReason(StrEnum):
     DEFORMED = "deformed"
     NEEDS_OLDER_KEYFRAMES = "needs_older_keyframes"
     TIMEOUT = "timeout"
+    WORKER = "worker"
 
 
 @dataclass(frozen=True, slots=True)
