@@ -1,4 +1,4 @@
-"""The command line: `dualslam run`, `eval`, `render`, `config`, `demo`. It only words what the Python interface does.
+"""The command line (`dualslam run`, `eval`, `bench`, `render`, ...): it only words what the Python interface does.
 
 Exit status: 0 done, 1 the run could not produce a map (or a bug of ours), 2 bad usage or bad input, 130 interrupted.
 """

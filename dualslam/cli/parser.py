@@ -45,6 +45,7 @@ def _build_parser() -> _Parser:
     _add_render(commands)
     _add_config(commands)
     _add_demo(commands)
+    _add_bench(commands)
     return parser
 
 
@@ -138,6 +139,17 @@ def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument("--frames", metavar="N", type=_positive, default=300, help="how long a drive (default: 300)")
     talk.add_argument("--profile", action="store_true", help="print where the time went, stage by stage")
     _add_configuration(parser)
+
+
+def _add_bench(commands: argparse._SubParsersAction[_Parser]) -> None:
+    parser, _ = _command(commands, "bench", "Run trials of sequences, variants and corruptions, and write the tables.")
+    parser.add_argument("spec", metavar="SPEC", type=Path, help="YAML file, such as benchmarks/kitti.yaml")
+    parser.add_argument("--out", metavar="DIR", type=Path, help="folder; a bench goes on there (default: runs/NAME)")
+    parser.add_argument("--data", metavar="DIR", type=Path, help="folder in which the sequences of the bench are")
+    parser.add_argument("--only", metavar="SEQUENCE", action="append", default=[], help="this sequence; repeatable")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--jobs", metavar="N", type=_positive, help="trials at the same time (default: one a CPU)")
+    where.add_argument("--scheduler", metavar="ADDRESS", help="run the trials on the workers of this Dask scheduler")
 
 
 def _add_output(parser: argparse.ArgumentParser) -> None:

@@ -9,13 +9,15 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import UnionType
-from typing import Any, Union, get_args, get_origin
+from typing import Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
 from dualslam.core import strict_yaml
 from dualslam.core.config import Config
 from dualslam.core.errors import ConfigError
+
+Model = TypeVar("Model", bound=BaseModel)
 
 _PLAIN_WORDS = {
     "must be an object": "must be a mapping of fields",
@@ -85,12 +87,22 @@ def load_config(path: str | Path | None = None, overrides: Iterable[str | Overri
     parsed = [Override.parse(o) if isinstance(o, str) else o for o in overrides]
     for override in parsed:
         _set(data, override)
-    return _validate(data, str(path) if path is not None else "config", parsed)
+    return _validate(data, str(path) if path is not None else "config", parsed, Config)
 
 
 def config_from_dict(data: Mapping[str, Any], source: str = "config") -> Config:
     """Make the configuration from nested plain values, as strictly as `load_config` does."""
-    return _validate(dict(data), source, [])
+    return _validate(dict(data), source, [], Config)
+
+
+def model_from_dict(model: type[Model], data: Mapping[str, Any], source: str) -> Model:
+    """Make any strict model from nested plain values, with errors as `load_config` words them.
+
+    Raises
+    ------
+    ConfigError
+    """
+    return _validate(dict(data), source, [], model)
 
 
 def dump_config(config: BaseModel) -> str:
@@ -128,10 +140,10 @@ def _set(data: dict[str, Any], override: Override) -> None:
     data[field] = override.value
 
 
-def _validate(data: dict[str, Any], source: str, overrides: list[Override]) -> Config:
+def _validate(data: dict[str, Any], source: str, overrides: list[Override], model: type[Model]) -> Model:
     try:
         # By way of JSON: strict about types there (no "5" for 5), yet lists become tuples and words become enums.
-        return Config.model_validate_json(json.dumps(data), strict=True)
+        return model.model_validate_json(json.dumps(data), strict=True)
     except ValidationError as error:
         problems = error.errors(include_url=False)
         path = tuple(problems[0]["loc"])
@@ -139,15 +151,15 @@ def _validate(data: dict[str, Any], source: str, overrides: list[Override]) -> C
             if override.path[: len(path)] == path or path[: len(override.path)] == override.path:
                 source = override.source
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        raise ConfigError(f"{source}: {_sentence(problems[0], path)}{more}") from error
+        raise ConfigError(f"{source}: {_sentence(problems[0], path, model)}{more}") from error
     except TypeError as error:
         raise ConfigError(f"{source}: holds a value that YAML cannot ({error})") from error
 
 
-def _sentence(problem: Any, path: tuple[str | int, ...]) -> str:
+def _sentence(problem: Any, path: tuple[str | int, ...], root: type[BaseModel]) -> str:
     name = ".".join(map(str, path))
     if problem["type"] == "extra_forbidden":
-        return _unknown(path)
+        return _unknown(path, root)
     if problem["type"] == "missing":
         return f"{name} is missing"
     message = str(problem["msg"]).removeprefix("Value error, ").replace("Input should be", "must be")
@@ -160,16 +172,16 @@ def _sentence(problem: Any, path: tuple[str | int, ...]) -> str:
     return f"{name}: {message}" if name else message
 
 
-def _unknown(path: tuple[str | int, ...]) -> str:
+def _unknown(path: tuple[str | int, ...], root: type[BaseModel]) -> str:
     *sections, field = map(str, path)
-    model = _model_at(Config, path[:-1])
+    model = _model_at(root, path[:-1])
     known = list(model.model_fields) if model else []
     section = ".".join(sections)
     near = difflib.get_close_matches(field, known, n=1)
     if near:
         hint = f"did you mean {'.'.join([*sections, near[0]])}?"
     else:
-        elsewhere = [p for p in _all_paths(Config) if p.rpartition(".")[2] == field]
+        elsewhere = [p for p in _all_paths(root) if p.rpartition(".")[2] == field]
         hint = f"did you mean {elsewhere[0]}?" if elsewhere else ""
     owner = f"of {section}" if section else "at the top"
     return f"unknown field {'.'.join(map(str, path))}{'; ' + hint if hint else ''} (fields {owner}: {', '.join(known)})"

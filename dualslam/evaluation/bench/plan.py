@@ -1,0 +1,182 @@
+"""From a bench to its trials: where each starts, where its corruption lies, which configuration it runs with.
+
+All variants get the same trials. What is random about one depends on the bench's seed and on the names of its sequence
+and condition alone, so that adding a sequence to a bench leaves the other trials as they are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from dualslam.core.config import Config
+from dualslam.core.config_io import Override, load_config
+from dualslam.core.errors import ConfigError
+from dualslam.evaluation.bench.spec import BenchSpec, ConditionSpec, SequenceSpec, VariantSpec
+
+
+@dataclass(frozen=True, slots=True)
+class SourceInfo:
+    """What a plan needs to know of a source.
+
+    Attributes
+    ----------
+    source, camera : str
+        As a trial opens them; `camera` empty for the source's own.
+    n_frames : int
+    rate_hz : float
+        At stride 1.
+    """
+
+    source: str
+    camera: str
+    n_frames: int
+    rate_hz: float
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One run of a bench: plain values, so that it can be sent to another process or machine.
+
+    Attributes
+    ----------
+    sequence, condition, variant : str
+    number : int
+        Of the trial, from 0.
+    source, camera : str
+    start, stride, max_frames : int
+        Which frames; `max_frames` 0 for all that there are.
+    config : dict
+        The whole configuration.
+    returns_to_start : bool
+    timeout_s : float or None
+    """
+
+    sequence: str
+    condition: str
+    variant: str
+    number: int
+    source: str
+    camera: str
+    start: int
+    stride: int
+    max_frames: int
+    config: dict[str, Any]
+    returns_to_start: bool
+    timeout_s: float | None
+
+    @property
+    def key(self) -> str:
+        """Its name, and the path of its folder."""
+        return f"{self.sequence}/{self.condition}/{self.variant}/{self.number:02d}"
+
+    @property
+    def fingerprint(self) -> str:
+        """Changes with whatever the trial's result depends on, save the code and the images."""
+        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def plan_trials(spec: BenchSpec, describe: Callable[[SequenceSpec], SourceInfo]) -> list[Trial]:
+    """Return all trials of a bench, so ordered that an unfinished one has a bit of everything.
+
+    Parameters
+    ----------
+    spec : BenchSpec
+    describe : callable
+        Opens a sequence so far that its length is known; raises `InputError` where it cannot be.
+
+    Raises
+    ------
+    ConfigError
+        Where a variant sets what the configuration does not have, or a clip does not fit into its sequence.
+    InputError
+    """
+    info = {sequence.name: describe(sequence) for sequence in spec.sequences}
+    for variant in spec.variants:
+        _config(spec, variant, 0, [])  # a wrong field is told before any long work
+    return [
+        _trial(spec, sequence, info[sequence.name], condition, variant, number)
+        for number in range(spec.trials)
+        for sequence in spec.sequences
+        for condition in _conditions_of(spec, sequence)
+        for variant in spec.variants
+    ]
+
+
+def _conditions_of(spec: BenchSpec, sequence: SequenceSpec) -> Iterator[ConditionSpec]:
+    return (c for c in spec.conditions if c.sequences is None or sequence.name in c.sequences)
+
+
+def _trial(
+    spec: BenchSpec,
+    sequence: SequenceSpec,
+    info: SourceInfo,
+    condition: ConditionSpec,
+    variant: VariantSpec,
+    number: int,
+) -> Trial:
+    rng = _rng(spec.seed, sequence.name, condition.name, number)
+    # Strata: the trials of a sequence and condition are spread over what there is.
+    first, last = _start_range(sequence, info)
+    start = first + int((last - first + 1) * (number + rng.random()) / spec.trials)
+    span = min(sequence.frames or info.n_frames, info.n_frames - start)
+    seed = int(rng.integers(2**31))
+    corruptions = []
+    for placed in condition.corruptions:
+        # Another stratum than the start's, or late starts would always have late corruptions.
+        stratum = (number * _step(spec.trials) + rng.random()) % spec.trials / spec.trials
+        share = placed.at[0] + (placed.at[1] - placed.at[0]) * stratum
+        at = start + int(share * (span - 1))
+        corruptions.append(placed.placed(at, info.rate_hz, int(rng.integers(2**31))).model_dump(mode="json"))
+    return Trial(
+        sequence=sequence.name,
+        condition=condition.name,
+        variant=variant.name,
+        number=number,
+        source=info.source,
+        camera=info.camera,
+        start=start,
+        stride=sequence.stride,
+        max_frames=-(-span // sequence.stride) if sequence.frames is not None else 0,
+        config=_config(spec, variant, seed, corruptions).model_dump(mode="json"),
+        returns_to_start=sequence.returns_to_start,
+        timeout_s=spec.timeout_s,
+    )
+
+
+def _start_range(sequence: SequenceSpec, info: SourceInfo) -> tuple[int, int]:
+    room = info.n_frames - (sequence.frames or 1)
+    if room < 0:
+        raise ConfigError(
+            f"sequence {sequence.name}: a trial spans {sequence.frames} frames, but {info.source} has {info.n_frames}"
+        )
+    first, last = sequence.start or ((0, room) if sequence.frames is not None else (0, 0))
+    if last > room:
+        raise ConfigError(
+            f"sequence {sequence.name}: a trial may start at frame {last}, but {info.source} has {info.n_frames} "
+            f"and a trial spans {sequence.frames or 'what is left'}; start at {room} at the latest"
+        )
+    return first, last
+
+
+def _step(n: int) -> int:
+    """Return a stride through n strata that meets each once, far from the last."""
+    return next(step for step in range(max(1, round(0.618 * n)), 2 * n + 2) if np.gcd(step, n) == 1)
+
+
+def _rng(seed: int, sequence: str, condition: str, number: int) -> np.random.Generator:
+    words = hashlib.sha256(f"{sequence}\0{condition}".encode()).digest()[:8]
+    return np.random.default_rng([seed, int.from_bytes(words, "little"), number])
+
+
+def _config(spec: BenchSpec, variant: VariantSpec, seed: int, corruptions: list[dict[str, Any]]) -> Config:
+    overrides = [Override(("seed",), seed, "seed")]
+    for where, fields in ((f"bench {spec.name}", spec.set), (f"variant {variant.name}", variant.set)):
+        overrides += [Override(tuple(path.split(".")), value, f"{where}, {path}") for path, value in fields.items()]
+    overrides.append(Override(("corruptions",), corruptions, "corruptions"))
+    return load_config(None, overrides)

@@ -1,0 +1,174 @@
+"""One line a trial, whatever happens to the processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from dualslam.core.errors import InputError
+from dualslam.evaluation.bench.cluster import run_on_cluster
+from dualslam.evaluation.bench.ledger import TRIALS, Ledger
+from dualslam.evaluation.bench.plan import Trial, plan_trials
+from dualslam.evaluation.bench.pool import run_in_processes
+from dualslam.evaluation.bench.record import TrialOutcome, TrialRecord
+from dualslam.evaluation.bench.run import Executor, run_bench
+from dualslam.evaluation.bench.tables import bench_tables
+from tests.evaluation.bench import fakes
+from tests.evaluation.bench.fakes import SPEC, describe, processes_in, run_fake, runs_in
+
+
+@pytest.fixture(scope="module")
+def trials() -> list[Trial]:
+    return plan_trials(SPEC, describe)
+
+
+@pytest.fixture
+def notes(tmp_path: Path) -> Path:
+    (tmp_path / "notes").mkdir()
+    return tmp_path / "notes"
+
+
+def in_this_process(trials: Iterable[Trial]) -> Iterator[TrialRecord]:
+    return map(run_fake, trials)
+
+
+def tables_of(records: list[TrialRecord]) -> list[str]:
+    return [table.csv() for table in bench_tables(SPEC, records)]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(trials: list[Trial]) -> list[str]:
+    return tables_of(list(map(run_fake, trials)))
+
+
+def test_records_come_back_as_they_were(trials: list[Trial], tmp_path: Path) -> None:
+    records = run_bench(SPEC, trials, tmp_path, in_this_process)
+    assert Ledger(tmp_path / TRIALS).records == records == list(map(run_fake, trials))
+    assert len((tmp_path / TRIALS).read_text().splitlines()) == len(trials)
+
+
+def test_a_killed_bench_goes_on_where_it_was(
+    trials: list[Trial], tmp_path: Path, notes: Path, undisturbed: list[str]
+) -> None:
+    def killed(todo: Iterable[Trial]) -> Iterator[TrialRecord]:
+        yield from map(run_fake, list(todo)[:7])
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_bench(SPEC, trials, tmp_path, killed)
+    with (tmp_path / TRIALS).open("a") as file:
+        file.write('{"key": "a/nat')  # killed while it wrote
+    again = partial(fakes.run_and_note, folder=str(notes))
+    records = run_bench(SPEC, trials, tmp_path, lambda todo: map(again, todo))
+    assert len(runs_in(notes)) == len(trials) - 7
+    assert tables_of(records) == undisturbed
+    assert len(Ledger(tmp_path / TRIALS).records) == len(trials)
+
+
+def test_a_changed_trial_runs_again(trials: list[Trial], tmp_path: Path, notes: Path) -> None:
+    run_bench(SPEC, trials, tmp_path, in_this_process)
+    changed = SPEC.model_copy(
+        update={"variants": (SPEC.variants[0], SPEC.variants[1].model_copy(update={"set": {"health.min_inliers": 30}}))}
+    )
+    again = partial(fakes.run_and_note, folder=str(notes))
+    records = run_bench(changed, plan_trials(changed, describe), tmp_path, lambda todo: map(again, todo))
+    assert all("_Dual_" in name for name in runs_in(notes))
+    assert len(runs_in(notes)) == len(records) / 2
+
+
+def test_a_line_that_is_none_is_named(tmp_path: Path) -> None:
+    (tmp_path / TRIALS).write_text('{"key": 3}\n')
+    with pytest.raises(InputError, match=r"trials.jsonl, line 1 is not the line of a trial"):
+        Ledger(tmp_path / TRIALS)
+
+
+def test_processes_run_all_trials(trials: list[Trial], tmp_path: Path, notes: Path, undisturbed: list[str]) -> None:
+    run = partial(fakes.run_and_note, folder=str(notes))
+    records = run_bench(SPEC, trials, tmp_path, lambda todo: run_in_processes(run, todo, 2))
+    assert tables_of(records) == undisturbed
+    assert len(processes_in(notes)) == 2
+    assert str(os.getpid()) not in processes_in(notes)
+
+
+def test_a_process_that_dies_costs_its_trial_alone(trials: list[Trial], tmp_path: Path, notes: Path) -> None:
+    run = partial(fakes.run_or_die, folder=str(notes))
+    records = {r.key: r for r in run_bench(SPEC, trials, tmp_path, lambda todo: run_in_processes(run, todo, 2))}
+    assert len(records) == len(trials)
+    died = records.pop("a/natural/base/01")
+    assert (died.outcome, died.error) == (TrialOutcome.CRASHED, "the process died with exit code 7")
+    expected = {t.key: run_fake(t) for t in trials}
+    assert all(record == expected[key] for key, record in records.items())
+
+
+def worker(address: str, folder: Path) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny"]
+    options = ["--no-dashboard", "--local-directory", str(folder)]
+    return subprocess.Popen([*command, *options], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A scheduler and two workers, each a process of its own, on loopback."""
+    info = tmp_path / "scheduler.json"
+    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
+    options = ["--no-dashboard", "--no-show", "--scheduler-file", str(info)]
+    processes = [subprocess.Popen([*command, *options], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)]
+    try:
+        address = _address(info)
+        workers = [worker(address, tmp_path / f"worker{i}") for i in range(2)]
+        processes += workers
+        yield address, workers
+    finally:
+        for process in reversed(processes):
+            process.kill()
+            process.wait()
+
+
+def _address(info: Path) -> str:
+    import json
+
+    for _ in range(600):
+        if info.exists() and info.stat().st_size:
+            return str(json.loads(info.read_text())["address"])
+        time.sleep(0.1)
+    raise AssertionError("the scheduler did not start")
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_gives_the_same_tables(
+    cluster: tuple[str, list[subprocess.Popen[bytes]]],
+    trials: list[Trial],
+    tmp_path: Path,
+    notes: Path,
+    undisturbed: list[str],
+) -> None:
+    address, workers = cluster
+    killed = []
+
+    def kill_one(record: TrialRecord, n_done: int, n: int) -> None:
+        if not killed and len(processes_in(notes)) == 2:
+            workers[0].send_signal(signal.SIGKILL)
+            workers[0].wait()
+            killed.append(n_done)
+
+    run = partial(fakes.run_slowly, folder=str(notes))
+    execute: Executor = lambda todo: run_on_cluster(run, todo, address)  # noqa: E731
+    records = run_bench(SPEC, trials, tmp_path, execute, kill_one)
+    assert killed
+    assert killed[0] < len(trials) - 3
+    assert tables_of(records) == undisturbed
+    assert processes_in(notes) == {str(process.pid) for process in workers}
+
+
+def test_no_scheduler_is_told_in_one_sentence(trials: list[Trial], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dualslam.evaluation.bench.cluster.CONNECT_S", 1)
+    with pytest.raises(InputError, match=r"No Dask scheduler answers at tcp://127.0.0.1:9"):
+        list(run_on_cluster(run_fake, trials, "tcp://127.0.0.1:9"))
