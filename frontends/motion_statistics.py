@@ -8,6 +8,7 @@ cells stands where there are more than chance would give (eq. 9: more than alpha
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,7 +117,10 @@ def match_by_motion(
     zoom: bool = False,
     threshold: float = THRESHOLD,
 ) -> Matches:
-    """Match wide: nearest neighbours without a ratio test, sorted out by their motion, then one to one.
+    """Match wide: nearest neighbours either way, without a ratio test, sorted out by their motion, then one to one.
+
+    A pair needs the support of one direction and to be the best of those that have it, for both of its features: so the
+    matches of b with a are those of a with b.
 
     Parameters
     ----------
@@ -140,26 +144,18 @@ def match_by_motion(
     search = nearest_search(frontend)
     if len(a) == 0 or len(b) == 0:
         return NO_MATCHES
-    nearest = search.nearest(a, b)
-    uv_a, uv_b = a.uv_px, b.uv_px[nearest]
+    to_b, to_a = search.nearest(a, b), search.nearest(b, a)
     width, height = np.maximum(a.uv_px.max(axis=0), b.uv_px.max(axis=0)) + 1.0
-    cells = int(np.clip(np.sqrt(len(a) / MIN_PER_CELL), 1, CELLS))
-    supported = supported_matches(
-        uv_a,
-        uv_b,
-        (width, height),
-        (width, height),
-        rotation=rotation,
-        zoom=zoom,
-        threshold=threshold,
-        cells=cells,
-    )
-    rows = np.flatnonzero(supported)
-    distance = frontend.distance(a.descriptors[rows], b.descriptors[nearest[rows]])
+    supported = partial(_supported_nearest, size_px=(width, height), rotation=rotation, zoom=zoom, threshold=threshold)
+    there, back = supported(a, b, to_b), supported(b, a, to_a)
+    pairs = np.unique(np.concatenate([np.stack([there, to_b[there]], 1), np.stack([to_a[back], back], 1)]), axis=0)
+    distance = frontend.distance(a.descriptors[pairs[:, 0]], b.descriptors[pairs[:, 1]])
     near = distance <= frontend.max_distance  # where a match ends is a guide, as in a guided search
-    rows, distance = rows[near], distance[near]
-    chosen = best_per_group(nearest[rows], distance, len(b))
-    return Matches(np.stack([rows[chosen], nearest[rows[chosen]]], axis=1), distance[chosen])
+    pairs, distance = pairs[near], distance[near]
+    best_of_a = best_per_group(pairs[:, 0], distance, len(a))
+    best_of_b = best_per_group(pairs[:, 1], distance, len(b))
+    chosen = np.intersect1d(best_of_a, best_of_b, assume_unique=True)
+    return Matches(pairs[chosen], distance[chosen])
 
 
 def nearest_search(frontend: Frontend) -> NearestSearch:
@@ -176,6 +172,26 @@ def nearest_search(frontend: Frontend) -> NearestSearch:
             "is not; choose ratio"
         )
     return frontend
+
+
+def _supported_nearest(
+    a: Features,
+    b: Features,
+    nearest: IntArray,
+    size_px: tuple[float, float],
+    *,
+    rotation: bool,
+    zoom: bool,
+    threshold: float,
+) -> IntArray:
+    """Rows of a whose nearest of b moves as its neighbours do."""
+    cells = int(np.clip(np.sqrt(len(a) / MIN_PER_CELL), 1, CELLS))
+    uv_b = b.uv_px[nearest]
+    return np.flatnonzero(
+        supported_matches(
+            a.uv_px, uv_b, size_px, size_px, rotation=rotation, zoom=zoom, threshold=threshold, cells=cells
+        )
+    )
 
 
 def _table(

@@ -1,0 +1,54 @@
+"""Does a front end keep what `dualslam.core.interfaces.Frontend` promises? For ours, and for other packages'.
+
+In a test of another package::
+
+    from frontends.conformance import CHECKS, Subject
+
+    @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+    def test_front_end_conforms(check):
+        check(Subject(MyFrontend))
+
+or all at once, with a report of everything that is wrong: ``check_frontend(MyFrontend)``. What is checked is what the
+entry point names, built by its `from_options`. The scenes are drawn: their truth is exact, and no file is needed. A
+quick front end takes some seconds on a CPU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from frontends.conformance import features, matching
+from frontends.conformance.subject import NotConforming, Subject
+from frontends.registry import FrontendFactory
+
+__all__ = ["CHECKS", "NotConforming", "Subject", "check_frontend"]
+
+CHECKS: tuple[Callable[[Subject], None], ...] = (*features.CHECKS, *matching.CHECKS)
+"""Each takes a `Subject` and raises `NotConforming` where it does not keep the protocol."""
+
+
+def check_frontend(factory: FrontendFactory, options: Mapping[str, Any] | None = None) -> None:
+    """Run all checks.
+
+    Parameters
+    ----------
+    factory : FrontendFactory
+        What the entry point names: usually the front end's class.
+    options : mapping, optional
+        `frontend.options` to build it with.
+
+    Raises
+    ------
+    NotConforming
+        Says everything that is wrong, one line for each check.
+    """
+    subject = Subject(factory, options or {})
+    problems = []
+    for check in CHECKS:
+        try:
+            check(subject)
+        except NotConforming as problem:
+            problems.append(f"{check.__name__}: {problem}")
+    if problems:
+        raise NotConforming(f"{len(problems)} of {len(CHECKS)} checks failed\n" + "\n".join(problems))

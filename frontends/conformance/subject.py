@@ -1,0 +1,68 @@
+"""What the checks are given, and how they complain."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.interfaces import Frontend
+from dualslam.core.types import Features, FloatArray
+from frontends.conformance.scene import Scene
+from frontends.registry import FrontendFactory
+
+N_FEATURES = 800
+FEATURES_ARRAYS = ("uv_px", "uv_rect_px", "sigma_px", "scale", "octave", "angle_rad", "descriptors")
+
+
+class NotConforming(AssertionError):  # noqa: N818 (it reads as what is raised: a test's failure, no error of ours)
+    """A front end does not keep the protocol; the message says in what."""
+
+
+def expect(condition: bool | np.bool_, complaint: str) -> None:
+    """Complain unless a condition holds."""
+    if not condition:
+        raise NotConforming(complaint)
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """The front end under examination, and the scene that it is shown.
+
+    Attributes
+    ----------
+    factory : FrontendFactory
+        What the entry point names.
+    options : mapping
+        `frontend.options` to build it with.
+    """
+
+    factory: FrontendFactory
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def make(self, n_features: int = N_FEATURES) -> Frontend:
+        """Build it anew."""
+        return self.factory.from_options(n_features, self.options)
+
+    def scene(self, seed: int = 1) -> Scene:
+        """Return a flat scene full of blobs, bars and corners."""
+        return _printed(seed)
+
+    def image(self, H_view_scene: FloatArray | None = None, seed: int = 0) -> NDArray[np.uint8]:
+        """Photograph that scene (`Scene.photograph`)."""
+        return self.scene().photograph(H_view_scene, seed=seed)
+
+
+@lru_cache(maxsize=2)
+def _printed(seed: int) -> Scene:
+    """The scene of a seed: drawing one takes longer than most checks."""
+    return Scene.printed(seed)
+
+
+def same_features(a: Features, b: Features) -> bool:
+    """Whether two sets of features are equal bit for bit."""
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in FEATURES_ARRAYS)
