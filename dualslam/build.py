@@ -75,19 +75,20 @@ def build_system(config: Config, camera: Camera) -> System:
                 lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px)
             ),
             calibration=calibration,
-            recovery=recovery_executor(config, size_px),
+            recovery=recovery_executor(config, size_px, faults),
         ),
         config,
     )
 
 
-def recovery_executor(config: Config, size_px: tuple[int, int]) -> RecoveryExecutor:
+def recovery_executor(config: Config, size_px: tuple[int, int], faults: FaultScript) -> RecoveryExecutor:
     """Build what runs walks back in time: in this process, or in workers, which are started at once."""
     recovery = config.recovery
     if recovery.workers == 0:
-        return InlineExecutor(recovery_parts(config, size_px))
+        return faults.around_inline(InlineExecutor(recovery_parts(config, size_px)))
     make_parts = partial(recovery_parts, config, size_px)
-    return WorkerExecutor(make_parts, recovery.workers, recovery.time_limit_s, recovery.finish_wait_s)
+    limits = recovery.time_limit_s, recovery.finish_wait_s
+    return WorkerExecutor(make_parts, recovery.workers, *limits, on_start=faults.kill_worker)
 
 
 def recovery_parts(config: Config, size_px: tuple[int, int]) -> RecoveryParts:

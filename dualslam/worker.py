@@ -144,12 +144,22 @@ class WorkerExecutor:
         How long a job may take before its worker counts as hung.
     finish_wait_s : float
         How long the end of the run waits for what is under way.
+    on_start : callable, optional
+        Called with each job that a process begins, and the process's id: where the failure lab takes hold.
     """
 
-    def __init__(self, make_parts: MakeParts, n_workers: int, time_limit_s: float, finish_wait_s: float) -> None:
+    def __init__(
+        self,
+        make_parts: MakeParts,
+        n_workers: int,
+        time_limit_s: float,
+        finish_wait_s: float,
+        on_start: Callable[[RecoveryJob, int | None], None] | None = None,
+    ) -> None:
         self._make_parts = make_parts
         self._time_limit_s = time_limit_s
         self._finish_wait_s = finish_wait_s
+        self._on_start = on_start
         self._idle = [Worker(make_parts) for _ in range(n_workers)]
         self._busy: list[_Task] = []
         self._waiting: deque[RecoveryJob] = deque()
@@ -206,6 +216,8 @@ class WorkerExecutor:
             job = self._waiting.popleft()
             worker.give(job)
             self._busy.append(_Task(job, worker, time.monotonic()))
+            if self._on_start is not None:
+                self._on_start(job, worker.pid)
 
     def _replaced(self, worker: Worker) -> Worker:
         worker.stop()

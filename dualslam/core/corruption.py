@@ -25,6 +25,7 @@ class CorruptionKind(StrEnum):
     STRIDE = "stride"  # one frame of so many arrives (their number)
     FEW_FEATURES = "few_features"  # the detector finds little (fraction of the features that is lost)
     WRONG_POSE = "wrong_pose"  # a wrong pose goes into the map as a keyframe (degrees; moved by as much of the depth)
+    KILL_WORKER = "kill_worker"  # the first recovery that starts in the frames loses its process (without meaning)
     SOLVER_ERROR = "solver_error"  # the live graph fails once, at the first keyframe of the frames (without meaning)
 
 
@@ -37,7 +38,7 @@ class Cause(StrEnum):
     INTERNAL = "internal"
 
 
-INTERNAL_KINDS = frozenset({CorruptionKind.WRONG_POSE, CorruptionKind.SOLVER_ERROR})
+INTERNAL_KINDS = frozenset({CorruptionKind.WRONG_POSE, CorruptionKind.SOLVER_ERROR, CorruptionKind.KILL_WORKER})
 
 # kind: (default, lowest, highest strength)
 STRENGTHS: dict[CorruptionKind, tuple[float, float, float]] = {
@@ -54,6 +55,7 @@ STRENGTHS: dict[CorruptionKind, tuple[float, float, float]] = {
     CorruptionKind.FEW_FEATURES: (0.8, 0.0, 1.0),
     CorruptionKind.WRONG_POSE: (15.0, 0.0, 180.0),
     CorruptionKind.SOLVER_ERROR: (1.0, 0.0, 1.0),
+    CorruptionKind.KILL_WORKER: (1.0, 0.0, 1.0),
 }
 
 
@@ -61,8 +63,8 @@ class Corruption(StrictModel):
     """One disturbance of the frames ``start <= index < start + length``, indices counted in the source."""
 
     kind: CorruptionKind
-    """wipe, occlusion, blur, motion_blur, blackout, exposure, noise, freeze, drop, stride, few_features, wrong_pose or
-    solver_error."""
+    """wipe, occlusion, blur, motion_blur, blackout, exposure, noise, freeze, drop, stride, few_features, wrong_pose,
+    solver_error or kill_worker."""
     start: int = Field(0, ge=0)
     """First frame, counted in the source whatever the stride."""
     length: int | None = Field(None, ge=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -39,42 +40,42 @@ def initialisation(rows: Sequence[FrameRow], events: Iterable[Event]) -> tuple[i
 def breakages(events: Sequence[Event]) -> tuple[Breakage, ...]:
     """Return every lost map with what was tried to recover it.
 
-    An attempt belongs to the breakage whose submap it tried to link (``old_submap``), or, where it says none, to all
-    that were not linked by then. Its number is its ``attempt``, from 1.
+    A recovery starts from a new submap and looks for the maps that are lost by then (``recovery_started``). Each
+    ``recovery_attempt`` of that submap is its next attempt; a map that several recoveries looked for counts the most
+    attempts that one of them made.
     """
     found: dict[int, dict[str, Any]] = {}
+    looked_for: dict[int, list[int]] = {}  # by the recovery's submap
+    made: Counter[int] = Counter()
     for event in events:
-        data = event.data
-        if event.event is EventKind.FAILED and event.submap is not None:
-            found[event.submap] = {
-                "frame": event.frame,
-                "reason": str(data.get("reason", "")),
-                "at_s": event.timestamp_s,
-            }
+        submap = -1 if event.submap is None else event.submap
+        if event.event is EventKind.FAILED:
+            reason = str(event.data.get("reason", ""))
+            found[submap] = {"frame": event.frame, "reason": reason, "at_s": event.timestamp_s}
         elif event.event is EventKind.REINITIALISED:
             for lost in found.values():
                 if "restart_frames" not in lost:
                     lost["restart_frames"] = abs(event.frame - lost["frame"])
                     lost["restart_s"] = abs(event.timestamp_s - lost["at_s"])
-        elif event.event in (EventKind.RECOVERY_STARTED, EventKind.RECOVERY_ATTEMPT, EventKind.LINK_REFUSED):
-            for submap in _about(data, found):
-                lost = found[submap]
-                if "succeeded_at" not in lost:
-                    lost["attempts"] = max(lost.get("attempts", 0), int(data.get("attempt", 1)))
-        elif event.event is EventKind.LINKED and data.get("old_submap") in found:
-            lost = found[data["old_submap"]]
-            attempt = int(data.get("attempt", max(lost.get("attempts", 1), 1)))
-            lost |= {"attempts": attempt, "succeeded_at": attempt, "recovery_s": data.get("seconds")}
+        elif event.event is EventKind.RECOVERY_STARTED:
+            looked_for[submap] = [m for m in event.data.get("lost", ()) if m in found]
+            _count(found, looked_for[submap], 1)
+        elif event.event is EventKind.RECOVERY_ATTEMPT:
+            made[submap] += 1
+            _count(found, looked_for.get(submap, []), made[submap])
+        elif event.event is EventKind.LINKED and event.data.get("old_submap") in found:
+            attempt = max(made[submap], 1)
+            lost = found[event.data["old_submap"]]
+            lost |= {"attempts": attempt, "succeeded_at": attempt, "recovery_s": event.data.get("seconds")}
     return tuple(
         Breakage(submap=submap, **{name: value for name, value in lost.items() if name != "at_s"})
         for submap, lost in found.items()
     )
 
 
-def _about(data: dict[str, Any], found: dict[int, Any]) -> list[int]:
-    if "old_submap" in data:
-        return [data["old_submap"]] if data["old_submap"] in found else []
-    return [submap for submap in data.get("lost", found) if submap in found]
+def _count(found: dict[int, dict[str, Any]], submaps: Iterable[int], attempt: int) -> None:
+    for submap in submaps:
+        found[submap]["attempts"] = max(found[submap].get("attempts", 0), attempt)
 
 
 def trajectory_error(main: PosedFrames, truth: Trajectory, times_s: FloatArray) -> tuple[float | None, float | None]:

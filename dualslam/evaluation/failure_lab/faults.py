@@ -6,20 +6,24 @@ whether redundancy helps.
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
 
-from dualslam.core.corruption import Corruption, CorruptionKind
+from dualslam.core.corruption import INTERNAL_KINDS, Corruption, CorruptionKind
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import so3
 from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry
 from dualslam.core.submap import Submap
-from dualslam.core.types import Failure, FloatArray, Frame, Track, View
+from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, Track, View
+from dualslam.recoveries import Outcome, RecoveryExecutor
+from dualslam.recovery import RecoveryJob
 
-_KINDS = (CorruptionKind.FEW_FEATURES, CorruptionKind.WRONG_POSE, CorruptionKind.SOLVER_ERROR)
+_KINDS = INTERNAL_KINDS | {CorruptionKind.FEW_FEATURES}
 
 
 class FaultScript:
@@ -56,6 +60,15 @@ class FaultScript:
             return new_odometry
         return lambda submap, graph: cast(VisualOdometry, _FaultyOdometry(new_odometry(submap, graph), self))
 
+    def around_inline(self, executor: RecoveryExecutor) -> RecoveryExecutor:
+        """Return what runs recoveries in this process, with one of them taken away where the script says so."""
+        return _FaultyInline(executor, self) if self._faults else executor
+
+    def kill_worker(self, job: RecoveryJob, pid: int | None) -> None:
+        """Kill the process that has begun a recovery, where the script says so."""
+        if pid is not None and self.worker_dies(job):
+            os.kill(pid, signal.SIGKILL)
+
     def active(self, kind: CorruptionKind, index: int) -> Corruption | None:
         """Return the fault of a kind at frame `index`, if that is the live frame."""
         if index != self._frame:
@@ -64,7 +77,15 @@ class FaultScript:
 
     def solver_fails(self, index: int) -> bool:
         """Return whether the solver fails at this keyframe: once for each fault, at its first live keyframe."""
-        fault = self.active(CorruptionKind.SOLVER_ERROR, index)
+        return self._fires_once(CorruptionKind.SOLVER_ERROR, index)
+
+    def worker_dies(self, job: RecoveryJob) -> bool:
+        """Return whether the recovery that starts now loses its process: once for each fault."""
+        # A walk that only poses the frames before a start recovers nothing.
+        return bool(job.lost) and self._fires_once(CorruptionKind.KILL_WORKER, self._frame)
+
+    def _fires_once(self, kind: CorruptionKind, index: int) -> bool:
+        fault = self.active(kind, index)
         if fault is None or fault in self._fired:
             return False
         self._fired.append(fault)
@@ -106,6 +127,27 @@ class _FaultyOdometry:
         if self._script.solver_fails(track.view.index):
             raise SolverError(f"frame {track.view.index}: the failure lab lets the solver fail here")
         return self._inner.insert_keyframe(track)
+
+
+class _FaultyInline:
+    """What runs recoveries inline, one of which ends as if its process had been killed."""
+
+    def __init__(self, inner: RecoveryExecutor, script: FaultScript) -> None:
+        self._inner, self._script = inner, script
+        self._lost: list[Outcome] = []
+
+    def submit(self, job: RecoveryJob) -> None:
+        if self._script.worker_dies(job):
+            self._lost.append((job, Failure(FailureReason.WORKER, "the failure lab takes this recovery away")))
+        else:
+            self._inner.submit(job)
+
+    def poll(self) -> list[Outcome]:
+        lost, self._lost = self._lost, []
+        return lost + self._inner.poll()
+
+    def finish(self) -> list[Outcome]:
+        return self.poll() + self._inner.finish()
 
 
 def wrong_pose(track: Track, submap: Submap, fault: Corruption) -> FloatArray:

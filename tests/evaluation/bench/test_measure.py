@@ -59,15 +59,34 @@ def test_each_loss_has_its_attempts() -> None:
         event(EventKind.FAILED, 40, 0, reason="too_few_matches"),
         event(EventKind.REINITIALISED, 52, 1),
         event(EventKind.RECOVERY_STARTED, 52, 1, lost=[0]),
-        event(EventKind.LINK_REFUSED, 38, 1, old_submap=0, attempt=1),
-        event(EventKind.RECOVERY_ATTEMPT, 36, 1, old_submap=0, attempt=2),
-        event(EventKind.LINKED, 52, 1, old_submap=0, attempt=2, seconds=1.5),
+        event(EventKind.LINK_REFUSED, 38, 1, old_submap=0, attempt="orb"),
+        event(EventKind.RECOVERY_ATTEMPT, 36, 1, attempt="orb"),
+        event(EventKind.RECOVERY_ATTEMPT, 36, 1, attempt="sift"),
+        event(EventKind.LINKED, 52, 1, old_submap=0, attempt="sift", seconds=1.5),
         event(EventKind.FAILED, 80, 1, reason="motion_jump"),
     ]
     assert breakages(events) == (
         Breakage(40, 0, "too_few_matches", 12, pytest.approx(1.2), 2, 2, 1.5),
         Breakage(80, 1, "motion_jump"),
     )
+
+
+def test_a_later_recovery_may_link_what_the_first_could_not() -> None:
+    events = [
+        event(EventKind.FAILED, 40, 0, reason="x"),
+        event(EventKind.REINITIALISED, 50, 1),
+        event(EventKind.RECOVERY_STARTED, 50, 1, lost=[0]),
+        event(EventKind.RECOVERY_ATTEMPT, 36, 1, attempt="orb"),
+        event(EventKind.RECOVERY_ATTEMPT, 36, 1, attempt="sift"),
+        event(EventKind.FAILED, 60, 1, reason="x"),
+        event(EventKind.REINITIALISED, 70, 2),
+        event(EventKind.RECOVERY_STARTED, 70, 2, lost=[0, 1]),
+        event(EventKind.RECOVERY_ATTEMPT, 36, 2, attempt="orb"),
+        event(EventKind.LINKED, 70, 2, old_submap=1, attempt="orb", seconds=1.0),
+    ]
+    first, second = breakages(events)
+    assert (first.attempts, first.succeeded_at) == (2, None)
+    assert (second.attempts, second.succeeded_at, second.restart_frames) == (1, 1, 10)
 
 
 def test_a_loss_that_is_never_linked() -> None:

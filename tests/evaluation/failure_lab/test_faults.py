@@ -15,6 +15,7 @@ from dualslam.evaluation.failure_lab import Corruption, FaultScript
 from dualslam.session import run_to_folder
 from dualslam.sources import open_source
 from dualslam.system import System
+from dualslam.worker import WorkerExecutor
 from tests.point_world import PointWorld, cloud, hand_held, system_in
 
 N = 45
@@ -110,6 +111,27 @@ def test_a_corrupted_run_can_be_made_again_from_its_config(tmp_path: Path) -> No
     clean = run_to_folder(load_config(), open_source(source), tmp_path / "clean")
     assert clean.summary["frames"] == 45
     assert (tmp_path / "clean" / "trajectory.txt").read_bytes() != texts[0]
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_killed_worker_costs_its_recovery_and_nothing_else(workers: int) -> None:
+    world = PointWorld(cloud(), hand_held(70), covered=frozenset(range(35, 50)))
+    system = system_in(world, recovery={"enabled": True, "workers": workers})
+    script = FaultScript([Corruption.model_validate({"kind": "kill_worker", "start": 30})])
+    system._parts = replace(system._parts, view_of=script.around_views(system._parts.view_of))
+    executor = system._recoveries._executor
+    if isinstance(executor, WorkerExecutor):
+        executor._on_start = script.kill_worker
+    else:
+        system._recoveries._executor = script.around_inline(executor)
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    (failed,) = system.events.of_kind(EventKind.RECOVERY_FAILED)
+    assert failed.data["reason"] == "worker"
+    assert not system.events.of_kind(EventKind.LINKED)
+    assert len(system.atlas.submaps) == 2
+    assert system.rows[69].status is FrameStatus.TRACKED
 
 
 def test_the_command_line_takes_a_file_of_corruptions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
