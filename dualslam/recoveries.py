@@ -246,7 +246,7 @@ class Recoveries:
             agreeing_keyframes=agreeing,
             change_point=link.change_point,
             seconds=seconds,
-            **link.numbers,
+            **(link.numbers | {"scale": float(sim3.scale(S_old_new))}),
         )
         n_bypassed = self._bypass(walked, new_id, handover=max(agreeing))
         for frame in walked:

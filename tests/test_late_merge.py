@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from dualslam.build import build_system
+from dualslam.core.config import Config
 from dualslam.core.events import EventKind
-from dualslam.core.types import Failure, FailureReason, FrameStatus
+from dualslam.core.geometry import se3
+from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, View
 from dualslam.recoveries import Outcome, RecoveryExecutor
 from dualslam.recovery import RecoveryJob
 from dualslam.results import trajectories_of
 from dualslam.system import System
-from tests.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
+from tests.backend.test_self_calibration import wrong_camera
+from tests.point_world import PointWorld, cloud, hand_held, pose_errors, random_features, system_in
+from tests.test_calibration import PointWorld as CalibrationWorld
 
 COVERED = frozenset(range(35, 50))
 POSITION_M, ROTATION_RAD = 0.08, 0.01
@@ -125,6 +132,62 @@ def test_two_walks_overlap(twice_lost: PointWorld) -> None:
     assert system.events.of_kind(EventKind.RECOVERY_STARTED)[1].frame < first.frame < second.frame
     assert system.events.of_kind(EventKind.RECOVERY_STARTED)[1].data["lost"] == [0, 1]
     assert_one_right_map(system, twice_lost, twice_lost.covered)
+
+
+def prediction_errors(world: PointWorld, polls: int) -> tuple[System, dict[int, FloatArray]]:
+    """Turn and shift between what the motion model said of each live frame, and where it was found."""
+    system, errors = late_system(world, polls), {}
+    for frame in world.frames():
+        system.step(frame)
+        track = system.live._tracker.last if system.live is not None else None
+        if track is not None and track.view.index == frame.index:
+            xi = se3.log(track.T_cam_submap @ se3.inverse(track.T_predicted))
+            errors[frame.index] = np.array([np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])])
+    return system, errors
+
+
+def test_tracking_goes_on_with_no_jump_that_the_motion_model_could_not_explain(world: PointWorld) -> None:
+    _, undisturbed = prediction_errors(world, 1000)
+    usual = np.max([undisturbed[i] for i in range(60, 90)], axis=0)
+    system, errors = prediction_errors(world, 15)
+    (ended,) = system.events.of_kind(EventKind.RECOVERY_ENDED)
+    assert all((errors[i] <= 1.2 * usual).all() for i in range(ended.frame, ended.frame + 3))
+
+
+def test_the_camera_has_been_refined_meanwhile() -> None:
+    """What the walk saw by the old camera is merged by the pixels of the new one, and fits the map as it is now."""
+    settings = {
+        "calibration": {"first_keyframes": 14, "max_observations": 6000},
+        "keyframes": {"max_parallax_deg": 1.0},
+        "mapping": {"redundant_ratio": 1.0},
+        "camera": {"model_sigma_px": 0.0},
+    }
+    system, world = build_system(Config.model_validate(settings), wrong_camera(1.03)), CalibrationWorld()
+    calibration, rng = system._parts.calibration, np.random.default_rng(0)
+    covered = range(12, 26)
+
+    def view_of(frame: Frame) -> View:
+        if frame.index in covered:
+            return View(frame.index, frame.timestamp_s, random_features(rng))
+        return world.view(frame, calibration)
+
+    system._parts = replace(system._parts, view_of=view_of)
+    system._recoveries._executor = LateExecutor(system._recoveries._executor, 34)
+    for i in range(75):
+        system.step(Frame(i, i / 30, None))
+    system.finish()
+    order = [EventKind.RECOVERY_STARTED, EventKind.CALIBRATED, EventKind.RECOVERY_ENDED]
+    assert [event.event for event in system.events.of_kind(*order)] == order
+    submap = system.atlas.submaps[1]
+    assert min(submap.keyframes) < min(covered)
+    for keyframe in submap.keyframes.values():
+        uv_rect_px, _ = calibration.camera.rectify(keyframe.features.uv_px)
+        np.testing.assert_allclose(keyframe.features.uv_rect_px, uv_rect_px)
+    ids = sorted(submap.keyframes)
+    truth = np.stack([world.T_world_cam(k) for k in ids])
+    translation, rotation = pose_errors(submap.keyframe_poses(ids), truth)
+    assert translation.max() < POSITION_M
+    assert rotation.max() < ROTATION_RAD
 
 
 def test_the_run_ends_meanwhile(world: PointWorld) -> None:

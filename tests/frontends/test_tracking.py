@@ -7,7 +7,7 @@ import pytest
 
 from backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.config import Config, KeyframeConfig
-from dualslam.core.geometry import se3
+from dualslam.core.geometry import se3, sim3
 from dualslam.core.submap import NO_LANDMARK, Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe, Track, View
 from frontends.keyframing import keyframe_due, parallax_deg
@@ -100,6 +100,26 @@ class TestTracker:
         error = se3.log(track.T_cam_submap @ far.T_world_cam[24])
         assert np.linalg.norm(error[:3]) < ROTATION_RAD
         assert not tracked(live, far.view(24)).wide
+
+    def test_it_follows_a_map_that_has_moved(self, world: PointWorld) -> None:
+        """Another unit and another frame, between two keyframes: the motion model goes on as if nothing were."""
+        live, untouched = (front_end(world, [0, 4, 8, 12, 16], start_at=8) for _ in range(2))
+        for i in (9, 10, 11):
+            tracked(live, world.view(i))
+            tracked(untouched, world.view(i))
+        before = live.submap.copy()
+        T_new_old = se3.exp(np.array([0.3, -0.2, 0.1, 1.0, 2.0, -1.0]))
+        live.submap.transform(2.5, T_new_old)
+        graph = ISam2SubmapGraph(Config().graph)
+        graph.update(live.submap)
+        live.adopt(graph, before)
+        a, b = tracked(live, world.view(13)), tracked(untouched, world.view(13))
+        S_new_old = sim3.from_parts(2.5, T_new_old[:3, :3], T_new_old[:3, 3])
+        for moved, still in ((a.T_predicted, b.T_predicted), (a.T_cam_submap, b.T_cam_submap)):
+            np.testing.assert_allclose(
+                se3.inverse(moved), sim3.act_on_pose(S_new_old, se3.inverse(still)), rtol=0, atol=1e-6
+            )
+        assert a.n_inliers == b.n_inliers
 
     def test_a_failure_leaves_the_tracker_as_it_was(self, world: PointWorld) -> None:
         live, untouched = (front_end(world, [0, 4, 8], start_at=8) for _ in range(2))
