@@ -29,6 +29,7 @@ import gtsam
 import numpy as np
 
 from backend import convert
+from backend.bayes_tree import BayesTree, UpdateStatistics, parse_bayes_tree
 from dualslam.core.types import FloatArray, IntArray
 
 POSE_THRESHOLDS = (0.0005, 0.0025)
@@ -69,6 +70,8 @@ class IncrementalSolver:
         params.relinearizeSkip = 1 << 30  # whoever updates says when
         params.enablePartialRelinearizationCheck = False
         self._isam = gtsam.ISAM2(params)
+        self.statistics = UpdateStatistics(0, 0)
+        """Of the last step."""
 
     def update(
         self,
@@ -106,6 +109,9 @@ class IncrementalSolver:
             raise SolverFailure.of(error) from error
         if cliques == 0:
             raise SolverFailure("the solver is dead (no cliques)")
+        self.statistics = UpdateStatistics(
+            int(result.getVariablesRelinearized()), int(result.getVariablesReeliminated())
+        )
         return np.asarray(indices, np.int64)
 
     def iterate(self, newest: list[int]) -> None:
@@ -141,6 +147,13 @@ class IncrementalSolver:
     def has(self, key: int) -> bool:
         """Return whether a variable is there."""
         return bool(self._isam.valueExists(key))
+
+    def bayes_tree(self) -> BayesTree:
+        """Return the tree as it is now."""
+        try:
+            return parse_bayes_tree(self._isam.dot())
+        except GTSAM_ERRORS as error:
+            raise SolverFailure.of(error) from error
 
     def covariance(self, key: int) -> FloatArray:
         """Return the marginal covariance of one variable."""

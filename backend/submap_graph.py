@@ -15,6 +15,7 @@ import gtsam
 import numpy as np
 
 from backend import convert
+from backend.bayes_tree import BayesTree, UpdateStatistics
 from backend.factors import baseline_factor, insert_projections, pose_prior
 from backend.gauge import Gauge, choose_gauge
 from backend.ledger import OUTSIDE, Ledger, Plan
@@ -80,6 +81,8 @@ class ISam2SubmapGraph:
         self._suspects: IntArray = np.zeros(0, np.int64)
         self._n_updates = 0
         self._misfit = False
+        self.statistics: tuple[UpdateStatistics, ...] = ()
+        """Of the steps that the last update took."""
 
     # --- the SubmapGraph protocol
 
@@ -165,6 +168,23 @@ class ISam2SubmapGraph:
                 raise SolverError(f"no covariance of landmark {j}: {failure}; rebuild the graph") from failure
         return covariances
 
+    # --- for those who want to look inside
+
+    def bayes_tree(self) -> BayesTree:
+        """Return the incremental solver's Bayes tree as it is now.
+
+        Raises
+        ------
+        SolverError
+            If nothing has been solved yet.
+        """
+        try:
+            if self._solver is not None:
+                return self._solver.bayes_tree()
+        except SolverFailure as failure:
+            raise SolverError(f"no Bayes tree: {failure}; rebuild the graph") from failure
+        raise SolverError("there is no Bayes tree before the first update")
+
     # --- one update
 
     def _changes(self, submap: Submap, plan: Plan, poses: Mapping[int, FloatArray], xyz_mu: FloatArray) -> _Changes:
@@ -223,8 +243,11 @@ class ISam2SubmapGraph:
         factors[changes.order] = indices[projections:]
         self._ledger.commit(plan, factors)
         # One Gauss-Newton step leaves the newest landmarks short of their optimum, and good rows look like outliers.
+        steps = [solver.statistics]
         for _ in range(self._config.extra_iterations):
             solver.iterate(newest)
+            steps.append(solver.statistics)
+        self.statistics = tuple(steps)
 
     def _n_rows(self, submap: Submap, plan: Plan, keyframe_id: int) -> int:
         kf = submap.observations["kf"]

@@ -27,8 +27,10 @@ if TYPE_CHECKING:
     from dualslam.core.threads import limit_threads
     from dualslam.core.types import Frame
     from dualslam.evaluation.failure_lab import corrupted
+    from dualslam.evaluation.trajectory_metrics import evaluate_run
     from dualslam.frame_records import FrameResult
     from dualslam.map_store import load_atlas, save_atlas
+    from dualslam.report import comparison_page, read_run, report_page
     from dualslam.results import trajectories_of
     from dualslam.runner import run_sequence
     from dualslam.session import run_to_folder
@@ -46,13 +48,17 @@ _WHERE = {
     "SolverError": "core.errors",
     "System": "system",
     "build_system": "build",
+    "comparison_page": "report",
     "config_from_dict": "core.config_io",
     "corrupted": "evaluation.failure_lab",
     "dump_config": "core.config_io",
+    "evaluate_run": "evaluation.trajectory_metrics",
     "limit_threads": "core.threads",
     "load_atlas": "map_store",
     "load_config": "core.config_io",
     "open_source": "sources",
+    "read_run": "report",
+    "report_page": "report",
     "run_sequence": "runner",
     "run_to_folder": "session",
     "save_atlas": "map_store",
@@ -71,13 +77,17 @@ __all__ = [
     "System",
     "__version__",
     "build_system",
+    "comparison_page",
     "config_from_dict",
     "corrupted",
     "dump_config",
+    "evaluate_run",
     "limit_threads",
     "load_atlas",
     "load_config",
     "open_source",
+    "read_run",
+    "report_page",
     "run_sequence",
     "run_to_folder",
     "save_atlas",

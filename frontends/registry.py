@@ -42,6 +42,8 @@ def known_frontends() -> list[str]:
 def create_frontend(config: FrontendConfig) -> Frontend:
     """Build the front end that the config names; a built-in name wins over an entry point of the same name.
 
+    ``module:Class`` is a name as well: of what can be imported, whether it is installed or just being written.
+
     Raises
     ------
     ConfigError
@@ -71,10 +73,10 @@ def parse_options(model: type[OptionsT], frontend: str, options: Mapping[str, An
 def _factory(name: str) -> FrontendFactory:
     """Import what a name points to."""
     try:
-        if name in BUILT_IN:
-            module, _, attribute = BUILT_IN[name].partition(":")
-            built_in: FrontendFactory = getattr(importlib.import_module(module), attribute)
-            return built_in
+        if name in BUILT_IN or ":" in name:
+            module, _, attribute = BUILT_IN.get(name, name).partition(":")
+            named: FrontendFactory = getattr(importlib.import_module(module), attribute)
+            return named
         for entry in entry_points(group=ENTRY_POINT_GROUP, name=name):
             loaded: FrontendFactory = entry.load()
             return loaded

@@ -15,7 +15,7 @@ class FrontendConfig(StrictModel):
 
     name: str = "orb"
     """Which front end: `orb`, `sift`, `gms`, or one that another package offers as an entry point of
-    `dualslam.frontends`."""
+    `dualslam.frontends`; or `module:Class`, of what can be imported."""
     n_features: int = Field(1000, ge=50, le=20000)
     """Keypoints per image."""
     options: dict[str, Any] = Field(default_factory=dict)

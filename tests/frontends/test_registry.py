@@ -56,6 +56,12 @@ def test_entry_points_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(registry.create_frontend(FrontendConfig(name="orb")), OrbFrontend)
 
 
+def test_what_can_be_imported_needs_no_entry_point() -> None:
+    assert isinstance(registry.create_frontend(FrontendConfig(name="frontends.orb:OrbFrontend")), OrbFrontend)
+    with pytest.raises(ConfigError, match=r"'frontends\.orb:Nothing'.*cannot be imported"):
+        registry.create_frontend(FrontendConfig(name="frontends.orb:Nothing"))
+
+
 @pytest.mark.parametrize("value", ["no_such_module:Thing", "frontends.orb:NoSuchThing"])
 def test_broken_entry_point_is_a_config_error(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
     offer(monkeypatch, broken=value)
