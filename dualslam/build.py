@@ -103,6 +103,7 @@ def recovery_parts(config: Config, size_px: tuple[int, int]) -> RecoveryParts:
         ),
         judge=lambda track: judge_track(track, config.health),
         config=config.recovery,
+        fusion=config.fusion,
     )
 
 

@@ -1,9 +1,28 @@
-"""Is this map still consistent with what the camera sees? A verdict for every tracked frame, with its reason."""
+"""Is this map still consistent with what the camera sees? A verdict for every tracked frame, with its reason.
+
+Some reasons fail a frame. Weaker ones, the early signs, fail nothing: they mark the stretch before a failure in which
+the map may be corrupted already, so that linking does not trust it.
+"""
 
 from __future__ import annotations
 
+import math
+from collections import Counter, deque
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
 from dualslam.core.config import HealthConfig
-from dualslam.core.types import Failure, FailureReason, Track
+from dualslam.core.geometry import se3
+from dualslam.core.interfaces import KeyframeReport
+from dualslam.core.types import Failure, FailureReason, FloatArray, Track
+
+MEMORY_FRAMES = 300
+"""Verdicts that are kept: no suspected stretch reaches back farther than the frame buffer."""
+MEDIAN_CHI2_6DOF = 5.348
+MIN_INNOVATIONS = 8
+"""Frames before which the motion model's error is not known."""
 
 
 def judge_track(track: Track | Failure, config: HealthConfig) -> Track | Failure:
@@ -27,3 +46,136 @@ def judge_track(track: Track | Failure, config: HealthConfig) -> Track | Failure
     if track.chi2 > config.max_chi2:
         return Failure(FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {track.chi2:.1f}", numbers)
     return track
+
+
+@dataclass(frozen=True, slots=True)
+class FrameHealth:
+    """The verdict on one frame: whether the map explains it, and what speaks against that.
+
+    Attributes
+    ----------
+    index : int
+    signs : tuple of FailureReason
+        Empty for a healthy frame. Signs alone fail nothing: they mark the stretch that may be corrupted.
+    failed : bool
+    numbers : dict
+        Inlier ratio, chi-square over its degrees of freedom, squared Mahalanobis distance from the motion model.
+    """
+
+    index: int
+    signs: tuple[FailureReason, ...]
+    failed: bool
+    numbers: dict[str, float]
+
+
+class HealthMonitor:
+    """Judges the frames of one submap one after the other, each against what the frames before it were like.
+
+    The motion model's error has no sigma that could be known beforehand: a car and a hand differ. It is measured on the
+    frames of the last seconds, and so is the level of the chi-square, in which the camera model's own error
+    stands.
+
+    Parameters
+    ----------
+    config : HealthConfig
+    """
+
+    def __init__(self, config: HealthConfig) -> None:
+        self._config = config
+        self._frames: deque[FrameHealth] = deque(maxlen=MEMORY_FRAMES)
+        self._chi2: deque[float] = deque(maxlen=config.level_frames)
+        self._jump: deque[float] = deque(maxlen=config.level_frames)
+        self._innovation: deque[FloatArray] = deque(maxlen=config.level_frames)
+
+    def judge(self, track: Track | Failure, index: int) -> Track | Failure:
+        """Return the track if the map explains it, else why not, and remember either (`index`: the frame's)."""
+        verdict = judge_track(track, self._config)
+        if isinstance(track, Failure):
+            self._frames.append(FrameHealth(index, (track.reason,), True, track.numbers))
+            return verdict
+        jump2, innovation = self._jump2(track)
+        numbers = {
+            "inlier_ratio": track.n_inliers / max(track.n_matches, 1),
+            "chi2": track.chi2,
+            "jump2": jump2,
+        }
+        signs = self._signs(track, jump2)
+        if isinstance(verdict, Failure):
+            self._frames.append(FrameHealth(index, (verdict.reason, *signs), True, numbers))
+            return verdict
+        self._frames.append(FrameHealth(index, signs, False, numbers))
+        # Frames with signs too: a median is not moved by few, and what has become the rule is learnt.
+        self._chi2.append(track.chi2)
+        if not track.wide:
+            self._innovation.append(innovation)
+            self._jump.append(jump2)
+        return verdict
+
+    def note_keyframe(self, report: KeyframeReport) -> None:
+        """Hold what the graph made of the newest frame against it: its newest factors' chi-square, a solver failure."""
+        if not self._frames:
+            return
+        newest, signs, estimate = self._frames[-1], [], report.estimate
+        if estimate.chi2_newest > self._config.max_keyframe_chi2 * _level(self._chi2, 1.0):
+            signs.append(FailureReason.CHI_SQUARE)
+        if report.solver_failed:
+            signs.append(FailureReason.SOLVER)
+        numbers = {**newest.numbers, "chi2_keyframe": estimate.chi2_newest}
+        self._frames[-1] = replace(newest, signs=(*newest.signs, *signs), numbers=numbers)
+
+    @property
+    def newest(self) -> FrameHealth | None:
+        """The verdict on the newest frame."""
+        return self._frames[-1] if self._frames else None
+
+    def suspected(self) -> list[FrameHealth]:
+        """Return the frames of the stretch that may be corrupted, oldest first: from the onset to the newest frame.
+
+        A cumulative sum (Page's CUSUM): a frame with signs adds, a healthy one takes away, and the stretch began where
+        the sum last left zero. It is empty where the sum is zero now.
+        """
+        began, total = len(self._frames), 0
+        for i, frame in enumerate(self._frames):
+            if total == 0:
+                began = i
+            total = total + self._config.sign_weight if frame.signs else max(total - 1, 0)
+        return list(self._frames)[began:] if total else []
+
+    # --- signs
+
+    def _signs(self, track: Track, jump2: float) -> tuple[FailureReason, ...]:
+        config = self._config
+        signs = []
+        if track.n_inliers < 2 * config.min_inliers:
+            signs.append(FailureReason.TOO_FEW_INLIERS)
+        if track.n_inliers < config.majority * track.n_matches:
+            signs.append(FailureReason.LOW_INLIER_RATIO)
+        if jump2 > config.jump_chi2 * _level(self._jump, MEDIAN_CHI2_6DOF):
+            signs.append(FailureReason.MOTION_JUMP)
+        dof = max(2 * track.n_inliers - 6, 1)
+        if track.chi2 > _level(self._chi2, 1.0) * (1 + config.sign_sigmas * math.sqrt(2 / dof)):
+            signs.append(FailureReason.CHI_SQUARE)
+        return tuple(signs)
+
+    def _jump2(self, track: Track) -> tuple[float, FloatArray]:
+        """Return the squared Mahalanobis distance of a pose from the prediction, and the difference itself (6,).
+
+        Its covariance is that of the pose and that of the motion model, as the last frames show it; 0 without those.
+        """
+        difference = se3.log(track.T_cam_submap @ se3.inverse(track.T_predicted))
+        if len(self._innovation) < MIN_INNOVATIONS or track.wide:
+            return 0.0, difference
+        # Median absolute deviation of a Gaussian: 0.6745 sigma.
+        sigma = np.median(np.abs(self._innovation), axis=0) / 0.6745
+        covariance = track.covariance + np.diag(sigma**2)
+        return float(difference @ np.linalg.solve(covariance, difference)), difference
+
+
+def _level(recent: Collection[float], expected: float) -> float:
+    """Return how many times larger a chi-square is as a rule than expected, at least 1."""
+    return max(1.0, float(np.median(list(recent))) / expected) if recent else 1.0
+
+
+def count_signs(frames: Iterable[FrameHealth]) -> dict[str, int]:
+    """Return how many of the frames show each sign, for the event log."""
+    return dict(Counter(str(sign) for frame in frames for sign in frame.signs))

@@ -15,6 +15,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
+from dualslam.core.solving import solve
 from dualslam.core.submap import Submap
 from dualslam.core.submap_change import change_of_frame
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus, Keyframe, View
@@ -253,7 +254,9 @@ class Recoveries:
             if self._was_lost(frame.pose.index, found.old_id, job.onsets[found.old_id]):
                 record.rows[frame.pose.index].status = FrameStatus.RECOVERED
         self._onsets.pop(found.old_id, None)
-        record.event(EventKind.FUSED, now, new_id, old_submap=found.old_id, bypassed=n_bypassed)
+        seam = found.seam
+        numbers = {"seam": str(seam.reason)} if isinstance(seam, Failure) else {"seam": "refined", **seam.numbers}
+        record.event(EventKind.FUSED, now, new_id, old_submap=found.old_id, bypassed=n_bypassed, **numbers)
 
     def _bypass(self, walked: list[WalkedFrame], new_id: int, handover: int) -> int:
         """Let the now part of the old map, beyond the keyframes that agree, take its poses from the new one."""
@@ -270,20 +273,6 @@ class Recoveries:
     def _was_lost(self, index: int, old_id: int, onset: int) -> bool:
         tracked = self._record.rows[index].status is FrameStatus.TRACKED
         return self._record.poses[index].submap_id != old_id and tracked and index >= onset
-
-
-def solve(submap: Submap, graph: SubmapGraph) -> None:
-    """Solve a merged submap in a new graph and drop what the solution contradicts.
-
-    Raises
-    ------
-    SolverError
-    """
-    estimate = graph.rebuild(submap)
-    submap.apply_estimate(estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu)
-    touched = submap.observations["landmark"][estimate.outlier_rows]
-    submap.remove_observations(estimate.outlier_rows)
-    submap.remove_landmarks(touched[submap.n_observations(touched) < 2])
 
 
 def _scaled(T: FloatArray, scale: float) -> FloatArray:

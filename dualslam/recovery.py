@@ -13,16 +13,17 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from dualslam.core.camera import Camera
-from dualslam.core.config import RecoveryConfig
+from dualslam.core.config import FusionConfig, RecoveryConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Track, View
 from dualslam.linking import LinkEstimate
+from dualslam.seam import SeamReport, refine_seam
 from dualslam.trajectory import FramePose
 
 log = logging.getLogger(__name__)
@@ -70,10 +71,11 @@ class WalkedFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundLink:
-    """The link that a walk ended with."""
+    """The link that a walk ended with. `seam`: how the seam was refined, or why it was not."""
 
     old_id: int
     estimate: LinkEstimate
+    seam: SeamReport | Failure
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,6 +112,7 @@ class RecoveryParts:
     link: Linker
     judge: Judge
     config: RecoveryConfig
+    fusion: FusionConfig
 
 
 def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Failure:
@@ -127,7 +130,8 @@ def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Fai
     walker = parts.new_odometry(submap, graph)
     walker.start_at(job.newest_id)
     relinker = Relinker(submap, job.lost, job.onsets, parts.link, parts.config)
-    frames, events, link = [], [], None
+    frames, events = [], []
+    link: FoundLink | None = None
     for step in walk_back(walker, job.views, parts.judge, relinker.keyframe_ids, parts.config.max_leap_frames):
         frames.append(_walked(walker, step))
         if step.view.index not in submap.keyframes:
@@ -135,11 +139,25 @@ def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Fai
         for attempt in relinker.attempts(step.view.index):
             events.append(_event_of(attempt, step.view, submap.id))
             if link is None and not isinstance(attempt.result, Failure):
-                link = FoundLink(attempt.old_id, attempt.result)
+                found = _fused(job.lost[attempt.old_id], submap, attempt.result, parts)
+                if isinstance(found, Failure):
+                    events.append(_event_of(replace(attempt, result=found), step.view, submap.id))
+                else:
+                    link = found
         if link is not None:
             break
     seconds, cpu_s = time.perf_counter() - started, time.thread_time() - cpu_started
     return RecoveryResult(submap, tuple(frames), link, tuple(events), seconds, cpu_s)
+
+
+def _fused(old: Submap, submap: Submap, link: LinkEstimate, parts: RecoveryParts) -> FoundLink | Failure:
+    """Refine the seam and with it the link; a failure where the refined seam contradicts the link."""
+    seam = refine_seam(old, submap, link, parts.new_graph, parts.link, parts.fusion)
+    if isinstance(seam, Failure):
+        contradicted = seam.reason is FailureReason.CONTRADICTION
+        return seam if contradicted else FoundLink(old.id, link, seam)
+    submap.take_over(seam.submap)
+    return FoundLink(old.id, seam.link, seam.report)
 
 
 def _walked(walker: VisualOdometry, step: WalkStep) -> WalkedFrame:

@@ -21,7 +21,7 @@ from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, Start, Track, View
 from dualslam.frame_buffer import FrameBuffer
 from dualslam.frame_records import FrameResult, FrameRow
-from dualslam.health import judge_track
+from dualslam.health import HealthMonitor, count_signs
 from dualslam.merging import carry_links
 from dualslam.record import Record
 from dualslam.recoveries import Recoveries, RecoveryExecutor
@@ -73,6 +73,7 @@ class System:
         self._live: VisualOdometry | None = None
         self._starter = components.new_starter()
         self._lost: list[View] = []
+        self._health = HealthMonitor(config.health)
         self._recoveries = Recoveries(
             record, self.buffer, components.recovery, components.new_graph, components.calibration, config.recovery
         )
@@ -146,6 +147,7 @@ class System:
         self._record.event(kind, view, submap.id, first_view=start.views[0].index, **start.numbers)
         self._live = self._parts.new_odometry(submap, graph)
         self._live.start_at(view.index)
+        self._health = HealthMonitor(self._config.health)
         self._recoveries.start(submap, view)
         self._recoveries.collect(self._live, view)
         self.buffer.thaw()
@@ -153,9 +155,6 @@ class System:
         T_cam_submap = se3.inverse(submap.T_submap_kf[view.index])
         ids = submap.landmark_of[view.index]
         return Track(view, T_cam_submap, T_cam_submap, ids, n, n, n, 1.0, False, np.zeros((6, 6)))
-
-    def _judge(self, track: Track | Failure) -> Track | Failure:
-        return judge_track(track, self._config.health)
 
     # --- tracking
 
@@ -181,7 +180,7 @@ class System:
     def _track_with(self, odometry: VisualOdometry, view: View) -> Track | Failure:
         """Pose a frame, judge it, record it, and make it a keyframe where one is due."""
         with self.timer.measure("tracking"):
-            track = self._judge(odometry.track(view))
+            track = self._health.judge(odometry.track(view), view.index)
         if isinstance(track, Failure):
             return track
         if track.wide:
@@ -193,6 +192,7 @@ class System:
             except SolverError as error:
                 return Failure(FailureReason.SOLVER, str(error))
             self.timer.add("graph (in mapping)", report.estimate.seconds)
+            self._health.note_keyframe(report)
             if report.estimate.rebuilt:
                 self._record.event(EventKind.GRAPH_REBUILT, view, odometry.submap.id)
         pose = FramePose(
@@ -223,6 +223,8 @@ class System:
 
     def _give_up(self, live: VisualOdometry, view: View, failure: Failure) -> None:
         """Declare the track failed: archive the submap whole, and start the next from the frames since the loss."""
+        suspected = self._health.suspected()
+        onset = suspected[0].index if suspected else self._lost[0].index
         self._record.event(
             EventKind.FAILED,
             view,
@@ -230,10 +232,12 @@ class System:
             reason=str(failure.reason),
             detail=failure.detail,
             lost_since=self._lost[0].index,
+            suspected_since=onset,
+            signs=count_signs(frame for frame in suspected if not frame.failed),
             **failure.numbers,
         )
         self._archive(live, "track lost")
-        self._recoveries.declare_lost(live.submap.id, self._lost[0].index)
+        self._recoveries.declare_lost(live.submap.id, onset)
         self._live = None
         self._starter = self._parts.new_starter()
         for lost in self._lost:

@@ -77,13 +77,16 @@ class VisualFrontEnd:
     def insert_keyframe(self, track: Track) -> KeyframeReport:
         """Make the frame a keyframe: extend the map, solve its graph, drop what the solution contradicts."""
         mapping = self._mapper.insert(track)
-        estimate = self.graph.rebuild(self.submap) if self._rebuild_due(track) else self.graph.update(self.submap)
+        rebuild = self._rebuild_due(track)
+        estimate = self.graph.rebuild(self.submap) if rebuild else self.graph.update(self.submap)
         self.submap.apply_estimate(estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu)
         self._mapper.remove_outliers(estimate.outlier_rows)
         self._meet(track.view.index)
         culled = self._cull_keyframe()
         self._tracker.refresh()
-        return KeyframeReport(mapping, estimate, len(estimate.outlier_rows), culled)
+        return KeyframeReport(
+            mapping, estimate, len(estimate.outlier_rows), culled, solver_failed=estimate.rebuilt and not rebuild
+        )
 
     def _rebuild_due(self, track: Track) -> bool:
         """Whether the frame contradicts the map so much that the incremental estimate is to be made anew in batch."""

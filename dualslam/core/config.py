@@ -114,6 +114,23 @@ class HealthConfig(StrictModel):
     """Share of the matched landmarks that must agree."""
     max_chi2: float = Field(2.5, gt=0)
     """Mean squared whitened residual per degree of freedom of the agreeing landmarks (1 is expected)."""
+    majority: float = Field(0.5, ge=0, le=1)
+    """Early sign: share of the matches below which those that disagree could hold another pose."""
+    jump_chi2: float = Field(27.856, gt=0)
+    """Early sign: squared Mahalanobis distance of a pose from the motion model's, under the pose's covariance and the
+    motion model's own error as the last frames show it, above its level there: chi-square, 6 degrees of freedom,
+    99.99 % (what drivers and hands do has heavier tails than a Gaussian)."""
+    sign_sigmas: float = Field(3.09, gt=0)
+    """Early sign: standard deviations of a chi-square over its degrees of freedom, above its level as a rule
+    (one-sided 99.9 %)."""
+    max_keyframe_chi2: float = Field(2.0, gt=0)
+    """Early sign: chi-square of the graph's newest factors over its degrees of freedom, relative to that level. They
+    hold outliers that no one has sorted out yet, and no quantile is known for them."""
+    level_frames: int = Field(60, ge=10)
+    """Healthy frames on which the level of the chi-square and the error of the motion model are measured."""
+    sign_weight: int = Field(4, ge=1)
+    """Healthy frames that outweigh one with a sign: the stretch in which the signs outweigh, up to the loss, is
+    suspected to be corrupted. Signs on up to one healthy frame in five then add up to nothing."""
 
 
 class RecoveryConfig(StrictModel):
@@ -247,6 +264,18 @@ class LinkingConfig(StrictModel):
     """Triplets that RANSAC draws at most."""
 
 
+class FusionConfig(StrictModel):
+    """How the seam of two linked maps is refined."""
+
+    seam_keyframes: int = Field(10, ge=0)
+    """Keyframes of the old map's healthy end that the new map takes in as observations, beside those that it holds:
+    half of what a frame's local map joins, so that the two overlap by as much as neighbouring frames do. 0 leaves the
+    seam as the link found it."""
+    max_shift_chi2: float = Field(24.322, gt=0)
+    """Squared Mahalanobis distance of the link estimated again on the refined seam from the first one, above which
+    neither is believed: chi-square, 7 degrees of freedom, 99.9 %."""
+
+
 class CalibrationConfig(StrictModel):
     """Self-calibration: when a submap is asked about its camera, and when the answer counts."""
 
@@ -300,6 +329,7 @@ class Config(StrictModel):
     recovery: RecoveryConfig = RecoveryConfig()
     graph: GraphConfig = GraphConfig()
     linking: LinkingConfig = LinkingConfig()
+    fusion: FusionConfig = FusionConfig()
     calibration: CalibrationConfig = CalibrationConfig()
     corruptions: tuple[Corruption, ...] = ()
     """What the failure lab does to the run on purpose, for example [{kind: blackout, start: 100, length: 10}]."""

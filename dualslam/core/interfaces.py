@@ -288,12 +288,13 @@ class MappingReport:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeReport:
-    """What a keyframe did to the map and how its graph took it."""
+    """What a keyframe did to the map and how its graph took it. `solver_failed`: it threw and had to be made anew."""
 
     mapping: MappingReport
     estimate: GraphEstimate
     n_outliers: int
     culled_keyframe: int | None
+    solver_failed: bool = False
 
 
 class MapStarter(Protocol):

@@ -241,11 +241,13 @@ class FailureReason(StrEnum):
     SCALE = "scale"
     SPREAD = "spread"
     AGREEMENT = "agreement"
+    CONTRADICTION = "contradiction"
     REPROJECTION = "reprojection"
     DEFORMED = "deformed"
     NEEDS_OLDER_KEYFRAMES = "needs_older_keyframes"
     TIMEOUT = "timeout"
     WORKER = "worker"
+    DISABLED = "disabled"
 
 
 @dataclass(frozen=True, slots=True)

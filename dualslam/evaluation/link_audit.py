@@ -25,6 +25,12 @@ WRONG_SCALE, WRONG_ROTATION_DEG, WRONG_POSITION = 0.05, 3.0, 0.05
 """Beyond any of these a link is wrong: relative, degrees, relative to the path that it links."""
 MIN_FRAMES = 5
 """Fewer frames of a map with ground truth say nothing about it."""
+CORRELATED_FRAMES = 8.0
+"""So many neighbouring frames err alike: their number counts for so much less."""
+MAX_REACH = 1000
+"""Frames on either side of a seam beyond which truth is not looked for."""
+CERTAIN_SIGMAS = 2.0
+"""A link is surely wrong where it is so by more than this many standard deviations of the truth itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +72,22 @@ class LinkAudit:
 
     @property
     def wrong(self) -> bool:
-        """Whether the link is one that should never have been made."""
-        return abs(self.scale) > WRONG_SCALE or self.rotation_deg > WRONG_ROTATION_DEG or self.position > WRONG_POSITION
+        """Whether the link is one that should never have been made, taking the truth at its word."""
+        return self._is_wrong(0.0)
+
+    @property
+    def surely_wrong(self) -> bool:
+        """Whether it is one also for all that is not known of the truth."""
+        return self._is_wrong(CERTAIN_SIGMAS)
+
+    def _is_wrong(self, sigmas: float) -> bool:
+        scale = abs(self.scale) - sigmas * self.scale_sigma
+        rotation_deg = self.rotation_deg - sigmas * self.rotation_sigma_deg
+        return scale > WRONG_SCALE or rotation_deg > WRONG_ROTATION_DEG or self.position > WRONG_POSITION
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all fields, with `position` and `wrong`."""
-        return {**asdict(self), "position": self.position, "wrong": self.wrong}
+        """Return all fields, with `position`, `wrong` and `surely_wrong`."""
+        return {**asdict(self), "position": self.position, "wrong": self.wrong, "surely_wrong": self.surely_wrong}
 
 
 def audit_links(
@@ -87,7 +103,8 @@ def audit_links(
         True ``T_world_cam`` by frame index, for the frames that have it.
     reach : int
         Truth is taken from the frames of either map among the keyframes that a link stands on, and so many before and
-        after them (in counts of the source's index): what lies farther off has drifted away from the seam.
+        after them (in counts of the source's index), or twice or four times as many and so on: whatever tells the scale
+        best. Slow motion tells little of it, and what lies farther off has drifted away from the seam.
     """
     posed = list(poses)
     return [audit_link(atlas, link, posed, truth, reach) for link in atlas.links if link.kind is LinkKind.RECOVERY]
@@ -99,22 +116,24 @@ def audit_link(
     """Audit one link; a failure where ground truth says too little about either map. Parameters: see `audit_links`."""
     if not link.keyframes:
         return Failure(FailureReason.TOO_FEW_MATCHES, f"link {link.a}-{link.b} names no keyframes")
-    first, handover = min(link.keyframes) - reach, max(link.keyframes)
-    sides = []
-    for submap, last in ((atlas.submaps[link.a], handover), (atlas.submaps[link.b], handover + reach)):
-        T_est = _poses_in(submap, poses)
-        near = [i for i in T_est if first <= i <= last and i in truth]
-        if len(near) < MIN_FRAMES:
-            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(near)} frames of submap {submap.id} have a true pose")
-        ids = np.array(sorted(near), np.int64)
-        sides.append((ids, _align(np.array([T_est[int(i)] for i in ids]), np.array([truth[int(i)] for i in ids]))))
-    (ids_a, a), (ids_b, b) = sides
+    known = [{i: T for i, T in _poses_in(atlas.submaps[m], poses).items() if i in truth} for m in (link.a, link.b)]
+    # Slow motion tells little of scale, and far from the seam the maps have drifted: the reach that tells most.
+    best: tuple[float, list[_Side]] | None = None
+    while best is None or reach <= MAX_REACH:
+        sides = _truth_about(link, known, truth, reach)
+        if isinstance(sides, Failure):
+            return sides
+        sigma = math.hypot(*(side.scale_sigma for side in sides))
+        if best is None or sigma < best[0]:
+            best = sigma, sides
+        reach *= 2
+    a, b = best[1]
     S_true = sim3.inverse(a.S_world_submap) @ b.S_world_submap
     S_link = link.S_a_b
     # In metres, where the truth of the old map puts them.
     moved = [sim3.act(a.S_world_submap @ S, b.centres) for S in (S_link, S_true)]
     R = sim3.rotation(S_true).T @ sim3.rotation(S_link)
-    both = np.array([truth[int(i)][:3, 3] for i in np.union1d(ids_a, ids_b)])
+    both = np.array([truth[int(i)][:3, 3] for i in np.union1d(a.ids, b.ids)])
     return LinkAudit(
         link.a,
         link.b,
@@ -124,15 +143,30 @@ def audit_link(
         path_m=float(np.linalg.norm(np.diff(both, axis=0), axis=1).sum()),
         scale_sigma=math.hypot(a.scale_sigma, b.scale_sigma),
         rotation_sigma_deg=math.degrees(math.hypot(a.rotation_sigma_rad, b.rotation_sigma_rad)),
-        n_old=len(ids_a),
-        n_new=len(ids_b),
+        n_old=len(a.ids),
+        n_new=len(b.ids),
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Alignment:
-    """A map laid upon the truth: the similarity, the map's centres (N, 3), and how well they fix it."""
+def _truth_about(
+    link: Link, known: list[dict[int, FloatArray]], truth: Mapping[int, FloatArray], reach: int
+) -> list[_Side] | Failure:
+    """Lay either map upon the truth by its frames near the seam: of the old one none that the link left behind."""
+    first, handover = min(link.keyframes) - reach, max(link.keyframes)
+    sides = []
+    for m, T_est, last in ((link.a, known[0], handover), (link.b, known[1], handover + reach)):
+        ids = np.array(sorted(i for i in T_est if first <= i <= last), np.int64)
+        if len(ids) < MIN_FRAMES:
+            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(ids)} frames of submap {m} have a true pose")
+        sides.append(_align(ids, np.array([T_est[int(i)] for i in ids]), np.array([truth[int(i)] for i in ids])))
+    return sides
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Side:
+    """A map laid upon the truth by some frames: the similarity, the centres (N, 3) in the map, how well they fix it."""
+
+    ids: IntArray
     S_world_submap: FloatArray
     centres: FloatArray
     scale_sigma: float
@@ -145,7 +179,7 @@ def _poses_in(submap: Submap, poses: list[FramePose]) -> dict[int, FloatArray]:
     return found | {k: submap.resolve_anchor(k, np.eye(4)) for k in (*submap.anchors, *submap.keyframes)}
 
 
-def _align(T_submap_cam: FloatArray, T_world_cam: FloatArray) -> _Alignment:
+def _align(ids: IntArray, T_submap_cam: FloatArray, T_world_cam: FloatArray) -> _Side:
     """Lay cameras (N, 4, 4) upon true ones: the turn from their orientations, since a straight path leaves it open."""
     turns = T_world_cam[:, :3, :3] @ T_submap_cam[:, :3, :3].swapaxes(1, 2)
     R = so3.orthonormalise(turns.sum(0))
@@ -158,11 +192,13 @@ def _align(T_submap_cam: FloatArray, T_world_cam: FloatArray) -> _Alignment:
         s = 1e-9  # a map that runs against the truth: any link with it comes out wrong
     error2 = float(((q - s * p) ** 2).sum())
     n = len(est)
-    return _Alignment(
+    independent = max(n / CORRELATED_FRAMES, 2.0)
+    return _Side(
+        ids,
         sim3.from_parts(s, R, true.mean(0) - s * R @ est.mean(0)),
         est,
-        math.sqrt(error2 / max(3 * n - 4, 1) / spread2) / s,
-        math.sqrt(float((off**2).mean()) / n),
+        math.sqrt(error2 / spread2 / max(3 * independent - 4, 1.0)) / s,
+        math.sqrt(float((off**2).mean()) / independent),
     )
 
 

@@ -96,7 +96,7 @@ def test_the_truth_of_a_noisy_map_has_its_sigma() -> None:
     atlas.link(Link(0, 1, S_OLD_NEW, np.eye(7), LinkKind.RECOVERY, SEAM))
     (found,) = audit_links(atlas, [], dict(enumerate(T)))
     assert isinstance(found, LinkAudit)
-    assert 0.001 < found.scale_sigma < 0.02
+    assert 0.002 < found.scale_sigma < 0.04
     assert abs(found.scale) < 4 * found.scale_sigma
 
 

@@ -1,0 +1,21 @@
+"""A submap to which much was added at once, solved in batch."""
+
+from __future__ import annotations
+
+from dualslam.core.interfaces import SubmapGraph
+from dualslam.core.submap import Submap
+
+
+def solve(submap: Submap, graph: SubmapGraph) -> int:
+    """Solve a submap in a graph made anew, and drop what the solution contradicts; return how many observations.
+
+    Raises
+    ------
+    SolverError
+    """
+    estimate = graph.rebuild(submap)
+    submap.apply_estimate(estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu)
+    touched = submap.observations["landmark"][estimate.outlier_rows]
+    submap.remove_observations(estimate.outlier_rows)
+    submap.remove_landmarks(touched[submap.n_observations(touched) < 2])
+    return len(estimate.outlier_rows)
