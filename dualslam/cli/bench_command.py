@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from dualslam.bench_trial import describe_source, run_trial
 from dualslam.cli import logs
+from dualslam.cli.bench_figures import draw_figures
 from dualslam.core.errors import InputError
 from dualslam.evaluation.bench.cluster import run_on_cluster
 from dualslam.evaluation.bench.plan import plan_trials
@@ -38,6 +39,7 @@ def execute(args: argparse.Namespace) -> int:
         records = run_bench(spec, trials, out, _executor(args, out), on_trial)
     tables = bench_tables(spec, records)
     written = write_tables(spec, tables, records, out, command=_command(args))
+    written += draw_figures(spec, tables, records, out)
     if not args.quiet:
         print((out / TABLES).read_text(encoding="utf-8"), end="")
         print(f"{len(records)} trials and {len(written)} files of tables and figures in {out}", flush=True)
