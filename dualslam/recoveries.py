@@ -121,9 +121,11 @@ class Recoveries:
         """Merge the walks that have ended. `live` goes on in its submap as it is after that."""
         self._take(self._executor.poll(), live, now)
 
-    def finish(self, live: VisualOdometry | None, now: Moment) -> None:
-        """Merge the walks that are under way at the end of the run, if they end soon."""
-        self._take(self._executor.finish(), live, now)
+    def finish(self, live: VisualOdometry | None, last: Moment | None) -> None:
+        """Merge the walks that are under way after the last frame, if they end soon, and end the executor."""
+        outcomes = self._executor.finish()
+        if last is not None:
+            self._take(outcomes, live, last)
 
     def _take(self, outcomes: list[Outcome], live: VisualOdometry | None, now: Moment) -> None:
         for job, result in outcomes:
@@ -192,6 +194,7 @@ class Recoveries:
             estimate = result.link.estimate
             S_now_then = change_of_frame(unsolved, submap, estimate.agreeing_keyframes.tolist()) @ merged.S_live_grown
             self._fuse(job, result.link, S_now_then, walked, now, seconds)
+            self._settle(result.link.old_id, live)
 
     def _rectifier(self, job: RecoveryJob, submap: Submap) -> Callable[[Keyframe], Keyframe]:
         """Return what gives the walk's keyframes the pixels of the camera that the submap has now."""
@@ -253,13 +256,12 @@ class Recoveries:
         for frame in walked:
             if self._was_lost(frame.pose.index, found.old_id, job.onsets[found.old_id]):
                 record.rows[frame.pose.index].status = FrameStatus.RECOVERED
-        self._onsets.pop(found.old_id, None)
         seam = found.seam
         numbers = {"seam": str(seam.reason)} if isinstance(seam, Failure) else {"seam": "refined", **seam.numbers}
         record.event(EventKind.FUSED, now, new_id, old_submap=found.old_id, bypassed=n_bypassed, **numbers)
 
     def _bypass(self, walked: list[WalkedFrame], new_id: int, handover: int) -> int:
-        """Let the now part of the old map, beyond the keyframes that agree, take its poses from the new one."""
+        """Let the newest part of the old map, beyond the keyframes that agree, take its poses from the new one."""
         poses, n_bypassed = self._record.poses, 0
         for frame in walked:
             i = frame.pose.index
@@ -269,6 +271,13 @@ class Recoveries:
             self._record.rows[i].status = FrameStatus.BYPASSED
             n_bypassed += 1
         return n_bypassed
+
+    def _settle(self, old_id: int, live: VisualOdometry | None) -> None:
+        """Let no walk look any more for what is linked: the old submap, and all that is one map with the live one."""
+        settled = {old_id}
+        if live is not None:
+            settled.update(next(c for c in self._record.atlas.components() if live.submap.id in c))
+        self._onsets = {m: onset for m, onset in self._onsets.items() if m not in settled}
 
     def _was_lost(self, index: int, old_id: int, onset: int) -> bool:
         tracked = self._record.rows[index].status is FrameStatus.TRACKED

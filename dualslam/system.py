@@ -112,8 +112,7 @@ class System:
 
     def finish(self) -> None:
         """End the run: wait for walks back that are under way, for so long and no longer; archive what is live."""
-        if self.rows:
-            self._recoveries.finish(self._live, next(reversed(self.rows.values())))
+        self._recoveries.finish(self._live, next(reversed(self.rows.values()), None))
         if self._live is not None:
             self._archive(self._live, "end of sequence")
 

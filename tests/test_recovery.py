@@ -77,6 +77,13 @@ def test_the_events_tell_the_recovery_in_order(recovered: tuple[System, PointWor
     assert max(linked.data["agreeing_keyframes"]) < min(COVERED)
 
 
+def test_the_same_seed_gives_the_same_map_bit_for_bit(recovered: tuple[System, PointWorld]) -> None:
+    system, _ = recovered
+    again, _ = run(recovery=True)
+    assert np.array_equal(*(trajectories_of(s).main.T_world_cam for s in (system, again)))
+    assert np.array_equal(system.atlas.links[0].S_a_b, again.atlas.links[0].S_a_b)
+
+
 def test_rows_and_summary_agree_with_the_map(recovered: tuple[System, PointWorld]) -> None:
     system, _ = recovered
     trajectories = trajectories_of(system)

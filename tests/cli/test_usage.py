@@ -8,6 +8,8 @@ import pytest
 
 import dualslam
 from dualslam.cli import main
+from dualslam.cli.configuration import config_of
+from dualslam.cli.parser import parse
 from dualslam.core.config_io import load_config
 
 
@@ -159,3 +161,18 @@ def test_limit_threads_leaves_what_the_user_has_set() -> None:
     environment = {"OMP_NUM_THREADS": "3", "PATH": ""}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert done.stdout.split() == ["True", "False", "3", "1"]
+
+
+@pytest.mark.parametrize(
+    ("options", "workers"),
+    [
+        ("", 0),
+        ("--realtime", 1),
+        ("--realtime --inline", 0),
+        ("--realtime --set recovery.workers=3", 3),
+        ("--workers 2 --set recovery.workers=3", 2),
+    ],
+)
+def test_where_recovery_runs(options: str, workers: int) -> None:
+    args = parse(["run", "here", "--out", "there", *options.split()])
+    assert config_of(args).recovery.workers == workers
