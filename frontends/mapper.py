@@ -95,7 +95,12 @@ class Mapper:
         ids = submap.landmark_of[keyframe_id]
         found, counts = submap.covisible(ids[ids >= 0])
         keep = (found != keyframe_id) & (counts >= 15)
-        return [int(k) for k in found[keep][: self._config.triangulate_against]]
+        covisible = [int(k) for k in found[keep][: self._config.triangulate_against]]
+        if covisible:
+            return covisible
+        # Beyond a leap hardly a landmark may be known: what the frames on the other side see is found by its features.
+        by_time = sorted(submap.keyframes, key=lambda k: (abs(k - keyframe_id), k))
+        return [k for k in by_time if k != keyframe_id][: self._config.triangulate_against]
 
     def _cull_young(self) -> int:
         """Cull landmarks on probation that tracking does not find, or that too few keyframes came to see."""
@@ -167,7 +172,15 @@ class Mapper:
         if not self._wide_enough(other, baseline) or len(rows_a) == 0 or len(rows_b) == 0:
             return np.zeros(0, np.int64)
         T_b_a = se3.inverse(T_submap_b) @ T_submap_a
-        matches = match_epipolar(self._frontend, a, b, rows_a, rows_b, fundamental_from_pose(submap.K, T_b_a))
+        matches = match_epipolar(
+            self._frontend,
+            a,
+            b,
+            rows_a,
+            rows_b,
+            fundamental_from_pose(submap.K, T_b_a),
+            octave_tolerance=self._octave_tolerance(other, baseline),
+        )
         fa, fb = matches.index[:, 0], matches.index[:, 1]
         points = triangulate_two_view(a.uv_rect_px[fa], b.uv_rect_px[fb], submap.K, T_submap_a, T_submap_b)
         ok = (
@@ -186,14 +199,22 @@ class Mapper:
 
     def _wide_enough(self, other: int, baseline_mu: float) -> bool:
         """Whether the baseline can give the scene's median depth the smallest parallax that is asked for."""
+        return baseline_mu > 0.5 * np.radians(self._config.min_parallax_deg) * self._median_depth(other)
+
+    def _octave_tolerance(self, other: int, baseline_mu: float) -> int:
+        """Octaves between two views of a point: one, and as many as going so far towards the scene brings in scale."""
+        growth = np.log1p(baseline_mu / max(self._median_depth(other), 1e-12)) / np.log(self._frontend.scale_factor)
+        return 1 + int(growth)
+
+    def _median_depth(self, k: int) -> float:
+        """Median depth of a keyframe's landmarks; infinite if it has none."""
         submap = self._submap
-        ids = submap.landmark_of[other]
+        ids = submap.landmark_of[k]
         ids = ids[ids >= 0]
         if len(ids) == 0:
-            return False
-        T_cam_submap = se3.inverse(submap.T_submap_kf[other])
-        depth = submap.landmarks["xyz_mu"][ids] @ T_cam_submap[2, :3] + T_cam_submap[2, 3]
-        return baseline_mu > 0.5 * np.radians(self._config.min_parallax_deg) * float(np.median(depth))
+            return np.inf
+        T_cam_submap = se3.inverse(submap.T_submap_kf[k])
+        return float(np.median(submap.landmarks["xyz_mu"][ids] @ T_cam_submap[2, :3] + T_cam_submap[2, 3]))
 
     def _scales_agree(
         self, a: Features, b: Features, fa: IntArray, fb: IntArray, depth_a: FloatArray, depth_b: FloatArray

@@ -5,13 +5,13 @@ The tracker does not know in which direction time runs: it predicts from the las
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dualslam.core.config import TrackingConfig
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.geometry.projection import refine_pose
+from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
 from dualslam.core.submap import NO_LANDMARK, Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
@@ -20,7 +20,31 @@ from frontends.matching import FeatureGrid, match_projected
 from frontends.resection import resect
 
 WIDER = 2.5  # second guided search: this many times the first radius
+GIVEN_POSE_CHI2 = 4 * 9.210  # 99 % with 2 degrees of freedom, and the pose off by as much as a pixel
 PNP_MIN_MATCHES = 12  # below this a RANSAC consensus of a 3-point solver is no evidence
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GivenPose:
+    """A pose that the tracker did not find itself, with the evidence that it came with.
+
+    Attributes
+    ----------
+    T_cam_submap : (4, 4)
+    n_matches, n_inliers : int
+    chi2 : float
+        Mean squared whitened residual per degree of freedom of the inliers.
+    covariance : (6, 6)
+    wide : bool
+        Whether it is not the next frame's after the last one.
+    """
+
+    T_cam_submap: FloatArray
+    n_matches: int
+    n_inliers: int
+    chi2: float
+    covariance: FloatArray
+    wide: bool
 
 
 class Tracker:
@@ -95,6 +119,36 @@ class Tracker:
         self._accept(track)
         return track
 
+    def track_at(self, view: View, pose: GivenPose) -> Track:
+        """Take a pose as it is, and look for the landmarks of the keyframes nearest in time under it."""
+        keyframe_ids = self._nearest_keyframes(view.index, self._config.local_keyframes)
+        self._local = LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(keyframe_ids))
+        landmark_ids = np.full(len(view.features), NO_LANDMARK, np.int64)
+        grid = FeatureGrid.build(view.features.uv_rect_px)
+        landmark_ids, visible = self._search_local_map(view, grid, pose.T_cam_submap, landmark_ids)
+        feature = np.flatnonzero(landmark_ids >= 0)
+        uv, _ = project_points(
+            self._submap.K, pose.T_cam_submap, self._submap.landmarks["xyz_mu"][landmark_ids[feature]]
+        )
+        error2 = ((uv - view.features.uv_rect_px[feature]) ** 2).sum(axis=1)
+        fits = error2 < GIVEN_POSE_CHI2 * view.features.sigma_px[feature] ** 2
+        landmark_ids[feature[~fits]] = NO_LANDMARK
+        T = pose.T_cam_submap
+        track = Track(
+            view,
+            T,
+            T,
+            landmark_ids,
+            len(visible),
+            pose.n_matches,
+            pose.n_inliers,
+            pose.chi2,
+            pose.wide,
+            pose.covariance,
+        )
+        self._accept(track)
+        return track
+
     # --- steps
 
     def _predict(self, timestamp_s: float) -> FloatArray:
@@ -134,7 +188,7 @@ class Tracker:
     def _pose_from_wide_matches(self, view: View) -> tuple[FloatArray, IntArray] | Failure:
         """Match the whole image against the recent keyframes, pose by PnP."""
         submap, best = self._submap, Failure(FailureReason.TOO_FEW_MATCHES, "no keyframe matched")
-        for k in self._recent_keyframes(view.index):
+        for k in self._nearest_keyframes(view.index, self._config.wide_keyframes):
             has_landmark = np.flatnonzero(submap.landmark_of[k] >= 0)
             matches = self._frontend.match_wide(submap.keyframes[k].features.take(has_landmark), view.features)
             if len(matches) < PNP_MIN_MATCHES:
@@ -179,22 +233,8 @@ class Tracker:
         wide: bool,
     ) -> Track | Failure:
         """Add the local map's other landmarks about their pixels under the first pose, and refine with all of them."""
-        assert self._local is not None
-        features, local, submap = view.features, self._local, self._submap
-        prediction = self._predict_local(local, T_cam_submap)
-        new = ~np.isin(local.landmark_ids[prediction.rows], landmark_ids)
-        matches = match_projected(
-            self._frontend,
-            grid,
-            features,
-            prediction.uv_px[new],
-            self._config.local_radius_px * self._frontend.scale_factor ** prediction.octave[new],
-            local.descriptors[prediction.rows[new]],
-            octave=prediction.octave[new],
-            taken=landmark_ids >= 0,
-        )
-        landmark_ids = landmark_ids.copy()
-        landmark_ids[matches.index[:, 1]] = local.landmark_ids[prediction.rows[new][matches.index[:, 0]]]
+        features, submap = view.features, self._submap
+        landmark_ids, visible = self._search_local_map(view, grid, T_cam_submap, landmark_ids)
         feature = np.flatnonzero(landmark_ids >= 0)
         ids = landmark_ids[feature]
         estimate = refine_pose(
@@ -209,7 +249,6 @@ class Tracker:
         if estimate.n_inliers < self._config.min_inliers:
             return Failure(FailureReason.TOO_FEW_INLIERS, f"{estimate.n_inliers} inliers of {len(ids)} matches")
         landmark_ids[feature[~estimate.inliers]] = NO_LANDMARK
-        visible = local.landmark_ids[prediction.rows]
         submap.landmarks["n_visible"][visible] += 1
         submap.landmarks["n_found"][ids[estimate.inliers]] += 1
         return Track(
@@ -224,6 +263,28 @@ class Tracker:
             wide=wide,
             covariance=estimate.covariance,
         )
+
+    def _search_local_map(
+        self, view: View, grid: FeatureGrid, T_cam_submap: FloatArray, landmark_ids: IntArray
+    ) -> tuple[IntArray, IntArray]:
+        """Return the features' landmarks, those of the local map added that were not among them, and all in view."""
+        assert self._local is not None
+        features, local = view.features, self._local
+        prediction = self._predict_local(local, T_cam_submap)
+        new = ~np.isin(local.landmark_ids[prediction.rows], landmark_ids)
+        matches = match_projected(
+            self._frontend,
+            grid,
+            features,
+            prediction.uv_px[new],
+            self._config.local_radius_px * self._frontend.scale_factor ** prediction.octave[new],
+            local.descriptors[prediction.rows[new]],
+            octave=prediction.octave[new],
+            taken=landmark_ids >= 0,
+        )
+        landmark_ids = landmark_ids.copy()
+        landmark_ids[matches.index[:, 1]] = local.landmark_ids[prediction.rows[new][matches.index[:, 0]]]
+        return landmark_ids, local.landmark_ids[prediction.rows]
 
     def _accept(self, track: Track) -> None:
         assert self._last is not None
@@ -243,7 +304,7 @@ class Tracker:
         nearest = keyframe_ids[: self._config.local_keyframes]
         return LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(nearest))
 
-    def _recent_keyframes(self, frame_index: int) -> list[int]:
+    def _nearest_keyframes(self, frame_index: int, n: int) -> list[int]:
         """Keyframes nearest in time, nearest first."""
         by_time = sorted(self._submap.keyframes, key=lambda k: (abs(k - frame_index), k))
-        return by_time[: self._config.wide_keyframes]
+        return by_time[:n]

@@ -16,7 +16,7 @@ from dualslam.core.submap_change import change_of_frame
 from dualslam.core.types import Failure, FloatArray, Track, View
 from frontends.keyframing import keyframe_due
 from frontends.mapper import Mapper
-from frontends.tracker import Tracker
+from frontends.tracker import GivenPose, Tracker
 
 CULL_BEHIND = 2  # the newest keyframes are not judged redundant: the next ones may need them
 N_CULL_CANDIDATES = 10  # of the covisible keyframes, the nearest in what they see
@@ -63,6 +63,13 @@ class VisualFrontEnd:
         """Pose a frame against the submap."""
         track = self._tracker.track(view)
         if track and view.index in self.submap.keyframes:
+            self._meet(view.index)
+        return track
+
+    def track_at(self, view: View, pose: GivenPose) -> Track:
+        """Take a frame's pose from elsewhere, and find the submap's landmarks in it."""
+        track = self._tracker.track_at(view, pose)
+        if view.index in self.submap.keyframes:
             self._meet(view.index)
         return track
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from dualslam.core.corruption import Corruption
 from dualslam.core.strict_model import StrictModel as StrictModel  # part of this module, too
@@ -133,6 +133,24 @@ class HealthConfig(StrictModel):
     suspected to be corrupted. Signs on up to one healthy frame in five then add up to nothing."""
 
 
+class AttemptConfig(StrictModel):
+    """One attempt at a recovery: where its walk back takes the poses from. Written as a word, it is the front end."""
+
+    frontend: str = "live"
+    """`live`: the live features, guided by the motion model in reverse. Or a front end by its name: features of its
+    own, found in the buffered images, pose the frames by PnP from one to the next, and leap those that cannot be used.
+    Landmarks, and what is compared when linking, are made of the live features in either case."""
+    n_features: int = Field(2000, ge=50, le=20000)
+    """Keypoints per image of that front end."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """Settings of that front end alone."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_word(cls, value: Any) -> Any:
+        return {"frontend": value} if isinstance(value, str) else value
+
+
 class RecoveryConfig(StrictModel):
     """The walk back in time that joins a new submap to the one that was lost."""
 
@@ -140,6 +158,12 @@ class RecoveryConfig(StrictModel):
     """Off: a lost track ends the submap, and the next one stays apart from it."""
     max_leap_frames: int = Field(30, ge=0)
     """Frames in a row that the walk may leap, because none of its keyframes can be matched in them."""
+    attempts: tuple[AttemptConfig, ...] = Field((AttemptConfig(), AttemptConfig(frontend="sift")), min_length=1)
+    """In this order, each from the same snapshot of the new map, until one leads to a link. A list of words will do,
+    such as `[live, sift]`; an attempt with settings is written `{frontend: sift, n_features: 3000}`."""
+    max_leap_scale_sigma: float = Field(0.025, gt=0)
+    """Largest standard deviation (relative) of the scale beyond a leap, by the Hessian of its wide matches: all that is
+    mapped beyond inherits the error, and 5 %, two of these, is a wrong link."""
     min_shared_keyframes: int = Field(4, ge=2)
     """Keyframes that both maps must hold before a link is tried."""
     workers: int = Field(0, ge=0, le=16)

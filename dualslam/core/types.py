@@ -245,6 +245,7 @@ class FailureReason(StrEnum):
     REPROJECTION = "reprojection"
     DEFORMED = "deformed"
     NEEDS_OLDER_KEYFRAMES = "needs_older_keyframes"
+    UNCONFIRMED = "unconfirmed"
     TIMEOUT = "timeout"
     WORKER = "worker"
     DISABLED = "disabled"

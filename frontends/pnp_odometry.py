@@ -1,0 +1,265 @@
+"""Poses by a front end of its own, frame to frame (paper, section III-B); keyframes and landmarks of the live one.
+
+Features of another front end, found in the buffered images, are matched from frame to frame; their points, triangulated
+from the frames before, give each frame's pose by PnP. Under that pose the live front end looks for the submap's
+landmarks, and what it finds there makes the frame a keyframe like any other: landmarks are reconstructed from live
+features, and the factor graph solves for the pose anew. What other attempts took for the pose plays no part.
+
+Where the next frame cannot be posed so (blur, black-out, frames that are missing) the odometry leaps: it matches each
+further frame with several frames before the gap, and believes a pose only once a second frame beyond the gap, posed by
+itself, sees the same points where they should be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.core.config import Config
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.projection import project_points, refine_pose
+from dualslam.core.interfaces import BundleAdjuster, Frontend, KeyframeReport, SubmapGraph
+from dualslam.core.submap import Submap
+from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray, Matches, Track, View
+from frontends.guest_map import GuestMap, triangulate
+from frontends.resection import resect
+from frontends.tracker import GivenPose
+from frontends.visual import VisualFrontEnd
+from frontends.wide_pose import CHI2_2DOF_99, WidePose, estimate_wide_pose
+
+Extract = Callable[[View], Features | Failure]
+
+FOLLOW_FRAMES = 2  # frames that the next one is matched with
+POINT_FRAMES = 6  # frames that a point is triangulated from
+LEAP_FRAMES = 5  # frames before a gap that those beyond it are matched with
+SEED_KEYFRAMES = 8  # keyframes of the submap that the walk starts from
+CONFIRMING_SHARE = 0.5  # of the points that both frames beyond a gap see, a majority must confirm the leap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Beyond:
+    """A frame beyond a gap, and which of its features the tracks that agree with its pose are."""
+
+    index: int
+    rows: IntArray
+    pose: WidePose
+
+
+class PnpOdometry:
+    """Implements `VisualOdometry` on the live front end's submap with another front end's poses.
+
+    Parameters
+    ----------
+    live : VisualFrontEnd
+        Of the submap.
+    guest : Frontend
+    extract : callable
+        The guest's rectified features of a view, from its image.
+    views : iterable of View
+        Views of the submap's own keyframes are taken from these, to start with.
+    """
+
+    def __init__(
+        self,
+        live: VisualFrontEnd,
+        guest: Frontend,
+        extract: Extract,
+        views: Iterable[View],
+        adjuster: BundleAdjuster,
+        config: Config,
+        size_px: tuple[int, int],
+    ) -> None:
+        self._live = live
+        self._guest = guest
+        self._extract = extract
+        self._views = {view.index: view for view in views}
+        self._adjuster = adjuster
+        self._config = config
+        self._size_px = size_px
+        self._map = GuestMap(live.submap)
+        self._following = False  # whether the last frame that was given has a pose
+        self._beyond: _Beyond | None = None  # the last frame beyond a gap, until another confirms it
+
+    # --- the VisualOdometry protocol, as far as the live front end does it
+
+    @property
+    def submap(self) -> Submap:
+        """The submap that grows."""
+        return self._live.submap
+
+    @property
+    def graph(self) -> SubmapGraph:
+        """Its factor graph."""
+        return self._live.graph
+
+    @property
+    def reference_id(self) -> int:
+        """The keyframe that frames are posed against."""
+        return self._live.reference_id
+
+    def adopt(self, graph: SubmapGraph) -> None:
+        """Go on with another graph of the same submap."""
+        self._live.adopt(graph)
+
+    def relative_pose(self, track: Track) -> FloatArray:
+        """Return ``T_kf_cam``: the track's pose relative to the reference keyframe."""
+        return self._live.relative_pose(track)
+
+    def keyframe_due(self, track: Track) -> bool:
+        """Whether the frame should become a keyframe: in any case after a leap, which only its landmarks tie down."""
+        return track.wide or self._live.keyframe_due(track)
+
+    def insert_keyframe(self, track: Track) -> KeyframeReport:
+        """Make the frame a keyframe and solve the graph."""
+        report = self._live.insert_keyframe(track)
+        self._map.put(track.view.index, track.view.index, se3.inverse(self.submap.T_submap_kf[track.view.index]))
+        return report
+
+    # --- its own
+
+    def start_at(self, keyframe_id: int) -> None:
+        """Begin at a keyframe of the submap: it and its neighbours in time give the first points."""
+        self._live.start_at(keyframe_id)
+        nearest = sorted(self.submap.keyframes, key=lambda k: (abs(k - keyframe_id), k))[:SEED_KEYFRAMES]
+        for k in reversed(nearest):
+            if k in self._views:
+                self._learn(self._views[k])
+
+    def track(self, view: View) -> Track | Failure:
+        """Pose a frame."""
+        if view.index in self.submap.keyframes:
+            return self._meet(view)
+        features = self._features(view)
+        if isinstance(features, Failure):
+            self._following = False
+            return features
+        pose = self._follow(view.index, features) if self._following else Failure(FailureReason.TOO_FEW_MATCHES)
+        if isinstance(pose, Failure):
+            self._following = False
+            pose = self._leap(view.index, features)
+        if isinstance(pose, Failure):
+            return pose
+        self._following, self._beyond = True, None
+        self._map.put(view.index, self.reference_id, pose.T_cam_submap)
+        self._forget()
+        return self._live.track_at(view, pose)
+
+    def _meet(self, view: View) -> Track:
+        """Come to a frame that is a keyframe of the submap already."""
+        if view.index not in self._map.frames:
+            self._learn(view)
+        self._following = view.index in self._map.frames
+        n = int((self.submap.landmark_of[view.index] >= 0).sum())
+        T_cam_submap = se3.inverse(self.submap.T_submap_kf[view.index])
+        return self._live.track_at(view, GivenPose(T_cam_submap, n, n, 1.0, np.zeros((6, 6)), wide=False))
+
+    def _learn(self, view: View) -> None:
+        """Take a keyframe of the submap in."""
+        features = self._features(view)
+        if isinstance(features, Failure):
+            return
+        self._map.add(view.index, features, self._matches(features, self._map.frames[-LEAP_FRAMES:]))
+        self._map.put(view.index, view.index, se3.inverse(self.submap.T_submap_kf[view.index]))
+
+    def _features(self, view: View) -> Features | Failure:
+        minimum = self._config.tracking.min_inliers
+        if len(view.features) < minimum:
+            return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image")
+        features = self._extract(view)
+        if not isinstance(features, Failure) and len(features) < minimum:
+            return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features of {self._guest.name} in the image")
+        return features
+
+    def _matches(self, features: Features, frames: list[int]) -> dict[int, Matches]:
+        return {k: self._guest.match_wide(self._map.features(k), features) for k in reversed(frames)}
+
+    def _forget(self) -> None:
+        """Let go of frames that no later one will be compared with."""
+        for index in self._map.frames[:-POINT_FRAMES]:
+            if index not in self.submap.keyframes:
+                self._map.drop(index)
+
+    # --- from frame to frame
+
+    def _follow(self, index: int, features: Features) -> GivenPose | Failure:
+        """PnP against the points of the frames before."""
+        frames = self._map.frames[-POINT_FRAMES:]
+        self._map.add(index, features, self._matches(features, frames[-FOLLOW_FRAMES:]))
+        rows = self._map.rows_with_track(index)
+        xyz, good = triangulate(self._map.views(index, rows, frames), self.submap.K)
+        pose = self._pnp(features, rows[good], xyz[good])
+        if isinstance(pose, Failure):
+            self._map.drop(index)
+        return pose
+
+    def _pnp(self, features: Features, rows: IntArray, xyz: FloatArray) -> GivenPose | Failure:
+        minimum = self._config.health.min_inliers
+        if len(rows) < minimum:
+            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(rows)} points of {self._guest.name}")
+        uv, sigma = features.uv_rect_px[rows], features.sigma_px[rows]
+        T = resect(self.submap.K, self._size_px, uv, xyz, float(np.median(sigma)), self._config.seed)
+        found = refine_pose(self.submap.K, T, xyz, uv, sigma, min_inliers=minimum)
+        if isinstance(found, Failure):
+            return found
+        chi2 = float(found.chi2[found.inliers].mean() / 2)
+        return GivenPose(found.T_cam_w, len(rows), found.n_inliers, chi2, found.covariance, wide=False)
+
+    # --- over a gap
+
+    def _leap(self, index: int, features: Features) -> GivenPose | Failure:
+        """Wide matching with several frames before the gap; believed when a second frame beyond it agrees."""
+        keyframes = [k for k in self._map.frames[:-1] if k in self.submap.keyframes]
+        frames = [*keyframes[1 - LEAP_FRAMES :], *self._map.frames[-1:]]
+        self._map.add(index, features, self._matches(features, frames))
+        rows = self._map.rows_with_track(index)
+        wide = estimate_wide_pose(
+            self._map.views(index, rows, frames),
+            features.uv_rect_px[rows],
+            features.sigma_px[rows],
+            self.submap.K,
+            self._size_px,
+            self._adjuster,
+            self._config.seed,
+        )
+        wide = self._judge(wide)
+        if isinstance(wide, Failure):
+            self._map.drop(index)
+            return wide
+        before, self._beyond = self._beyond, _Beyond(index, rows[wide.inliers], wide)
+        if before is None:
+            return Failure(FailureReason.UNCONFIRMED, "the first frame beyond a gap", wide.numbers)
+        share = self._confirmed_share(before, self._beyond)
+        if share < CONFIRMING_SHARE:
+            self._map.drop(before.index)
+            return Failure(FailureReason.UNCONFIRMED, f"{share:.0%} of the points confirm the leap", wide.numbers)
+        self._map.put(before.index, self.reference_id, before.pose.T_cam_submap)
+        n_inliers = int(wide.inliers.sum())
+        return GivenPose(wide.T_cam_submap, len(rows), n_inliers, wide.chi2, wide.covariance, wide=True)
+
+    def _judge(self, wide: WidePose | Failure) -> WidePose | Failure:
+        """Hold a leap to what health asks of a track, and to the scale that it must not lose."""
+        health, limit = self._config.health, self._config.recovery.max_leap_scale_sigma
+        if isinstance(wide, Failure):
+            return wide
+        n = int(wide.inliers.sum())
+        if n < health.min_inliers or n < health.min_inlier_ratio * len(wide.inliers):
+            return Failure(FailureReason.TOO_FEW_INLIERS, f"{n} of {len(wide.inliers)} tracks agree", wide.numbers)
+        if wide.chi2 > health.max_chi2:
+            return Failure(FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {wide.chi2:.1f}", wide.numbers)
+        if wide.scale_sigma > limit:
+            return Failure(FailureReason.SCALE, f"the scale beyond is known to {wide.scale_sigma:.1%}", wide.numbers)
+        return wide
+
+    def _confirmed_share(self, first: _Beyond, second: _Beyond) -> float:
+        """Share of the points of one frame beyond the gap that the other one, posed by itself, sees where it should."""
+        features = self._map.features(second.index)
+        matches = self._guest.match_wide(self._map.features(first.index).take(first.rows), features)
+        if len(matches) < self._config.health.min_inliers:
+            return 0.0
+        xyz = first.pose.xyz_mu[first.pose.inliers][matches.index[:, 0]]
+        uv, _ = project_points(self.submap.K, second.pose.T_cam_submap, xyz)
+        error2 = ((uv - features.uv_rect_px[matches.index[:, 1]]) ** 2).sum(axis=1)
+        sigma = 2.0 * features.sigma_px[matches.index[:, 1]]  # the two poses are off by about a pixel's noise as well
+        return float((error2 < CHI2_2DOF_99 * sigma**2).mean())
