@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -11,20 +12,22 @@ from backend.self_calibration import estimate_calibration
 from backend.submap_graph import ISam2SubmapGraph
 from dualslam.calibration import Calibration, rectify
 from dualslam.core.camera import Camera
-from dualslam.core.config import Config
+from dualslam.core.config import AttemptConfig, Config, FrontendConfig
+from dualslam.core.errors import ConfigError
 from dualslam.core.grey_image import GreyImage
-from dualslam.core.interfaces import Frontend
+from dualslam.core.interfaces import Frontend, SubmapGraph
 from dualslam.core.submap import Submap
-from dualslam.core.types import Failure, FailureReason, Frame, View
+from dualslam.core.types import Failure, FailureReason, Features, Frame, View
 from dualslam.evaluation.failure_lab import FaultScript
 from dualslam.health import judge_track
 from dualslam.linking import DescriptorMatcher, estimate_link
 from dualslam.recoveries import InlineExecutor, RecoveryExecutor
-from dualslam.recovery import RecoveryParts
+from dualslam.recovery import Attempt, RecoveryJob, RecoveryParts
 from dualslam.system import Components, System
 from dualslam.worker import WorkerExecutor
 from frontends.images import to_grey
 from frontends.initialiser import Initialiser
+from frontends.pnp_odometry import PnpOdometry
 from frontends.registry import create_frontend
 from frontends.visual import VisualFrontEnd
 
@@ -64,7 +67,7 @@ def build_system(config: Config, camera: Camera) -> System:
         Components(
             view_of=faults.around_views(
                 lambda frame: view_of(
-                    frame, frontend, calibration.camera, config.camera.model_sigma_px, config.recovery.enabled
+                    frame, frontend, calibration.camera, config.camera.model_sigma_px, config.recovery.needs_images
                 )
             ),
             new_starter=lambda: Initialiser(
@@ -84,20 +87,34 @@ def build_system(config: Config, camera: Camera) -> System:
 def recovery_executor(config: Config, size_px: tuple[int, int], faults: FaultScript) -> RecoveryExecutor:
     """Build what runs walks back in time: in this process, or in workers, which are started at once."""
     recovery = config.recovery
+    # Built here in any case: a mistake in the config is told at once, not by a worker.
+    parts = recovery_parts(config, size_px)
     if recovery.workers == 0:
-        return faults.around_inline(InlineExecutor(recovery_parts(config, size_px)))
+        return faults.around_inline(InlineExecutor(parts))
     make_parts = partial(recovery_parts, config, size_px)
     limits = recovery.time_limit_s, recovery.finish_wait_s
     return WorkerExecutor(make_parts, recovery.workers, *limits, on_start=faults.kill_worker)
 
 
 def recovery_parts(config: Config, size_px: tuple[int, int]) -> RecoveryParts:
-    """Build what a walk back in time is made of, for images of this width and height."""
+    """Build what a walk back in time is made of, for images of this width and height.
+
+    Raises
+    ------
+    ConfigError
+        If a front end that an attempt names is not known, or its options are wrong.
+    """
     frontend = create_frontend(config.frontend)
+
+    def live(submap: Submap, graph: SubmapGraph) -> VisualFrontEnd:
+        return VisualFrontEnd(frontend, config, submap, graph, size_px)
+
     matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
     return RecoveryParts(
+        attempts=tuple(
+            _attempt(attempt, n, config, live, size_px) for n, attempt in enumerate(config.recovery.attempts)
+        ),
         new_graph=lambda: ISam2SubmapGraph(config.graph),
-        new_odometry=lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px),
         link=lambda old, new, onset: estimate_link(
             old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
         ),
@@ -105,6 +122,34 @@ def recovery_parts(config: Config, size_px: tuple[int, int]) -> RecoveryParts:
         config=config.recovery,
         fusion=config.fusion,
     )
+
+
+def _attempt(
+    attempt: AttemptConfig,
+    number: int,
+    config: Config,
+    live: Callable[[Submap, SubmapGraph], VisualFrontEnd],
+    size_px: tuple[int, int],
+) -> Attempt:
+    """Build one attempt: the live front end itself, or another one that gives it its poses."""
+    if attempt.is_live:
+        return Attempt(attempt.frontend, lambda job, submap, graph: live(submap, graph))
+    try:
+        guest = create_frontend(
+            FrontendConfig(name=attempt.frontend, n_features=attempt.n_features, options=attempt.options)
+        )
+    except ConfigError as error:
+        raise ConfigError(f"recovery.attempts[{number}]: {error}") from error
+
+    def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> PnpOdometry:
+        def extract(view: View) -> Features | Failure:
+            if view.image is None:
+                return Failure(FailureReason.UNREADABLE, "its image is no longer buffered")
+            return rectify(guest.extract(view.image.pixels()), job.camera, config.camera.model_sigma_px)
+
+        return PnpOdometry(live(submap, graph), guest, extract, job.own, bundle_adjust_arrays, config, size_px)
+
+    return Attempt(attempt.frontend, new_odometry)
 
 
 def view_of(

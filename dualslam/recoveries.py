@@ -112,6 +112,7 @@ class Recoveries:
             lost={m: atlas.submaps[m].copy() for m in onsets},
             onsets=onsets,
             views=tuple(self._views_before(newest, submap, stop_at_posed=not onsets)),
+            own=tuple(view for view in self._buffer if view.index in submap.keyframes),
             camera=self._calibration.camera,
         )
         self._began[submap.id] = time.perf_counter()
@@ -245,6 +246,7 @@ class Recoveries:
             now,
             new_id,
             old_submap=found.old_id,
+            attempt=found.attempt,
             matches=link.n_matches,
             inliers=link.n_inliers,
             agreeing_keyframes=agreeing,

@@ -1,8 +1,9 @@
 """Algorithm 1: walk back in time from a new submap until it overlaps a lost one so well that a Sim(3) links the two.
 
-The walk is the visual front end, given the buffered frames latest first. It sees images and features only, never the
+The walk is a visual front end, given the buffered frames latest first. It sees images and features only, never the
 old map's poses or landmarks: a link must not confirm itself. What it takes from the old map is which frames were
-keyframes, so that both maps hold the same ones.
+keyframes, so that both maps hold the same ones. Several attempts, each with poses from another front end, start from
+the same snapshot one after the other until one leads to a link; what one of them got wrong does not reach the next.
 
 It is a job: a function of a snapshot that nobody else changes, so that it can run beside the tracking, in a process of
 its own, and be merged (`dualslam.merging`) when it is ready.
@@ -13,7 +14,8 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
+from typing import Any
 
 from dualslam.core.camera import Camera
 from dualslam.core.config import FusionConfig, RecoveryConfig
@@ -48,6 +50,8 @@ class RecoveryJob:
         For each of them the frame from which on it is suspected to be corrupted.
     views : tuple of View
         What is buffered, latest first, from the frame before `newest_id` on.
+    own : tuple of View
+        Buffered views of the new submap's keyframes, `newest_id` included: for attempts that need their images.
     camera : Camera
         The one that rectified them.
     """
@@ -57,6 +61,7 @@ class RecoveryJob:
     lost: dict[int, Submap]
     onsets: dict[int, int]
     views: tuple[View, ...]
+    own: tuple[View, ...]
     camera: Camera
 
 
@@ -71,16 +76,17 @@ class WalkedFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundLink:
-    """The link that a walk ended with. `seam`: how the seam was refined, or why it was not."""
+    """The link that a walk ended with, and the attempt that it was. `seam`: how that was refined, or why it was not."""
 
     old_id: int
     estimate: LinkEstimate
     seam: SeamReport | Failure
+    attempt: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecoveryResult:
-    """What a walk back found out.
+    """What a recovery found out: the attempt that led to a link, or else the first one that walked at all.
 
     Attributes
     ----------
@@ -90,9 +96,9 @@ class RecoveryResult:
         In the order of the walk.
     link : FoundLink or None
     events : tuple of Event
-        The attempts, in order.
+        Of all attempts, in order.
     seconds, cpu_s : float
-        Wall and CPU time of the walk.
+        Wall and CPU time of all attempts.
     """
 
     submap: Submap
@@ -104,11 +110,19 @@ class RecoveryResult:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RecoveryParts:
-    """What a walk is made of; put together by the composition root of the process in which it runs."""
+class Attempt:
+    """One way to walk back, by the name of the front end that its poses come from."""
 
+    name: str
+    new_odometry: Callable[[RecoveryJob, Submap, SubmapGraph], VisualOdometry]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecoveryParts:
+    """What a recovery is made of; put together by the composition root of the process in which it runs."""
+
+    attempts: tuple[Attempt, ...]
     new_graph: Callable[[], SubmapGraph]
-    new_odometry: Callable[[Submap, SubmapGraph], VisualOdometry]
     link: Linker
     judge: Judge
     config: RecoveryConfig
@@ -118,79 +132,151 @@ class RecoveryParts:
 def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Failure:
     """Walk back from the job's submap until a link to a lost one passes its gates, or nothing is left to walk on.
 
-    The job is left as it was.
+    The job is left as it was. Where there is no map to link with, the first attempt poses the frames before the start.
     """
     started, cpu_started = time.perf_counter(), time.thread_time()
+    best: _Walk | None = None
+    problem = Failure(FailureReason.SOLVER)
+    events: list[Event] = []
+    for attempt in parts.attempts if job.lost else parts.attempts[:1]:
+        walk = _walk(job, parts, attempt)
+        if isinstance(walk, Failure):
+            problem = walk
+            continue
+        events += walk.events
+        if best is None or walk.link is not None:
+            best = walk
+        if walk.link is not None:
+            break
+    if best is None:
+        return problem
+    seconds, cpu_s = time.perf_counter() - started, time.thread_time() - cpu_started
+    return RecoveryResult(best.submap, tuple(best.frames), best.link, tuple(events), seconds, cpu_s)
+
+
+@dataclass(slots=True, eq=False)
+class _Walk:
+    """What one attempt has come to so far."""
+
+    submap: Submap
+    frames: list[WalkedFrame] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+    link: FoundLink | None = None
+    n_keyframes: int = 0
+    n_leaps: int = 0
+    n_leaped: int = 0  # frames without a pose between some that have one
+    n_unusable: int = 0  # the last frames
+    verdict: str = ""
+
+    def note_unusable(self, failure: Failure) -> None:
+        self.n_unusable += 1
+        self.verdict = failure.detail or str(failure.reason)
+
+    def note_posed(self, frame: WalkedFrame, new_keyframe: bool) -> None:
+        self.frames.append(frame)
+        self.n_keyframes += new_keyframe
+        self.n_leaps += self.n_unusable > 0
+        self.n_leaped += self.n_unusable
+        self.n_unusable = 0
+        self.verdict = ""
+
+
+def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt) -> _Walk | Failure:
+    """Make one attempt, from a copy of the job's submap."""
+    started = time.perf_counter()
     submap, graph = job.submap.copy(), parts.new_graph()
     try:
         estimate = graph.update(submap)
     except SolverError as error:
         return Failure(FailureReason.SOLVER, str(error))
     submap.apply_estimate(estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu)
-    walker = parts.new_odometry(submap, graph)
+    walker = attempt.new_odometry(job, submap, graph)
     walker.start_at(job.newest_id)
     relinker = Relinker(submap, job.lost, job.onsets, parts.link, parts.config)
-    frames, events = [], []
-    link: FoundLink | None = None
+    walk = _Walk(submap)
     for step in walk_back(walker, job.views, parts.judge, relinker.keyframe_ids, parts.config.max_leap_frames):
-        frames.append(_walked(walker, step))
+        if isinstance(step.track, Failure):
+            walk.note_unusable(step.track)
+            continue
+        walk.note_posed(_walked(walker, step.view, step.track), step.report is not None)
         if step.view.index not in submap.keyframes:
             continue
-        for attempt in relinker.attempts(step.view.index):
-            events.append(_event_of(attempt, step.view, submap.id))
-            if link is None and not isinstance(attempt.result, Failure):
-                found = _fused(job.lost[attempt.old_id], submap, attempt.result, parts)
-                if isinstance(found, Failure):
-                    events.append(_event_of(replace(attempt, result=found), step.view, submap.id))
-                else:
-                    link = found
-        if link is not None:
+        for tried in relinker.attempts(step.view.index):
+            found = _fused(tried, job, submap, attempt.name, parts)
+            if not isinstance(found, Failure):
+                walk.link = found
+                break
+            walk.verdict = found.detail
+            walk.events.append(_refusal(tried, found, attempt.name, step.view, submap.id))
+        if walk.link is not None:
             break
-    seconds, cpu_s = time.perf_counter() - started, time.thread_time() - cpu_started
-    return RecoveryResult(submap, tuple(frames), link, tuple(events), seconds, cpu_s)
+    if job.lost:
+        walk.events.append(_event_of(job, walk, attempt.name, time.perf_counter() - started))
+    return walk
 
 
-def _fused(old: Submap, submap: Submap, link: LinkEstimate, parts: RecoveryParts) -> FoundLink | Failure:
-    """Refine the seam and with it the link; a failure where the refined seam contradicts the link."""
-    seam = refine_seam(old, submap, link, parts.new_graph, parts.link, parts.fusion)
+def _fused(tried: LinkTry, job: RecoveryJob, submap: Submap, attempt: str, parts: RecoveryParts) -> FoundLink | Failure:
+    """Refine the seam and with it the link; a failure where there is none, or where the refined seam contradicts it."""
+    link = tried.result
+    if isinstance(link, Failure):
+        return link
+    seam = refine_seam(job.lost[tried.old_id], submap, link, parts.new_graph, parts.link, parts.fusion)
     if isinstance(seam, Failure):
         contradicted = seam.reason is FailureReason.CONTRADICTION
-        return seam if contradicted else FoundLink(old.id, link, seam)
+        return seam if contradicted else FoundLink(tried.old_id, link, seam, attempt)
     submap.take_over(seam.submap)
-    return FoundLink(old.id, seam.link, seam.report)
+    return FoundLink(tried.old_id, seam.link, seam.report, attempt)
 
 
-def _walked(walker: VisualOdometry, step: WalkStep) -> WalkedFrame:
-    view, track = step.view, step.track
+def _walked(walker: VisualOdometry, view: View, track: Track) -> WalkedFrame:
     pose = FramePose(view.index, view.timestamp_s, walker.submap.id, walker.reference_id, walker.relative_pose(track))
     return WalkedFrame(pose, track.n_matches, track.n_inliers)
 
 
-def _event_of(attempt: LinkAttempt, view: View, submap_id: int) -> Event:
-    result = attempt.result
-    refused = isinstance(result, Failure)
+def _refusal(tried: LinkTry, failure: Failure, attempt: str, view: View, submap_id: int) -> Event:
     data = {
-        "old_submap": attempt.old_id,
-        "shared_keyframes": attempt.n_shared,
-        "verdict": result.detail if isinstance(result, Failure) else "linked",
-        "reason": str(result.reason) if isinstance(result, Failure) else "linked",
-        **result.numbers,
+        "attempt": attempt,
+        "old_submap": tried.old_id,
+        "shared_keyframes": tried.n_shared,
+        "verdict": failure.detail,
+        "reason": str(failure.reason),
+        **failure.numbers,
     }
-    kind = EventKind.LINK_REFUSED if refused else EventKind.RECOVERY_ATTEMPT
-    return Event(kind, view.index, view.timestamp_s, submap_id, data)
+    return Event(EventKind.LINK_REFUSED, view.index, view.timestamp_s, submap_id, data)
+
+
+def _event_of(job: RecoveryJob, walk: _Walk, attempt: str, seconds: float) -> Event:
+    """One attempt in one line, at the frame where it ended."""
+    by_index = {view.index: view for view in (*job.own, *job.views)}
+    last = walk.frames[-1].pose.index if walk.frames else job.newest_id
+    data: dict[str, Any] = {
+        "attempt": attempt,
+        "frames": len(walk.frames),
+        "new_keyframes": walk.n_keyframes,
+        "leaps": walk.n_leaps,
+        "leaped_frames": walk.n_leaped,
+        "unusable_at_end": walk.n_unusable,
+        "matches": sum(frame.n_matches for frame in walk.frames),
+        "inliers": sum(frame.n_inliers for frame in walk.frames),
+        "verdict": "linked" if walk.link is not None else walk.verdict or "the buffer ends",
+        "seconds": seconds,
+    }
+    if walk.link is not None:
+        data |= {"old_submap": walk.link.old_id, **walk.link.estimate.numbers}
+    return Event(EventKind.RECOVERY_ATTEMPT, last, by_index[last].timestamp_s, job.submap.id, data)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WalkStep:
-    """One frame of a walk back: where it was found to be, and whether it became a keyframe."""
+    """One frame of a walk back: where it was found to be or why not, and whether it became a keyframe."""
 
     view: View
-    track: Track
+    track: Track | Failure
     report: KeyframeReport | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LinkAttempt:
+class LinkTry:
     """One try to link the growing submap with an older one."""
 
     old_id: int
@@ -221,6 +307,7 @@ def walk_back(
         track = judge(walker.track(view))
         if isinstance(track, Failure):
             n_failed += 1
+            yield WalkStep(view, track, None)
             if n_failed > max_leap_frames:
                 return
             continue
@@ -269,10 +356,10 @@ class Relinker:
         """Keyframes of the lost submaps."""
         return {k for old in self._old for k in old.keyframes}
 
-    def attempts(self, keyframe_id: int) -> Iterator[LinkAttempt]:
+    def attempts(self, keyframe_id: int) -> Iterator[LinkTry]:
         """Try each lost submap that holds the newest keyframe of the walk, the latest lost one first."""
         for old in reversed(self._old):
             shared = old.keyframes.keys() & self._submap.keyframes.keys()
             if keyframe_id not in shared or len(shared) < self._config.min_shared_keyframes:
                 continue
-            yield LinkAttempt(old.id, len(shared), self._linker(old, self._submap, self._onsets[old.id]))
+            yield LinkTry(old.id, len(shared), self._linker(old, self._submap, self._onsets[old.id]))

@@ -145,10 +145,21 @@ class AttemptConfig(StrictModel):
     options: dict[str, Any] = Field(default_factory=dict)
     """Settings of that front end alone."""
 
+    @property
+    def is_live(self) -> bool:
+        """Whether it walks on the live features."""
+        return self.frontend == "live"
+
     @model_validator(mode="before")
     @classmethod
     def _from_word(cls, value: Any) -> Any:
         return {"frontend": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _settings_have_an_owner(self) -> AttemptConfig:
+        if self.is_live and self.model_fields_set - {"frontend"}:
+            raise ValueError("`live` has no settings of its own: it is the front end that the section `frontend` sets")
+        return self
 
 
 class RecoveryConfig(StrictModel):
@@ -174,6 +185,11 @@ class RecoveryConfig(StrictModel):
     about a tenth of it on a free core."""
     finish_wait_s: float = Field(30.0, ge=0)
     """How long the end of the run waits for walks that are still under way."""
+
+    @property
+    def needs_images(self) -> bool:
+        """Whether an attempt reads the buffered images."""
+        return self.enabled and not all(attempt.is_live for attempt in self.attempts)
 
 
 class BufferConfig(StrictModel):

@@ -1,0 +1,230 @@
+"""Poses from another front end, leaps over a gap: on scenes of points where both front ends see what truth says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from backend.local_ba import bundle_adjust_arrays
+from dualslam.core.config import Config
+from dualslam.core.geometry import se3
+from dualslam.core.submap import NO_LANDMARK
+from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Track, View
+from frontends.guest_map import GuestMap, triangulate
+from frontends.orb import OrbFrontend
+from frontends.pnp_odometry import PnpOdometry
+from frontends.wide_pose import WidePose, estimate_wide_pose
+from tests.frontends.test_tracking import front_end
+from tests.point_world import CAMERA, SIZE_PX, PointWorld, cloud, path, random_features
+
+POSITION_M, ROTATION_RAD = 0.06, 0.005
+KEYFRAMES = [40, 43, 46, 49]
+"""Of the submap that the walk back starts from, at its truth."""
+DRIVE = path(60, np.array([0.05, 0.0, 0.2]), np.array([0.0, 0.004, 0.0]))
+"""Forwards: what lies ahead is seen at another scale on the other side of a gap."""
+
+
+def worlds(covered: range = range(0)) -> tuple[PointWorld, PointWorld]:
+    """The live front end's points and the guest's, which are others, along the same path."""
+    hidden = frozenset(covered)
+    xyz = cloud(1200, seed=1) * (1.5, 1.0, 2.5)
+    live = PointWorld(xyz, DRIVE, covered=hidden)
+    guest = PointWorld(cloud(1200, seed=7) * (1.5, 1.0, 2.5), DRIVE, seed=3, covered=hidden)
+    return live, guest
+
+
+def odometry(live: PointWorld, guest: PointWorld, config: Config | None = None) -> PnpOdometry:
+    def extract(view: View) -> Features | Failure:
+        return guest.features(view.index)
+
+    walker = PnpOdometry(
+        front_end(live, KEYFRAMES, 40),
+        OrbFrontend(),
+        extract,
+        [live.view(k) for k in KEYFRAMES],
+        bundle_adjust_arrays,
+        config or Config(),
+        SIZE_PX,
+    )
+    walker.start_at(40)
+    return walker
+
+
+def walk(walker: PnpOdometry, live: PointWorld, frames: range) -> dict[int, Track | Failure]:
+    steps = {}
+    for i in frames:
+        steps[i] = walker.track(live.view(i))
+        if steps[i] and walker.keyframe_due(steps[i]):
+            walker.insert_keyframe(steps[i])
+    return steps
+
+
+def errors(steps: dict[int, Track | Failure], world: PointWorld) -> FloatArray:
+    """(N, 6): rotation and position of each posed frame against the truth, in whose frame and unit the submap is."""
+    posed = {i: track for i, track in steps.items() if isinstance(track, Track)}
+    T = np.stack([track.T_cam_submap for track in posed.values()])
+    return se3.log(T @ world.T_world_cam[list(posed)])
+
+
+class TestFollowing:
+    def test_poses_are_right_and_come_from_the_guest_alone(self) -> None:
+        """The live front end sees nothing of its landmarks, and the frames are posed all the same."""
+        live, guest = worlds()
+        walker = odometry(live, guest)
+        blind = [replace(live.view(i), features=random_features(np.random.default_rng(i))) for i in range(39, 25, -1)]
+        steps = {view.index: walker.track(view) for view in blind}
+        assert all(isinstance(track, Track) for track in steps.values())
+        assert all((track.landmark_ids == NO_LANDMARK).mean() > 0.9 for track in steps.values() if track)
+        error = errors(steps, live)
+        assert np.linalg.norm(error[:, 3:], axis=1).max() < POSITION_M
+        assert np.linalg.norm(error[:, :3], axis=1).max() < ROTATION_RAD
+
+    def test_keyframes_hold_landmarks_of_live_features(self) -> None:
+        live, guest = worlds()
+        walker = odometry(live, guest)
+        before = len(walker.submap.landmarks)
+        steps = walk(walker, live, range(39, 19, -1))
+        new = [k for k in walker.submap.keyframes if k < 40]
+        assert len(new) >= 2
+        assert len(walker.submap.landmarks) > before + 50
+        lm = walker.submap.landmarks
+        assert lm["descriptor"].shape[1] == live.descriptors.shape[1]
+        for k in new:
+            assert (walker.submap.landmark_of[k] >= 0).sum() > 50
+            true = live.T_world_cam[k][:3, 3]
+            assert np.linalg.norm(walker.submap.T_submap_kf[k][:3, 3] - true) < POSITION_M
+        assert np.linalg.norm(errors(steps, live)[:, 3:], axis=1).max() < POSITION_M
+
+    def test_an_image_that_is_gone_is_a_failure_with_its_reason(self) -> None:
+        live, guest = worlds()
+        walker = odometry(live, guest)
+        walker._extract = lambda view: Failure(FailureReason.UNREADABLE, "gone")
+        failure = walker.track(live.view(39))
+        assert isinstance(failure, Failure)
+        assert failure.detail == "gone"
+
+
+class TestLeap:
+    covered = range(22, 40)
+
+    def test_it_leaps_a_gap_and_a_second_frame_confirms(self) -> None:
+        live, guest = worlds(self.covered)
+        walker = odometry(live, guest)
+        steps = walk(walker, live, range(39, 14, -1))
+        assert not any(steps[i] for i in self.covered)
+        first, second = steps[21], steps[20]
+        assert isinstance(first, Failure)
+        assert first.reason is FailureReason.UNCONFIRMED
+        assert isinstance(second, Track)
+        assert second.wide
+        assert all(steps[i] for i in range(20, 14, -1))
+        error = errors(steps, live)
+        assert np.linalg.norm(error[:, 3:], axis=1).max() < POSITION_M * 2
+        assert np.linalg.norm(error[:, :3], axis=1).max() < ROTATION_RAD
+        assert 20 in walker.submap.keyframes
+
+    def test_the_scale_beyond_is_that_before(self) -> None:
+        live, guest = worlds(self.covered)
+        walker = odometry(live, guest)
+        walk(walker, live, range(39, 9, -1))
+        beyond = sorted(k for k in walker.submap.keyframes if k < 22)
+        est = np.stack([walker.submap.T_submap_kf[k][:3, 3] for k in beyond])
+        true = live.T_world_cam[beyond][:, :3, 3]
+        ratio = np.linalg.norm(est[0] - est[-1]) / np.linalg.norm(true[0] - true[-1])
+        assert abs(ratio - 1) < 0.02
+
+    def test_poses_that_contradict_each_other_are_not_believed(self) -> None:
+        """Rows of like houses: beyond the gap, frame after frame shows what was before it from another place, and each
+        pose is as well supported as the true one. Only what was not seen before the gap tells how the camera moved.
+        """
+        live, guest = worlds(self.covered)
+        before = PointWorld(guest.xyz[:600], DRIVE, seed=3, covered=guest.covered)
+        np.testing.assert_array_equal(before.descriptors, guest.descriptors[:600])
+
+        def features(view: View) -> Features:
+            xyz = guest.xyz.copy()
+            xyz[:600, 1] += 0.6 if view.index % 2 else -0.6
+            return (PointWorld(xyz, DRIVE, seed=3) if view.index < 22 else before).features(view.index)
+
+        walker = odometry(live, before)
+        walker._extract = features
+        steps = {i: walker.track(live.view(i)) for i in range(39, 14, -1)}
+        assert not any(steps.values())
+        assert {steps[i].reason for i in range(21, 14, -1)} == {FailureReason.UNCONFIRMED}
+
+    def test_a_scale_that_is_not_known_is_refused(self) -> None:
+        live, guest = worlds(self.covered)
+        config = Config.model_validate({"recovery": {"max_leap_scale_sigma": 1e-4}})
+        walker = odometry(live, guest, config)
+        steps = walk(walker, live, range(39, 14, -1))
+        assert not any(steps.values())
+        assert steps[21].reason is FailureReason.SCALE
+
+
+def wide_case(seed: int, n_views: int, wrong: float) -> tuple[WidePose | Failure, FloatArray]:
+    """Wide matches of frame 15 of the drive with frames from 40 on, some of them wrong; the pose, and the truth."""
+    _, guest = worlds()
+    rng = np.random.default_rng(seed)
+    frontend, submap = OrbFrontend(), front_end(worlds()[0], KEYFRAMES, 40).submap
+    tracks = GuestMap(submap)
+    for k in KEYFRAMES[:n_views]:
+        features = guest.features(k)
+        tracks.add(k, features, {j: frontend.match_wide(tracks.features(j), features) for j in tracks.frames})
+        tracks.put(k, k, se3.inverse(guest.T_world_cam[k]))
+    features = guest.features(15)
+    matches = {k: frontend.match_wide(tracks.features(k), features) for k in tracks.frames}
+    tracks.add(15, features, matches)
+    rows = tracks.rows_with_track(15)
+    uv = features.uv_rect_px[rows].copy()
+    swap = rng.random(len(rows)) < wrong
+    uv[swap] = rng.uniform([0, 0], SIZE_PX, (int(swap.sum()), 2))
+    views = tracks.views(15, rows, tracks.frames)
+    found = estimate_wide_pose(views, uv, features.sigma_px[rows], CAMERA.K, SIZE_PX, bundle_adjust_arrays, seed)
+    if found:
+        # A pixel anywhere may lie on the epipolar line of a track that only one view knows.
+        assert found.inliers[swap].sum() <= 0.1 * swap.sum()
+    return found, guest.T_world_cam[15]
+
+
+class TestWidePose:
+    @pytest.mark.parametrize("wrong", [0.0, 0.4])
+    @pytest.mark.parametrize("n_views", [2, 4])
+    def test_pose_with_wrong_matches(self, n_views: int, wrong: float) -> None:
+        found, T_world_cam = wide_case(1, n_views, wrong)
+        assert isinstance(found, WidePose)
+        error = se3.log(found.T_cam_submap @ T_world_cam)
+        assert np.linalg.norm(error[3:]) < 2 * POSITION_M
+        assert np.linalg.norm(error[:3]) < ROTATION_RAD
+        assert 0.5 < found.chi2 < 1.5
+
+    def test_uncertainty_is_that_of_the_errors(self) -> None:
+        distance2 = []
+        for seed in range(8):
+            found, T_world_cam = wide_case(seed, 3, 0.1)
+            assert isinstance(found, WidePose)
+            error = se3.log(found.T_cam_submap @ T_world_cam)
+            distance2.append(error @ np.linalg.solve(found.covariance, error))
+        # Six degrees of freedom, the covariance inflated by 1.5 squared.
+        assert 0.5 < np.mean(distance2) < 12
+
+    def test_one_known_view_knows_no_scale(self) -> None:
+        found, _ = wide_case(1, 1, 0.0)
+        assert isinstance(found, Failure) or found.scale_sigma > 0.5
+
+    def test_points_of_the_known_views_are_right(self) -> None:
+        live, guest = worlds()
+        frontend, tracks = OrbFrontend(), GuestMap(front_end(live, KEYFRAMES, 40).submap)
+        for k in KEYFRAMES:
+            features = guest.features(k)
+            tracks.add(k, features, {j: frontend.match_wide(tracks.features(j), features) for j in tracks.frames})
+            tracks.put(k, k, se3.inverse(guest.T_world_cam[k]))
+        rows = tracks.rows_with_track(49)
+        xyz, good = triangulate(tracks.views(49, rows, tracks.frames), CAMERA.K)
+        words = guest.features(49).descriptors[rows[good]]
+        true = guest.xyz[[int(np.bitwise_count(guest.descriptors ^ d).sum(1).argmin()) for d in words]]
+        depth = np.linalg.norm(true - guest.T_world_cam[49][:3, 3], axis=1)
+        relative = np.linalg.norm(xyz[good] - true, axis=1) / depth
+        assert good.sum() > 50
+        assert np.median(relative) < 0.1

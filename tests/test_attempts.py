@@ -1,0 +1,127 @@
+"""Attempts at a recovery: their order, what they say, and a leap over a black-out on rendered images."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dualslam.build import build_system
+from dualslam.core.camera import PinholeCamera
+from dualslam.core.config import AttemptConfig, Config, RecoveryConfig
+from dualslam.core.errors import ConfigError
+from dualslam.core.events import Event, EventKind
+from dualslam.core.geometry import sim3
+from dualslam.results import trajectories_of
+from dualslam.synthetic import Event as Spoil
+from dualslam.synthetic import make_sequence
+from dualslam.synthetic.events import EventKind as SpoilKind
+from dualslam.system import System
+from tests.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
+
+COVERED = frozenset(range(35, 50))
+CAMERA = PinholeCamera(640, 480, 450.0, 450.0, 319.5, 239.5)
+
+
+def config(**recovery: object) -> RecoveryConfig:
+    return Config.model_validate({"recovery": recovery}).recovery
+
+
+class TestConfig:
+    def test_a_list_of_words_is_a_list_of_front_ends(self) -> None:
+        attempts = config(attempts=["live", "sift", {"frontend": "orb", "n_features": 4000}]).attempts
+        assert [attempt.frontend for attempt in attempts] == ["live", "sift", "orb"]
+        assert attempts[0].is_live
+        assert attempts[2] == AttemptConfig(frontend="orb", n_features=4000)
+
+    def test_images_are_kept_only_where_an_attempt_reads_them(self) -> None:
+        assert config().needs_images
+        assert not config(attempts=["live"]).needs_images
+        assert not config(enabled=False).needs_images
+
+    @pytest.mark.parametrize(
+        ("attempts", "told"),
+        [
+            ([], "at least 1"),
+            ([{"frontend": "live", "n_features": 500}], "no settings of its own"),
+            ([{"frontent": "sift"}], "frontent"),
+            ([3], "attempts.0"),
+        ],
+    )
+    def test_mistakes_are_told(self, attempts: list[object], told: str) -> None:
+        with pytest.raises(ValueError, match=told):
+            config(attempts=attempts)
+
+    def test_an_unknown_front_end_is_told_with_its_place(self) -> None:
+        with pytest.raises(ConfigError, match=r"recovery.attempts\[1\].*'surf'.*known: .*sift"):
+            build_system(Config.model_validate({"recovery": {"attempts": ["live", "surf"]}}), CAMERA)
+        options = [{"frontend": "sift", "options": {"ratios": 0.7}}]
+        with pytest.raises(ConfigError, match=r"recovery.attempts\[0\].*ratios"):
+            build_system(Config.model_validate({"recovery": {"attempts": options}}), CAMERA)
+
+
+def events_of(attempts: list[str], **settings: object) -> list[Event]:
+    """Attempts of a run in a world of points, where there are no images."""
+    system = system_in(PointWorld(cloud(), hand_held(60), covered=COVERED), recovery={"attempts": attempts, **settings})
+    for frame in PointWorld(cloud(), hand_held(60), covered=COVERED).frames():
+        system.step(frame)
+    return system.events.of_kind(EventKind.RECOVERY_ATTEMPT, EventKind.LINKED, EventKind.RECOVERY_ENDED)
+
+
+class TestOrder:
+    def test_the_first_that_links_is_the_last_that_is_made(self) -> None:
+        attempt, ended, linked = events_of(["live", "sift"])
+        assert attempt.data["attempt"] == linked.data["attempt"] == "live"
+        assert attempt.data["verdict"] == "linked"
+        assert attempt.data["frames"] >= attempt.data["new_keyframes"] >= 4
+        assert attempt.data["inliers"] <= attempt.data["matches"]
+        assert attempt.data["leaped_frames"] >= len(COVERED)
+        assert ended.data["linked"]
+
+    def test_one_that_fails_is_followed_by_the_next(self) -> None:
+        first, second, _, linked = events_of(["sift", "live"])
+        assert [first.data["attempt"], second.data["attempt"]] == ["sift", "live"]
+        assert first.data["verdict"] == "its image is no longer buffered"
+        assert linked.data["attempt"] == "live"
+
+    def test_the_next_starts_where_the_first_did(self) -> None:
+        alone = events_of(["live"])[-1].data
+        second = events_of(["sift", "live"])[-1].data
+        assert {k: v for k, v in alone.items() if k != "seconds"} == {k: v for k, v in second.items() if k != "seconds"}
+
+    def test_all_may_fail(self) -> None:
+        events = events_of(["live", "sift"], max_leap_frames=3)
+        assert [event.event for event in events[:2]] == [EventKind.RECOVERY_ATTEMPT] * 2
+        assert not events[-1].data["linked"]
+        assert events[0].data["unusable_at_end"] == 4
+
+
+def drive(attempts: list[str]) -> tuple[System, np.ndarray]:
+    """A street with a black-out of a second, at ten frames a second and half a metre a frame."""
+    sequence = make_sequence("street", 52, seed=2, events=[Spoil(SpoilKind.BLACKOUT, 26, 10)])
+    settings = {"recovery": {"attempts": attempts}, "calibration": {"refine": False}, "buffer": {"duration_s": 5.0}}
+    system = build_system(Config.model_validate(settings), sequence.camera)
+    for i in range(6, 52):
+        system.step(sequence.frame(i))
+    system.finish()
+    return system, sequence.ground_truth_T_world_cam
+
+
+@pytest.mark.slow
+def test_sift_leaps_a_black_out_on_the_road() -> None:
+    system, truth = drive(["sift"])
+    (attempt,) = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)
+    assert attempt.data["leaps"] == 1
+    (link,) = system.atlas.links
+    scales = []
+    for m in (link.a, link.b):
+        submap = system.atlas.submaps[m]
+        ids = [k for k in submap.keyframes if (k > 35) == (m == link.b)]
+        est, true = submap.keyframe_poses(ids)[:, :3, 3], truth[ids][:, :3, 3]
+        scales.append(np.linalg.norm(true - true.mean(0)) / np.linalg.norm(est - est.mean(0)))
+    # The whole new map, not only its end on this side of the gap, has its place and size.
+    assert abs(float(sim3.scale(link.S_a_b)) / (scales[1] / scales[0]) - 1) < 0.05
+    main = trajectories_of(system).main
+    translation, rotation = pose_errors(main.T_world_cam, truth[main.index])
+    length = np.linalg.norm(np.diff(truth[6:, :3, 3], axis=0), axis=1).sum()
+    assert translation.max() < 0.03 * length
+    assert rotation.max() < 0.01
