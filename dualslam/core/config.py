@@ -157,7 +157,7 @@ class AttemptConfig(StrictModel):
 
     @model_validator(mode="after")
     def _settings_have_an_owner(self) -> AttemptConfig:
-        if self.is_live and self.model_fields_set - {"frontend"}:
+        if self.is_live and self != AttemptConfig.model_construct():
             raise ValueError("`live` has no settings of its own: it is the front end that the section `frontend` sets")
         return self
 
