@@ -87,7 +87,8 @@ def assert_same(a: RecoveryResult | Failure, b: RecoveryResult | Failure) -> Non
     for x, y in zip(a.frames, b.frames, strict=True):
         assert x.pose.keyframe_id == y.pose.keyframe_id
         assert np.array_equal(x.pose.T_kf_cam, y.pose.T_kf_cam)
-    assert [event.as_dict() for event in a.events] == [event.as_dict() for event in b.events]
+    told = [[event.as_dict() | {"seconds": None} for event in result.events] for result in (a, b)]
+    assert told[0] == told[1]
     assert a.link is not None
     assert b.link is not None
     assert np.array_equal(a.link.estimate.S_old_new, b.link.estimate.S_old_new)
