@@ -5,6 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed.stamp
+KORNIA_STAMP := $(VENV)/kornia.stamp
 
 # One BLAS thread: two on busy cores make a bundle adjustment many times slower. Must be set before numpy is imported.
 export OMP_NUM_THREADS = 1
@@ -24,10 +25,15 @@ $(STAMP): pyproject.toml requirements/dev.lock
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
+# torch and kornia, an extra of the size of all the rest: only the tests need them.
+$(KORNIA_STAMP): $(STAMP) requirements/kornia.lock
+	$(BIN)/python -m pip install --quiet --only-binary :all: --requirement requirements/kornia.lock
+	@touch $@
+
 demo: setup
 	$(BIN)/dualslam demo --out runs/demo --overwrite
 
-test: setup
+test: $(KORNIA_STAMP)
 	$(BIN)/python -m pytest $(ARGS)
 
 check: setup
