@@ -93,6 +93,13 @@ def select_spread(xy: IntArray, response: FloatArray, n_wanted: int) -> IntArray
     return np.sort(by_cell[by_rank[:n_wanted]])
 
 
+def grades(response: FloatArray) -> FloatArray:
+    """Responses of any kind as whole numbers from 0 to 255, equally many of each, for `select_spread`."""
+    rank = np.empty(len(response))
+    rank[np.argsort(response, kind="stable")] = np.arange(len(response))
+    return np.floor(rank * 256 / max(len(response), 1))
+
+
 def share_out(n_available: Sequence[int], weights: FloatArray, n_wanted: int) -> list[int]:
     """Divide `n_wanted` among levels by weight; what a poor level cannot fill goes to the others, finest first.
 

@@ -26,3 +26,10 @@ def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     if image.ndim == 3:
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), np.uint8)
     return np.ascontiguousarray(image)
+
+
+def to_rgb(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The same image as contiguous (H, W, 3) uint8; three like channels where it is grey."""
+    if image.ndim == 2:
+        image = np.repeat(image[:, :, None], 3, axis=2)
+    return np.ascontiguousarray(image)

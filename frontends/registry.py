@@ -20,8 +20,12 @@ BUILT_IN: Mapping[str, str] = {
     "orb": "frontends.orb:OrbFrontend",
     "sift": "frontends.sift:SiftFrontend",
     "gms": "frontends.gms:GmsFrontend",
+    "kornia": "frontends.kornia.frontend:KorniaFrontend",
 }
 """Name to ``module:attribute``; the module is imported only when its name is asked for."""
+
+EXTRAS: Mapping[str, str] = {"kornia": "dualslam[kornia]"}
+"""What to install for a built-in front end that needs more than the core's dependencies."""
 
 OptionsT = TypeVar("OptionsT", bound=BaseModel)
 
@@ -81,5 +85,7 @@ def _factory(name: str) -> FrontendFactory:
             loaded: FrontendFactory = entry.load()
             return loaded
     except (ImportError, AttributeError) as error:
-        raise ConfigError(f"frontend.name: '{name}' is known but cannot be imported: {error}") from error
+        missing_extra = isinstance(error, ModuleNotFoundError) and name in EXTRAS
+        advice = f"; pip install '{EXTRAS[name]}'" if missing_extra else ""
+        raise ConfigError(f"frontend.name: '{name}' is known but cannot be imported: {error}{advice}") from error
     raise ConfigError(f"frontend.name: no front end is called '{name}'; known: {', '.join(known_frontends())}")

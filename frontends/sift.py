@@ -33,7 +33,7 @@ from pydantic import Field
 
 from dualslam.core.config import StrictModel
 from dualslam.core.types import Features, FloatArray, IntArray, Matches
-from frontends.corners import select_spread, share_out
+from frontends.corners import grades, select_spread, share_out
 from frontends.groups import consistent_rotation, mutual_best
 from frontends.images import to_grey
 from frontends.registry import parse_options
@@ -168,15 +168,8 @@ class SiftFrontend:
         weights = self.scale_factor ** -np.arange(self.n_octaves, dtype=np.float64)
         quotas = share_out([len(rows) for rows in levels], weights, self.n_features)
         return np.concatenate(
-            [rows[select_spread(xy[rows], _grades(response[rows]), n)] for rows, n in zip(levels, quotas, strict=True)]
+            [rows[select_spread(xy[rows], grades(response[rows]), n)] for rows, n in zip(levels, quotas, strict=True)]
         )
-
-
-def _grades(response: FloatArray) -> FloatArray:
-    """Responses as whole numbers from 0 to 255, equally many of each."""
-    rank = np.empty(len(response))
-    rank[np.argsort(response, kind="stable")] = np.arange(len(response))
-    return np.floor(rank * 256 / max(len(response), 1))
 
 
 def _root(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
