@@ -6,6 +6,7 @@ import gc
 import pickle
 import subprocess
 import sys
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from dualslam.core.config import FrontendConfig
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.types import Features
+from frontends.conformance import CHECKS, Subject
 from frontends.kornia.frontend import KorniaFrontend
 from frontends.kornia.options import KorniaOptions
 from frontends.kornia.runtime import DeviceCopies, inference
@@ -34,6 +36,12 @@ def on_cpu(n_features: int = 500, **options: object) -> KorniaFrontend:
 @pytest.fixture(scope="module")
 def features(image: Image) -> Features:
     return on_cpu().extract(image)
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("options", [{}, {"detector": "harris", "matcher": "smnn"}], ids=["dog", "harris"])
+def test_conforms(options: dict[str, str], check: Callable[[Subject], None]) -> None:
+    check(Subject(KorniaFrontend, {"device": "cpu", **options}))
 
 
 def test_is_found_by_its_name_and_takes_its_options() -> None:
