@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 import traceback
 from dataclasses import replace
@@ -34,7 +35,7 @@ from dualslam.results import trajectories_of
 from dualslam.session import Outcome, run_to_folder
 from dualslam.sources import SYNTHETIC, open_source
 
-ERROR_LOG = "error.log"
+ERROR_LOG, TRIAL = "error.log", "trial.json"
 
 
 class _TimedOutError(Exception):
@@ -96,6 +97,9 @@ def _run(trial: Trial, folder: Path, began: float) -> TrialRecord:
             raise _TimedOutError(f"longer than {trial.timeout_s:g} s; it was at frame {result.index}")
 
     config = config_from_dict(trial.config, trial.key)
+    # With config.yaml beside it, all that the run is made of.
+    frames = {"source": trial.source, "start": trial.start, "stride": trial.stride, "max_frames": trial.max_frames}
+    write_text(folder / TRIAL, json.dumps(frames | {"camera": trial.camera}, indent=2) + "\n")
     outcome = run_to_folder(config, sequence, folder, overwrite=True, on_frame=watch)
     if outcome.report.interrupted:
         raise KeyboardInterrupt

@@ -56,6 +56,7 @@ def test_a_trial_is_a_run_folder_and_a_line(spec: BenchSpec, trial: Trial, tmp_p
     assert judge(record, spec.thresholds) is None
     run = tmp_path / "trials" / "room" / "gap" / "base" / "00"
     assert json.loads((run / "summary.json").read_text())["ate_rmse_m"] == pytest.approx(record.ate_m)
+    assert json.loads((run / "trial.json").read_text())["start"] == trial.start
     # The same trial again takes the place of the first, with the same result but for its times.
     again = run_trial(trial, str(tmp_path))
     assert replace(again, wall_s=record.wall_s, cpu_s=record.cpu_s) == record

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from threading import Thread
 
 from dualslam.core.threads import limit_threads
 from dualslam.evaluation.bench.plan import Trial
@@ -102,6 +104,15 @@ def _collect(worker: _Worker, workers: list[_Worker]) -> TrialRecord:
 
 def _serve(run_trial: RunTrial, pipe: Connection) -> None:
     """Run trials until the other end of the pipe is closed, or someone interrupts."""
+    Thread(target=_end_with_the_bench, daemon=True).start()
     with suppress(EOFError, BrokenPipeError, KeyboardInterrupt):
         while True:
             pipe.send(run_trial(pipe.recv()))
+
+
+def _end_with_the_bench() -> None:
+    """End this process when the bench's is gone: a bench that goes on would find its trials' folders in use."""
+    bench = multiprocessing.parent_process()
+    assert bench is not None
+    wait([bench.sentinel])
+    os._exit(1)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from dualslam.evaluation.bench.plan import SourceInfo, Trial
+from dualslam.evaluation.bench.plan import SourceInfo, Trial, plan_trials
+from dualslam.evaluation.bench.pool import run_in_processes
 from dualslam.evaluation.bench.record import Breakage, LinkError, TrialOutcome, TrialRecord, blank_record
 from dualslam.evaluation.bench.spec import BenchSpec, SequenceSpec
 
@@ -64,6 +66,17 @@ def run_or_die(trial: Trial, folder: str) -> TrialRecord:
 def run_slowly(trial: Trial, folder: str) -> TrialRecord:
     time.sleep(0.3)
     return run_and_note(trial, folder)
+
+
+def run_for_long(trial: Trial, folder: str) -> TrialRecord:
+    (Path(folder) / str(os.getpid())).touch()
+    time.sleep(120)
+    return run_fake(trial)
+
+
+def bench_for_long(folder: str) -> None:
+    """What a process does that will be killed."""
+    list(run_in_processes(partial(run_for_long, folder=folder), plan_trials(SPEC, describe), 2))
 
 
 def runs_in(folder: Path) -> list[str]:

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -106,6 +106,35 @@ def test_a_process_that_dies_costs_its_trial_alone(trials: list[Trial], tmp_path
     assert (died.outcome, died.error) == (TrialOutcome.CRASHED, "the process died with exit code 7")
     expected = {t.key: run_fake(t) for t in trials}
     assert all(record == expected[key] for key, record in records.items())
+
+
+def test_no_process_outlives_a_bench_that_is_killed(notes: Path) -> None:
+    """Or the bench that goes on where this one was would find its trials' folders in use."""
+    code = f"from tests.evaluation.bench.fakes import bench_for_long; bench_for_long({str(notes)!r})"
+    root = Path(__file__).parents[3]
+    bench = subprocess.Popen([sys.executable, "-c", code], cwd=root)
+    try:
+        wait_for(lambda: len(list(notes.iterdir())) == 2)
+    finally:
+        bench.kill()
+        bench.wait()
+    for file in notes.iterdir():
+        wait_for(lambda pid=int(file.name): not running(pid))  # type: ignore[misc]
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def running(pid: int) -> bool:
+    try:
+        # A zombie that nobody has buried runs no more.
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 def worker(address: str, folder: Path) -> subprocess.Popen[bytes]:
