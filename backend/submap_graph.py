@@ -114,15 +114,22 @@ class ISam2SubmapGraph:
             self._blame(failure, submap)
         return self._remake(submap, start, rebuilt=True)
 
-    def rebuild(self, submap: Submap) -> GraphEstimate:
+    def rebuild(self, submap: Submap, near_optimum: bool = False) -> GraphEstimate:
         """Make the graph anew from the submap's arrays (batch optimum seeds a fresh iSAM2); returns everything.
+
+        Parameters
+        ----------
+        submap : Submap
+        near_optimum : bool
+            Whether its parts are solved already, so that few iterations are enough.
 
         Raises
         ------
         SolverError
             If that cannot be done.
         """
-        return self._remake(submap, time.thread_time(), rebuilt=True)
+        iterations = self._config.merge_iterations if near_optimum else self._config.rebuild_iterations
+        return self._remake(submap, time.thread_time(), rebuilt=True, iterations=iterations)
 
     def full_estimate(self, submap: Submap) -> GraphEstimate:
         """Return the estimate of every keyframe and landmark in the graph as of the last update, without solving."""
@@ -323,7 +330,7 @@ class ISam2SubmapGraph:
         elif convert.keyframe_of(failure.key) in submap.keyframes:
             self._forced_holds.add(convert.keyframe_of(failure.key))
 
-    def _remake(self, submap: Submap, start: float, rebuilt: bool) -> GraphEstimate:
+    def _remake(self, submap: Submap, start: float, rebuilt: bool, iterations: int | None = None) -> GraphEstimate:
         """Make the graph from the submap's arrays, more cautiously with each attempt that fails."""
         if not submap.keyframes:
             raise SolverError(f"submap {submap.id} has no keyframes: there is nothing to solve")
@@ -333,7 +340,7 @@ class ISam2SubmapGraph:
             if attempt >= REBUILD_ATTEMPTS // 2:
                 self._forced_holds.update(submap.keyframes)
             try:
-                plan = self._seed(submap, caution=1.0 + 0.5 * attempt)
+                plan = self._seed(submap, iterations or self._config.rebuild_iterations, caution=1.0 + 0.5 * attempt)
                 return self._read(submap, start, plan, True, rebuilt)
             except SolverFailure as failure:
                 message = str(failure)
@@ -342,16 +349,14 @@ class ISam2SubmapGraph:
         self._reset()
         raise SolverError(f"graph of submap {submap.id} could not be made in {REBUILD_ATTEMPTS} attempts: {message}")
 
-    def _seed(self, submap: Submap, caution: float) -> Plan:
+    def _seed(self, submap: Submap, iterations: int, caution: float) -> Plan:
         """Batch-optimise what the submap holds, and seed a fresh iSAM2 with the result."""
         poses: Mapping[int, FloatArray] = submap.T_submap_kf
         xyz = submap.landmarks["xyz_mu"]
         plan = self._ledger.plan(submap, poses, xyz, caution, strict=False)
         self._hold_loose_pieces(submap, plan)
         batch = self._changes(submap, plan, poses, xyz)
-        optimum = optimise_batch(
-            batch.graph, batch.values, plan.new_keyframes, plan.new_landmarks, self._config.rebuild_iterations
-        )
+        optimum = optimise_batch(batch.graph, batch.values, plan.new_keyframes, plan.new_landmarks, iterations)
         poses = dict(zip(plan.new_keyframes.tolist(), optimum.T_submap_kf, strict=True))
         xyz = xyz.copy()
         xyz[plan.new_landmarks] = optimum.xyz_mu

@@ -166,7 +166,7 @@ class Recoveries:
         merged = merge_recovery(submap, job.submap, result.submap, self._rectifier(job, submap))
         unsolved, graph = merged.submap.copy(), self._new_graph()
         try:
-            solve(merged.submap, graph)
+            solve(merged.submap, graph, near_optimum=_same_camera(job, submap))
         except SolverError as error:
             failure = Failure(FailureReason.SOLVER, str(error))
             self._failed(job, now, failure, time.perf_counter() - started_s)
@@ -201,7 +201,7 @@ class Recoveries:
         """Return what gives the walk's keyframes the pixels of the camera that the submap has now."""
 
         def rectify(keyframe: Keyframe) -> Keyframe:
-            if (submap.K == job.submap.K).all():
+            if _same_camera(job, submap):
                 return keyframe
             view = View(keyframe.id, keyframe.timestamp_s, keyframe.features)
             return replace(keyframe, features=self._calibration.rectified(view).features)
@@ -284,6 +284,10 @@ class Recoveries:
     def _was_lost(self, index: int, old_id: int, onset: int) -> bool:
         tracked = self._record.rows[index].status is FrameStatus.TRACKED
         return self._record.poses[index].submap_id != old_id and tracked and index >= onset
+
+
+def _same_camera(job: RecoveryJob, submap: Submap) -> bool:
+    return bool((submap.K == job.submap.K).all())
 
 
 def _scaled(T: FloatArray, scale: float) -> FloatArray:

