@@ -23,6 +23,7 @@ from dualslam.frame_buffer import FrameBuffer
 from dualslam.merging import Merged, carry_links, merge_recovery
 from dualslam.record import Moment, Record
 from dualslam.recovery import FoundLink, RecoveryJob, RecoveryParts, RecoveryResult, WalkedFrame, run_recovery
+from dualslam.seam import gauge_at_seam
 
 Outcome = tuple[RecoveryJob, RecoveryResult | Failure]
 
@@ -164,6 +165,8 @@ class Recoveries:
         """Merge a result into its submap, live or archived by now; solve it; pose and link by what came of it."""
         submap = self._record.atlas.submaps[job.submap.id]
         merged = merge_recovery(submap, job.submap, result.submap, self._rectifier(job, submap))
+        if result.link is not None:
+            merged.submap.gauge = gauge_at_seam(merged.submap, result.link.estimate.agreeing_keyframes)
         unsolved, graph = merged.submap.copy(), self._new_graph()
         try:
             solve(merged.submap, graph, near_optimum=_same_camera(job, submap))

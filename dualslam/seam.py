@@ -132,6 +132,24 @@ def refine_seam(
     return Seam(submap, again, replace(report, n_outliers=n_outliers, shift_sigmas=float(np.sqrt(chi2 / 7))))
 
 
+def gauge_at_seam(submap: Submap, keyframe_ids: IntArray) -> tuple[int, int]:
+    """Return the two keyframes that are to hold a submap's gauge from now on: the widest baseline of the seam.
+
+    A link is measured at its seam. While the map goes on at its other end its scale is still solved for, and if the
+    gauge lay there, the seam would drift away under the link. Where the seam spans less than the gauge in use (a turn
+    in place), that one stays.
+    """
+    ids = [int(k) for k in keyframe_ids if int(k) in submap.keyframes]
+    if len(ids) < 2:
+        return submap.gauge
+    newest = ids[-1]
+    reach = np.linalg.norm(submap.keyframe_poses(ids)[:, :3, 3] - submap.T_submap_kf[newest][:3, 3], axis=1)
+    in_use = [submap.resolve_anchor(k, np.eye(4))[:3, 3] for k in submap.gauge]
+    if reach.max() <= np.linalg.norm(in_use[0] - in_use[1]):
+        return submap.gauge
+    return newest, ids[int(np.argmax(reach))]
+
+
 def link_distance2(first: LinkEstimate, second: LinkEstimate) -> float:
     """Return the squared Mahalanobis distance of two estimates of a link, as if they were independent.
 

@@ -60,6 +60,17 @@ def test_the_link_has_the_true_scale(recovered: tuple[System, PointWorld]) -> No
     assert np.all(np.linalg.eigvalsh(link.covariance) > 0)
 
 
+def test_the_link_stays_true_while_the_live_map_goes_on(recovered: tuple[System, PointWorld]) -> None:
+    """At the end of the run the cameras that both maps hold still lie as far apart in both as the link says."""
+    system, _ = recovered
+    (link,) = system.atlas.links
+    old, new = system.atlas.submaps[link.a], system.atlas.submaps[link.b]
+    assert set(new.gauge) <= set(link.keyframes)
+    shared = [k for k in link.keyframes if k in old.keyframes and k in new.keyframes]
+    extent = [float(np.linalg.norm(p - p.mean(0))) for p in (m.keyframe_poses(shared)[:, :3, 3] for m in (old, new))]
+    assert abs(extent[0] / extent[1] / float(np.cbrt(np.linalg.det(link.S_a_b[:3, :3]))) - 1) < SCALE
+
+
 def test_the_events_tell_the_recovery_in_order(recovered: tuple[System, PointWorld]) -> None:
     system, _ = recovered
     told = (

@@ -16,7 +16,7 @@ from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason
 from dualslam.evaluation.link_audit import LinkAudit, audit_links
 from dualslam.linking import DescriptorMatcher, LinkEstimate, estimate_link
-from dualslam.seam import Seam, graft_keyframes, refine_seam
+from dualslam.seam import Seam, gauge_at_seam, graft_keyframes, refine_seam
 from tests.linking.worlds import FRAME_STEP, Case, hamming, make_case, make_world
 
 CONFIG = FusionConfig()
@@ -149,3 +149,14 @@ def test_without_keyframes_to_take_in_the_seam_stays_as_it_is(room: tuple[Case, 
     seam = refine_seam(case.old, case.new, link, new_graph, relink, FusionConfig(seam_keyframes=0))
     assert isinstance(seam, Failure)
     assert seam.reason is FailureReason.DISABLED
+
+
+def test_the_gauge_goes_to_the_widest_baseline_of_the_seam() -> None:
+    """Else the scale of the seam drifts away under the link while the map is still solved at its other end."""
+    case, link = linked("street", 0)
+    assert case.new.gauge not in {(39, 30), (30, 39)}
+    assert gauge_at_seam(case.new, link.agreeing_keyframes) == (39, 30)
+    # A seam that spans less than the gauge in use does not get it.
+    case.new.gauge = (69, 36)
+    assert gauge_at_seam(case.new, link.agreeing_keyframes) == (69, 36)
+    assert gauge_at_seam(case.new, np.array([39])) == (69, 36)

@@ -1,0 +1,156 @@
+"""Failures scripted into rendered worlds with exact truth: what is recovered, and how true each link is.
+
+    python benchmarks/synthetic_recovery.py --runs 40 --jobs 2 --out runs/synthetic_recovery.jsonl
+
+A run is a street or a room of its own seed, 320 x 240 pixels, with one failure of one kind in the middle. Each prints
+a line; a file that holds some runs already is continued. Run k of a kind has the same world, place and seed always.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dualslam.core.threads import limit_threads
+
+KINDS = ("wrong_pose", "blur", "blackout", "drop", "exposure", "turn")
+SCENES = ("street", "room")
+WIDTH, HEIGHT = 320, 240
+FEATURES = 600
+SECONDS = {"street": 9.0, "room": 6.0}
+
+
+def script(kind: str, scene: str, rng: np.random.Generator, n_frames: int, rate_hz: float) -> dict[str, list[Any]]:
+    """Return the disturbances of a run: `events` of the world, `corruptions` of the config."""
+    start = int(rng.uniform(0.45, 0.6) * n_frames)
+    # Longer than tracking waits for a lost map (8 frames), up to 1 s.
+    length = int(rng.integers(10, max(11, round(rate_hz)) + 1))
+    if kind == "wrong_pose":
+        # Forced into keyframe after keyframe, until the map around the camera is wrong.
+        level, n = float(rng.uniform(8, 25)), int(rng.integers(1, 6))
+        fault = {"kind": "wrong_pose", "start": start, "length": n, "strength": level, "seed": int(rng.integers(1000))}
+        return {"events": [], "corruptions": [fault]}
+    event: dict[str, Any] = {"start": start, "length": length}
+    event |= {
+        "blur": {"kind": "blur", "strength": float(rng.uniform(10, 25))},
+        "blackout": {"kind": "blackout"},
+        "drop": {"kind": "drop"},
+        "exposure": {"kind": "exposure", "strength": float(rng.choice([-6.0, 5.0]))},
+        "turn": {"kind": "rotation", "strength": float(rng.choice([-1, 1]) * rng.uniform(60, 110))},
+    }[kind]
+    return {"events": [event], "corruptions": []}
+
+
+def run_once(job: tuple[str, str, int], settings: dict[str, Any]) -> dict[str, Any]:
+    """Run one world, and measure."""
+    limit_threads()
+    from dualslam.build import build_system
+    from dualslam.core.config_io import config_from_dict
+    from dualslam.synthetic import make_sequence
+
+    scene, kind, seed = job
+    rate_hz = 10.0 if scene == "street" else 30.0
+    n_frames = round(SECONDS[scene] * rate_hz)
+    rng = np.random.default_rng([seed, KINDS.index(kind), SCENES.index(scene)])
+    made = script(kind, scene, rng, n_frames, rate_hz)
+    world = make_sequence(scene, n_frames, seed, WIDTH, HEIGHT, events=made["events"])
+    values = {"seed": seed, "frontend": {"n_features": FEATURES}, "corruptions": made["corruptions"]}
+    config = config_from_dict(values | settings, "synthetic_recovery")
+    began = time.process_time()
+    system = build_system(config, world.camera)
+    for frame in world:
+        system.step(frame)
+    system.finish()
+    return {"scene": scene, "kind": kind, "seed": seed} | measure(system, world, time.process_time() - began)
+
+
+def measure(system: Any, world: Any, cpu_s: float) -> dict[str, Any]:
+    """Return the numbers of a finished run."""
+    from dualslam.core.events import EventKind
+    from dualslam.evaluation.link_audit import audit_links
+    from dualslam.evaluation.trajectory_metrics import align_points
+    from dualslam.results import trajectories_of
+
+    truth = dict(enumerate(world.ground_truth_T_world_cam))
+    audits = audit_links(system.atlas, system.poses.values(), truth)
+    main = trajectories_of(system).main
+    started = min((i for i in system.poses), default=0)
+    possible = [i for i in world.indices.tolist() if i >= started]
+    ate_pct = None
+    if len(main) >= 10:
+        p, q = main.T_world_cam[:, :3, 3], world.ground_truth_T_world_cam[main.index][:, :3, 3]
+        s, R, t = align_points(p, q)
+        path = float(np.linalg.norm(np.diff(q, axis=0), axis=1).sum())
+        ate_pct = 100 * float(np.sqrt(((q - (s * p @ R.T + t)) ** 2).sum(1).mean())) / path
+    return {
+        "failures": len(system.events.of_kind(EventKind.FAILED)),
+        "restarts": len(system.events.of_kind(EventKind.REINITIALISED)),
+        "links": [a.as_dict() for a in audits if hasattr(a, "as_dict")],
+        "unaudited": sum(not hasattr(a, "as_dict") for a in audits),
+        "refused": [str(e.data.get("reason")) for e in system.events.of_kind(EventKind.LINK_REFUSED)],
+        "coverage": len(main) / max(len(possible), 1),
+        "ate_pct": ate_pct,
+        "cpu_s": cpu_s,
+    }
+
+
+def table(runs: list[dict[str, Any]]) -> str:
+    """Return the results by kind of failure, as Markdown."""
+    lines = [
+        "| scene | failure | runs | lost maps | with a new map | linked | wrong | scale % med / max "
+        "| rotation deg med / max | position % med / max | ATE % med |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    groups = [(s, k) for s in SCENES for k in KINDS] + [("all", "all")]
+    for scene, kind in groups:
+        of = [r for r in runs if scene == "all" or (r["scene"], r["kind"]) == (scene, kind)]
+        if not of:
+            continue
+        links = [link for r in of for link in r["links"]]
+        cells = [scene, kind, len(of), sum(r["failures"] for r in of), sum(r["restarts"] for r in of), len(links)]
+        cells.append(sum(link["wrong"] for link in links))
+        for name, factor in (("scale", 100), ("rotation_deg", 1), ("position", 100)):
+            values = [factor * abs(link[name]) for link in links]
+            cells.append(f"{np.median(values):.2f} / {max(values):.2f}" if values else "-")
+        ate = [r["ate_pct"] for r in of if r["ate_pct"] is not None]
+        cells.append(f"{np.median(ate):.2f}" if ate else "-")
+        lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run what is missing, then print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=17, help="runs of each scene and kind of failure")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--only", action="append", choices=(*KINDS, *SCENES), help="kinds or scenes to run")
+    parser.add_argument("--set", type=json.loads, default={}, help="config values as JSON, over the script's own")
+    parser.add_argument("--out", type=Path, default=Path("runs/synthetic_recovery.jsonl"))
+    args = parser.parse_args()
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    text = args.out.read_text() if args.out.exists() else ""
+    runs = [json.loads(line) for line in text.splitlines()]
+    done = {(r["scene"], r["kind"], r["seed"]) for r in runs}
+    wanted = [(s, k, n) for n in range(args.runs) for s in SCENES for k in KINDS]
+    if args.only:
+        wanted = [job for job in wanted if {job[0], job[1]} & set(args.only)]
+    missing = [job for job in wanted if job not in done]
+    with ProcessPoolExecutor(args.jobs) as pool, args.out.open("a") as out:
+        for result in pool.map(partial(run_once, settings=args.set), missing):
+            runs.append(result)
+            out.write(json.dumps(result) + "\n")
+            out.flush()
+            short = {name: result[name] for name in ("scene", "kind", "seed", "failures", "restarts", "coverage")}
+            print(json.dumps(short | {"links": [round(link["scale"], 4) for link in result["links"]]}), flush=True)
+    print(table(runs))
+
+
+if __name__ == "__main__":
+    main()
