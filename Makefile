@@ -1,4 +1,4 @@
-# make setup | demo | test | check | bench | lock | clean
+# make setup | demo | test | check | docs | bench | lock | clean
 # A fresh clone needs python3 (3.11 to 3.13, choose with PYTHON=python3.12), its venv and pip modules, and make.
 
 PYTHON ?= python3
@@ -13,7 +13,7 @@ export OPENBLAS_NUM_THREADS = 1
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 unexport PYTHONPATH
 
-.PHONY: setup demo test check format bench lock clean
+.PHONY: setup demo test check docs format bench lock clean
 .DEFAULT_GOAL := setup
 
 setup: $(STAMP)
@@ -42,6 +42,9 @@ check: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+docs: setup
+	$(BIN)/mkdocs build --quiet --strict
+
 format: setup
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -53,4 +56,4 @@ lock: setup
 	$(BIN)/python tools/lock.py
 
 clean:
-	rm -rf $(VENV) dist build runs/demo .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) dist build site runs/demo .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

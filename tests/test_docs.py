@@ -1,0 +1,75 @@
+"""The documentation: it builds without a warning, asks for nothing outside, and what it names is there."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from dualslam.core.config import Config
+from dualslam.core.config_io import _all_paths
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"]
+CODE = re.compile(r"`((?:dualslam|frontends|backend|tools|tests|notebooks|benchmarks|docs)/[\w./-]*)(?:::(\w+))?`")
+
+
+@pytest.fixture(scope="module")
+def hooks() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("docs_hooks", ROOT / "tools" / "docs_hooks.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("docs") / "site"
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return out
+
+
+def test_it_builds_and_asks_for_nothing_outside(site: Path) -> None:
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 10
+    for page in pages:
+        fetched = re.findall(r"<(?:script|link|img|iframe)\b[^>]*(?:src|href)=\"?([^\s\">]+)", page.read_text())
+        assert not [url for url in fetched if re.match(r"(https?:)?//", url)]
+
+
+def test_every_field_of_the_configuration_is_explained(site: Path) -> None:
+    text = (site / "configuration.html").read_text()
+    for path in _all_paths(Config):
+        if not (path in Config.model_fields and path != "seed"):
+            assert f"<code>{path}</code>" in text
+
+
+def test_equations_are_drawn_and_code_is_left_alone(site: Path, hooks: ModuleType) -> None:
+    assert (site / "theory.html").read_text().count(
+        '<math xmlns="http://www.w3.org/1998/Math/MathML" display="block"'
+    ) > 10
+    for page in site.rglob("*.html"):
+        assert not re.search(r"equation\d+ofpage|\\(?:frac|sum|left|begin)\b", page.read_text())
+    page = type("Page", (), {"meta": {}})
+    text = hooks.on_page_markdown("`$HOME` and $x$, 3 $ and 4 $\n```\n$y$\n```", page=page)
+    assert text == "`$HOME` and equation0ofpage, 3 $ and 4 $\n```\n$y$\n```"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_what_it_names_in_the_code_is_there(page: Path) -> None:
+    for path, name in CODE.findall(page.read_text()):
+        assert (ROOT / path).exists(), path
+        if name:
+            tree = ast.parse((ROOT / path).read_text())
+            defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+            assert name in defined, f"{path}::{name}"
