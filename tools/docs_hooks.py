@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import html
 import re
+from collections.abc import Iterator
 from typing import Any, get_args
 
 from latex2mathml.converter import convert
@@ -50,20 +51,24 @@ def math(latex: str, display: str) -> str:
 
 def configuration_page() -> str:
     """Return a section for each part of the configuration, with all its fields."""
-    sections = ["\n## At the top\n\n" + _fields(Config, "")]
-    for name, field in Config.model_fields.items():
-        model = _model_in(field.annotation)
-        if model is not None:
-            meaning = _sentence(model.__doc__ or field.description or "")
-            sections.append(f"\n## {name}\n\n{meaning}\n\n{_fields(model, name)}")
-    return "\n".join(sections)
+    return "\n## At the top\n\n" + _fields(Config, "") + "\n" + "\n".join(_sections(Config, "", "##"))
+
+
+def _sections(model: type[BaseModel], above: str, heading: str) -> Iterator[str]:
+    for name, field in model.model_fields.items():
+        inner = _model_in(field.annotation)
+        if inner is not None:
+            path = f"{above}{name}"
+            meaning = _sentence(field.description or inner.__doc__ or "")
+            yield f"\n{heading} {path}\n\n{meaning}\n\n{_fields(inner, path)}"
+            yield from _sections(inner, f"{path}.", heading + "#")
 
 
 def _fields(model: type[BaseModel], section: str) -> str:
     """Return the plain fields of a model as an HTML list: descriptions hold what Markdown would take for markup."""
     items = []
     for name, field in model.model_fields.items():
-        if not section and _model_in(field.annotation) is not None:
+        if _model_in(field.annotation) is not None:
             continue
         path = f"{section}.{name}" if section else name
         default = "required" if field.is_required() else _value(field.get_default(call_default_factory=True))
