@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 from collections.abc import Mapping
 from importlib.metadata import entry_points
 from typing import Any, Protocol, TypeVar
@@ -65,13 +66,18 @@ def parse_options(model: type[OptionsT], frontend: str, options: Mapping[str, An
         Names each offending option and lists those that exist.
     """
     try:
-        return model.model_validate(dict(options))
+        # By way of JSON, as the rest of the config: strict about types there, yet lists become tuples.
+        return model.model_validate_json(json.dumps(dict(options)), strict=True)
     except ValidationError as error:
         problems = "; ".join(
-            f"frontend.options.{'.'.join(map(str, each['loc'])) or '*'}: {each['msg']}" for each in error.errors()
+            f"frontend.options.{'.'.join(map(str, each['loc'])) or '*'}: "
+            f"{'there is no such option' if each['type'] == 'extra_forbidden' else each['msg']}"
+            for each in error.errors()
         )
         known = ", ".join(model.model_fields)
         raise ConfigError(f"front end '{frontend}': {problems} (its options: {known})") from error
+    except TypeError as error:
+        raise ConfigError(f"front end '{frontend}': frontend.options holds what YAML cannot: {error}") from error
 
 
 def _factory(name: str) -> FrontendFactory:
