@@ -1,7 +1,7 @@
 """From a bench to its trials: where each starts, where its corruption lies, which configuration it runs with.
 
-All variants get the same trials. What is random about one depends on the bench's seed and on the names of its sequence
-and condition alone, so that adding a sequence to a bench leaves the other trials as they are.
+All variants get the same trials. What is random about one depends on the bench's seed, the names of its sequence and
+condition, and its number alone, so that another sequence or more trials leave the others as they are.
 """
 
 from __future__ import annotations
@@ -18,6 +18,10 @@ from dualslam.core.config import Config
 from dualslam.core.config_io import Override, load_config
 from dualslam.core.errors import ConfigError
 from dualslam.evaluation.bench.spec import BenchSpec, ConditionSpec, SequenceSpec, VariantSpec
+
+# Steps of start and place that spread any number of trials evenly over both: the golden ratio's fraction leaves the
+# smallest gaps, and the square root of 2 is in no simple ratio to it.
+_SPREAD = (0.6180339887498949, 0.41421356237309515)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,17 +124,16 @@ def _trial(
     variant: VariantSpec,
     number: int,
 ) -> Trial:
-    rng = _rng(spec.seed, sequence.name, condition.name, number)
-    # Strata: the trials of a sequence and condition are spread over what there is.
+    words = int.from_bytes(hashlib.sha256(f"{sequence.name}\0{condition.name}".encode()).digest()[:8], "little")
+    rng = np.random.default_rng([spec.seed, words, number])
+    shares = np.random.default_rng([spec.seed, words]).random(2) + np.multiply(number, _SPREAD)
     first, last = _start_range(sequence, info)
-    start = first + int((last - first + 1) * (number + rng.random()) / spec.trials)
+    start = first + int((last - first + 1) * (shares[0] % 1))
     span = min(sequence.frames or info.n_frames, info.n_frames - start)
     seed = int(rng.integers(2**31))
     corruptions = []
     for placed in condition.corruptions:
-        # Another stratum than the start's, or late starts would always have late corruptions.
-        stratum = (number * _step(spec.trials) + rng.random()) % spec.trials / spec.trials
-        share = placed.at[0] + (placed.at[1] - placed.at[0]) * stratum
+        share = placed.at[0] + (placed.at[1] - placed.at[0]) * (shares[1] % 1)
         at = start + int(share * (span - 1))
         corruptions.append(placed.placed(at, info.rate_hz, int(rng.integers(2**31))).model_dump(mode="json"))
     return Trial(
@@ -162,16 +165,6 @@ def _start_range(sequence: SequenceSpec, info: SourceInfo) -> tuple[int, int]:
             f"and a trial spans {sequence.frames or 'what is left'}; start at {room} at the latest"
         )
     return first, last
-
-
-def _step(n: int) -> int:
-    """Return a stride through n strata that meets each once, far from the last."""
-    return next(step for step in range(max(1, round(0.618 * n)), 2 * n + 2) if np.gcd(step, n) == 1)
-
-
-def _rng(seed: int, sequence: str, condition: str, number: int) -> np.random.Generator:
-    words = hashlib.sha256(f"{sequence}\0{condition}".encode()).digest()[:8]
-    return np.random.default_rng([seed, int.from_bytes(words, "little"), number])
 
 
 def _config(spec: BenchSpec, variant: VariantSpec, seed: int, corruptions: list[dict[str, Any]]) -> Config:

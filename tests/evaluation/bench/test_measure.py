@@ -31,6 +31,7 @@ from dualslam.evaluation.bench.spec import Thresholds
 from dualslam.io.run_folder import FrameRow, PosedFrames
 from dualslam.io.trajectory_files import Trajectory
 from tests.evaluation.bench.fakes import SPEC, describe, run_fake
+from tests.point_world import PointWorld, cloud, hand_held, system_in
 
 GOOD = replace(run_fake(plan_trials(SPEC, describe)[0]), status="i" * 4 + "T" * 96, initialised_at=4)
 
@@ -187,3 +188,16 @@ def test_where_truth_is_there_in_parts_the_path_is_the_estimates() -> None:
         ate_m, path_m = trajectory_error(main, part, truth.timestamps_s)
         assert ate_m == pytest.approx(0, abs=1e-9)
         assert path_m == pytest.approx(length, rel=1e-6)
+
+
+def test_a_recovery_of_the_real_system_is_read_from_its_events() -> None:
+    world = PointWorld(cloud(), hand_held(70), covered=frozenset(range(35, 50)))
+    system = system_in(world, recovery={"enabled": True})
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    (lost,) = breakages(list(system.events))
+    assert 35 <= lost.frame < 50
+    assert (lost.submap, lost.attempts, lost.succeeded_at) == (0, 1, 1)
+    assert lost.recovery_s is not None
+    assert lost.restart_frames is not None

@@ -88,11 +88,9 @@ def test_trials_differ_in_start_place_and_seed() -> None:
     starts = np.array([t.start for t in trials])
     places = np.array([t.config["corruptions"][0]["start"] for t in trials]) - starts
     assert len(set(starts.tolist())) == len({t.config["seed"] for t in trials}) == 20
-    assert len(set(places.tolist())) > 15
+    assert len(set(places.tolist())) > 8
     # Spread over all that there is: 1000 frames and clips of 100, from 35 % to 65 % of the clip.
-    assert starts.min() < 45
-    assert starts.max() > 855
-    assert np.all(np.diff(starts) > 0)
+    assert np.diff(np.sort(np.r_[0, starts, 900])).max() < 0.15 * 900
     assert np.all((places >= 34) & (places <= 65))
     assert np.ptp(places) > 25
     assert abs(np.corrcoef(starts, places)[0, 1]) < 0.4
@@ -104,6 +102,11 @@ def test_another_sequence_changes_no_other_trial() -> None:
     prints = {t.key: t.fingerprint for t in plan_trials(SPEC, describe)}
     assert all(prints[t.key] == t.fingerprint for t in fewer)
     assert prints != {t.key: t.fingerprint for t in plan_trials(SPEC.model_copy(update={"seed": 1}), describe)}
+
+
+def test_more_trials_leave_those_that_there_are() -> None:
+    prints = {t.fingerprint for t in plan_trials(SPEC.model_copy(update={"trials": 8}), describe)}
+    assert all(t.fingerprint in prints for t in plan_trials(SPEC, describe))
 
 
 def test_a_whole_sequence_is_run_to_its_end() -> None:
