@@ -58,6 +58,7 @@ class Calibration:
         self._adjust = adjust
         self._due_at: dict[int, int] = {}
         self._refined_in: int | None = None
+        self._log_focal_sigma = np.inf  # of the change that the camera holds
 
     @property
     def camera(self) -> Camera:
@@ -89,7 +90,9 @@ class Calibration:
                 self._due_at[submap.id] = n + max(RETRY_KEYFRAMES, int(RETRY_SHARE * n))
             return estimate
         numbers = estimate.numbers
-        if not estimate.accepted:
+        log_focal_sigma = float(np.sqrt(estimate.covariance[0, 0]))
+        sharper = log_focal_sigma < self._config.update_sigma_ratio * self._log_focal_sigma
+        if not estimate.accepted and not (self._refined_in == submap.id and sharper):
             return Failure(FailureReason.CHI_SQUARE, "no significant change", numbers)
         try:
             camera = correct(self._camera, estimate.correction)
@@ -102,7 +105,7 @@ class Calibration:
         changed.apply_estimate(solved.keyframe_ids, solved.T_submap_kf, solved.landmark_ids, solved.xyz_mu)
         before = submap.copy()
         submap.take_over(changed)
-        self._camera, self._refined_in = camera, submap.id
+        self._camera, self._refined_in, self._log_focal_sigma = camera, submap.id, log_focal_sigma
         return Refinement(graph, before, numbers)
 
     def rectified(self, view: View) -> View:

@@ -78,6 +78,28 @@ class TestRefine:
         for a, b in zip(before, snapshot(submap), strict=True):
             assert a == b if isinstance(a, dict) else np.array_equal(a, b)  # type: ignore[arg-type]
 
+    @pytest.mark.parametrize(("log_focal_sigma", "changes"), [(0.004, True), (0.008, False)])
+    def test_a_changed_camera_follows_an_answer_that_is_twice_as_sure(
+        self, log_focal_sigma: float, changes: bool
+    ) -> None:
+        near, covariance = LensCorrection(log_focal=RIGHT_AGAIN.log_focal + 0.01), np.diag([0.01**2, 1, 1, 1, 1])
+        answers = [
+            replace(estimate_of(near, accepted=True), covariance=covariance),
+            replace(
+                estimate_of(RIGHT_AGAIN, accepted=False), covariance=np.diag([log_focal_sigma**2, 1.0, 1.0, 1.0, 1.0])
+            ),
+        ]
+        submap = make_submap(wrong_camera(WRONG), turning=True, n=12)
+        calibration = Calibration(
+            wrong_camera(WRONG),
+            CalibrationConfig(),
+            estimate=lambda submap, camera: answers.pop(0),
+            adjust=lambda submap: adjust_submap(submap, 1.345),
+        )
+        assert calibration.refine(submap, new_graph())
+        assert bool(calibration.refine(submap, new_graph())) is changes
+        assert correction_of(calibration.camera) == (RIGHT_AGAIN if changes else near)
+
     def test_a_solver_that_fails_leaves_the_submap(self) -> None:
         def adjust(submap: Submap) -> None:
             raise SolverError("no")
