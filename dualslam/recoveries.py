@@ -258,12 +258,18 @@ class Recoveries:
             **(link.numbers | {"scale": float(sim3.scale(S_old_new))}),
         )
         n_bypassed = self._bypass(walked, new_id, handover=max(agreeing))
+        onset = job.onsets[found.old_id]
+        n_dropped = self._drop_corrupted(
+            found.old_id, onset if link.change_point is None else min(onset, link.change_point)
+        )
         for frame in walked:
             if self._was_lost(frame.pose.index, found.old_id, job.onsets[found.old_id]):
                 record.rows[frame.pose.index].status = FrameStatus.RECOVERED
         seam = found.seam
         numbers = {"seam": str(seam.reason)} if isinstance(seam, Failure) else {"seam": "refined", **seam.numbers}
-        record.event(EventKind.FUSED, now, new_id, old_submap=found.old_id, bypassed=n_bypassed, **numbers)
+        record.event(
+            EventKind.FUSED, now, new_id, old_submap=found.old_id, bypassed=n_bypassed, dropped=n_dropped, **numbers
+        )
 
     def _bypass(self, walked: list[WalkedFrame], new_id: int, handover: int) -> int:
         """Let the newest part of the old map, beyond the keyframes that agree, take its poses from the new one."""
@@ -276,6 +282,18 @@ class Recoveries:
             self._record.rows[i].status = FrameStatus.BYPASSED
             n_bypassed += 1
         return n_bypassed
+
+    def _drop_corrupted(self, old_id: int, since: int) -> int:
+        """Take the pose from frames of the corrupted tail that the walk has leaped: that of the old map may be wrong.
+
+        They keep their row.
+        """
+        poses = self._record.poses
+        corrupted = [i for i, pose in poses.items() if pose.submap_id == old_id and i >= since]
+        for i in corrupted:
+            del poses[i]
+            self._record.rows[i].status, self._record.rows[i].submap_id = FrameStatus.BYPASSED, None
+        return len(corrupted)
 
     def _settle(self, old_id: int, live: VisualOdometry | None) -> None:
         """Let no walk look any more for what is linked: the old submap, and all that is one map with the live one."""

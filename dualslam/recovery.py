@@ -193,6 +193,7 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt) -> _Walk | F
     walker = attempt.new_odometry(job, submap, graph)
     walker.start_at(job.newest_id)
     relinker = Relinker(submap, job.lost, job.onsets, parts.link, parts.config)
+    walker.keep(relinker.keyframe_ids)  # redundant or not: linking stands on keyframes that both maps hold
     walk = _Walk(submap)
     for step in walk_back(walker, job.views, parts.judge, relinker.keyframe_ids, parts.config.max_leap_frames):
         if isinstance(step.track, Failure):

@@ -12,7 +12,7 @@ itself, sees the same points where they should be.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -100,6 +100,10 @@ class PnpOdometry:
         """Go on with another graph of the same submap."""
         self._live.adopt(graph, before)
         self.graph = graph
+
+    def keep(self, keyframe_ids: Set[int]) -> None:
+        """Never cull these keyframes."""
+        self._live.keep(keyframe_ids)
 
     def relative_pose(self, track: Track) -> FloatArray:
         """Return ``T_kf_cam``: the track's pose relative to the reference keyframe."""

@@ -6,6 +6,8 @@ through a buffer to an older submap: the only difference is the order in which i
 
 from __future__ import annotations
 
+from collections.abc import Set
+
 import numpy as np
 
 from dualslam.core.config import Config
@@ -35,6 +37,7 @@ class VisualFrontEnd:
         self._mapper = Mapper(frontend, config.mapping, submap, size_px)
         self._reference_id = -1
         self._since_rebuild = 0
+        self._kept: frozenset[int] = frozenset()
         self._path: list[int] = []  # keyframes in the order in which this front end met them
 
     @property
@@ -53,6 +56,10 @@ class VisualFrontEnd:
         self._tracker.start(track)
         self._reference_id = keyframe_id
         self._path = [keyframe_id]
+
+    def keep(self, keyframe_ids: Set[int]) -> None:
+        """Never cull these keyframes, however redundant they become."""
+        self._kept = frozenset(keyframe_ids)
 
     def adopt(self, graph: SubmapGraph, before: Submap) -> None:
         """Go on with another graph of the same submap, whose poses and points have moved since it was `before`."""
@@ -114,7 +121,7 @@ class VisualFrontEnd:
         submap = self.submap
         ids = submap.landmark_of[self._reference_id]
         covisible, _ = submap.covisible(ids[ids >= 0])
-        kept = {*submap.gauge, *self._path[-CULL_BEHIND:]}
+        kept = {*submap.gauge, *self._path[-CULL_BEHIND:], *self._kept}
         candidates = [k for k in covisible.tolist() if k not in kept][:N_CULL_CANDIDATES]
         culled = self._mapper.redundant_keyframe(candidates)
         if culled is not None:

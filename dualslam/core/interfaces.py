@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -322,6 +322,10 @@ class VisualOdometry(Protocol):
 
     def start_at(self, keyframe_id: int) -> None:
         """Begin at a keyframe of the submap, at rest."""
+        ...
+
+    def keep(self, keyframe_ids: Set[int]) -> None:
+        """Never cull these keyframes, however redundant they become."""
         ...
 
     def adopt(self, graph: SubmapGraph, before: Submap) -> None:
