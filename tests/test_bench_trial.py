@@ -12,9 +12,11 @@ import pytest
 from dualslam.bench_trial import describe_source, run_trial
 from dualslam.cli import main
 from dualslam.core.threads import LIMITS
+from dualslam.evaluation.bench.ledger import Ledger
 from dualslam.evaluation.bench.plan import Trial, plan_trials
 from dualslam.evaluation.bench.record import FailureKind, TrialOutcome, judge
 from dualslam.evaluation.bench.spec import BenchSpec, load_spec
+from tests.evaluation.bench.dask_cluster import dask_cluster
 
 SPEC = """
 name: tiny
@@ -96,6 +98,21 @@ def test_the_command_writes_tables_and_runs_nothing_twice(tmp_path: Path, capsys
     captured = capsys.readouterr()
     assert captured.err == ""
     assert ((out / "trials.jsonl").read_text(), (out / "tables.md").read_text()) == (lines, page)
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_line_that_this_machine_gives(trial: Trial, tmp_path: Path) -> None:
+    (tmp_path / "tiny.yaml").write_text(SPEC)
+    out = tmp_path / "out"
+    with dask_cluster(tmp_path) as cluster:
+        command = ["bench", str(tmp_path / "tiny.yaml"), "--out", str(out), "--scheduler", cluster.address]
+        assert main([*command, "--quiet"]) == 0
+    (line,) = Ledger(out / "trials.jsonl").records
+    here = run_trial(trial, str(tmp_path / "here"))
+    assert here.outcome is TrialOutcome.DONE
+    assert replace(here, wall_s=line.wall_s, cpu_s=line.cpu_s) == line
+    runs = [folder / "trials" / trial.key / "trajectory.txt" for folder in (out, tmp_path / "here")]
+    assert runs[0].read_bytes() == runs[1].read_bytes()
 
 
 @pytest.mark.parametrize(

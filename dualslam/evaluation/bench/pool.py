@@ -54,7 +54,7 @@ def run_in_processes(run_trial: RunTrial, trials: Iterable[Trial], n_processes: 
     try:
         while waiting or any(worker.trial for worker in workers):
             busy = [worker for worker in workers if worker.trial is not None]
-            idle = [worker for worker in workers if worker.trial is None]
+            idle = [worker for worker in workers if worker.trial is None and worker.process.is_alive()]
             while waiting and len(busy) < n_processes:
                 worker = idle.pop() if idle else _start(run_trial, workers)
                 worker.give(waiting.pop())

@@ -22,6 +22,7 @@ from dualslam.evaluation.bench.record import TrialOutcome, TrialRecord
 from dualslam.evaluation.bench.run import Executor, run_bench
 from dualslam.evaluation.bench.tables import bench_tables
 from tests.evaluation.bench import fakes
+from tests.evaluation.bench.dask_cluster import Cluster, dask_cluster
 from tests.evaluation.bench.fakes import SPEC, describe, processes_in, run_fake, runs_in
 
 
@@ -137,49 +138,21 @@ def running(pid: int) -> bool:
         return False
 
 
-def worker(address: str, folder: Path) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny"]
-    options = ["--no-dashboard", "--local-directory", str(folder)]
-    return subprocess.Popen([*command, *options], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-
-
 @pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """A scheduler and two workers, each a process of its own, on loopback."""
-    info = tmp_path / "scheduler.json"
-    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
-    options = ["--no-dashboard", "--no-show", "--scheduler-file", str(info)]
-    processes = [subprocess.Popen([*command, *options], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)]
-    try:
-        address = _address(info)
-        workers = [worker(address, tmp_path / f"worker{i}") for i in range(2)]
-        processes += workers
-        yield address, workers
-    finally:
-        for process in reversed(processes):
-            process.kill()
-            process.wait()
-
-
-def _address(info: Path) -> str:
-    import json
-
-    for _ in range(600):
-        if info.exists() and info.stat().st_size:
-            return str(json.loads(info.read_text())["address"])
-        time.sleep(0.1)
-    raise AssertionError("the scheduler did not start")
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    with dask_cluster(tmp_path) as running:
+        yield running
 
 
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_gives_the_same_tables(
-    cluster: tuple[str, list[subprocess.Popen[bytes]]],
+    cluster: Cluster,
     trials: list[Trial],
     tmp_path: Path,
     notes: Path,
     undisturbed: list[str],
 ) -> None:
-    address, workers = cluster
+    address, workers = cluster.address, cluster.workers
     killed = []
 
     def kill_one(record: TrialRecord, n_done: int, n: int) -> None:
