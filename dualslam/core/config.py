@@ -14,8 +14,8 @@ class FrontendConfig(StrictModel):
     """Features and their comparison."""
 
     name: str = "orb"
-    """Which front end: `orb`, `sift`, `gms`, or one that another package offers as an entry point of
-    `dualslam.frontends`; or `module:Class`, of what can be imported."""
+    """Which front end: `orb`, `sift`, `gms`, `kornia` (an extra), or one that another package offers as an entry point
+    of `dualslam.frontends`; or `module:Class`, of what can be imported."""
     n_features: int = Field(1000, ge=50, le=20000)
     """Keypoints per image."""
     options: dict[str, Any] = Field(default_factory=dict)
