@@ -75,6 +75,7 @@ def measure(system: Any, world: Any, cpu_s: float) -> dict[str, Any]:
     """Return the numbers of a finished run."""
     from dualslam.core.events import EventKind
     from dualslam.evaluation.link_audit import audit_links
+    from dualslam.evaluation.map_jumps import find_map_jumps
     from dualslam.evaluation.trajectory_metrics import align_points
     from dualslam.results import trajectories_of
 
@@ -95,6 +96,9 @@ def measure(system: Any, world: Any, cpu_s: float) -> dict[str, Any]:
         "links": [a.as_dict() for a in audits if hasattr(a, "as_dict")],
         "unaudited": sum(not hasattr(a, "as_dict") for a in audits),
         "refused": [str(e.data.get("reason")) for e in system.events.of_kind(EventKind.LINK_REFUSED)],
+        "silent_jumps": sum(
+            not jump.noticed for jump in find_map_jumps(system.atlas, system.poses.values(), truth, system.events)
+        ),
         "coverage": len(main) / max(len(possible), 1),
         "ate_pct": ate_pct,
         "cpu_s": cpu_s,
@@ -105,8 +109,8 @@ def table(runs: list[dict[str, Any]]) -> str:
     """Return the results by kind of failure, as Markdown."""
     lines = [
         "| scene | failure | runs | lost maps | with a new map | linked | wrong | scale % med / max "
-        "| rotation deg med / max | position % med / max | ATE % med |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| rotation deg med / max | position % med / max | ATE % med | silent jumps |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     groups = [(s, k) for s in SCENES for k in KINDS] + [("all", "all")]
     for scene, kind in groups:
@@ -121,6 +125,7 @@ def table(runs: list[dict[str, Any]]) -> str:
             cells.append(f"{np.median(values):.2f} / {max(values):.2f}" if values else "-")
         ate = [r["ate_pct"] for r in of if r["ate_pct"] is not None]
         cells.append(f"{np.median(ate):.2f}" if ate else "-")
+        cells.append(sum(r["silent_jumps"] for r in of))
         lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
     return "\n".join(lines)
 

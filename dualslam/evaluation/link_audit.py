@@ -118,7 +118,7 @@ def audit_link(
         return Failure(FailureReason.TOO_FEW_MATCHES, f"link {link.a}-{link.b} names no keyframes")
     known = [{i: T for i, T in _poses_in(atlas.submaps[m], poses).items() if i in truth} for m in (link.a, link.b)]
     # Slow motion tells little of scale, and far from the seam the maps have drifted: the reach that tells most.
-    best: tuple[float, list[_Side]] | None = None
+    best: tuple[float, list[Side]] | None = None
     while best is None or reach <= MAX_REACH:
         sides = _truth_about(link, known, truth, reach)
         if isinstance(sides, Failure):
@@ -150,7 +150,7 @@ def audit_link(
 
 def _truth_about(
     link: Link, known: list[dict[int, FloatArray]], truth: Mapping[int, FloatArray], reach: int
-) -> list[_Side] | Failure:
+) -> list[Side] | Failure:
     """Lay either map upon the truth by its frames near the seam: of the old one none that the link left behind."""
     first, handover = min(link.keyframes) - reach, max(link.keyframes)
     sides = []
@@ -158,12 +158,12 @@ def _truth_about(
         ids = np.array(sorted(i for i in T_est if first <= i <= last), np.int64)
         if len(ids) < MIN_FRAMES:
             return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(ids)} frames of submap {m} have a true pose")
-        sides.append(_align(ids, np.array([T_est[int(i)] for i in ids]), np.array([truth[int(i)] for i in ids])))
+        sides.append(align_cameras(ids, np.array([T_est[int(i)] for i in ids]), np.array([truth[int(i)] for i in ids])))
     return sides
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Side:
+class Side:
     """A map laid upon the truth by some frames: the similarity, the centres (N, 3) in the map, how well they fix it."""
 
     ids: IntArray
@@ -179,7 +179,7 @@ def _poses_in(submap: Submap, poses: list[FramePose]) -> dict[int, FloatArray]:
     return found | {k: submap.resolve_anchor(k, np.eye(4)) for k in (*submap.anchors, *submap.keyframes)}
 
 
-def _align(ids: IntArray, T_submap_cam: FloatArray, T_world_cam: FloatArray) -> _Side:
+def align_cameras(ids: IntArray, T_submap_cam: FloatArray, T_world_cam: FloatArray) -> Side:
     """Lay cameras (N, 4, 4) upon true ones: the turn from their orientations, since a straight path leaves it open."""
     turns = T_world_cam[:, :3, :3] @ T_submap_cam[:, :3, :3].swapaxes(1, 2)
     R = so3.orthonormalise(turns.sum(0))
@@ -193,7 +193,7 @@ def _align(ids: IntArray, T_submap_cam: FloatArray, T_world_cam: FloatArray) -> 
     error2 = float(((q - s * p) ** 2).sum())
     n = len(est)
     independent = max(n / CORRELATED_FRAMES, 2.0)
-    return _Side(
+    return Side(
         ids,
         sim3.from_parts(s, R, true.mean(0) - s * R @ est.mean(0)),
         est,
