@@ -16,7 +16,9 @@ from dualslam.recoveries import Outcome, RecoveryExecutor
 from dualslam.recovery import RecoveryJob
 from dualslam.results import trajectories_of
 from dualslam.system import System
+from dualslam.trajectory import compose
 from tests.backend.test_self_calibration import wrong_camera
+from tests.core.test_submap import assert_consistent
 from tests.point_world import PointWorld, cloud, hand_held, pose_errors, random_features, system_in
 from tests.test_calibration import PointWorld as CalibrationWorld
 
@@ -236,10 +238,48 @@ def test_what_the_live_map_knew_stays_as_it_was(world: PointWorld) -> None:
     assert list(submap.keyframes)[len(added) :] == list(before.keyframes)
     assert max(added) < min(before.keyframes)
     assert submap.gauge == before.gauge
-    # Each feature's landmark and the observations tell the same.
-    obs = submap.observations
-    rows = np.flatnonzero(obs["alive"])
-    seen = zip(*(obs[name][rows].tolist() for name in ("kf", "feature", "landmark")), strict=True)
-    assert all(submap.landmark_of[k][f] == j for k, f, j in seen)
-    assert submap.landmarks["alive"][obs["landmark"][rows]].all()
-    assert len(np.unique(np.stack([obs["kf"][rows], obs["landmark"][rows]]), axis=1).T) == len(rows)
+    assert_consistent(submap)
+
+
+class UnsteadyExecutor(LateExecutor):
+    """Gives results out after delays of all kinds, in any order, and loses some."""
+
+    def __init__(self, inner: RecoveryExecutor, seed: int) -> None:
+        super().__init__(inner, 0)
+        self.rng = np.random.default_rng(seed)
+
+    def submit(self, job: RecoveryJob) -> None:
+        self.polls = int(self.rng.integers(0, 50))
+        super().submit(job)
+
+    def poll(self) -> list[Outcome]:
+        lost = Failure(FailureReason.WORKER, "the recovery process ended with exit code -9")
+        return [(job, lost if self.rng.random() < 0.1 else result) for job, result in super().poll()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [12, 15, 21, 22])
+def test_any_schedule_leaves_a_consistent_atlas(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n, covered, at = 150, set(), 30
+    while at < n - 15:
+        length = int(rng.integers(9, 16))
+        covered |= set(range(at, at + length))
+        at += length + int(rng.integers(8, 40))
+    world = PointWorld(cloud(), hand_held(n), covered=frozenset(covered), seed=seed)
+    system = system_in(world, recovery={"enabled": True}, graph={"max_keyframes": 20, "rollover_keyframes": 6}, **DENSE)
+    system._recoveries._executor = UnsteadyExecutor(system._recoveries._executor, seed)
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    assert len(system.events.of_kind(EventKind.FAILED)) > 1
+    for submap in system.atlas.submaps.values():
+        assert_consistent(submap)
+        assert submap.keyframes.keys() == submap.T_submap_kf.keys() == submap.landmark_of.keys()
+        assert np.isfinite([submap.resolve_anchor(k, np.eye(4)) for k in submap.anchors]).all()
+    assert all(system.rows[i].submap_id == pose.submap_id for i, pose in system.poses.items())
+    for component in system.atlas.components():  # what is linked is one map
+        found = compose(system.poses.values(), system.atlas, system.atlas.S_world_submap(component))
+        translation, rotation = pose_errors(found.T_world_cam, world.T_world_cam[found.index])
+        assert translation.max() < POSITION_M
+        assert rotation.max() < ROTATION_RAD

@@ -279,9 +279,10 @@ class Submap:
     def apply_estimate(
         self, keyframe_ids: IntArray, T_submap_kf: FloatArray, landmark_ids: IntArray, xyz_mu: FloatArray
     ) -> None:
-        """Take refined poses and points over."""
+        """Take refined poses and points over; those of keyframes that were culled since are passed over."""
         for k, T in zip(keyframe_ids.tolist(), T_submap_kf, strict=True):
-            self.T_submap_kf[k] = np.array(T)
+            if k in self.keyframes:
+                self.T_submap_kf[k] = np.array(T)
         self.landmarks["xyz_mu"][landmark_ids] = xyz_mu
 
     def copy(self) -> Submap:

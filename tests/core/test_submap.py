@@ -47,6 +47,15 @@ def assert_consistent(submap: Submap) -> None:
 
 
 class TestSubmap:
+    def test_an_estimate_does_not_bring_a_culled_keyframe_back(self, submap: Submap) -> None:
+        """A graph knows it until its next update; what is posed against it follows the keyframe that it is tied to."""
+        ids, T = np.array([10, 20, 30]), submap.keyframe_poses([10, 20, 30])
+        submap.remove_keyframe(20, 30)
+        T[:, :3, 3] += 1.0
+        submap.apply_estimate(ids, T, np.zeros(0, np.int64), np.zeros((0, 3)))
+        assert list(submap.T_submap_kf) == [10, 30]
+        np.testing.assert_allclose(submap.resolve_anchor(20, np.eye(4)), T[1], atol=1e-12)
+
     def test_of_a_start(self) -> None:
         T = path(3, np.array([0.2, 0, 0]), np.zeros(3))
         feature = np.array([[0, 1, 2], [0, -1, 2], [3, 4, 5]])
