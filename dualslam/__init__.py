@@ -20,16 +20,18 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from dualslam.build import build_system
+    from dualslam.build import build_system, recovery_parts
     from dualslam.core.config import Config
     from dualslam.core.config_io import config_from_dict, dump_config, load_config
     from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError, SolverError
     from dualslam.core.threads import limit_threads
-    from dualslam.core.types import Frame
+    from dualslam.core.types import Failure, Frame
     from dualslam.evaluation.failure_lab import corrupted
     from dualslam.evaluation.trajectory_metrics import evaluate_run
     from dualslam.frame_records import FrameResult
+    from dualslam.linking import propose_correspondences
     from dualslam.map_store import load_atlas, save_atlas
+    from dualslam.recovery import walk_back
     from dualslam.report import comparison_page, read_run, report_page
     from dualslam.results import trajectories_of
     from dualslam.runner import run_sequence
@@ -41,6 +43,7 @@ _WHERE = {
     "Config": "core.config",
     "ConfigError": "core.errors",
     "DualSlamError": "core.errors",
+    "Failure": "core.types",
     "Frame": "core.types",
     "FrameResult": "frame_records",
     "InputError": "core.errors",
@@ -57,18 +60,22 @@ _WHERE = {
     "load_atlas": "map_store",
     "load_config": "core.config_io",
     "open_source": "sources",
+    "propose_correspondences": "linking",
     "read_run": "report",
+    "recovery_parts": "build",
     "report_page": "report",
     "run_sequence": "runner",
     "run_to_folder": "session",
     "save_atlas": "map_store",
     "trajectories_of": "results",
+    "walk_back": "recovery",
 }
 
 __all__ = [
     "Config",
     "ConfigError",
     "DualSlamError",
+    "Failure",
     "Frame",
     "FrameResult",
     "InputError",
@@ -86,12 +93,15 @@ __all__ = [
     "load_atlas",
     "load_config",
     "open_source",
+    "propose_correspondences",
     "read_run",
+    "recovery_parts",
     "report_page",
     "run_sequence",
     "run_to_folder",
     "save_atlas",
     "trajectories_of",
+    "walk_back",
 ]
 
 

@@ -34,7 +34,7 @@ from frontends.visual import VisualFrontEnd
 ADJUST_ITERATIONS = 20
 
 
-def build_system(config: Config, camera: Camera) -> System:
+def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | None = None) -> System:
     """Build a system from its config.
 
     Parameters
@@ -42,6 +42,8 @@ def build_system(config: Config, camera: Camera) -> System:
     config : Config
     camera : Camera
         Lens model and size of the images that `System.step` will be given.
+    recovery : RecoveryExecutor, optional
+        What takes on the walks back in time, in the place of what the config says: to look at them one by one.
 
     Returns
     -------
@@ -78,7 +80,7 @@ def build_system(config: Config, camera: Camera) -> System:
                 lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px)
             ),
             calibration=calibration,
-            recovery=recovery_executor(config, size_px, faults),
+            recovery=recovery or recovery_executor(config, size_px, faults),
         ),
         config,
     )
