@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from dualslam.build import build_system, recovery_parts
+    from dualslam.build import build_system, create_frontend, recovery_parts
     from dualslam.core.config import Config
     from dualslam.core.config_io import config_from_dict, dump_config, load_config
     from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError, SolverError
@@ -54,6 +54,7 @@ _WHERE = {
     "comparison_page": "report",
     "config_from_dict": "core.config_io",
     "corrupted": "evaluation.failure_lab",
+    "create_frontend": "build",
     "dump_config": "core.config_io",
     "evaluate_run": "evaluation.trajectory_metrics",
     "limit_threads": "core.threads",
@@ -87,6 +88,7 @@ __all__ = [
     "comparison_page",
     "config_from_dict",
     "corrupted",
+    "create_frontend",
     "dump_config",
     "evaluate_run",
     "limit_threads",

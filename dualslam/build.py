@@ -28,7 +28,7 @@ from dualslam.worker import WorkerExecutor
 from frontends.images import to_grey
 from frontends.initialiser import Initialiser
 from frontends.pnp_odometry import PnpOdometry
-from frontends.registry import create_frontend
+from frontends.registry import create_frontend as create_frontend  # part of the Python interface
 from frontends.visual import VisualFrontEnd
 
 ADJUST_ITERATIONS = 20

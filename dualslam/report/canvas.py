@@ -70,8 +70,9 @@ class Canvas:
     def label(self, uv: FloatArray, text: object, cls: str, title: str | None = None) -> Markup:
         """Return words that stand at a point (2,)."""
         left, top = self.to_percent(uv)
-        # Near an edge they stand on its inner side.
-        side = " inward-right" if left < _EDGE_PERCENT else " inward-left" if left > 100 - _EDGE_PERCENT else ""
+        side = ""
+        if len(str(text)) > 1:  # near an edge, words stand on its inner side; a mark stays where it is
+            side = " inward-right" if left < _EDGE_PERCENT else " inward-left" if left > 100 - _EDGE_PERCENT else ""
         return tag("span", text, cls=f"at {cls}{side}", style=f"left:{left:.2f}%;top:{top:.2f}%", title=title)
 
     def scale_bar(self, unit: str, drawn: FloatArray) -> Markup:

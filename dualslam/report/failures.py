@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from dualslam.report.attempts import link_table, walk_table
 from dualslam.report.markup import Markup, join, number, tag
 from dualslam.report.placement import Scene, place
 from dualslam.report.run_data import RunData
@@ -16,10 +17,8 @@ from dualslam.report.top_view import close_up, failure_letter
 
 AROUND = 12
 """Frames before and after a loss that the close-up shows."""
-SHOWN_ATTEMPTS = 8
-"""Attempts of one failure that are shown at once; the rest unfolds."""
 Event = dict[str, Any]
-_TRIES = ("recovery_attempt", "link_refused", "linked")
+_TRIES = ("link_refused", "linked")
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +31,12 @@ class FailureStory:
     failed : dict
     restart : dict or None
         Where the next map began.
+    walks : list of dict
+        Attempts to walk back from a later map to the lost one.
+    broken : list of dict
+        Recoveries that came to nothing by themselves: the worker died, the solver failed.
     tries : list of dict
-        Attempts and links, accepted or refused, that concern the lost map.
+        Links to the lost map, accepted or refused.
     linked : dict or None
     fused : dict or None
     """
@@ -41,6 +44,8 @@ class FailureStory:
     letter: str
     failed: Event
     restart: Event | None
+    walks: list[Event]
+    broken: list[Event]
     tries: list[Event]
     linked: Event | None
     fused: Event | None
@@ -59,17 +64,17 @@ def stories(run: RunData) -> list[FailureStory]:
             continue
         later, lost = run.events[i + 1 :], event.get("submap")
         own = [e for e in later if e.get("old_submap") == lost]
-        tries = [e for e in own if e.get("event") in _TRIES]
-        linked = next((e for e in own if e["event"] == "linked"), None)
-        if linked is not None:  # the attempt that led to the link says the same as the link
-            tries = [e for e in tries if e.get("event") != "recovery_attempt" or e.get("reason") != "linked"]
+        looking = {e.get("submap") for e in later if e.get("event") == "recovery_started" and lost in e.get("lost", [])}
+        walking = [e for e in later if e.get("submap") in looking]
         found.append(
             FailureStory(
                 letter=failure_letter(len(found) + 1),
                 failed=event,
                 restart=next((e for e in later if e.get("event") == "reinitialised"), None),
-                tries=tries,
-                linked=linked,
+                walks=[e for e in walking if e.get("event") == "recovery_attempt"],
+                broken=[e for e in walking if e.get("event") == "recovery_failed"],
+                tries=[e for e in own if e.get("event") in _TRIES],
+                linked=next((e for e in own if e["event"] == "linked"), None),
                 fused=next((e for e in own if e["event"] == "fused"), None),
             )
         )
@@ -98,7 +103,7 @@ def _card(run: RunData, scene: Scene, story: FailureStory) -> Markup:
         "h3", tag("span", story.letter, cls="break"), f" Frame {story.lost_since} ", tag("span", verdict, cls=cls)
     )
     parts = [head, tag("p", _told(run, story)), _sample_frames(run, story), _close_up(run, scene, story)]
-    parts.append(_table(story.tries))
+    parts += [walk_table(story.walks), link_table(story.tries)]
     return tag("article", parts, cls="failure")
 
 
@@ -145,11 +150,14 @@ def _outcome(story: FailureStory) -> str:
             if "scale" in link
             else f"The recovery linked the two{took}{after}.{bypass}"
         )
+    broken = "".join(f" A recovery failed: {e.get('detail') or e.get('reason')}." for e in story.broken)
     if not refused:
-        return "No link was tried: the walk back in time met too few keyframes of the lost map."
+        why = "the walk back in time met too few keyframes of the lost map" if story.walks else "there was no walk back"
+        return f"No link was tried: {why}.{broken}"
     reasons = Counter(str(e.get("reason", "?")).replace("_", " ") for e in refused)
     common = ", ".join(f"{reason} ({n})" if len(reasons) > 1 else reason for reason, n in reasons.most_common(3))
-    return f"All {count(len(refused), 'link')} that were tried were refused: {common}. The two maps stay apart."
+    tried = f"All {len(refused)} links that were tried were" if len(refused) > 1 else "The one link that was tried was"
+    return f"{tried} refused: {common}. The two maps stay apart.{broken}"
 
 
 def _link_words(link: Mapping[str, Any]) -> str:
@@ -175,10 +183,8 @@ def _close_up(run: RunData, scene: Scene, story: FailureStory) -> Markup:
     if drawing is None:
         return join(None)
     marks = "; ◆ keyframes that the link rests on" if keyframes else ""
-    words = (
-        f"The path around the loss, from above: thick where frames were recovered, dotted where there is none{marks}."
-    )
-    return tag("figure", drawing, tag("figcaption", words), cls="close-up")
+    words = "The path around the loss, from above: thick where frames were recovered, dotted where none has a pose"
+    return tag("figure", drawing, tag("figcaption", f"{words}{marks}."), cls="close-up")
 
 
 # --- frames
@@ -227,86 +233,3 @@ def _refused_starts(run: RunData) -> Markup:
         return join(None)
     items = [tag("li", f"{reason} ({count(n, 'time')})") for reason, n in reasons.most_common(5)]
     return tag("div", tag("p", "Starts that were refused:"), tag("ul", items))
-
-
-# --- attempts
-
-
-def _table(tries: Sequence[Event]) -> Markup:
-    if not tries:
-        return join(None)
-    # The last ones tell the outcome.
-    shown, folded = tries[-SHOWN_ATTEMPTS:], tries[:-SHOWN_ATTEMPTS]
-    parts = [_attempts(shown)]
-    if folded:
-        summary = tag("summary", f"{count(len(folded), 'earlier attempt')}")
-        parts.insert(0, tag("details", summary, _attempts(folded)))
-    return join(parts)
-
-
-def _attempts(tries: Sequence[Event]) -> Markup:
-    columns = (
-        "frame",
-        "verdict",
-        "attempt",
-        "keyframes",
-        "matches",
-        "inliers",
-        "scale",
-        "rotation",
-        "position",
-        "time",
-    )
-    cells = [_cells(event) for event in tries]
-    used = [c for c in columns if any(row.get(c) for row in cells)]
-    head = tag("tr", [tag("th", name, scope="col") for name in used])
-    body = [
-        tag("tr", [tag("td", row.get(c) or "-", data_label=c, cls="words" if c == "verdict" else "num") for c in used])
-        for row in cells
-    ]
-    table = tag("table", tag("thead", head), tag("tbody", body), cls="cards")
-    note = "scale, rotation and position with one standard deviation; position in the old map's unit"
-    return tag("div", table, tag("p", note, cls="note") if "scale" in used else None, cls="scroll")
-
-
-def _cells(event: Event) -> dict[str, str]:
-    """Return the columns of one attempt: whatever its event knows."""
-    agreeing = event.get("n_agreeing_keyframes")
-    shared = event.get("n_shared_keyframes", event.get("shared_keyframes"))
-    keyframes = "" if shared is None else f"{shared:.0f} shared"
-    scale = _with_sigma(event.get("scale"), event.get("sigma_scale"))
-    rotation, position = event.get("sigma_rot_deg"), event.get("sigma_trans_mu")
-    matches, inliers = _first(event, "matches", "n_matches", "n_pairs"), _first(event, "inliers", "n_inliers")
-    seconds = event.get("seconds")
-    return {
-        "frame": str(event.get("frame", "")),
-        "verdict": _judged(event),
-        "attempt": str(event.get("attempt", "")),
-        "keyframes": keyframes if agreeing is None else f"{agreeing:.0f} of {keyframes}",
-        "matches": number(matches, 6) if matches is not None else "",
-        "inliers": number(inliers, 6) if inliers is not None else "",
-        "scale": scale,
-        "rotation": f"± {number(rotation, 2)}°" if rotation is not None else "",
-        "position": f"± {number(position, 2)}" if position is not None else "",
-        "time": f"{number(seconds, 3)} s" if seconds is not None else "",
-    }
-
-
-def _judged(event: Event) -> str:
-    if event.get("event") == "linked":
-        return f"✓ linked with submap {event.get('old_submap')}"
-    reason = str(event.get("reason", "")).replace("_", " ")
-    detail = str(event.get("verdict") or event.get("detail") or "")
-    if event.get("event") == "link_refused":
-        return f"✕ refused: {reason}{' - ' if detail else ''}{detail}"
-    return detail or reason or "tried"
-
-
-def _with_sigma(scale: float | None, sigma: float | None) -> str:
-    if scale is None:
-        return ""
-    return number(scale, 4) + ("" if sigma is None else f" ± {number(100 * sigma, 2)} %")
-
-
-def _first(event: Event, *names: str) -> float | None:
-    return next((event[name] for name in names if event.get(name) is not None), None)

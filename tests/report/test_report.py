@@ -74,9 +74,10 @@ def test_it_says_what_happened(broken_run: RunData) -> None:
     assert "Tracking failed 1 time; 0 of 1 linked by a recovery; 50.0 % of 40 frames" in text
     assert "Tracking was lost at frame 20" in text
     assert "<b>0 features</b>" in text  # as words
-    assert "All 1 link that were tried were refused: too few inliers" in text
+    assert "The one link that was tried was refused: too few inliers" in text
     assert "refused: too few inliers - 9 inliers, 20 needed" in text
-    for words in ("31", "0.72 ± 0.21 %", "± 0.13°", "4 shared"):
+    assert "Walks back in time" in text
+    for words in ("sift", "9 frames", "the buffer ends", "1.25 s", "31", "0.72 ± 0.21 %", "± 0.13°", "4 shared"):
         assert words in text
     assert "seed" in text
 
