@@ -166,11 +166,19 @@ class _Walk:
     n_leaps: int = 0
     n_leaped: int = 0  # frames without a pose between some that have one
     n_unusable: int = 0  # the last frames
-    verdict: str = ""
+    why_unusable: str = ""
+    why_not_linked: str = ""
+
+    @property
+    def verdict(self) -> str:
+        if self.link is not None:
+            return "linked"
+        ended = self.why_unusable if self.n_unusable else "the buffer ends"
+        return f"{ended}; no link: {self.why_not_linked}" if self.why_not_linked else ended
 
     def note_unusable(self, failure: Failure) -> None:
         self.n_unusable += 1
-        self.verdict = failure.detail or str(failure.reason)
+        self.why_unusable = failure.detail or str(failure.reason)
 
     def note_posed(self, frame: WalkedFrame, new_keyframe: bool) -> None:
         self.frames.append(frame)
@@ -178,7 +186,6 @@ class _Walk:
         self.n_leaps += self.n_unusable > 0
         self.n_leaped += self.n_unusable
         self.n_unusable = 0
-        self.verdict = ""
 
 
 def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt) -> _Walk | Failure:
@@ -207,7 +214,7 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt) -> _Walk | F
             if not isinstance(found, Failure):
                 walk.link = found
                 break
-            walk.verdict = found.detail
+            walk.why_not_linked = found.detail
             walk.events.append(_refusal(tried, found, attempt.name, step.view, submap.id))
         if walk.link is not None:
             break
@@ -259,7 +266,7 @@ def _event_of(job: RecoveryJob, walk: _Walk, attempt: str, seconds: float) -> Ev
         "unusable_at_end": walk.n_unusable,
         "matches": sum(frame.n_matches for frame in walk.frames),
         "inliers": sum(frame.n_inliers for frame in walk.frames),
-        "verdict": "linked" if walk.link is not None else walk.verdict or "the buffer ends",
+        "verdict": walk.verdict,
         "seconds": seconds,
     }
     if walk.link is not None:
