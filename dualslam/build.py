@@ -135,7 +135,7 @@ def _attempt(
 ) -> Attempt:
     """Build one attempt: the live front end itself, or another one that gives it its poses."""
     if attempt.is_live:
-        return Attempt(attempt.frontend, lambda job, submap, graph: live(submap, graph))
+        return Attempt(attempt.name, lambda job, submap, graph: live(submap, graph))
     try:
         guest = create_frontend(
             FrontendConfig(name=attempt.frontend, n_features=attempt.n_features, options=attempt.options)
@@ -149,9 +149,11 @@ def _attempt(
                 return Failure(FailureReason.UNREADABLE, "its image is no longer buffered")
             return rectify(guest.extract(view.image.pixels()), job.camera, config.camera.model_sigma_px)
 
-        return PnpOdometry(live(submap, graph), guest, extract, job.own, bundle_adjust_arrays, config, size_px)
+        walker = live(submap, graph)
+        walks_live = attempt.walk == "live"
+        return PnpOdometry(walker, guest, extract, job.own, bundle_adjust_arrays, config, size_px, walks_live)
 
-    return Attempt(attempt.frontend, new_odometry)
+    return Attempt(attempt.name, new_odometry)
 
 
 def view_of(

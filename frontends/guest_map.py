@@ -59,8 +59,8 @@ class GuestMap:
 
     @property
     def frames(self) -> list[int]:
-        """Frames with a pose, in the order in which they came."""
-        return list(self._place)
+        """Frames with features and a pose, in the order in which they were posed."""
+        return [index for index in self._place if index in self._features]
 
     def features(self, index: int) -> Features:
         """Return the features of a frame."""
@@ -71,7 +71,7 @@ class GuestMap:
         return se3.inverse(self._submap.resolve_anchor(*self._place[index]))
 
     def add(self, index: int, features: Features, matches: Mapping[int, Matches]) -> None:
-        """Take a frame in, without a pose as yet.
+        """Take a frame's features in.
 
         Parameters
         ----------

@@ -5,6 +5,9 @@ from the frames before, give each frame's pose by PnP. Under that pose the live 
 landmarks, and what it finds there makes the frame a keyframe like any other: landmarks are reconstructed from live
 features, and the factor graph solves for the pose anew. What other attempts took for the pose plays no part.
 
+Or the live front end walks by itself as far as it can (`walks_live`), which is ten times as fast, and the other one
+poses only the frames where it fails.
+
 Where the next frame cannot be posed so (blur, black-out, frames that are missing) the odometry leaps: it matches each
 further frame with several frames before the gap, and believes a pose only once a second frame beyond the gap, posed by
 itself, sees the same points where they should be.
@@ -37,6 +40,7 @@ Extract = Callable[[View], Features | Failure]
 FOLLOW_FRAMES = 2  # frames that the next one is matched with
 POINT_FRAMES = 6  # frames that a point is triangulated from
 LEAP_FRAMES = 5  # frames before a gap that those beyond it are matched with
+MIN_CONTRAST = 4.0  # standard deviation of the greys; sensors have a noise of 1 to 3, and blank images have that alone
 SEED_KEYFRAMES = 8  # keyframes of the submap that the walk starts from
 CONFIRMING_SHARE = 0.85
 """Of what two frames beyond a gap both see must agree with their poses. Of a true leap 98 % do (a rendered street,
@@ -64,6 +68,8 @@ class PnpOdometry:
         The guest's rectified features of a view, from its image.
     views : iterable of View
         Views of the submap's own keyframes are taken from these, to start with.
+    walks_live : bool
+        The live front end poses the frames as long as it can by itself, and the guest where it cannot.
     """
 
     def __init__(
@@ -75,6 +81,7 @@ class PnpOdometry:
         adjuster: BundleAdjuster,
         config: Config,
         size_px: tuple[int, int],
+        walks_live: bool = False,
     ) -> None:
         self.submap = live.submap
         self.graph = live.graph
@@ -86,6 +93,8 @@ class PnpOdometry:
         self._config = config
         self._size_px = size_px
         self._map = GuestMap(live.submap)
+        self._walks_live = walks_live
+        self._pending: dict[int, View] = {}  # posed, but without features of the guest as yet
         self._following = False  # whether the last frame that was given has a pose
         self._beyond: _Beyond | None = None  # the last frame beyond a gap, until another confirms it
 
@@ -127,17 +136,25 @@ class PnpOdometry:
         nearest = sorted(self.submap.keyframes, key=lambda k: (abs(k - keyframe_id), k))[:SEED_KEYFRAMES]
         for k in reversed(nearest):
             if k in self._views:
-                self._learn(self._views[k])
-        self._following = keyframe_id in self._map.frames
+                self._map.put(k, k, se3.inverse(self.submap.T_submap_kf[k]))
+                self._pending[k] = self._views[k]
+        self._following = True
 
     def track(self, view: View) -> Track | Failure:
         """Pose a frame."""
         if view.index in self.submap.keyframes:
             return self._meet(view)
+        if self._walks_live and self._following:
+            track = self._live.track(view)
+            if not isinstance(track, Failure) and self._healthy(track.n_inliers, track.n_matches, track.chi2):
+                self._map.put(view.index, self.reference_id, track.T_cam_submap)
+                self._pending[view.index] = view
+                return track
         features = self._features(view)
         if isinstance(features, Failure):
             self._following = False
             return features
+        self._catch_up()
         pose = self._follow(view.index, features) if self._following else Failure(FailureReason.TOO_FEW_MATCHES)
         if isinstance(pose, Failure):
             self._following = False
@@ -151,25 +168,30 @@ class PnpOdometry:
 
     def _meet(self, view: View) -> Track:
         """Come to a frame that is a keyframe of the submap already."""
-        if view.index not in self._map.frames:
-            self._learn(view)
-        self._following = view.index in self._map.frames
-        n = int((self.submap.landmark_of[view.index] >= 0).sum())
         T_cam_submap = se3.inverse(self.submap.T_submap_kf[view.index])
+        if view.index not in self._map.frames:
+            self._map.put(view.index, view.index, T_cam_submap)
+            self._pending[view.index] = view
+        self._following = True
+        n = int((self.submap.landmark_of[view.index] >= 0).sum())
         return self._live.track_at(view, GivenPose(T_cam_submap, n, n, 1.0, np.zeros((6, 6)), wide=False))
 
-    def _learn(self, view: View) -> None:
-        """Take a keyframe of the submap in."""
-        features = self._features(view)
-        if isinstance(features, Failure):
-            return
-        self._map.add(view.index, features, self._matches(features, self._map.frames[-LEAP_FRAMES:]))
-        self._map.put(view.index, view.index, se3.inverse(self.submap.T_submap_kf[view.index]))
+    def _catch_up(self) -> None:
+        """Find the guest's features in the frames that have been posed without them, those that the next one needs."""
+        keyframes = [k for k in self._pending if k in self.submap.keyframes]
+        needed = {*keyframes[-SEED_KEYFRAMES:], *list(self._pending)[-FOLLOW_FRAMES:]}
+        for index, view in self._pending.items():
+            features = self._features(view) if index in needed else None
+            if features is not None and not isinstance(features, Failure):
+                self._map.add(index, features, self._matches(features, self._map.frames[-LEAP_FRAMES:]))
+        self._pending = {}
 
     def _features(self, view: View) -> Features | Failure:
         minimum = self._config.tracking.min_inliers
         if len(view.features) < minimum:
             return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image")
+        if view.image is not None and view.image.pixels()[::8, ::8].std() < MIN_CONTRAST:
+            return Failure(FailureReason.NO_TEXTURE, "a blank image")
         features = self._extract(view)
         if not isinstance(features, Failure) and len(features) < minimum:
             return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features of {self._guest.name} in the image")
@@ -209,6 +231,11 @@ class PnpOdometry:
         chi2 = float(found.chi2[found.inliers].mean() / 2)
         return GivenPose(found.T_cam_w, len(rows), found.n_inliers, chi2, found.covariance, wide=False)
 
+    def _healthy(self, n_inliers: int, n_matches: int, chi2: float) -> bool:
+        health = self._config.health
+        enough = n_inliers >= max(health.min_inliers, health.min_inlier_ratio * n_matches)
+        return enough and chi2 <= health.max_chi2
+
     # --- over a gap
 
     def _leap(self, index: int, features: Features) -> GivenPose | Failure:
@@ -243,14 +270,13 @@ class PnpOdometry:
 
     def _judge(self, wide: WidePose | Failure) -> WidePose | Failure:
         """Hold a leap to what health asks of a track, and to the scale that it must not lose."""
-        health, limit = self._config.health, self._config.recovery.max_leap_scale_sigma
+        limit = self._config.recovery.max_leap_scale_sigma
         if isinstance(wide, Failure):
             return wide
         n = int(wide.inliers.sum())
-        if n < health.min_inliers or n < health.min_inlier_ratio * len(wide.inliers):
-            return Failure(FailureReason.TOO_FEW_INLIERS, f"{n} of {len(wide.inliers)} tracks agree", wide.numbers)
-        if wide.chi2 > health.max_chi2:
-            return Failure(FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {wide.chi2:.1f}", wide.numbers)
+        if not self._healthy(n, len(wide.inliers), wide.chi2):
+            detail = f"{n} of {len(wide.inliers)} tracks agree, chi-square {wide.chi2:.1f}"
+            return Failure(FailureReason.TOO_FEW_INLIERS, detail, wide.numbers)
         if wide.scale_sigma > limit:
             return Failure(FailureReason.SCALE, f"the scale beyond is known to {wide.scale_sigma:.1%}", wide.numbers)
         return wide

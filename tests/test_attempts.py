@@ -32,6 +32,8 @@ class TestConfig:
         assert [attempt.frontend for attempt in attempts] == ["live", "sift", "orb"]
         assert attempts[0].is_live
         assert attempts[2] == AttemptConfig(frontend="orb", n_features=4000)
+        (leap,) = config(attempts=["leap"]).attempts
+        assert (leap.frontend, leap.walk, leap.name) == ("sift", "live", "leap (sift)")
 
     def test_images_are_kept_only_where_an_attempt_reads_them(self) -> None:
         assert config().needs_images
@@ -107,10 +109,11 @@ def drive(attempts: list[str]) -> tuple[System, np.ndarray]:
 
 
 @pytest.mark.slow
-def test_sift_leaps_a_black_out_on_the_road() -> None:
-    system, truth = drive(["sift"])
-    (attempt,) = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)
-    assert attempt.data["leaps"] == 1
+@pytest.mark.parametrize("attempt", ["sift", "leap"])
+def test_a_black_out_on_the_road_is_leapt(attempt: str) -> None:
+    system, truth = drive([attempt])
+    (made,) = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)
+    assert made.data["leaps"] == 1
     (link,) = system.atlas.links
     scales = []
     for m in (link.a, link.b):

@@ -134,12 +134,17 @@ class HealthConfig(StrictModel):
 
 
 class AttemptConfig(StrictModel):
-    """One attempt at a recovery: where its walk back takes the poses from. Written as a word, it is the front end."""
+    """One attempt at a recovery: where its walk back takes the poses from. It may be written as one word, which is
+    `live`, `leap` (`{frontend: sift, walk: live}`) or a front end's name.
+    """
 
     frontend: str = "live"
     """`live`: the live features, guided by the motion model in reverse. Or a front end by its name: features of its
     own, found in the buffered images, pose the frames by PnP from one to the next, and leap those that cannot be used.
     Landmarks, and what is compared when linking, are made of the live features in either case."""
+    walk: Literal["own", "live"] = "own"
+    """Whether that front end poses every frame, so that the attempt does not depend on the live features, or only the
+    leaps and what comes after them until the live features can take over, which is several times as fast."""
     n_features: int = Field(2000, ge=50, le=20000)
     """Keypoints per image of that front end."""
     options: dict[str, Any] = Field(default_factory=dict)
@@ -147,12 +152,19 @@ class AttemptConfig(StrictModel):
 
     @property
     def is_live(self) -> bool:
-        """Whether it walks on the live features."""
+        """Whether it walks on the live features alone."""
         return self.frontend == "live"
+
+    @property
+    def name(self) -> str:
+        """What events call it."""
+        return self.frontend if self.walk == "own" else f"leap ({self.frontend})"
 
     @model_validator(mode="before")
     @classmethod
     def _from_word(cls, value: Any) -> Any:
+        if value == "leap":
+            return {"frontend": "sift", "walk": "live"}
         return {"frontend": value} if isinstance(value, str) else value
 
     @model_validator(mode="after")
@@ -169,9 +181,11 @@ class RecoveryConfig(StrictModel):
     """Off: a lost track ends the submap, and the next one stays apart from it."""
     max_leap_frames: int = Field(30, ge=0)
     """Frames in a row that the walk may leap, because none of its keyframes can be matched in them."""
-    attempts: tuple[AttemptConfig, ...] = Field((AttemptConfig(), AttemptConfig(frontend="sift")), min_length=1)
+    attempts: tuple[AttemptConfig, ...] = Field(
+        (AttemptConfig(), AttemptConfig(frontend="sift", walk="live"), AttemptConfig(frontend="sift")), min_length=1
+    )
     """In this order, each from the same snapshot of the new map, until one leads to a link. A list of words will do,
-    such as `[live, sift]`; an attempt with settings is written `{frontend: sift, n_features: 3000}`."""
+    such as `[live, leap, sift]`; an attempt with settings is written `{frontend: sift, n_features: 3000}`."""
     max_leap_scale_sigma: float = Field(0.025, gt=0)
     """Largest standard deviation (relative) of the scale beyond a leap, by the Hessian of its wide matches: all that is
     mapped beyond inherits the error, and 5 %, two of these, is a wrong link."""

@@ -35,7 +35,9 @@ def worlds(covered: range = range(0)) -> tuple[PointWorld, PointWorld]:
     return live, guest
 
 
-def odometry(live: PointWorld, guest: PointWorld, config: Config | None = None) -> PnpOdometry:
+def odometry(
+    live: PointWorld, guest: PointWorld, config: Config | None = None, walks_live: bool = False
+) -> PnpOdometry:
     def extract(view: View) -> Features | Failure:
         return guest.features(view.index)
 
@@ -47,6 +49,7 @@ def odometry(live: PointWorld, guest: PointWorld, config: Config | None = None) 
         bundle_adjust_arrays,
         config or Config(),
         SIZE_PX,
+        walks_live,
     )
     walker.start_at(40)
     return walker
@@ -124,6 +127,22 @@ class TestLeap:
         assert np.linalg.norm(error[:, 3:], axis=1).max() < POSITION_M * 2
         assert np.linalg.norm(error[:, :3], axis=1).max() < ROTATION_RAD
         assert 20 in walker.submap.keyframes
+
+    def test_the_live_front_end_walks_where_it_can(self) -> None:
+        live, guest = worlds(range(25, 32))
+        walker = odometry(live, guest, walks_live=True)
+        extracted, extract = [], walker._extract
+        walker._extract = lambda view: (extracted.append(view.index), extract(view))[1]
+        before = walk(walker, live, range(39, 31, -1))
+        assert all(before.values())
+        assert not extracted
+        beyond = walk(walker, live, range(31, 9, -1))
+        assert all(beyond[i] for i in range(23, 9, -1))
+        # Those before the gap that it matches with, those in it and the two that confirm it; then live features again.
+        assert {24, 23} <= set(extracted)
+        assert not {i for i in extracted if i < 21}
+        error = errors(before | beyond, live)
+        assert np.linalg.norm(error[:, 3:], axis=1).max() < POSITION_M * 2
 
     def test_the_scale_beyond_is_that_before(self) -> None:
         live, guest = worlds(self.covered)
