@@ -40,6 +40,7 @@ Extract = Callable[[View], Features | Failure]
 FOLLOW_FRAMES = 2  # frames that the next one is matched with
 POINT_FRAMES = 6  # frames that a point is triangulated from
 LEAP_FRAMES = 5  # frames before a gap that those beyond it are matched with
+SMALL_STEP = 0.1  # of the median depth: a scale that is off by a quarter then moves what lies beyond by 2.5 %
 MIN_CONTRAST = 4.0  # standard deviation of the greys; sensors have a noise of 1 to 3, and blank images have that alone
 SEED_KEYFRAMES = 8  # keyframes of the submap that the walk starts from
 CONFIRMING_SHARE = 0.85
@@ -155,16 +156,19 @@ class PnpOdometry:
             self._following = False
             return features
         self._catch_up()
-        pose = self._follow(view.index, features) if self._following else Failure(FailureReason.TOO_FEW_MATCHES)
+        pose: GivenPose | Track | Failure = Failure(FailureReason.TOO_FEW_MATCHES)
+        if self._following:
+            pose = self._follow(view.index, features)
         if isinstance(pose, Failure):
             self._following = False
-            pose = self._leap(view.index, features)
+            pose = self._leap(view, features)
         if isinstance(pose, Failure):
             return pose
+        track = pose if isinstance(pose, Track) else self._live.track_at(view, pose)
         self._following, self._beyond = True, None
-        self._map.put(view.index, self.reference_id, pose.T_cam_submap)
+        self._map.put(view.index, self.reference_id, track.T_cam_submap)
         self._forget()
-        return self._live.track_at(view, pose)
+        return track
 
     def _meet(self, view: View) -> Track:
         """Come to a frame that is a keyframe of the submap already."""
@@ -238,13 +242,14 @@ class PnpOdometry:
 
     # --- over a gap
 
-    def _leap(self, index: int, features: Features) -> GivenPose | Failure:
+    def _leap(self, view: View, features: Features) -> GivenPose | Track | Failure:
         """Wide matching with several frames before the gap; believed when a second frame beyond it agrees."""
+        index, before = view.index, self._beyond
         keyframes = [k for k in self._map.frames[:-1] if k in self.submap.keyframes]
         frames = [*keyframes[1 - LEAP_FRAMES :], *self._map.frames[-1:]]
         self._map.add(index, features, self._matches(features, frames))
         rows = self._map.rows_with_track(index)
-        wide = estimate_wide_pose(
+        found = estimate_wide_pose(
             self._map.views(index, rows, frames),
             features.uv_rect_px[rows],
             features.sigma_px[rows],
@@ -253,11 +258,13 @@ class PnpOdometry:
             self._adjuster,
             self._config.seed,
         )
-        wide = self._judge(wide)
+        wide = self._judge(found)
         if isinstance(wide, Failure):
-            self._map.drop(index)
-            return wide
-        before, self._beyond = self._beyond, _Beyond(index, rows[wide.inliers], wide)
+            step = self._small_step(view, found) if isinstance(found, WidePose) else None
+            if step is None:
+                self._map.drop(index)
+            return wide if step is None else step
+        self._beyond = _Beyond(index, rows[wide.inliers], wide)
         if before is None:
             return Failure(FailureReason.UNCONFIRMED, "the first frame beyond a gap", wide.numbers)
         share = self._confirmed_share(before, self._beyond)
@@ -267,6 +274,25 @@ class PnpOdometry:
         self._map.put(before.index, self.reference_id, before.pose.T_cam_submap)
         n_inliers = int(wide.inliers.sum())
         return GivenPose(wide.T_cam_submap, len(rows), n_inliers, wide.chi2, wide.covariance, wide=True)
+
+    def _small_step(self, view: View, found: WidePose) -> Track | None:
+        """Let the submap's landmarks decide where the guest's matches alone do not, if the camera has hardly moved.
+
+        A camera in the hand turns fast and moves little: few of the guest's points have parallax enough to keep the
+        scale, but the landmarks that it still sees have, and a step that is small against their depth changes nothing
+        in that. (Across a long one, landmarks of two or three views would carry their errors over as scale.)
+        """
+        track = self._live.track_near(view, found.T_cam_submap)
+        if isinstance(track, Failure) or not self._healthy(track.n_inliers, track.n_matches, track.chi2):
+            return None
+        last = se3.inverse(self._map.T_cam_submap(self._map.frames[-1]))[:3, 3]
+        step = float(np.linalg.norm(se3.inverse(track.T_cam_submap)[:3, 3] - last))
+        ids = track.landmark_ids[track.landmark_ids >= 0]
+        _, depth = project_points(self.submap.K, track.T_cam_submap, self.submap.landmarks["xyz_mu"][ids])
+        if not step < SMALL_STEP * float(np.median(depth)):
+            return None
+        self._live.take(track)
+        return track
 
     def _judge(self, wide: WidePose | Failure) -> WidePose | Failure:
         """Hold a leap to what health asks of a track, and to the scale that it must not lose."""

@@ -149,6 +149,21 @@ class Tracker:
         self._accept(track)
         return track
 
+    def track_near(self, view: View, T_cam_submap: FloatArray) -> Track | Failure:
+        """Pose a frame by the landmarks of the keyframes nearest in time, from a pose that is near its own.
+
+        The tracker goes on from there only if it is told to `take` the track.
+        """
+        keyframe_ids = self._nearest_keyframes(view.index, self._config.local_keyframes)
+        self._local = LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(keyframe_ids))
+        grid = FeatureGrid.build(view.features.uv_rect_px)
+        nothing = np.full(len(view.features), NO_LANDMARK, np.int64)
+        return self._pose_from_local_map(view, grid, T_cam_submap, nothing, T_cam_submap, wide=True)
+
+    def take(self, track: Track) -> None:
+        """Go on from a track."""
+        self._accept(track)
+
     # --- steps
 
     def _predict(self, timestamp_s: float) -> FloatArray:

@@ -80,6 +80,14 @@ class VisualFrontEnd:
             self._meet(view.index)
         return track
 
+    def track_near(self, view: View, T_cam_submap: FloatArray) -> Track | Failure:
+        """Pose a frame by the submap's landmarks, from a pose that is near its own; `take` goes on from there."""
+        return self._tracker.track_near(view, T_cam_submap)
+
+    def take(self, track: Track) -> None:
+        """Go on from a track."""
+        self._tracker.take(track)
+
     def relative_pose(self, track: Track) -> FloatArray:
         """Return ``T_kf_cam``, the track's pose relative to the reference keyframe."""
         return se3.inverse(self.submap.T_submap_kf[self._reference_id]) @ se3.inverse(track.T_cam_submap)

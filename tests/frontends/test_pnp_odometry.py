@@ -173,6 +173,18 @@ class TestLeap:
         assert not any(steps.values())
         assert {steps[i].reason for i in range(21, 14, -1)} == {FailureReason.UNCONFIRMED}
 
+    def test_a_small_step_is_decided_by_landmarks_that_are_still_seen(self) -> None:
+        """The guest's own points keep no scale here, and one frame is missing: the live landmarks do."""
+        live, guest = worlds(range(38, 40))
+        config = Config.model_validate({"recovery": {"max_leap_scale_sigma": 1e-4}})
+        walker = odometry(live, guest, config)
+        steps = walk(walker, live, range(39, 29, -1))
+        assert all(steps[i] for i in range(37, 29, -1))
+        assert steps[37].wide
+        error = errors(steps, live)
+        assert np.linalg.norm(error[:, 3:], axis=1).max() < POSITION_M
+        assert np.linalg.norm(error[:, :3], axis=1).max() < ROTATION_RAD
+
     def test_a_scale_that_is_not_known_is_refused(self) -> None:
         live, guest = worlds(self.covered)
         config = Config.model_validate({"recovery": {"max_leap_scale_sigma": 1e-4}})
