@@ -32,6 +32,8 @@ from frontends.registry import create_frontend as create_frontend  # part of the
 from frontends.visual import VisualFrontEnd
 
 ADJUST_ITERATIONS = 20
+WORKER_BUDGET = 0.75
+"""Share of the time after which a worker counts as hung that its walks may take: what they have by then is not lost."""
 
 
 def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | None = None) -> System:
@@ -93,13 +95,13 @@ def recovery_executor(config: Config, size_px: tuple[int, int], faults: FaultScr
     parts = recovery_parts(config, size_px)
     if recovery.workers == 0:
         return faults.around_inline(InlineExecutor(parts))
-    make_parts = partial(recovery_parts, config, size_px)
+    make_parts = partial(recovery_parts, config, size_px, WORKER_BUDGET * recovery.time_limit_s)
     limits = recovery.time_limit_s, recovery.finish_wait_s
     return WorkerExecutor(make_parts, recovery.workers, *limits, on_start=faults.kill_worker)
 
 
-def recovery_parts(config: Config, size_px: tuple[int, int]) -> RecoveryParts:
-    """Build what a walk back in time is made of, for images of this width and height.
+def recovery_parts(config: Config, size_px: tuple[int, int], budget_s: float | None = None) -> RecoveryParts:
+    """Build what a walk back in time is made of, for images of this width and height; see `RecoveryParts.budget_s`.
 
     Raises
     ------
@@ -123,6 +125,7 @@ def recovery_parts(config: Config, size_px: tuple[int, int]) -> RecoveryParts:
         judge=lambda track: judge_track(track, config.health),
         config=config.recovery,
         fusion=config.fusion,
+        budget_s=budget_s,
     )
 
 

@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from dualslam.core.camera import Camera
 from dualslam.core.config import FusionConfig, RecoveryConfig
 from dualslam.core.errors import SolverError
@@ -119,7 +121,10 @@ class Attempt:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecoveryParts:
-    """What a recovery is made of; put together by the composition root of the process in which it runs."""
+    """What a recovery is made of; put together by the composition root of the process in which it runs.
+
+    `budget_s`: wall time after which it comes to an end with what it has, where it does not run inline.
+    """
 
     attempts: tuple[Attempt, ...]
     new_graph: Callable[[], SubmapGraph]
@@ -127,6 +132,7 @@ class RecoveryParts:
     judge: Judge
     config: RecoveryConfig
     fusion: FusionConfig
+    budget_s: float | None = None
 
 
 def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Failure:
@@ -138,8 +144,11 @@ def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Fai
     best: _Walk | None = None
     problem = Failure(FailureReason.SOLVER)
     events: list[Event] = []
+    until = np.inf if parts.budget_s is None else started + parts.budget_s
     for attempt in parts.attempts if job.lost else parts.attempts[:1]:
-        walk = _walk(job, parts, attempt)
+        if best is not None and time.perf_counter() > until:
+            break
+        walk = _walk(job, parts, attempt, until)
         if isinstance(walk, Failure):
             problem = walk
             continue
@@ -166,6 +175,7 @@ class _Walk:
     n_leaps: int = 0
     n_leaped: int = 0  # frames without a pose between some that have one
     n_unusable: int = 0  # the last frames
+    out_of_time: bool = False
     why_unusable: str = ""
     why_not_linked: str = ""
 
@@ -173,7 +183,7 @@ class _Walk:
     def verdict(self) -> str:
         if self.link is not None:
             return "linked"
-        ended = self.why_unusable if self.n_unusable else "the buffer ends"
+        ended = "out of time" if self.out_of_time else self.why_unusable if self.n_unusable else "the buffer ends"
         return f"{ended}; no link: {self.why_not_linked}" if self.why_not_linked else ended
 
     def note_unusable(self, failure: Failure) -> None:
@@ -188,8 +198,8 @@ class _Walk:
         self.n_unusable = 0
 
 
-def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt) -> _Walk | Failure:
-    """Make one attempt, from a copy of the job's submap."""
+def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float) -> _Walk | Failure:
+    """Make one attempt, from a copy of the job's submap; it stops at the time `until`."""
     started = time.perf_counter()
     submap, graph = job.submap.copy(), parts.new_graph()
     try:
@@ -203,6 +213,9 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt) -> _Walk | F
     walker.keep(relinker.keyframe_ids)  # redundant or not: linking stands on keyframes that both maps hold
     walk = _Walk(submap)
     for step in walk_back(walker, job.views, parts.judge, relinker.keyframe_ids, parts.config.max_leap_frames):
+        walk.out_of_time = time.perf_counter() > until
+        if walk.out_of_time:
+            break
         if isinstance(step.track, Failure):
             walk.note_unusable(step.track)
             continue

@@ -94,6 +94,14 @@ def assert_same(a: RecoveryResult | Failure, b: RecoveryResult | Failure) -> Non
     assert np.array_equal(a.link.estimate.S_old_new, b.link.estimate.S_old_new)
 
 
+def test_a_recovery_out_of_time_gives_what_it_has(job: RecoveryJob) -> None:
+    result = run_recovery(job, recovery_parts(Config(), SIZE_PX, budget_s=0.0))
+    assert isinstance(result, RecoveryResult)
+    assert result.link is None
+    (attempt,) = result.events
+    assert attempt.data["verdict"] == "out of time"
+
+
 def test_a_job_can_be_pickled_and_is_left_as_it_was(job: RecoveryJob) -> None:
     before = job.submap.copy()
     here = run_recovery(job, MAKE_PARTS())
