@@ -108,7 +108,11 @@ def serve(connection: Connection, make_parts: MakeParts) -> None:
             job = _receive(connection)
         except EOFError:
             return
-        connection.send(run_recovery(job, parts))
+        result = run_recovery(job, parts)
+        try:
+            connection.send(result)
+        except BrokenPipeError:  # nobody waits for it any more
+            return
 
 
 def _send(connection: Connection, job: RecoveryJob) -> None:
