@@ -20,7 +20,8 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, Track
 
 MEMORY_FRAMES = 300
 """Verdicts that are kept: no suspected stretch reaches back farther than the frame buffer."""
-MEDIAN_CHI2_6DOF = 5.348
+TAIL, TAIL_SIGMAS, TAIL_CHI2_6DOF = 0.9, 1.645, 10.645
+"""A quantile; where it lies for the size of a Gaussian (in sigmas) and for a chi-square with 6 degrees of freedom."""
 MIN_INNOVATIONS = 8
 """Frames before which the motion model's error is not known."""
 
@@ -150,7 +151,7 @@ class HealthMonitor:
             signs.append(FailureReason.TOO_FEW_INLIERS)
         if track.n_inliers < config.majority * track.n_matches:
             signs.append(FailureReason.LOW_INLIER_RATIO)
-        if jump2 > config.jump_chi2 * _level(self._jump, MEDIAN_CHI2_6DOF):
+        if jump2 > config.jump_chi2 * _level(self._jump, TAIL_CHI2_6DOF, TAIL):
             signs.append(FailureReason.MOTION_JUMP)
         dof = max(2 * track.n_inliers - 6, 1)
         if track.chi2 > _level(self._chi2, 1.0) * (1 + config.sign_sigmas * math.sqrt(2 / dof)):
@@ -165,15 +166,15 @@ class HealthMonitor:
         difference = se3.log(track.T_cam_submap @ se3.inverse(track.T_predicted))
         if len(self._innovation) < MIN_INNOVATIONS or track.wide:
             return 0.0, difference
-        # Median absolute deviation of a Gaussian: 0.6745 sigma.
-        sigma = np.median(np.abs(self._innovation), axis=0) / 0.6745
+        # What drivers and hands do has heavier tails than a Gaussian: its sigma is taken from where they begin.
+        sigma = np.quantile(np.abs(self._innovation), TAIL, axis=0) / TAIL_SIGMAS
         covariance = track.covariance + np.diag(sigma**2)
         return float(difference @ np.linalg.solve(covariance, difference)), difference
 
 
-def _level(recent: Collection[float], expected: float) -> float:
-    """Return how many times larger a chi-square is as a rule than expected, at least 1."""
-    return max(1.0, float(np.median(list(recent))) / expected) if recent else 1.0
+def _level(recent: Collection[float], expected: float, quantile: float = 0.5) -> float:
+    """Return how many times larger a quantile of recent chi-squares is than expected, at least 1."""
+    return max(1.0, float(np.quantile(list(recent), quantile)) / expected) if recent else 1.0
 
 
 def count_signs(frames: Iterable[FrameHealth]) -> dict[str, int]:
