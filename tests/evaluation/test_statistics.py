@@ -57,7 +57,13 @@ def test_clusters_that_fail_together_widen_the_interval() -> None:
     assert lumped is not None
     assert lumped.high - lumped.low > spread.high - spread.low
     # ... and resamples in which nothing failed are told.
-    assert failure_reduction([5, 5] + [0] * 18, [0, 2] + [0] * 18).undefined == pytest.approx(0.9**20, abs=0.01)
+    assert failure_reduction([5] * 5 + [0] * 15, [0] * 20).undefined == pytest.approx(0.75**20, abs=0.003)
+
+
+def test_few_clusters_have_no_interval() -> None:
+    four = failure_reduction([5] * 4 + [0] * 16, [1] * 4 + [0] * 16)
+    assert (four.value, four.interval) == (0.8, None)
+    assert failure_reduction([5] * 5 + [0] * 15, [1] * 5 + [0] * 15).interval is not None
 
 
 def test_no_failures_no_reduction() -> None:

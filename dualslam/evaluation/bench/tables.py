@@ -105,8 +105,8 @@ def _failure_table(counted: _Counted) -> Table:
         ),
         rows,
         f"Rates with Wilson's 95 % interval. Reduction of failures against {spec.reference_name} with the 95 % "
-        "interval of a bootstrap over clusters (a sequence in a condition). Internal causes are faults forced inside "
-        "the system.",
+        "interval of a bootstrap over clusters (a sequence in a condition), where at least five of them failed. "
+        "Internal causes are faults forced inside the system.",
     )
 
 
@@ -142,9 +142,12 @@ def _failure_cells(counted: _Counted, variant: str, conditions: set[str], sequen
         shared = [r for r in of(name) if _trial_of(r) in both]
         sums[name] = [counted.failures(r for r in shared if (r.sequence, r.condition) == c) for c in clusters]
     reduction = failure_reduction(sums[counted.spec.reference_name], sums[variant], seed=counted.spec.seed)
-    if reduction.value is None or reduction.interval is None:
+    if reduction.value is None:
         return [*cells, None, None, None]
-    return [*cells, *(100 * x for x in (reduction.value, reduction.interval.low, reduction.interval.high))]
+    cells.append(100 * reduction.value)
+    if reduction.interval is None:
+        return [*cells, None, None]
+    return [*cells, 100 * reduction.interval.low, 100 * reduction.interval.high]
 
 
 def _trial_of(record: TrialRecord) -> tuple[str, str, int]:
