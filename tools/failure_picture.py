@@ -109,7 +109,7 @@ class Picture:
             tag("title", label),
             tag("rect", width=WIDTH, height=HEIGHT, rx=8, fill="#ffffff"),
             [
-                tag("rect", x=i * (PANEL + GAP), y=TOP, width=PANEL, height=HEIGHT - TOP - 30, rx=6, fill="#f4f6f9")
+                tag("rect", x=i * (PANEL + GAP), y=TOP, width=PANEL, height=HEIGHT - TOP, rx=6, fill=PAPER)
                 for i in range(3)
             ],
             panels,
