@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.core.types import FrameStatus
-from dualslam.report.markup import Markup, join, number, tag
+from dualslam.report.markup import Markup, duration, join, number, tag
 from dualslam.report.run_data import RunData
 
 BINS_PER_DECADE = 8
@@ -35,7 +35,7 @@ def latency_histogram(run: RunData) -> Markup:
         if c
     ]
     words = [
-        tag("span", f"{number(10.0**d)} ms", cls=f"at tick{side}", style=f"left:{100 * (d - low) / (high - low):.2f}%")
+        tag("span", duration(10.0**d), cls=f"at tick{side}", style=f"left:{100 * (d - low) / (high - low):.2f}%")
         for d in np.arange(low, high + 1)
         for side in (" inward-right" if d == low else " inward-left" if d == high else "",)
     ]
@@ -43,7 +43,7 @@ def latency_histogram(run: RunData) -> Markup:
     for name, share in (("median", 50), ("95 %", 95), ("max", 100)):
         value = float(np.percentile(latency, share))
         left = 100 * (np.log10(value) - low) / (high - low)
-        title = f"{name}: {number(value)} ms"
+        title = f"{name}: {duration(value)}"
         marks.append(tag("span", cls="at rule", style=f"left:{left:.2f}%", title=title))
     svg = tag(
         "svg",
@@ -54,8 +54,8 @@ def latency_histogram(run: RunData) -> Markup:
         role="img",
         aria_label="Histogram of the frames' latency",
     )
-    median, p95, most = (number(float(np.percentile(latency, q))) for q in (50, 95, 100))
-    caption = f"Median {median} ms, 95 % of the frames below {p95} ms, longest {most} ms (upright lines)."
+    median, p95, most = (duration(float(np.percentile(latency, q))) for q in (50, 95, 100))
+    caption = f"Median {median}, 95 % of the frames below {p95}, longest {most} (upright lines)."
     return tag("figure", tag("div", svg, marks, words, cls="histogram"), tag("figcaption", caption))
 
 

@@ -196,30 +196,33 @@ def _on_rows_of(reference: RunData, run: RunData) -> PosedRows:
 
 def _strips(runs: Sequence[RunData], names: Sequence[str]) -> Markup:
     found = {row.status for run in runs for row in run.rows}
-    lanes = [_strip(run, name) for name, run in zip(names, runs, strict=True)]
+    indices = [row.index for run in runs for row in run.rows]
+    first, last = min(indices, default=0), max(indices, default=0)
+    lanes = [_strip(run, name, first, last + 1) for name, run in zip(names, runs, strict=True)]
     keys = [
         tag("li", _strip_sample(status), f" {status}: {MEANING[status]}") for status in FrameStatus if status in found
     ]
     return join([tag("div", lanes, cls="lanes strips"), tag("ul", keys, cls="legend")])
 
 
-def _strip(run: RunData, name: str) -> Markup:
+def _strip(run: RunData, name: str, first: int, stop: int) -> Markup:
+    """Draw the frames of a run over the indices of all runs: the same frame stands at the same place in each strip."""
     status = [row.status for row in run.rows]
+    steps = np.abs(np.diff([row.index for row in run.rows]))
+    stride = int(np.median(steps)) if len(steps) else 1
     blocks = []
     for piece in stretches(status):
-        value = status[piece.start]
-        frames = span(run.rows[piece.start].index, run.rows[piece.stop - 1].index)
-        height = _HEIGHTS[value]
-        title = tag("title", f"{frames}: {value}")
-        blocks.append(
-            tag("rect", title, x=piece.start, y=f"{1 - height:.2f}", width=len(piece), height=height, cls=f"st-{value}")
-        )
+        value, height = status[piece.start], _HEIGHTS[status[piece.start]]
+        ends = sorted((run.rows[piece.start].index, run.rows[piece.stop - 1].index))
+        title = tag("title", f"{span(*ends)}: {value}")
+        place = {"x": ends[0] - first, "y": f"{1 - height:.2f}", "width": ends[1] - ends[0] + stride}
+        blocks.append(tag("rect", title, **place, height=f"{height:.2f}", cls=f"st-{value}"))
     unposed = sum(run.count(s) for s in WITHOUT_POSE)
     svg = tag(
         "svg",
         tag("title", f"Frames of {name}"),
         blocks,
-        viewBox=f"0 0 {max(len(status), 1)} 1",
+        viewBox=f"0 0 {max(stop - first, 1)} 1",
         preserveAspectRatio="none",
         role="img",
         aria_label=f"Frames of {name}",

@@ -125,6 +125,9 @@ def _told(run: RunData, story: FailureStory) -> str:
         f"Tracking was lost at frame {story.lost_since} and given up at frame {failed['frame']} ({reason}{detail}); "
         f"submap {failed.get('submap')} was archived whole."
     ]
+    suspected = failed.get("suspected_since")
+    if suspected is not None and suspected != story.lost_since:
+        told.append(f"There were signs of trouble since frame {suspected}: the map is not trusted from there on.")
     if story.restart is None:
         return " ".join([*told, "No map was started after it, until the run ended."])
     first_view = story.restart.get("first_view")

@@ -83,6 +83,11 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:.{digits - 1}e}"
 
 
+def duration(ms: float) -> str:
+    """Return a time with its unit: milliseconds, or seconds from one on."""
+    return f"{number(ms / 1000)} s" if ms >= 1000 else f"{number(ms)} ms"
+
+
 def coordinate(value: float) -> str:
     """Return a coordinate of a drawing, as short as its pixels need."""
     text = f"{value:.1f}"

@@ -8,7 +8,7 @@ from dualslam.core.config import Config
 from dualslam.core.types import FrameStatus
 from dualslam.report.charts import latency_histogram, stage_table
 from dualslam.report.failures import failures_section, stories
-from dualslam.report.markup import Markup, document, join, number, tag
+from dualslam.report.markup import Markup, document, duration, join, number, tag
 from dualslam.report.run_data import RunData
 from dualslam.report.statuses import WITHOUT_POSE, count
 from dualslam.report.timeline import timeline
@@ -44,7 +44,8 @@ def headline(run: RunData) -> str:
         failures = "Tracking never failed"
     else:
         linked = sum(story.linked is not None for story in told)
-        failures = f"Tracking failed {count(len(told), 'time')}; {linked} of {len(told)} linked by a recovery"
+        times = "once" if len(told) == 1 else f"{len(told)} times"
+        failures = f"Tracking failed {times}; {linked} of {len(told)} linked by a recovery"
     apart = f"; {count(len(run.unlinked), 'submap')} stayed apart" if run.unlinked else ""
     return f"{failures}; {posed}{apart}."
 
@@ -81,8 +82,8 @@ def _tiles(run: RunData) -> Markup:
         rest = "" if translation is None else f", {number(translation)} % of the way"
         tiles.append(_tile("error over 1 s", f"{number(rpe['rotation_deg_median'])}°", f"median rotation{rest}"))
     if latency:
-        words = f"median; 95 % below {number(latency['p95'])} ms"
-        tiles.append(_tile("latency", f"{number(latency['median'])} ms", words))
+        words = f"median; 95 % below {duration(latency['p95'])}"
+        tiles.append(_tile("latency", duration(latency["median"]), words))
     tiles.append(_tile("speed", f"{number(s.get('fps'))} fps", f"peak memory {number(s.get('peak_rss_mb'), 4)} MB"))
     return tag("dl", tiles, cls="tiles")
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from dualslam.core.types import FloatArray, FrameStatus
 from dualslam.report.canvas import ticks
-from dualslam.report.markup import Markup, coordinate, number, tag
+from dualslam.report.markup import Markup, coordinate, duration, number, tag
 from dualslam.report.placement import Scene, place
 from dualslam.report.run_data import RunData
 from dualslam.report.statuses import MEANING, count, span, stretches
@@ -130,10 +130,12 @@ def _error_lane(run: RunData, scene: Scene) -> Markup | None:
 
 def _latency_lane(run: RunData) -> Markup:
     latency = np.array([row.latency_ms for row in run.rows])
-    top = max(float(latency.max()), 1e-3)
-    words = [tag("span", f"{number(top)} ms", cls="y-max")]
-    svg = _stretched(len(latency), _area(latency, top, "latency"), "Latency of each frame", 100)
-    return _lane("latency", "wall time of each frame", svg, words)
+    # Logarithmic, as a recovery in this process takes a thousand times longer than a frame.
+    low, top = 1.0, max(float(latency.max()), 10.0)
+    height = np.log10(np.clip(latency, low, None) / low)
+    words = [tag("span", duration(top), cls="y-max")]
+    svg = _stretched(len(latency), _area(height, float(np.log10(top / low)), "latency"), "Latency of each frame", 100)
+    return _lane("latency", "wall time of each frame, logarithmic from 1 ms", svg, words)
 
 
 def _axis(run: RunData) -> Markup:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -41,6 +42,15 @@ def test_the_command_prints_it_and_writes_a_page(
     assert "--overwrite" in capsys.readouterr().err
     assert main([*command, "--overwrite", "--quiet"]) == 0
     assert capsys.readouterr().out == ""
+
+
+def test_the_same_frame_stands_at_the_same_place_in_each_strip(pair: list[Path]) -> None:
+    runs = [read_run(path) for path in pair]
+    late = replace(runs[1], rows=[replace(row, index=row.index + 20) for row in runs[1].rows])
+    found = Outline(comparison_page([runs[0], late]))
+    (lost,) = found.of_class("st-lost")[:1]
+    assert (lost["x"], lost["width"]) == ("20", "6")
+    assert {a["x"] for a in found.of_class("st-tracked") if a.get("width") == str(N_FRAMES)} == {"20"}
 
 
 def test_what_is_no_run_is_named(pair: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,16 +11,21 @@ import cv2
 import numpy as np
 import pytest
 
+from dualslam.atlas import Atlas, Link, LinkKind
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3, sim3, so3
-from dualslam.core.types import Frame, FrameStatus
+from dualslam.core.submap import Submap
+from dualslam.core.types import Frame, FrameStatus, Keyframe
+from dualslam.io.run_folder import RunFolder
+from dualslam.map_store import save_atlas
 from dualslam.report import RunData, SampleKeeper, read_run, report_page
 from dualslam.report.canvas import Canvas, nice_step, ticks
 from dualslam.report.failures import stories
 from dualslam.report.markup import Markup, tag
 from dualslam.report.placement import place, plane_from_above
-from dualslam.report.run_data import PosedRows
+from dualslam.report.run_data import PosedRows, _map_points
 from dualslam.synthetic import SyntheticSequence
+from tests.cli.fakes import NO_FEATURES
 from tests.report.conftest import LOST, N_FRAMES, MakeRun, with_events
 
 VOID = {"meta", "link", "img", "br"}
@@ -71,7 +76,7 @@ def test_every_run_leaves_a_report_that_needs_nothing_else(broken_run: RunData) 
 
 def test_it_says_what_happened(broken_run: RunData) -> None:
     text = outline(broken_run).text
-    assert "Tracking failed 1 time; 0 of 1 linked by a recovery; 50.0 % of 40 frames" in text
+    assert "Tracking failed once; 0 of 1 linked by a recovery; 50.0 % of 40 frames" in text
     assert "Tracking was lost at frame 20" in text
     assert "<b>0 features</b>" in text  # as words
     assert "The one link that was tried was refused: too few inliers" in text
@@ -195,6 +200,37 @@ def test_a_run_without_a_map_says_so(make_run: MakeRun) -> None:
     assert "No map: none of 40 frames has a pose." in found.text
     assert "never began" in found.text
     assert len([name for name, _ in found.elements if name == "img"]) == 2  # the first frame and the last
+
+
+def test_landmarks_of_all_linked_submaps_come_in_the_main_maps_frame(tmp_path: Path) -> None:
+    S = sim3.from_parts(2.0, so3.exp(np.array([0.0, 0.5, 0.0])), np.array([1.0, 0.0, 3.0]))
+    xyz = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (40, 3))
+    atlas = Atlas()
+    for m, points in enumerate((xyz, (xyz - S[:3, 3]) @ np.linalg.inv(S[:3, :3]).T)):
+        submap = Submap(m, np.eye(3), np.zeros(32, np.uint8))
+        submap.add_keyframe(Keyframe(m, 0.1 * m, NO_FEATURES), np.eye(4))
+        submap.add_landmarks(points, np.zeros((40, 32), np.uint8), np.ones(40), m)
+        submap.remove_landmarks(np.arange(5))
+        atlas.add(submap)
+    atlas.link(Link(0, 1, S, np.eye(7), LinkKind.RECOVERY))
+    save_atlas(tmp_path / "map", atlas, {})
+    points = _map_points(tmp_path / "map", {1})  # where 0 has no frame left, it is the world all the same
+    assert len(points) == 70
+    assert np.allclose(points[:35], xyz[5:])
+    assert np.allclose(points[35:], xyz[5:])
+
+
+def test_pictures_of_an_earlier_run_go_with_it(make_run: MakeRun) -> None:
+    folder = make_run()
+    (folder / "samples" / "mine.txt").write_text("mine")
+    RunFolder(folder, overwrite=True).close()
+    assert [file.name for file in (folder / "samples").iterdir()] == ["mine.txt"]
+    assert not (folder / "groundtruth.txt").exists()
+
+
+def test_signs_of_trouble_are_told(broken_run: RunData) -> None:
+    events = [e | {"suspected_since": 17} if e["event"] == "failed" else e for e in broken_run.events]
+    assert "signs of trouble since frame 17" in outline(replace(broken_run, events=events)).text
 
 
 def test_an_interrupted_run_says_so(make_run: MakeRun) -> None:
