@@ -9,6 +9,7 @@ from dualslam.atlas import LinkKind
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.evaluation.link_audit import LinkAudit, audit_links
 from dualslam.results import frame_rows, trajectories_of
 from dualslam.system import System
 from tests.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
@@ -123,3 +124,26 @@ def test_the_walk_never_reads_the_old_map(recovered: tuple[System, PointWorld]) 
     )
     assert 0 < difference.max() < 0.05
     assert not any(np.array_equal(se3.inverse(new.T_submap_kf[k]), se3.inverse(old.T_submap_kf[k])) for k in shared)
+
+
+def test_three_maps_chain() -> None:
+    """Two black-outs: each new map is linked with the one before it, and all frames end in one true trajectory."""
+    covered = frozenset((*range(35, 50), *range(100, 114)))
+    world = PointWorld(cloud(), hand_held(139), covered=covered)
+    system = system_in(world, recovery={"enabled": True})
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    assert [(link.a, link.b) for link in system.atlas.links] == [(0, 1), (1, 2)]
+    assert system.atlas.components() == [[0, 1, 2]]
+    main = trajectories_of(system).main
+    assert set(main.index.tolist()) == set(range(139)) - covered
+    translation, rotation = pose_errors(main.T_world_cam, world.T_world_cam[main.index])
+    assert translation.max() < 1.5 * POSITION_M  # two links' worth
+    assert rotation.max() < 1.5 * ROTATION_RAD
+    audits = audit_links(system.atlas, system.poses.values(), dict(enumerate(world.T_world_cam)))
+    assert all(isinstance(audit, LinkAudit) and not audit.wrong for audit in audits)
+    # Tracking goes on after each fusion as if nothing had happened.
+    fused = [event.frame for event in system.events.of_kind(EventKind.FUSED)]
+    assert len(fused) == 2
+    assert all(system.rows[i].status is FrameStatus.TRACKED for f in fused for i in range(f, f + 10))
