@@ -24,7 +24,7 @@ KINDS = ("wrong_pose", "blur", "blackout", "drop", "exposure", "turn")
 SCENES = ("street", "room")
 WIDTH, HEIGHT = 320, 240
 FEATURES = 600
-SECONDS = {"street": 9.0, "room": 6.0}
+SECONDS = {"street": 9.0, "room": 8.0}
 
 
 def script(kind: str, scene: str, rng: np.random.Generator, n_frames: int, rate_hz: float) -> dict[str, list[Any]]:
