@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 from dualslam.atlas import Link, LinkKind
 from dualslam.calibration import Calibration
@@ -94,18 +94,22 @@ class Recoveries:
         self._calibration = calibration
         self._config = config
         self._onsets: dict[int, int] = {}  # lost submaps that are not linked yet, and the frame of their loss
+        self._losses: dict[int, tuple[str, int]] = {}  # why, and the first frame without a pose
         self._began: dict[int, float] = {}  # when, by the new submap's id
+        self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
 
-    def declare_lost(self, submap_id: int, onset: int) -> None:
-        """Let the walks to come look for a submap that was lost at frame `onset`."""
+    def declare_lost(self, submap_id: int, onset: int, cause: str, first_lost: int) -> None:
+        """Let the walks to come look for a submap: lost at frame `first_lost`, suspected from `onset` on."""
         if self._config.enabled:
             self._onsets[submap_id] = onset
+            self._losses[submap_id] = cause, first_lost
 
     def start(self, submap: Submap, newest: View) -> None:
         """Start the walk back from a new submap: over the frames without a pose, then on into the lost submaps."""
         atlas, onsets = self._record.atlas, dict(self._onsets)
         if onsets:
-            numbers = self._buffer.numbers
+            self._circumstances[submap.id] = self._circumstances_of_loss()
+            numbers = {**self._circumstances[submap.id], **self._buffer.numbers}
             self._record.event(EventKind.RECOVERY_STARTED, newest, submap.id, lost=sorted(onsets), **numbers)
         job = RecoveryJob(
             submap=submap.copy(),
@@ -146,6 +150,13 @@ class Recoveries:
                 return
             yield view
 
+    def _circumstances_of_loss(self) -> dict[str, Any]:
+        """Why the newest of the lost maps was lost, and how many frames are buffered of before (k) and since (k_r)."""
+        cause, first_lost = self._losses[max(self._onsets)]
+        indices = [view.index for view in self._buffer]
+        k = indices.index(first_lost) if first_lost in indices else 0
+        return {"cause": cause, "k": k, "k_r": len(indices) - k}
+
     def _failed(self, job: RecoveryJob, now: Moment, failure: Failure, seconds: float) -> None:
         self._record.event(
             EventKind.RECOVERY_FAILED,
@@ -179,8 +190,10 @@ class Recoveries:
         carry_links(self._record.atlas, before, submap)
         if live is not None and live.submap is submap:
             live.adopt(graph, before)
+        told = self._circumstances.get(submap.id, {})
         for event in result.events:
-            self._record.events.add(event.event, event.frame, event.timestamp_s, event.submap, **event.data)
+            data = event.data | (told if event.event is EventKind.RECOVERY_ATTEMPT else {})
+            self._record.events.add(event.event, event.frame, event.timestamp_s, event.submap, **data)
         walked = self._pose_frames(result, merged, submap)
         seconds = time.perf_counter() - started_s
         if job.onsets:
@@ -254,6 +267,7 @@ class Recoveries:
             inliers=link.n_inliers,
             agreeing_keyframes=agreeing,
             change_point=link.change_point,
+            S_old_new=S_old_new.tolist(),
             seconds=seconds,
             **(link.numbers | {"scale": float(sim3.scale(S_old_new))}),
         )

@@ -236,7 +236,7 @@ class System:
             **failure.numbers,
         )
         self._archive(live, "track lost")
-        self._recoveries.declare_lost(live.submap.id, onset)
+        self._recoveries.declare_lost(live.submap.id, onset, str(failure.reason), self._lost[0].index)
         self._live = None
         self._starter = self._parts.new_starter()
         for lost in self._lost:

@@ -83,7 +83,13 @@ def test_the_events_tell_the_recovery_in_order(recovered: tuple[System, PointWor
         EventKind.FUSED,
     )
     assert [event.event for event in system.events.of_kind(*told)] == list(told)
+    (attempt,) = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)
+    (failed,) = system.events.of_kind(EventKind.FAILED)
+    assert attempt.data["cause"] == failed.data["reason"]
+    (started,) = system.events.of_kind(EventKind.RECOVERY_STARTED)
+    assert (attempt.data["k"], attempt.data["k_r"]) == (35, started.frame + 1 - 35)
     (linked,) = system.events.of_kind(EventKind.LINKED)
+    np.testing.assert_allclose(linked.data["S_old_new"], system.atlas.links[0].S_a_b)
     assert linked.data["old_submap"] == 0
     assert linked.data["inliers"] <= linked.data["matches"]
     assert max(linked.data["agreeing_keyframes"]) < min(COVERED)
