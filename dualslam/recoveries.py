@@ -97,6 +97,8 @@ class Recoveries:
         self._losses: dict[int, tuple[str, int]] = {}  # why, and the first frame without a pose
         self._began: dict[int, float] = {}  # when, by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
+        self._starts: dict[int, int] = {}  # the keyframe that its first walk started from
+        self._unlinked: dict[int, int] = {}  # how many keyframes it had when a walk from it last found no link
 
     def declare_lost(self, submap_id: int, onset: int, cause: str, first_lost: int) -> None:
         """Let the walks to come look for a submap: lost at frame `first_lost`, suspected from `onset` on."""
@@ -104,13 +106,23 @@ class Recoveries:
             self._onsets[submap_id] = onset
             self._losses[submap_id] = cause, first_lost
 
-    def start(self, submap: Submap, newest: View) -> None:
-        """Start the walk back from a new submap: over the frames without a pose, then on into the lost submaps."""
+    def start(self, submap: Submap, newest: View, now: View | None = None) -> None:
+        """Start the walk back from a new submap: over the frames without a pose, then on into the lost submaps.
+
+        It begins at its keyframe `newest`, also where it is made again later (`now`).
+        """
         atlas, onsets = self._record.atlas, dict(self._onsets)
         if onsets:
             self._circumstances[submap.id] = self._circumstances_of_loss()
             numbers = {**self._circumstances[submap.id], **self._buffer.numbers}
-            self._record.event(EventKind.RECOVERY_STARTED, newest, submap.id, lost=sorted(onsets), **numbers)
+            self._record.event(
+                EventKind.RECOVERY_STARTED,
+                now or newest,
+                submap.id,
+                lost=sorted(onsets),
+                again=now is not None,
+                **numbers,
+            )
         job = RecoveryJob(
             submap=submap.copy(),
             newest_id=newest.index,
@@ -121,7 +133,26 @@ class Recoveries:
             camera=self._calibration.camera,
         )
         self._began[submap.id] = time.perf_counter()
+        self._starts.setdefault(submap.id, newest.index)
         self._executor.submit(job)
+
+    def retry(self, submap: Submap, now: View) -> None:
+        """Walk back again where no link was found, once the new map has grown: it knows depths better then.
+
+        Only while the buffer still holds frames that a lost map saw.
+        """
+        tried_with = self._unlinked.get(submap.id)
+        if tried_with is None or submap.id in self._began or not self._onsets:
+            return
+        if not any(tried_with < n <= len(submap.keyframes) for n in self._config.retry_keyframes):
+            return
+        del self._unlinked[submap.id]
+        lost = {k for m in self._onsets for k in self._record.atlas.submaps[m].keyframes}
+        own = [view for view in self._buffer if view.index in submap.keyframes]
+        if not own or not any(view.index in lost for view in self._buffer):
+            return
+        first = self._starts[submap.id]
+        self.start(submap, min(own, key=lambda view: (abs(view.index - first), view.index)), now)
 
     def collect(self, live: VisualOdometry | None, now: Moment) -> None:
         """Merge the walks that have ended. `live` goes on in its submap as it is after that."""
@@ -136,6 +167,8 @@ class Recoveries:
     def _take(self, outcomes: list[Outcome], live: VisualOdometry | None, now: Moment) -> None:
         for job, result in outcomes:
             started_s = self._began.pop(job.submap.id)
+            if job.onsets and (isinstance(result, Failure) or result.link is None):
+                self._unlinked[job.submap.id] = len(job.submap.keyframes)
             if isinstance(result, Failure):
                 self._failed(job, now, result, time.perf_counter() - started_s)
                 continue

@@ -166,6 +166,8 @@ class System:
                 self._calibrate(live, view)
             if len(live.submap.keyframes) >= self._config.graph.max_keyframes:
                 self._roll_over(live, view)
+            elif live.reference_id == view.index:
+                self._recoveries.retry(live.submap, view)
             return track
         assert isinstance(track, Failure)
         self._lost.append(view)

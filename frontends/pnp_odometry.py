@@ -245,8 +245,10 @@ class PnpOdometry:
     def _leap(self, view: View, features: Features) -> GivenPose | Track | Failure:
         """Wide matching with several frames before the gap; believed when a second frame beyond it agrees."""
         index, before = view.index, self._beyond
-        keyframes = [k for k in self._map.frames[:-1] if k in self.submap.keyframes]
-        frames = [*keyframes[1 - LEAP_FRAMES :], *self._map.frames[-1:]]
+        # The last one, and others spread over the keyframes before it: the wider they stand, the better is depth known.
+        keyframes = [k for k in self._map.frames[:-1] if k in self.submap.keyframes][1 - SEED_KEYFRAMES :]
+        spread = np.linspace(0, len(keyframes) - 1, min(LEAP_FRAMES - 1, len(keyframes))).astype(np.int64)
+        frames = [*(keyframes[i] for i in spread.tolist()), *self._map.frames[-1:]]
         self._map.add(index, features, self._matches(features, frames))
         rows = self._map.rows_with_track(index)
         found = estimate_wide_pose(

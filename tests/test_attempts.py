@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,8 @@ from dualslam.core.config import AttemptConfig, Config, RecoveryConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import sim3
+from dualslam.recoveries import InlineExecutor, Outcome
+from dualslam.recovery import RecoveryJob
 from dualslam.results import trajectories_of
 from dualslam.synthetic import Event as Spoil
 from dualslam.synthetic import make_sequence
@@ -95,6 +99,68 @@ class TestOrder:
         assert [event.event for event in events[:2]] == [EventKind.RECOVERY_ATTEMPT] * 2
         assert not events[-1].data["linked"]
         assert events[0].data["unusable_at_end"] == 4
+
+
+class OutOfTimeAtFirst:
+    """Gives the first jobs that have a lost map to look for no time at all."""
+
+    def __init__(self, system: System, n_failing: int) -> None:
+        self._inline = system._recoveries._executor
+        assert isinstance(self._inline, InlineExecutor)
+        self._parts, self._n_failing = self._inline._parts, n_failing
+
+    def submit(self, job: RecoveryJob) -> None:
+        if job.lost:
+            self._inline._parts = replace(self._parts, budget_s=0.0 if self._n_failing > 0 else None)
+            self._n_failing -= 1
+        self._inline.submit(job)
+
+    def poll(self) -> list[Outcome]:
+        return self._inline.poll()
+
+    finish = poll
+
+
+class TestRetry:
+    @staticmethod
+    def run(n_failing: int, **recovery: object) -> System:
+        world = PointWorld(cloud(), hand_held(90), covered=COVERED)
+        system = system_in(world, recovery={"attempts": ["live"], "retry_keyframes": [6], **recovery})
+        system._recoveries._executor = OutOfTimeAtFirst(system, n_failing)
+        for frame in world.frames():
+            system.step(frame)
+        system.finish()
+        return system
+
+    def test_a_recovery_without_link_is_made_again_when_the_map_has_grown(self) -> None:
+        system = self.run(n_failing=1)
+        started = system.events.of_kind(EventKind.RECOVERY_STARTED)
+        assert [event.data["again"] for event in started] == [False, True]
+        ended = system.events.of_kind(EventKind.RECOVERY_ENDED)
+        assert [event.data["linked"] for event in ended] == [False, True]
+        (link,) = system.atlas.links
+        assert link.keyframes
+        main = trajectories_of(system).main
+        assert set(main.index.tolist()) == set(range(90)) - COVERED
+
+    def test_it_ends_with_the_last_of_the_sizes(self) -> None:
+        system = self.run(n_failing=9)
+        assert len(system.events.of_kind(EventKind.RECOVERY_STARTED)) == 2
+        assert not system.atlas.links
+
+    def test_what_is_linked_is_not_looked_for_again(self) -> None:
+        system = self.run(n_failing=0)
+        assert len(system.events.of_kind(EventKind.RECOVERY_STARTED)) == 1
+
+    def test_nothing_is_looked_for_that_the_buffer_does_not_hold(self) -> None:
+        world = PointWorld(cloud(), hand_held(90), covered=COVERED)
+        system = system_in(
+            world, recovery={"attempts": ["live"], "retry_keyframes": [6]}, buffer={"duration_s": 0.2}
+        )
+        system._recoveries._executor = OutOfTimeAtFirst(system, 9)
+        for frame in world.frames():
+            system.step(frame)
+        assert len(system.events.of_kind(EventKind.RECOVERY_STARTED)) == 1
 
 
 def drive(attempts: list[str]) -> tuple[System, np.ndarray]:

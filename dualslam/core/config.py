@@ -189,6 +189,8 @@ class RecoveryConfig(StrictModel):
     max_leap_scale_sigma: float = Field(0.025, gt=0)
     """Largest standard deviation (relative) of the scale beyond a leap, by the Hessian of its wide matches: all that is
     mapped beyond inherits the error, and 5 %, two of these, is a wrong link."""
+    retry_keyframes: tuple[int, ...] = (10, 20)
+    """Keyframes of the new map at which a recovery that found no link is tried again: it knows depths better then."""
     min_shared_keyframes: int = Field(4, ge=2)
     """Keyframes that both maps must hold before a link is tried."""
     workers: int = Field(0, ge=0, le=16)
