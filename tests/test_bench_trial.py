@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +10,11 @@ import pytest
 
 from dualslam.bench_trial import describe_source, run_trial
 from dualslam.cli import main
-from dualslam.core.threads import LIMITS
 from dualslam.evaluation.bench.ledger import Ledger
 from dualslam.evaluation.bench.plan import Trial, plan_trials
 from dualslam.evaluation.bench.record import FailureKind, TrialOutcome, judge
 from dualslam.evaluation.bench.spec import BenchSpec, load_spec
+from tests.cli.conftest import _own_environment  # noqa: F401 (used by every test)
 from tests.evaluation.bench.dask_cluster import dask_cluster
 
 SPEC = """
@@ -25,12 +24,6 @@ variants: [{name: base, set: {recovery.enabled: false}}]
 conditions: [{name: gap, corruptions: [{kind: drop, frames: 3}]}]
 trials: 1
 """
-
-
-@pytest.fixture(autouse=True)
-def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in (*LIMITS, "OPENCV_LOG_LEVEL"):
-        monkeypatch.setenv(name, os.environ.get(name, "1"))
 
 
 @pytest.fixture(scope="module")

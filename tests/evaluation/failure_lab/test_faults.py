@@ -16,6 +16,7 @@ from dualslam.session import run_to_folder
 from dualslam.sources import open_source
 from dualslam.system import System
 from dualslam.worker import WorkerExecutor
+from tests.cli.conftest import _own_environment  # noqa: F401 (used by every test)
 from tests.point_world import PointWorld, cloud, hand_held, system_in
 
 N = 45
