@@ -15,6 +15,8 @@ from dualslam.report.run_data import RunData
 from dualslam.report.statuses import count
 from dualslam.report.top_view import close_up, failure_letter
 
+MAX_CLOSE_UPS = 20
+"""Failures of which the path is drawn: a bound on the size of the page."""
 AROUND = 12
 """Frames before and after a loss that the close-up shows."""
 Event = dict[str, Any]
@@ -84,7 +86,7 @@ def stories(run: RunData) -> list[FailureStory]:
 def failures_section(run: RunData) -> Markup:
     """Return a card for each failure; without one, what there is to see of a run that never started."""
     scene = place(run)
-    cards = [_card(run, scene, story) for story in stories(run)]
+    cards = [_card(run, scene if i < MAX_CLOSE_UPS else None, story) for i, story in enumerate(stories(run))]
     if cards:
         return join(cards)
     if not len(run.main):
@@ -97,7 +99,7 @@ def failures_section(run: RunData) -> Markup:
 # --- one failure
 
 
-def _card(run: RunData, scene: Scene, story: FailureStory) -> Markup:
+def _card(run: RunData, scene: Scene | None, story: FailureStory) -> Markup:
     verdict, cls = _verdict(run, story)
     head = tag(
         "h3", tag("span", story.letter, cls="break"), f" Frame {story.lost_since} ", tag("span", verdict, cls=cls)
@@ -175,8 +177,10 @@ def _link_words(link: Mapping[str, Any]) -> str:
     return "; ".join(words)
 
 
-def _close_up(run: RunData, scene: Scene, story: FailureStory) -> Markup:
+def _close_up(run: RunData, scene: Scene | None, story: FailureStory) -> Markup:
     """Draw the path around the loss: far enough back to show the keyframes that a link rests on."""
+    if scene is None:
+        return join(None)
     row_of = run.row_of
     onset = row_of.get(story.lost_since, 0)
     keyframes = [int(k) for k in (story.linked or {}).get("agreeing_keyframes") or [] if int(k) in row_of]

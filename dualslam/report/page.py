@@ -6,6 +6,7 @@ from typing import Any
 
 from dualslam.core.config import Config
 from dualslam.core.types import FrameStatus
+from dualslam.io.run_folder import EVENTS
 from dualslam.report.charts import latency_histogram, stage_table
 from dualslam.report.failures import failures_section, stories
 from dualslam.report.markup import Markup, document, duration, join, number, tag
@@ -14,6 +15,8 @@ from dualslam.report.statuses import WITHOUT_POSE, count
 from dualslam.report.timeline import timeline
 from dualslam.report.top_view import top_view
 
+MAX_EVENTS = 500
+"""A bound on the size of the page."""
 _EVENT_FIELDS = frozenset({"event", "frame", "timestamp_s", "submap"})
 
 
@@ -140,11 +143,14 @@ def _events(run: RunData) -> Markup:
             tag("td", "-" if event.get("submap") is None else str(event["submap"]), data_label="submap", cls="num"),
             tag("td", _event_words(event), data_label="what belongs to it", cls="words"),
         )
-        for event in run.events
+        for event in run.events[:MAX_EVENTS]
     ]
     head = tag("tr", [tag("th", w, scope="col") for w in ("frame", "time", "event", "submap", "what belongs to it")])
     table = tag("table", tag("thead", head), tag("tbody", rows), cls="cards")
-    return tag("details", tag("summary", count(len(run.events), "event")), tag("div", table, cls="scroll"))
+    words = count(len(run.events), "event")
+    if len(run.events) > MAX_EVENTS:
+        words += f", of which the first {MAX_EVENTS} are here and all in {EVENTS}"
+    return tag("details", tag("summary", words), tag("div", table, cls="scroll"))
 
 
 def _event_words(event: dict[str, Any]) -> str:

@@ -85,15 +85,15 @@ def _owner_class(in_main: bool) -> str:
 
 
 def _event_lane(run: RunData) -> Markup:
-    marks = []
+    marks, row_of = [], run.row_of
     for event in run.events:
-        row, kind = run.row_of.get(event.get("frame", -1)), event.get("event")
+        row, kind = row_of.get(event.get("frame", -1)), event.get("event")
         if row is None or kind not in _MARKS:
             continue
         sign, cls, words = _MARKS[kind]
         marks.append(_at(_percent(run, row), sign, cls, f"frame {event['frame']}: {words}"))
     for i, event in enumerate(run.events_of("failed"), 1):
-        row = run.row_of.get(event.get("lost_since", event["frame"]))
+        row = row_of.get(event.get("lost_since", event["frame"]))
         if row is not None:
             marks.append(_at(_percent(run, row), failure_letter(i), "break", f"failure {i}, lost since here"))
     return _lane("events", "A failure, ○ new map, ◆ link", tag("div", cls="empty-lane"), marks)

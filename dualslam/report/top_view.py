@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.core.types import FloatArray, FrameStatus, IntArray
 from dualslam.report.canvas import Canvas
 from dualslam.report.markup import Markup, join, tag
 from dualslam.report.placement import Placed, Scene, extent, place, plane_from_above
@@ -14,6 +15,8 @@ from dualslam.report.run_data import RunData
 from dualslam.report.statuses import MEANING, count, span, stretches
 
 MIN_CLOSE_UP = 4
+BEYOND = 40
+"""Rows before and after those of a close-up that are drawn where they are in sight."""
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
@@ -22,11 +25,15 @@ def top_view(run: RunData) -> Markup:
     scene = place(run)
     if not scene.placed and not scene.apart:
         return tag("p", "No frame has a pose, so there is no trajectory to draw.", cls="empty")
-    parts = [tag("figure", _drawing(run, scene), tag("figcaption", _legend(run, scene)))] if scene.placed else []
+    parts = (
+        [tag("figure", _drawing(run, scene, _axes(scene)), tag("figcaption", _legend(run, scene)))]
+        if scene.placed
+        else []
+    )
     for placed in scene.apart:
         alone = Scene([placed], [], *_nothing(), np.zeros((0, 3)), "", scene.down * 0, "")
         words = f"Submap {placed.submap}, not linked, in its own frame and unit: {count(len(placed.row), 'frame')}."
-        parts.append(tag("figure", _drawing(run, alone), tag("figcaption", tag("p", words)), cls="apart"))
+        parts.append(tag("figure", _drawing(run, alone, _axes(alone)), tag("figcaption", tag("p", words)), cls="apart"))
     return join(parts)
 
 
@@ -43,19 +50,43 @@ def close_up(run: RunData, scene: Scene, rows: tuple[int, int], marked: Sequence
     marked : sequence of int
         Rows that get a mark: the keyframes on which a link rests.
     """
-    near = [p.xyz[(p.row >= rows[0]) & (p.row <= rows[1])] for p in scene.placed]
-    near.append(scene.truth_xyz[(scene.truth_row >= rows[0]) & (scene.truth_row <= rows[1])])
-    if sum(len(xyz) for xyz in near) < MIN_CLOSE_UP:
+    window = [xyz[(row >= rows[0]) & (row <= rows[1])] for row, xyz in _lines(scene)]
+    if sum(len(xyz) for xyz in window) < MIN_CLOSE_UP:
         return None
-    return _drawing(run, scene, near, marked)
+    # What lies far from there in time may cross the window all the same; it would only confuse.
+    low, high = rows[0] - BEYOND, rows[1] + BEYOND
+    placed = [_cut(p, low, high) for p in scene.placed]
+    kept = (scene.truth_row >= low) & (scene.truth_row <= high)
+    near = replace(
+        scene,
+        placed=[p for p in placed if len(p.row)],
+        truth_row=scene.truth_row[kept],
+        truth_xyz=scene.truth_xyz[kept],
+    )
+    return _drawing(run, near, _axes(scene), window, marked) if near.placed else None
+
+
+def _axes(scene: Scene) -> FloatArray:
+    return plane_from_above(np.concatenate([xyz for _, xyz in _lines(scene)]), scene.down)[0]
+
+
+def _lines(scene: Scene) -> list[tuple[IntArray, FloatArray]]:
+    return [*((p.row, p.xyz) for p in scene.placed), (scene.truth_row, scene.truth_xyz)]
+
+
+def _cut(placed: Placed, low: int, high: int) -> Placed:
+    kept = (placed.row >= low) & (placed.row <= high)
+    return Placed(placed.submap, placed.row[kept], placed.xyz[kept], placed.error[kept])
 
 
 def _drawing(
-    run: RunData, scene: Scene, window: Sequence[FloatArray] | None = None, marked: Sequence[int] = ()
+    run: RunData,
+    scene: Scene,
+    axes: FloatArray,
+    window: Sequence[FloatArray] | None = None,
+    marked: Sequence[int] = (),
 ) -> Markup:
-    drawn = [p.xyz for p in scene.placed] + [scene.truth_xyz]
-    every = np.concatenate(drawn)
-    axes, _ = plane_from_above(every, scene.down)
+    drawn = [xyz for _, xyz in _lines(scene)]
     canvas = Canvas.around(*extent([xyz @ axes.T for xyz in window or drawn]))
     shapes = [canvas.dots(scene.points @ axes.T, "landmarks") if len(scene.points) else None]
     shapes += _truth(run, scene, canvas, axes)
@@ -68,7 +99,7 @@ def _drawing(
         words += [canvas.label(uv, "◆", "agreeing", "keyframe that the link rests on") for uv in at @ axes.T]
     words += _ends(scene, canvas, axes) if window is None else []
     words += _breakages(run, scene, canvas, axes)
-    words.append(canvas.scale_bar(scene.unit, every @ axes.T))
+    words.append(canvas.scale_bar(scene.unit, np.concatenate(drawn) @ axes.T))
     return canvas.draw(shapes, words, _description(run, scene))
 
 
@@ -133,9 +164,9 @@ def _breakages(run: RunData, scene: Scene, canvas: Canvas, axes: FloatArray) -> 
     xyz = np.concatenate([p.xyz for p in scene.placed])
     if len(scene.truth_row):  # there the loss itself has a place
         rows, xyz = scene.truth_row, scene.truth_xyz
-    marks = []
+    marks, row_of = [], run.row_of
     for i, event in enumerate(run.events_of("failed"), 1):
-        onset = run.row_of.get(event.get("lost_since", event["frame"]))
+        onset = row_of.get(event.get("lost_since", event["frame"]))
         before = np.flatnonzero(rows <= onset) if onset is not None else np.zeros(0, np.int64)
         if not len(before):
             continue

@@ -228,6 +228,14 @@ def test_pictures_of_an_earlier_run_go_with_it(make_run: MakeRun) -> None:
     assert not (folder / "groundtruth.txt").exists()
 
 
+def test_a_page_stays_small_however_much_happens(broken_run: RunData) -> None:
+    failed = next(e for e in broken_run.events if e["event"] == "failed")
+    found = outline(replace(broken_run, events=[failed | {"submap": m} for m in range(900)]))
+    assert "900 events, of which the first 500 are here and all in events.jsonl" in found.text
+    assert len(found.of_class("close-up")) == 20
+    assert len(report_page(broken_run)) < 150_000
+
+
 def test_signs_of_trouble_are_told(broken_run: RunData) -> None:
     events = [e | {"suspected_since": 17} if e["event"] == "failed" else e for e in broken_run.events]
     assert "signs of trouble since frame 17" in outline(replace(broken_run, events=events)).text
