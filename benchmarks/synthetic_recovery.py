@@ -99,6 +99,11 @@ def measure(system: Any, world: Any, cpu_s: float) -> dict[str, Any]:
         "silent_jumps": sum(
             not jump.noticed for jump in find_map_jumps(system.atlas, system.poses.values(), truth, system.events)
         ),
+        "lost_after_fusion": sum(
+            row.status == "lost" and 0 < row.index - event.frame <= world.rate_hz
+            for event in system.events.of_kind(EventKind.FUSED)
+            for row in system.rows.values()
+        ),
         "coverage": len(main) / max(len(possible), 1),
         "ate_pct": ate_pct,
         "cpu_s": cpu_s,
@@ -109,8 +114,9 @@ def table(runs: list[dict[str, Any]]) -> str:
     """Return the results by kind of failure, as Markdown."""
     lines = [
         "| scene | failure | runs | lost maps | with a new map | linked | wrong | scale % med / max "
-        "| rotation deg med / max | position % med / max | ATE % med | silent jumps |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "| rotation deg med / max | position % med / max | ATE % med "
+        "| silent jumps | frames lost within 1 s of a fusion |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     groups = [(s, k) for s in SCENES for k in KINDS] + [("all", "all")]
     for scene, kind in groups:
@@ -125,7 +131,7 @@ def table(runs: list[dict[str, Any]]) -> str:
             cells.append(f"{np.median(values):.2f} / {max(values):.2f}" if values else "-")
         ate = [r["ate_pct"] for r in of if r["ate_pct"] is not None]
         cells.append(f"{np.median(ate):.2f}" if ate else "-")
-        cells.append(sum(r["silent_jumps"] for r in of))
+        cells += [sum(r[name] for r in of) for name in ("silent_jumps", "lost_after_fusion")]
         lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
     return "\n".join(lines)
 
