@@ -19,10 +19,11 @@ from dualslam.core.solving import solve
 from dualslam.core.submap import Submap
 from dualslam.core.submap_change import change_of_frame
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus, Keyframe, View
+from dualslam.direction import reads_backwards, recover
 from dualslam.frame_buffer import FrameBuffer
 from dualslam.merging import Merged, carry_links, merge_recovery
 from dualslam.record import Moment, Record
-from dualslam.recovery import FoundLink, RecoveryJob, RecoveryParts, RecoveryResult, WalkedFrame, run_recovery
+from dualslam.recovery import FoundLink, RecoveryJob, RecoveryParts, RecoveryResult, WalkedFrame
 from dualslam.seam import gauge_at_seam
 
 Outcome = tuple[RecoveryJob, RecoveryResult | Failure]
@@ -53,7 +54,7 @@ class InlineExecutor:
 
     def submit(self, job: RecoveryJob) -> None:
         """Run the job."""
-        self._done.append((job, run_recovery(job, self._parts)))
+        self._done.append((job, recover(job, self._parts)))
 
     def poll(self) -> list[Outcome]:
         """Return what has run since the last call."""
@@ -304,13 +305,15 @@ class Recoveries:
             seconds=seconds,
             **(link.numbers | {"scale": float(sim3.scale(S_old_new))}),
         )
-        n_bypassed = self._bypass(walked, new_id, handover=max(agreeing))
+        order = -1 if reads_backwards(job) else 1  # times a frame's number: ascends with time, as it is read
         onset = job.onsets[found.old_id]
-        n_dropped = self._drop_corrupted(
-            found.old_id, onset if link.change_point is None else min(onset, link.change_point)
-        )
+        corrupted_since = order * onset
+        if link.change_point is not None:
+            corrupted_since = min(corrupted_since, order * link.change_point)
+        n_bypassed = self._bypass(walked, new_id, agreeing[-1], order)
+        n_dropped = self._drop_corrupted(found.old_id, corrupted_since, order)
         for frame in walked:
-            if self._was_lost(frame.pose.index, found.old_id, job.onsets[found.old_id]):
+            if order * frame.pose.index >= order * onset and self._was_lost(frame.pose.index, found.old_id):
                 record.rows[frame.pose.index].status = FrameStatus.RECOVERED
         seam = found.seam
         numbers = {"seam": str(seam.reason)} if isinstance(seam, Failure) else {"seam": "refined", **seam.numbers}
@@ -318,25 +321,25 @@ class Recoveries:
             EventKind.FUSED, now, new_id, old_submap=found.old_id, bypassed=n_bypassed, dropped=n_dropped, **numbers
         )
 
-    def _bypass(self, walked: list[WalkedFrame], new_id: int, handover: int) -> int:
+    def _bypass(self, walked: list[WalkedFrame], new_id: int, handover: int, order: int) -> int:
         """Let the newest part of the old map, beyond the keyframes that agree, take its poses from the new one."""
         poses, n_bypassed = self._record.poses, 0
         for frame in walked:
             i = frame.pose.index
-            if i <= handover or poses[i].submap_id == new_id:
+            if order * i <= order * handover or poses[i].submap_id == new_id:
                 continue
             self._record.pose(frame.pose)
             self._record.rows[i].status = FrameStatus.BYPASSED
             n_bypassed += 1
         return n_bypassed
 
-    def _drop_corrupted(self, old_id: int, since: int) -> int:
+    def _drop_corrupted(self, old_id: int, since: int, order: int) -> int:
         """Take the pose from frames of the corrupted tail that the walk has leaped: that of the old map may be wrong.
 
         They keep their row.
         """
         poses = self._record.poses
-        corrupted = [i for i, pose in poses.items() if pose.submap_id == old_id and i >= since]
+        corrupted = [i for i, pose in poses.items() if pose.submap_id == old_id and order * i >= since]
         for i in corrupted:
             del poses[i]
             self._record.rows[i].status, self._record.rows[i].submap_id = FrameStatus.BYPASSED, None
@@ -349,9 +352,9 @@ class Recoveries:
             settled.update(next(c for c in self._record.atlas.components() if live.submap.id in c))
         self._onsets = {m: onset for m, onset in self._onsets.items() if m not in settled}
 
-    def _was_lost(self, index: int, old_id: int, onset: int) -> bool:
+    def _was_lost(self, index: int, old_id: int) -> bool:
         tracked = self._record.rows[index].status is FrameStatus.TRACKED
-        return self._record.poses[index].submap_id != old_id and tracked and index >= onset
+        return tracked and self._record.poses[index].submap_id != old_id
 
 
 def _same_camera(job: RecoveryJob, submap: Submap) -> bool:

@@ -342,7 +342,7 @@ def walk_back(
             try:
                 report = walker.insert_keyframe(track)
             except SolverError as error:
-                log.warning("the walk back ends at frame %d: %s", view.index, error)
+                log.warning("the walk back ends: %s", error)
                 return
         yield WalkStep(view, track, report)
 

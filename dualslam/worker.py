@@ -21,8 +21,9 @@ from queue import Empty, SimpleQueue
 from threading import Thread
 
 from dualslam.core.types import Failure, FailureReason
+from dualslam.direction import recover
 from dualslam.recoveries import Outcome
-from dualslam.recovery import RecoveryJob, RecoveryParts, RecoveryResult, run_recovery
+from dualslam.recovery import RecoveryJob, RecoveryParts, RecoveryResult
 
 log = logging.getLogger(__name__)
 
@@ -108,7 +109,7 @@ def serve(connection: Connection, make_parts: MakeParts) -> None:
             job = _receive(connection)
         except EOFError:
             return
-        result = run_recovery(job, parts)
+        result = recover(job, parts)
         try:
             connection.send(result)
         except BrokenPipeError:  # nobody waits for it any more

@@ -19,10 +19,10 @@ POSITION_M, ROTATION_RAD = 0.08, 0.01
 SCALE = 0.01  # share by which the link may miss the true ratio of the two units
 
 
-def run(recovery: bool) -> tuple[System, PointWorld]:
+def run(recovery: bool, backwards: bool = False) -> tuple[System, PointWorld]:
     world = PointWorld(cloud(), hand_held(70), covered=COVERED)
     system = system_in(world, recovery={"enabled": recovery})
-    for frame in world.frames():
+    for frame in sorted(world.frames(), key=lambda frame: frame.index, reverse=backwards):
         system.step(frame)
     system.finish()
     return system, world
@@ -153,3 +153,24 @@ def test_three_maps_chain() -> None:
     fused = [event.frame for event in system.events.of_kind(EventKind.FUSED)]
     assert len(fused) == 2
     assert all(system.rows[i].status is FrameStatus.TRACKED for f in fused for i in range(f, f + 10))
+
+
+def test_a_sequence_that_is_read_backwards_is_linked_where_its_old_map_is_healthy() -> None:
+    system, world = run(recovery=True, backwards=True)
+    main = trajectories_of(system).main
+    assert set(main.index.tolist()) == set(range(70)) - COVERED
+    translation, rotation = pose_errors(main.T_world_cam, world.T_world_cam[main.index])
+    assert translation.max() < POSITION_M
+    assert rotation.max() < ROTATION_RAD
+    (started,) = system.events.of_kind(EventKind.RECOVERY_STARTED)
+    (attempt,) = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)
+    first_lost = max(COVERED)
+    assert attempt.frame > first_lost
+    assert (attempt.data["k"], attempt.data["k_r"]) == (69 - first_lost, first_lost - started.frame + 1)
+    (linked,) = system.events.of_kind(EventKind.LINKED)
+    assert min(linked.data["agreeing_keyframes"]) > first_lost
+    bypassed = [i for i, row in system.rows.items() if row.status is FrameStatus.BYPASSED]
+    assert all(first_lost < i < min(linked.data["agreeing_keyframes"]) for i in bypassed)
+    recovered = [i for i, row in system.rows.items() if row.status is FrameStatus.RECOVERED]
+    assert recovered
+    assert started.frame < min(recovered) <= max(recovered) < min(COVERED)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -295,6 +296,18 @@ class Submap:
         twin.gauge = self.gauge
         twin.landmarks = Table.from_columns(self.landmarks.columns())
         twin.observations = Table.from_columns(self.observations.columns())
+        return twin
+
+    def renumbered(self, number_of: Callable[[int], int]) -> Submap:
+        """Return a copy with other ids for its keyframes; landmarks and rows keep theirs."""
+        twin = self.copy()
+        twin.keyframes = {number_of(k): replace(kf, id=number_of(k)) for k, kf in twin.keyframes.items()}
+        twin.T_submap_kf = {number_of(k): T for k, T in twin.T_submap_kf.items()}
+        twin.landmark_of = {number_of(k): ids for k, ids in twin.landmark_of.items()}
+        twin.anchors = {number_of(k): Anchor(number_of(a.keyframe_id), a.T_kf_cam) for k, a in twin.anchors.items()}
+        twin.gauge = (number_of(self.gauge[0]), number_of(self.gauge[1]))
+        for column in (twin.observations["kf"], twin.landmarks["first_kf"]):
+            column[:] = [number_of(k) for k in column.tolist()]
         return twin
 
     def take_over(self, changed: Submap) -> None:

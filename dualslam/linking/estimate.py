@@ -109,7 +109,7 @@ def estimate_link(
     if len(tears_new):
         trusted &= pairs.keyframes >= tears_new[-1]
         if np.count_nonzero(np.array(list(new.keyframes)) < tears_new[-1]) > 1:
-            detail = f"the new map is torn before keyframe {tears_new[-1]}"
+            detail = "the new map is torn among its older keyframes"
             return Failure(FailureReason.DEFORMED, detail, {"torn": float(tears_new[-1])})
     if np.count_nonzero(trusted) < config.min_keyframes:
         return _needs_older(int(np.count_nonzero(trusted)), config, onset)
@@ -218,8 +218,8 @@ def _look_back(old: Submap, keyframe_id: int, config: LinkingConfig) -> int:
 
 def _needs_older(n: int, config: LinkingConfig, onset: int | None, change: int | None = None) -> Failure:
     """Make the refusal that asks for more keyframes."""
-    before = "" if onset is None else f" older than {onset}"
-    broken = "" if change is None else f", another similarity from {change} on"
+    before = "" if onset is None else " older than the suspected onset"
+    broken = "" if change is None else ", another similarity fits the newer ones"
     numbers = {"n_keyframes": float(n)}
     numbers |= {} if onset is None else {"onset": float(onset)}
     numbers |= {} if change is None else {"change_point": float(change)}
