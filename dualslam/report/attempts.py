@@ -11,7 +11,7 @@ from dualslam.report.statuses import count
 SHOWN_TRIES = 8
 """Links of one failure that are shown at once; the rest unfolds."""
 Event = dict[str, Any]
-_WALK = ("attempt", "posed", "keyframes", "leaped", "verdict", "time")
+_WALK = ("attempt", "reached", "posed", "keyframes", "leaped", "verdict", "time")
 _LINK = ("back at", "verdict", "attempt", "keyframes", "matches", "inliers", "scale", "rotation", "position", "time")
 
 
@@ -57,6 +57,7 @@ def _walk_cells(event: Event) -> dict[str, str]:
     verdict = str(event.get("verdict", ""))
     return {
         "attempt": str(event.get("attempt", "")),
+        "reached": f"frame {event.get('frame', '-')}",
         "posed": count(event["frames"], "frame") if "frames" in event else "",
         "keyframes": str(event.get("new_keyframes", "")),
         "leaped": "" if leaped is None else count(leaped, "frame"),

@@ -139,6 +139,9 @@ def _told(run: RunData, story: FailureStory) -> str:
         f"Submap {story.restart.get('submap')} was started at frame {story.restart['frame']}{began}, "
         f"{count(gap, 'frame')} after the loss."
     )
+    if story.walks and "k_r" in story.walks[0]:
+        k, k_r = story.walks[0]["k"], story.walks[0]["k_r"]
+        told.append(f"The walk back could read {k} frames from before the loss and {k_r} since (k and k_r).")
     return " ".join([*told, _outcome(story)])
 
 

@@ -155,6 +155,8 @@ def _events(run: RunData) -> Markup:
 
 def _event_words(event: dict[str, Any]) -> str:
     def shown(value: object) -> str:
+        if isinstance(value, list):
+            return "[" + ", ".join(map(shown, value)) + "]"
         return number(value, 4) if isinstance(value, float) else str(value)
 
     return ", ".join(f"{k} {shown(v)}" for k, v in event.items() if k not in _EVENT_FIELDS and v is not None)

@@ -54,7 +54,15 @@ class Eventful(FakeSystem):
         if self.events.of_kind(EventKind.FAILED) and len(self.atlas.submaps) > 1:
             self.events.add(EventKind.REINITIALISED, LOST[-1] + 1, 2.6, 1, first_view=LOST[-1] + 1)
             self.events.add(EventKind.RECOVERY_STARTED, LOST[-1] + 1, 2.6, 1, lost=[0], frames=26)
-            walk = {"attempt": "sift", "frames": 9, "new_keyframes": 5, "leaped_frames": 6, "seconds": 1.25}
+            walk = {
+                "attempt": "sift",
+                "frames": 9,
+                "new_keyframes": 5,
+                "leaped_frames": 6,
+                "seconds": 1.25,
+                "k": 20,
+                "k_r": 7,
+            }
             self.events.add(EventKind.RECOVERY_ATTEMPT, 12, 1.2, 1, verdict="the buffer ends", **walk)
             numbers = {"n_pairs": 31.0, "scale": 0.72, "sigma_scale": 0.0021, "sigma_rot_deg": 0.13}
             self.events.add(
