@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dualslam.core.config import StrictModel
-from dualslam.core.types import Features, FloatArray, IntArray, Matches
+from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Matches
 from frontends.corners import grades, select_spread, share_out
 from frontends.groups import consistent_rotation, mutual_best
 from frontends.images import to_grey
@@ -45,6 +45,11 @@ BASE_SIGMA_PX = 1.6
 """Blur of the first level of an octave (Lowe, section 3.3); the image is taken twice as large at first."""
 MIN_SIDE_PX = 16
 """A descriptor at the finest level reads a square of this side; smaller images have no features."""
+CONTENDERS = 2
+"""Of so many times the keypoints that are asked for, the strongest, those are chosen that cover the image. If all that
+there are took part, the choice would change from frame to frame, and a quarter fewer landmarks be found again."""
+CELL_PX = 64
+"""Squares of this side without any of the strongest let their weak ones take part."""
 BLOCK_ROWS = 1024
 """Descriptor pairs compared at a time, so that the scratch stays in the cache."""
 
@@ -163,13 +168,24 @@ class SiftFrontend:
         """Rows of the strongest that cover the image, octave by octave, finest first."""
         xy = np.array([each.pt for each in keypoints], np.float64).reshape(-1, 2).astype(np.int64)
         response = np.array([each.response for each in keypoints], np.float64)
-        levels = [np.flatnonzero(octave == level) for level in range(self.n_octaves)]
+        contender = self._contenders(xy, response, octave < self.n_octaves)
+        levels = [np.flatnonzero(contender & (octave == level)) for level in range(self.n_octaves)]
         # As many per octave as its side is long: fine ones are the more accurate, coarse ones live the longer.
         weights = self.scale_factor ** -np.arange(self.n_octaves, dtype=np.float64)
         quotas = share_out([len(rows) for rows in levels], weights, self.n_features)
         return np.concatenate(
             [rows[select_spread(xy[rows], grades(response[rows]), n)] for rows, n in zip(levels, quotas, strict=True)]
         )
+
+    def _contenders(self, xy: IntArray, response: FloatArray, usable: BoolArray) -> BoolArray:
+        """The strongest of those that are usable, and in parts of the image that have none of these, all."""
+        strong = np.zeros(len(xy), np.bool_)
+        usable_rows = np.flatnonzero(usable)
+        by_strength = usable_rows[np.argsort(response[usable_rows], kind="stable")]
+        strong[by_strength[-CONTENDERS * self.n_features :]] = True
+        column, row = xy.T // CELL_PX
+        cell = row * 4096 + column
+        return strong | (usable & ~np.isin(cell, cell[strong]))
 
 
 def _root(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -62,7 +62,7 @@ def test_extrema_cover_the_image(image: Image) -> None:
     faint = image.copy()
     faint[:, :320] = 128 + (faint[:, :320].astype(np.int64) - 128) // 8
     uv = SiftFrontend(800).extract(faint).uv_px
-    assert (uv[:, 0] < 310).sum() >= 200
+    assert (uv[:, 0] < 310).sum() >= 150
 
 
 @pytest.mark.parametrize(
