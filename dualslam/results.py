@@ -102,6 +102,7 @@ def summarise(
         "seed": config.seed,
         "dropped": len(report.dropped),
         "interrupted": report.interrupted,
+        "crashed": report.bug is not None,
         "fps": report.fps,
         "wall_s": report.wall_s,
         "cpu_ms_per_frame": 1e3 * report.cpu_s / max(len(report.latencies_ms), 1),

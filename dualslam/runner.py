@@ -51,6 +51,8 @@ class RunReport:
         True where a signal ended the run early.
     error : InputError or None
         What ended the source early.
+    bug : Exception or None
+        What the system raised, which ended the run: its maker's mistake, no property of the input.
     """
 
     n_frames: int
@@ -61,6 +63,7 @@ class RunReport:
     peak_rss_mb: float
     interrupted: bool
     error: InputError | None
+    bug: Exception | None
 
     @property
     def fps(self) -> float:
@@ -80,7 +83,8 @@ def run_sequence(
     """Feed a system all frames of a sequence, then finish it.
 
     The first SIGINT or SIGTERM ends the run after the frame in hand, so that what there is can be saved; the second one
-    acts as ever. A source that breaks after its first frame ends the run in the same way.
+    acts as ever. A source that breaks after its first frame ends the run in the same way, and so does a system that
+    raises; what it raised is in the report, for the caller to raise again once the rest is saved.
 
     Parameters
     ----------
@@ -106,6 +110,7 @@ def run_sequence(
     dropped: list[tuple[int, float]] = []
     latencies_ms: list[float] = []
     error: InputError | None = None
+    bug: Exception | None = None
     began, cpu_began = clock(), _cpu_s()
     source = iter(sequence)
     frames = _in_real_time(source, dropped, clock, sleep) if realtime else source
@@ -121,14 +126,22 @@ def run_sequence(
                 error = problem
                 break
             before = clock()
-            result = system.step(frame)
-            latencies_ms.append(1e3 * (clock() - before))
+            try:
+                result = system.step(frame)
+            except Exception as problem:
+                bug = problem
+                break
+            finally:
+                latencies_ms.append(1e3 * (clock() - before))
             if on_frame is not None:
                 on_frame(result)
         interrupted = stop.is_set()
         if not latencies_ms and not interrupted:
             raise InputError(f"{sequence.name} gave no frame; check the source and which frames were asked for.")
-        system.finish()
+        try:
+            system.finish()
+        except Exception as problem:
+            bug = bug or problem  # a system that broke may well break again here: the first one tells why
     return RunReport(
         n_frames=len(latencies_ms) + len(dropped),
         dropped=tuple(dropped),
@@ -138,6 +151,7 @@ def run_sequence(
         peak_rss_mb=_peak_rss_mb(),
         interrupted=interrupted,
         error=error,
+        bug=bug,
     )
 
 

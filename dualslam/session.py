@@ -62,7 +62,7 @@ def run_to_folder(
     on_frame: Callable[[FrameResult], None] | None = None,
     build: Callable[[Config, Camera], System] | None = None,
 ) -> Outcome:
-    """Run on a sequence and write a run folder. What an interrupted run has found is kept all the same.
+    """Run on a sequence and write a run folder. What an interrupted run, or one that crashed, has found is kept.
 
     Parameters
     ----------
@@ -80,6 +80,8 @@ def run_to_folder(
     Raises
     ------
     ConfigError, InputError, OutputError
+    Exception
+        Whatever the system raised, once what it had found until then is written; a note on it says where.
     """
     sequence = corrupted(sequence, config.corruptions)
     system = (build or build_system)(config, sequence.camera)
@@ -99,18 +101,34 @@ def run_to_folder(
             last = next(reversed(system.rows.values()))
             system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap_id)
         _write_new_events(system, folder, n_events)
-        trajectories = trajectories_of(system)
-        truth: Trajectory | None = getattr(sequence, "ground_truth", None)
-        summary = {"sequence": sequence.name} | summarise(system, report, trajectories, config, truth)
-        rows = frame_rows(system, trajectories.main, report.dropped)
-        folder.write(RunRecord(rows, trajectories.main, trajectories.unlinked, summary))
-        if truth is not None:
-            folder.write_truth(truth_of_frames(truth, rows))
-        save_atlas(folder.map_path, system.atlas, system.poses)
-        folder.write_report(report_page(read_run(folder.path)))
+        try:
+            summary = _write_results(system, report, config, sequence, folder)
+        except Exception as error:
+            if report.bug is None:
+                raise
+            raise report.bug from error  # the map of a system that broke may be in pieces
+    if report.bug is not None:
+        report.bug.add_note(f"What was found until then is in {out}.")
+        raise report.bug
     if report.error is not None:
         raise InputError(f"{report.error} What was found until then is in {out}.")
     return Outcome(Path(out), summary, report, system)
+
+
+def _write_results(
+    system: System, report: RunReport, config: Config, sequence: Sequence, folder: RunFolder
+) -> dict[str, Any]:
+    """Write all that comes at the end of a run, and return the summary."""
+    trajectories = trajectories_of(system)
+    truth: Trajectory | None = getattr(sequence, "ground_truth", None)
+    summary = {"sequence": sequence.name} | summarise(system, report, trajectories, config, truth)
+    rows = frame_rows(system, trajectories.main, report.dropped)
+    folder.write(RunRecord(rows, trajectories.main, trajectories.unlinked, summary))
+    if truth is not None:
+        folder.write_truth(truth_of_frames(truth, rows))
+    save_atlas(folder.map_path, system.atlas, system.poses)
+    folder.write_report(report_page(read_run(folder.path)))
+    return summary
 
 
 class _Watched:

@@ -48,7 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _say(sentence: object, status: int) -> int:
-    print(f"dualslam: {' '.join(str(sentence).split())}", file=sys.stderr)
+    words = " ".join([str(sentence), *getattr(sentence, "__notes__", ())]).split()
+    print(f"dualslam: {' '.join(words)}", file=sys.stderr)
     return status
 
 
@@ -65,4 +66,5 @@ def _report_bug(error: Exception, arguments: list[str], out: Path | None) -> str
     except OSError:
         where = "the traceback could not be written"
     detail = " ".join(str(error).split())
-    return f"this is a bug, please report it: {type(error).__name__}{': ' if detail else ''}{detail} ({where})"
+    notes = "".join(f". {note}" for note in getattr(error, "__notes__", ()))
+    return f"this is a bug, please report it: {type(error).__name__}{': ' if detail else ''}{detail} ({where}){notes}"

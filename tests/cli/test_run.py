@@ -132,6 +132,28 @@ def test_a_bug_in_the_system_leaves_its_log_in_the_run_folder(
     assert "ZeroDivisionError: by zero" in log.read_text()
 
 
+def test_a_crash_in_the_middle_keeps_what_was_found(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(frame: Frame) -> None:
+        if frame.index == 6:
+            raise ZeroDivisionError("by zero")
+
+    out = tmp_path / "run"
+    fake(before_step=broken)
+    assert main(["run", str(folder), "--out", str(out)]) == 1
+    message = capsys.readouterr().err
+    assert "this is a bug, please report it: ZeroDivisionError: by zero" in message
+    assert message.rstrip().endswith(f"What was found until then is in {out}.")
+    assert len(rows_of(out)) == len((out / "trajectory.txt").read_text().splitlines()) == 6
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["crashed"], summary["frames"], summary["posed"]) == (True, 7, 6)
+    assert set(load_atlas(out).poses) == set(range(6))
+    assert (out / "report.html").exists()
+    (log,) = out.glob("dualslam-bug-*.log")
+    assert "in broken" in log.read_text()
+
+
 def test_profile_prints_a_table(
     folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

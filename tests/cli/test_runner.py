@@ -8,6 +8,7 @@ import pytest
 
 from dualslam.core.errors import InputError
 from dualslam.core.types import Frame
+from dualslam.frame_records import FrameResult
 from dualslam.results import frame_rows
 from dualslam.runner import run_sequence
 from tests.cli.fakes import FakeSystem
@@ -108,6 +109,25 @@ def test_a_source_that_breaks_ends_the_run_and_keeps_its_frames() -> None:
     assert list(system.rows) == [0, 1]
     assert system.n_finished == 1
     assert frames.closed
+
+
+def test_a_system_that_breaks_is_finished_and_what_it_raised_first_is_reported() -> None:
+    class Broken(FakeSystem):
+        def step(self, frame: Frame) -> FrameResult:
+            if frame.index == 2:
+                raise ZeroDivisionError("in a step")
+            return super().step(frame)
+
+        def finish(self) -> None:
+            super().finish()
+            raise ValueError("at the end")
+
+    system, frames = Broken(EVERYWHERE), Frames([0, 1, 2, 3])
+    report = run_sequence(system, frames)  # type: ignore[arg-type]
+    assert isinstance(report.bug, ZeroDivisionError)
+    assert (report.n_frames, list(system.rows), system.n_finished) == (3, [0, 1], 1)
+    assert frames.closed
+    assert isinstance(run_sequence(Broken(EVERYWHERE), Frames([0])).bug, ValueError)  # type: ignore[arg-type]
 
 
 def test_a_source_without_frames_is_bad_input() -> None:
