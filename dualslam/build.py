@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
@@ -27,13 +28,33 @@ from dualslam.system import Components, System
 from dualslam.worker import WorkerExecutor
 from frontends.images import to_grey
 from frontends.initialiser import Initialiser
+from frontends.motion_statistics import nearest_search
 from frontends.pnp_odometry import PnpOdometry
+from frontends.registry import check_frontend
 from frontends.registry import create_frontend as create_frontend  # part of the Python interface
 from frontends.visual import VisualFrontEnd
 
 ADJUST_ITERATIONS = 20
 WORKER_BUDGET = 0.75
 """Share of the time after which a worker counts as hung that its walks may take: what they have by then is not lost."""
+
+
+def check_config(config: Config) -> None:
+    """Refuse a config that no system can be built from, as far as it shows without extras and weights.
+
+    Raises
+    ------
+    ConfigError
+        If a front end, also one that an attempt at a recovery names, is not known or its options are wrong, or if the
+        initialiser cannot match with it.
+    """
+    frontend = check_frontend(config.frontend)
+    if frontend is not None and config.initialiser.matching == "gms":
+        nearest_search(frontend)
+    for number, attempt in enumerate(config.recovery.attempts):
+        if not attempt.is_live:
+            with _naming_attempt(number):
+                check_frontend(_guest(attempt))
 
 
 def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | None = None) -> System:
@@ -54,8 +75,9 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
     Raises
     ------
     ConfigError
-        If the front end is not known or its options are wrong.
+        As `check_config`, and where an extra or weights that a front end needs are missing.
     """
+    check_config(config)
     frontend = create_frontend(config.frontend)
     size_px = (camera.width, camera.height)
     calibration = Calibration(
@@ -139,12 +161,8 @@ def _attempt(
     """Build one attempt: the live front end itself, or another one that gives it its poses."""
     if attempt.is_live:
         return Attempt(attempt.name, lambda job, submap, graph: live(submap, graph))
-    try:
-        guest = create_frontend(
-            FrontendConfig(name=attempt.frontend, n_features=attempt.n_features, options=attempt.options)
-        )
-    except ConfigError as error:
-        raise ConfigError(f"recovery.attempts[{number}]: {error}") from error
+    with _naming_attempt(number):
+        guest = create_frontend(_guest(attempt))
 
     def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> PnpOdometry:
         def extract(view: View) -> Features | Failure:
@@ -157,6 +175,19 @@ def _attempt(
         return PnpOdometry(walker, guest, extract, job.own, bundle_adjust_arrays, config, size_px, walks_live)
 
     return Attempt(attempt.name, new_odometry)
+
+
+def _guest(attempt: AttemptConfig) -> FrontendConfig:
+    return FrontendConfig(name=attempt.frontend, n_features=attempt.n_features, options=attempt.options)
+
+
+@contextmanager
+def _naming_attempt(number: int) -> Iterator[None]:
+    """Say of a mistake in the config that it is in this attempt."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"recovery.attempts[{number}]: {error}") from error
 
 
 def view_of(

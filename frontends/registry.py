@@ -28,6 +28,9 @@ BUILT_IN: Mapping[str, str] = {
 EXTRAS: Mapping[str, str] = {"kornia": "dualslam[kornia]"}
 """What to install for a built-in front end that needs more than the core's dependencies."""
 
+EXTRA_OPTIONS: Mapping[str, str] = {"kornia": "frontends.kornia.options:KorniaOptions"}
+"""Options of the built-in front ends that need an extra, in modules that can be imported without it."""
+
 OptionsT = TypeVar("OptionsT", bound=BaseModel)
 
 
@@ -57,6 +60,28 @@ def create_frontend(config: FrontendConfig) -> Frontend:
     return _factory(config.name).from_options(config.n_features, config.options)
 
 
+def check_frontend(config: FrontendConfig) -> Frontend | None:
+    """Refuse what `create_frontend` would, as far as can be told without what an extra installs, and without weights.
+
+    Returns
+    -------
+    Frontend or None
+        A built-in one that needs neither; None for another, of which only the name (and built-in options) is checked.
+
+    Raises
+    ------
+    ConfigError
+    """
+    if config.name in EXTRA_OPTIONS:
+        module, _, attribute = EXTRA_OPTIONS[config.name].partition(":")
+        parse_options(getattr(importlib.import_module(module), attribute), config.name, config.options)
+        return None
+    if config.name in BUILT_IN:
+        return create_frontend(config)
+    _factory(config.name)
+    return None
+
+
 def parse_options(model: type[OptionsT], frontend: str, options: Mapping[str, Any]) -> OptionsT:
     """Check the `frontend.options` of the config against a front end's own strict model.
 
@@ -83,15 +108,23 @@ def parse_options(model: type[OptionsT], frontend: str, options: Mapping[str, An
 def _factory(name: str) -> FrontendFactory:
     """Import what a name points to."""
     try:
-        if name in BUILT_IN or ":" in name:
-            module, _, attribute = BUILT_IN.get(name, name).partition(":")
-            named: FrontendFactory = getattr(importlib.import_module(module), attribute)
-            return named
-        for entry in entry_points(group=ENTRY_POINT_GROUP, name=name):
-            loaded: FrontendFactory = entry.load()
-            return loaded
-    except (ImportError, AttributeError) as error:
+        found = _import(name)
+    except (ImportError, AttributeError, ValueError, SyntaxError) as error:
         missing_extra = isinstance(error, ModuleNotFoundError) and name in EXTRAS
         advice = f"; pip install '{EXTRAS[name]}'" if missing_extra else ""
-        raise ConfigError(f"frontend.name: '{name}' is known but cannot be imported: {error}{advice}") from error
+        raise ConfigError(f"frontend.name: '{name}' cannot be imported: {error}{advice}") from error
+    if not callable(getattr(found, "from_options", None)):
+        raise ConfigError(f"frontend.name: '{name}' is no front end: it has no from_options")
+    factory: FrontendFactory = found
+    return factory
+
+
+def _import(name: str) -> Any:
+    if name in BUILT_IN or ":" in name:
+        module, _, attribute = BUILT_IN.get(name, name).partition(":")
+        if not all(part.isidentifier() for part in (*module.split("."), attribute)):
+            raise ConfigError(f"frontend.name: '{name}' is not of the form module:Class")
+        return getattr(importlib.import_module(module), attribute)
+    for entry in entry_points(group=ENTRY_POINT_GROUP, name=name):
+        return entry.load()
     raise ConfigError(f"frontend.name: no front end is called '{name}'; known: {', '.join(known_frontends())}")

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 
+from dualslam.build import check_config
 from dualslam.cli.configuration import config_of
 from dualslam.core.config_io import dump_config
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Print the configuration as YAML."""
-    print(dump_config(config_of(args)), end="", flush=True)
+    """Print the configuration as YAML, if `run` would take it."""
+    config = config_of(args)
+    check_config(config)
+    print(dump_config(config), end="", flush=True)
     return 0

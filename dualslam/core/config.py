@@ -380,8 +380,8 @@ class CalibrationConfig(StrictModel):
 class Config(StrictModel):
     """The root of the configuration."""
 
-    seed: int = Field(0, ge=0)
-    """Seed of every random choice of the run."""
+    seed: int = Field(0, ge=0, le=2**64 - 1)
+    """Seed of every random choice of the run; the solvers take 64 bits."""
     frontend: FrontendConfig = FrontendConfig()
     camera: CameraConfig = CameraConfig()
     initialiser: InitialiserConfig = InitialiserConfig()

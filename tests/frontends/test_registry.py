@@ -64,6 +64,39 @@ def test_what_can_be_imported_needs_no_entry_point() -> None:
         registry.create_frontend(FrontendConfig(name="frontends.orb:Nothing"))
 
 
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("os:path", "^frontend.name: 'os:path' is no front end: it has no from_options$"),
+        ("numpy:ndarray", "is no front end: it has no from_options"),
+        ("nomod:X", "^frontend.name: 'nomod:X' cannot be imported: No module named 'nomod'$"),
+        (":", "':' is not of the form module:Class"),
+        ("os:", "'os:' is not of the form module:Class"),
+        (":path", "':path' is not of the form module:Class"),
+        ("..os:path", "is not of the form module:Class"),
+    ],
+)
+def test_what_is_no_front_end_is_a_config_error(name: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        registry.create_frontend(FrontendConfig(name=name))
+    with pytest.raises(ConfigError, match=said):
+        registry.check_frontend(FrontendConfig(name=name))
+
+
+def test_a_front_end_is_checked_without_its_extra() -> None:
+    code = """
+import sys
+sys.modules["torch"] = sys.modules["kornia"] = None
+from dualslam.cli import main
+sys.exit(main(["config", "--frontend", "kornia"]))
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "name: kornia" in done.stdout
+    with pytest.raises(ConfigError, match=r"frontend\.options\.no_such: there is no such option"):
+        registry.check_frontend(FrontendConfig(name="kornia", options={"no_such": 1}))
+
+
 @pytest.mark.parametrize("value", ["no_such_module:Thing", "frontends.orb:NoSuchThing"])
 def test_broken_entry_point_is_a_config_error(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
     offer(monkeypatch, broken=value)
