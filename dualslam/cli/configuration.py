@@ -34,8 +34,7 @@ def config_of(args: argparse.Namespace) -> Config:
     corrupt: Path | None = getattr(args, "corrupt", None)
     if corrupt is not None:
         overrides.append(Override(("corruptions",), _read_corruptions(corrupt), f"--corrupt {corrupt}"))
-    # A configuration without that section has no recovery to switch off.
-    if args.no_recovery and "recovery" in Config.model_fields:
+    if getattr(args, "no_recovery", False):
         overrides.append(Override(("recovery", "enabled"), False, "--no-recovery"))
     return load_config(args.config, overrides)
 

@@ -1,17 +1,20 @@
-"""`dualslam demo`: drive through a synthetic street, lose track on the way, and show what is left of the map."""
+"""`dualslam demo`: one drive through a synthetic street, twice: without recovery and with it, side by side."""
 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from dualslam.cli import logs
+from dualslam.cli.compare_command import table_text
 from dualslam.cli.configuration import config_of
 from dualslam.cli.console import progress
-from dualslam.cli.eval_command import score_text
 from dualslam.cli.run_command import conclude
-from dualslam.core.errors import InputError
-from dualslam.evaluation.trajectory_metrics import evaluate_run
+from dualslam.core.config import Config
+from dualslam.core.errors import InputError, OutputError
+from dualslam.io.atomic import write_text
+from dualslam.report import comparison_page, comparison_table, read_run
 from dualslam.session import run_to_folder
 from dualslam.sources import WorldSequence, make_world
 
@@ -21,18 +24,38 @@ WORLD_SEED = 0
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run on a street where the lens is covered half-way, and print the evaluation."""
+    """Run twice on a street where the lens is covered half-way, and print both scores; the status is the last run's."""
     if args.frames < MIN_FRAMES:
         raise InputError(f"--frames {args.frames}: the demo needs at least {MIN_FRAMES} to lose track and start again.")
     config = config_of(args)
+    page: Path = args.out / "compare.html"
+    if page.exists() and not args.overwrite:
+        raise OutputError(f"{page} is there already; name another folder with --out, or give --overwrite.")
     covered: dict[str, Any] = {"kind": "blackout", "start": args.frames // 2, "length": BLACKOUT_FRAMES}
     sequence = WorldSequence(make_world("street", args.frames, WORLD_SEED, [covered]))
     if not args.quiet:
         last = covered["start"] + BLACKOUT_FRAMES - 1
         print(f"A street of {args.frames} frames; the lens is covered in frames {covered['start']} to {last}.")
     logs.release()
-    with progress(sequence, args.quiet) as on_frame:
-        outcome = run_to_folder(config, sequence, args.out, overwrite=args.overwrite, on_frame=on_frame)
+    runs = []
+    # Both in this process: the second's peak memory is at least the first's.
+    for name, enabled in (("off", False), ("on", True)):
+        if not args.quiet:
+            print(f"Recovery {name}:", flush=True)
+        with progress(sequence, args.quiet) as on_frame:
+            outcome = run_to_folder(
+                _with_recovery(config, enabled), sequence, args.out / name, overwrite=args.overwrite, on_frame=on_frame
+            )
+        status = conclude(outcome, args)
+        if outcome.report.interrupted:
+            return status
+        runs.append(read_run(outcome.out))
+    write_text(page, comparison_page(runs))
     if not args.quiet:
-        print(score_text(evaluate_run(args.out, sequence)))
-    return conclude(outcome, args)
+        print(table_text(comparison_table(runs)))
+        print(f"page in {page}", flush=True)
+    return status
+
+
+def _with_recovery(config: Config, enabled: bool) -> Config:
+    return config.model_copy(update={"recovery": config.recovery.model_copy(update={"enabled": enabled})})

@@ -133,12 +133,12 @@ def _add_config(commands: argparse._SubParsersAction[_Parser]) -> None:
 
 
 def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> None:
-    parser, talk = _command(commands, "demo", "Drive through a synthetic street, lose track, and show what is left.")
+    parser, talk = _command(commands, "demo", "Lose track in a synthetic street: recovery off against on.")
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/demo"), help="default: runs/demo")
-    parser.add_argument("--overwrite", action="store_true", help="replace the run that is there")
-    parser.add_argument("--frames", metavar="N", type=_positive, default=300, help="how long a drive (default: 300)")
+    parser.add_argument("--overwrite", action="store_true", help="replace the runs that are there")
+    parser.add_argument("--frames", metavar="N", type=_positive, default=200, help="how long a drive (default: 200)")
     talk.add_argument("--profile", action="store_true", help="print where the time went, stage by stage")
-    _add_configuration(parser)
+    _add_fields(parser)
 
 
 def _add_bench(commands: argparse._SubParsersAction[_Parser]) -> None:
@@ -158,6 +158,11 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_configuration(parser: argparse.ArgumentParser) -> None:
+    group = _add_fields(parser)
+    group.add_argument("--no-recovery", action="store_true", help="do not try to link what a failure has parted")
+
+
+def _add_fields(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     group = parser.add_argument_group("configuration")
     group.add_argument("--config", metavar="FILE", type=Path, help="YAML file; what it does not name keeps its default")
     group.add_argument(
@@ -165,7 +170,7 @@ def _add_configuration(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--frontend", metavar="NAME", help="which front end (frontend.name)")
     group.add_argument("--seed", metavar="N", type=_count, help="seed of every random choice (seed)")
-    group.add_argument("--no-recovery", action="store_true", help="do not try to link what a failure has parted")
+    return group
 
 
 def _add_selection(parser: argparse.ArgumentParser) -> None:

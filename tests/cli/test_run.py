@@ -198,18 +198,3 @@ def test_render_writes_a_sequence_and_overwrites_only_its_own(
     assert main([*command[:4], "--frames", "2", "--overwrite"]) == 2
     assert "not written by dualslam render" in capsys.readouterr().err
     assert len(list((out / "images").iterdir())) == 2
-
-
-def test_demo_shows_the_evaluation(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from dualslam.sources import make_world
-    from tests.cli.fakes import builder
-
-    truth = dict(enumerate(make_world("street", 60, 0).ground_truth_T_world_cam))
-    monkeypatch.setattr("dualslam.session.build_system", builder(truth, lost=tuple(range(30, 45))))
-    assert main(["demo", "--frames", "60", "--out", str(tmp_path / "demo")]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert "covered in frames 30 to 44" in lines[0]
-    assert lines[1].startswith("main map: coverage 50.0 %")
-    assert "2 submaps, 1 failure" in lines[-1]

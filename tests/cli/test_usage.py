@@ -62,6 +62,7 @@ def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
         ("render street --out there --frames 0", "at least 1"),
         ("render street --out there --events none.yaml", "none.yaml cannot be read"),
         ("demo --frames 3", "at least 60"),
+        ("demo --no-recovery", "unrecognized arguments: --no-recovery"),
     ],
 )
 def test_bad_usage_is_one_sentence_and_status_2(
