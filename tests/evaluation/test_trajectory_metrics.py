@@ -1,4 +1,4 @@
-"""The numbers of the evaluation: against a case done by hand, against evo, and against the agreed scorer."""
+"""The numbers of the evaluation: against a case done by hand, against evo, and against an independent scorer."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def test_against_evo(alignment: str) -> None:
     # At 10 Hz without gaps, one second is ten frames.
     rpe = metrics.RPE(metrics.PoseRelation.rotation_angle_deg, delta=10, delta_unit=metrics.Unit.frames, all_pairs=True)
     rpe.process_data((reference, aligned))
-    # Ours has one pair more, as the agreed scorer: a pair may be one frame short of a second.
+    # Ours has one pair more, as an independent scorer: a pair may be one frame short of a second.
     median = rpe.get_statistic(metrics.StatisticsType.median)
     assert score.rpe_1s_rot_deg_median == pytest.approx(median, rel=0.02)
 
@@ -228,7 +228,7 @@ def test_evaluate_run_needs_its_inputs(tmp_path: Path) -> None:
         evaluate_run(tmp_path, KnownSequence("curve", truth.timestamps_s, truth))
 
 
-@pytest.mark.skipif("DUALSLAM_SCORE" not in os.environ, reason="DUALSLAM_SCORE does not name the agreed scorer")
+@pytest.mark.skipif("DUALSLAM_SCORE" not in os.environ, reason="DUALSLAM_SCORE does not name an independent scorer")
 @pytest.mark.parametrize("seed", range(4))
 def test_agrees_with_the_agreed_scorer(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -22,7 +22,7 @@ FOLDER = Path(__file__).parents[3] / "benchmarks"
 N = 60
 
 
-@pytest.mark.parametrize("name", ["kitti", "tum_mono", "shared", "sample", "against_cpp", "smoke"])
+@pytest.mark.parametrize("name", ["kitti", "tum_mono", "failure_lab", "sample", "against_cpp", "smoke"])
 def test_every_bench_can_be_planned(name: str) -> None:
     spec = load_spec(FOLDER / f"{name}.yaml")
     assert (spec.name, spec.reference_name) == (name, "base")
@@ -40,8 +40,8 @@ def test_the_papers_trials() -> None:
     assert counts == {"kitti": 110, "tum_mono": 500}
 
 
-def test_the_shared_bench_has_all_causes() -> None:
-    spec = load_spec(FOLDER / "shared.yaml")
+def test_the_failure_lab_bench_has_all_causes() -> None:
+    spec = load_spec(FOLDER / "failure_lab.yaml")
     assert {c.cause for c in spec.conditions} == set(Cause)
 
 
