@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -23,6 +24,8 @@ from dualslam.system import System
 from dualslam.trajectory import compose
 
 PACKAGES = ("dualslam", "numpy", "scipy", "opencv-python-headless", "gtsam", "poselib", "pydantic")
+PACKAGES_OF_EXTRAS = ("torch", "kornia")
+"""Named where a front end has loaded them; their modules have the packages' names."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,7 +133,7 @@ def truth_of_frames(truth: Trajectory, rows: Iterable[FrameRow]) -> Trajectory:
 def versions() -> dict[str, str]:
     """Return the versions that a run's numbers depend on."""
     found = {"python": python_version()}
-    for name in PACKAGES:
+    for name in (*PACKAGES, *(extra for extra in PACKAGES_OF_EXTRAS if extra in sys.modules)):
         try:
             found[name] = version(name)
         except PackageNotFoundError:

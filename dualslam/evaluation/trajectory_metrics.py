@@ -226,7 +226,7 @@ def evaluate_run(
     Raises
     ------
     InputError
-        If the run has no trajectory or the sequence no ground truth.
+        If the run has no trajectory or the sequence no ground truth, or no pose is at the time of any frame.
     """
     truth = sequence.ground_truth
     if truth is None:
@@ -239,8 +239,14 @@ def evaluate_run(
             estimate, truth, sequence.frame_timestamps, alignment=alignment, max_dt_s=max_dt_s
         ).as_dict()
 
-    submaps = [{"submap": m, **scored(file)} for m, file in unlinked_submaps(path.parent).items()]
-    return {**scored(path), "submaps": submaps}
+    score = {
+        **scored(path),
+        "submaps": [{"submap": m, **scored(file)} for m, file in unlinked_submaps(path.parent).items()],
+    }
+    parts = [score, *score["submaps"]]
+    if any(part["off_clock"] for part in parts) and not any(part["posed"] for part in parts):
+        raise InputError(f"{run}: no pose is at the time of any frame of {sequence.name}; is it of another sequence?")
+    return score
 
 
 def _positions(trajectory: Trajectory) -> FloatArray:

@@ -45,7 +45,7 @@ def render_to_folder(sequence: SyntheticSequence, out: str | Path, image_format:
     out = Path(out)
     try:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise OutputError(f"{out} exists and is not an empty folder; name another, or remove it first")
+            raise OutputError(f"{out} exists and is not an empty folder; name another, or replace it (--overwrite)")
         (out / "images").mkdir(parents=True, exist_ok=True)
         _write_texts(sequence, out)
     except OSError as error:

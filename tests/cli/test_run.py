@@ -3,9 +3,12 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from dualslam.cli import main
 from dualslam.core.config_io import load_config
 from dualslam.core.types import Frame
 from dualslam.map_store import load_atlas
+from dualslam.results import versions
 from dualslam.synthetic import SyntheticSequence
 from tests.cli.conftest import N_FRAMES
 
@@ -47,6 +51,15 @@ def test_a_run_leaves_all_that_it_should(
     assert {"numpy", "gtsam", "dualslam", "python"} <= set(summary["versions"])
     for field in ("frames", "posed", "failures", "recoveries", "submaps", "links", "fps", "recovery_s", "peak_rss_mb"):
         assert field in summary
+
+
+def test_versions_name_an_extra_that_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("torch", "kornia"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    assert not {"torch", "kornia"} & versions().keys()
+    monkeypatch.setitem(sys.modules, "torch", ModuleType("torch"))
+    assert "torch" in versions()
+    assert "kornia" not in versions()
 
 
 def test_a_lost_track_leaves_two_labelled_submaps(
@@ -182,6 +195,23 @@ def test_eval_gives_coverage_first(
     assert main(["eval", run, f"synthetic:street,frames={N_FRAMES},seed=1"]) == 0
 
 
+def test_eval_against_another_sequence_is_bad_input(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, later = tmp_path / "run", tmp_path / "later"
+    assert main(["run", str(folder), "--out", str(run), "--quiet"]) == 0
+    shutil.copytree(folder, later)
+    for name in ("times.txt", "groundtruth_tum.txt"):
+        rows = np.loadtxt(later / name, ndmin=2)
+        rows = rows.reshape(-1, 1) if name == "times.txt" else rows
+        rows[:, 0] += 1000.0
+        np.savetxt(later / name, rows, fmt="%.9f")
+    assert main(["eval", str(run), str(later)]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert f"{run}: no pose is at the time of any frame" in captured.err
+
+
 def test_render_writes_a_sequence_and_overwrites_only_its_own(
     tmp_path: Path, world: SyntheticSequence, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,6 +222,7 @@ def test_render_writes_a_sequence_and_overwrites_only_its_own(
     assert "4 frames of synthetic_room_0" in capsys.readouterr().out
     assert len(list((out / "images").iterdir())) == len(np.loadtxt(out / "times.txt")) == 4
     assert main(command) == 2
+    assert "--overwrite" in capsys.readouterr().err
     assert main([*command[:4], "--frames", "2", "--overwrite", "--quiet"]) == 0
     assert len(list((out / "images").iterdir())) == 2
     (out / "SOURCE.md").write_text("mine")
