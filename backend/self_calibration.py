@@ -30,8 +30,8 @@ from backend.factors import baseline_factor, pose_prior
 from backend.membership import MIN_DEPTH_MU, compute_depth_sigmas, compute_residuals
 from backend.noise import PixelNoise
 from backend.solver import GTSAM_ERRORS
+from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import Camera
-from dualslam.core.config import CalibrationConfig
 from dualslam.core.corrected_camera import LensCorrection, correction_of, given_camera
 from dualslam.core.geometry import so3
 from dualslam.core.interfaces import BundleProblem, CalibrationEstimate
@@ -139,7 +139,9 @@ def estimate_correction(
         len(problem.kf),
         time.perf_counter() - start,
     )
-    if math.sqrt(covariance[0, 0]) > config.max_sigma_ratio * prior[0]:
+    sigma = math.sqrt(covariance[0, 0])
+    far = abs(float(off[0])) > config.far_sigmas * sigma
+    if sigma > (config.far_sigma_ratio if far else config.max_sigma_ratio) * prior[0]:
         return Failure(FailureReason.DEGENERATE, "the motion does not fix the focal length", estimate.numbers)
     if (np.abs(correction) > MAX_PRIOR_SIGMAS * prior).any():
         return Failure(FailureReason.SCALE, "the calibration would be too far from the given one", estimate.numbers)

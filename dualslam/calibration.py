@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import Camera
-from dualslam.core.config import CalibrationConfig
 from dualslam.core.corrected_camera import correct
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph

@@ -11,8 +11,9 @@ from backend.submap_graph import ISam2SubmapGraph
 from dualslam.build import adjust_submap, build_system
 from dualslam.calibration import Calibration, rectify
 from dualslam.carried_poses import carry_anchors, carry_poses
+from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import Camera
-from dualslam.core.config import CalibrationConfig, Config, GraphConfig
+from dualslam.core.config import Config, GraphConfig
 from dualslam.core.corrected_camera import LensCorrection, correction_of
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind

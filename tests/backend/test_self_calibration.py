@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from backend.self_calibration import choose_window, estimate_calibration, estimate_correction, make_problem
+from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import PinholeCamera
-from dualslam.core.config import CalibrationConfig
 from dualslam.core.corrected_camera import LensCorrection, correct
 from dualslam.core.geometry import so3
 from dualslam.core.interfaces import BundleProblem
@@ -77,6 +77,13 @@ class TestEstimate:
         assert sigmas_off(estimate.correction, truth, estimate.covariance).max() < 1.5
         assert abs(estimate.correction.log_focal + np.log(f)) < 0.004
         assert estimate.cost_after < estimate.cost_before
+
+    @pytest.mark.parametrize(("f", "counts"), [(1.02, False), (1.12, True)])
+    def test_an_unsure_answer_counts_only_where_the_given_focal_length_is_far_off(self, f: float, counts: bool) -> None:
+        camera, unsure = wrong_camera(f), CalibrationConfig(inflation=9.0)
+        estimate = estimate_calibration(make_submap(camera, turning=True, n=6), camera, unsure)
+        assert unsure.max_sigma_ratio * unsure.log_focal_sigma < estimate.numbers["log_focal_sigma"]
+        assert bool(estimate) is counts
 
     def test_driving_straight_ahead_says_nothing(self) -> None:
         camera = wrong_camera()
