@@ -70,13 +70,6 @@ class Ledger:
         self.keyframes = set()
         self._n_planned = 0
 
-    def landmark_mask(self, submap: Submap) -> BoolArray:
-        """Return for each landmark of the submap whether it is in the graph."""
-        mask = np.zeros(len(submap.landmarks), bool)
-        inside = self.rows["factor"] >= 0
-        mask[submap.observations["landmark"][: len(inside)][inside]] = True
-        return mask
-
     def plan(
         self,
         submap: Submap,

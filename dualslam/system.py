@@ -265,12 +265,9 @@ class System:
         )
 
     def _unusable(self, frame: Frame, failure: Failure) -> Failure:
-        """A frame without image or features: it has its row, and tracking goes on with the next."""
-        self.rows[frame.index].status = (
-            FrameStatus.UNREADABLE if failure.reason is FailureReason.UNREADABLE else FrameStatus.LOST
-        )
-        if failure.reason is FailureReason.UNREADABLE:
-            self.events.add(EventKind.UNREADABLE, frame.index, frame.timestamp_s, None, detail=failure.detail)
+        """A frame without an image of the right size: it has its row, and tracking goes on with the next."""
+        self.rows[frame.index].status = FrameStatus.UNREADABLE
+        self.events.add(EventKind.UNREADABLE, frame.index, frame.timestamp_s, None, detail=failure.detail)
         return failure
 
     # --- a submap that is full

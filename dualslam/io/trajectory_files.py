@@ -110,11 +110,6 @@ def write_kitti(path: str | Path, T_world_cam: FloatArray, frames: ArrayLike, fr
     write_text(Path(frames_path), "".join(f"{i}\n" for i in index.tolist()))
 
 
-def read_frame_list(path: str | Path) -> IntArray:
-    """Read the frame indices that `write_kitti` left beside its rows."""
-    return read_number_table(path, 1, "a list of frame indices (one a line)").ravel().astype(np.int64)
-
-
 # --- association
 
 

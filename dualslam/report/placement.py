@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.core.geometry import sim3
 from dualslam.core.geometry.umeyama import umeyama
 from dualslam.core.types import Failure, FloatArray, IntArray
 from dualslam.report.run_data import PosedRows, RunData
@@ -144,11 +143,6 @@ def _unplaced(submap: int | None, posed: PosedRows) -> Placed:
 
 def _no_truth() -> tuple[IntArray, FloatArray]:
     return np.zeros(0, np.int64), np.zeros((0, 3))
-
-
-def relative_scale(S: FloatArray) -> float:
-    """Return the scale of a similarity."""
-    return float(sim3.scale(S))
 
 
 def extent(parts: Sequence[FloatArray]) -> FloatArray:

@@ -12,7 +12,7 @@ from dualslam.core.errors import InputError, OutputError
 from dualslam.core.geometry import so3
 from dualslam.io import Trajectory, read_kitti, read_tum, write_kitti, write_tum
 from dualslam.io.atomic import atomic_file
-from dualslam.io.trajectory_files import associate, read_frame_list
+from dualslam.io.trajectory_files import associate
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def test_kitti_round_trip(tmp_path: Path, trajectory: Trajectory) -> None:
     frames = np.arange(len(trajectory)) * 3
     write_kitti(path, trajectory.T_world_cam, frames, frames_path)
     assert read_kitti(path).tobytes() == trajectory.T_world_cam.tobytes()
-    assert read_frame_list(frames_path).tolist() == frames.tolist()
+    assert [int(line) for line in frames_path.read_text().splitlines()] == frames.tolist()
     evo = file_interface.read_kitti_poses_file(str(path))
     np.testing.assert_array_equal(np.array(evo.poses_se3), trajectory.T_world_cam)
 

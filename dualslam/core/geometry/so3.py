@@ -61,12 +61,6 @@ def hat(omega: ArrayLike) -> FloatArray:
     return out
 
 
-def vee(W: ArrayLike) -> FloatArray:
-    """Return the vector of a skew-symmetric matrix, (..., 3, 3) -> (..., 3): the inverse of `hat`."""
-    m = np.asarray(W, np.float64)
-    return np.stack([m[..., 2, 1], m[..., 0, 2], m[..., 1, 0]], -1)
-
-
 def exp(omega: ArrayLike) -> FloatArray:
     """Return the rotation matrix of a rotation vector (Rodrigues' formula).
 

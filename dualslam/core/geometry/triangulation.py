@@ -75,18 +75,6 @@ def in_front(*depths: FloatArray, min_depth: float = 0.0) -> BoolArray:
     return mask
 
 
-def enough_parallax(cos_parallax: FloatArray, min_parallax_rad: float) -> BoolArray:
-    """Return the mask of points whose rays differ by at least `min_parallax_rad`."""
-    return np.asarray(cos_parallax <= np.cos(min_parallax_rad), np.bool_)
-
-
-def bearings(K: FloatArray, uv: FloatArray) -> FloatArray:
-    """Return unit rays (..., 3) in the camera frame of rectified pixels (..., 2)."""
-    rays = np.ones((*uv.shape[:-1], 3))
-    rays[..., :2] = (uv - K[:2, 2]) / (K[0, 0], K[1, 1])
-    return np.asarray(rays / np.sqrt((rays * rays).sum(-1, keepdims=True)), np.float64)
-
-
 def triangulate_two_view(
     uv_a: FloatArray,
     uv_b: FloatArray,

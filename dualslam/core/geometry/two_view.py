@@ -1,4 +1,4 @@
-"""Geometry of two views: epipolar and homography errors, and the poses that an essential matrix or homography allows.
+"""Geometry of two views: epipolar and homography errors, and the poses that a homography allows.
 
 Everywhere ``T_b_a`` takes camera a to camera b, ``x_b' E x_a == 0``, ``u_b ~ H u_a``, and pixels are rectified (u, v).
 Sources: R. Hartley and A. Zisserman, "Multiple View Geometry", 2004 (HZ); Y. Ma et al., "An Invitation to 3-D Vision",
@@ -12,10 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.core.geometry import se3, so3
-from dualslam.core.geometry.triangulation import TwoViewPoints, triangulate_two_view
-from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.core.types import FloatArray
 
-CHI2_95_2DOF = 5.991
 MIN_SINGULAR_GAP = 1e-7
 """Difference of the outer singular values of a homography (middle one 1) below which it is a rotation: |t| / d."""
 
@@ -34,32 +32,6 @@ def fundamental_from_pose(K: FloatArray, T_b_a: FloatArray) -> FloatArray:
     """Return F, (3, 3), with ``u_b' F u_a == 0`` for pixels of two images with the same K."""
     K_inv = np.linalg.inv(K)
     return np.asarray(K_inv.T @ essential_from_pose(T_b_a) @ K_inv, np.float64)
-
-
-def homography_from_pose(K: FloatArray, T_b_a: FloatArray, normal_a: FloatArray, distance: float) -> FloatArray:
-    """Return H, (3, 3), of the plane ``normal_a' X_a == distance``: K (R + t n' / d) K^-1. Ma, eq. (5.66)."""
-    plane = T_b_a[:3, :3] + np.outer(T_b_a[:3, 3], normal_a) / distance
-    return np.asarray(K @ plane @ np.linalg.inv(K), np.float64)
-
-
-def epipolar_distance(F: FloatArray, uv_a: FloatArray, uv_b: FloatArray) -> FloatArray:
-    """Return squared distances of matched pixels to each other's epipolar lines.
-
-    Parameters
-    ----------
-    F : (3, 3)
-    uv_a, uv_b : (N, 2)
-
-    Returns
-    -------
-    (N, 2), px^2
-        In image a, in image b.
-    """
-    a, b = _homogeneous(uv_a), _homogeneous(uv_b)
-    line_b, line_a = F @ a, F.T @ b
-    c2 = np.einsum("ij,ij->j", b, line_b) ** 2
-    norm_a, norm_b = line_a[0] ** 2 + line_a[1] ** 2, line_b[0] ** 2 + line_b[1] ** 2
-    return np.asarray(np.stack([c2 / np.maximum(norm_a, 1e-300), c2 / np.maximum(norm_b, 1e-300)], 1), np.float64)
 
 
 def sampson_error(F: FloatArray, uv_a: FloatArray, uv_b: FloatArray) -> FloatArray:
@@ -97,23 +69,6 @@ def homography_transfer_error(H_b_a: FloatArray, uv_a: FloatArray, uv_b: FloatAr
     return np.stack(errors, 1)
 
 
-def decompose_essential(E: FloatArray) -> FloatArray:
-    """Return the four poses that an essential matrix allows. HZ, result 9.19.
-
-    Returns
-    -------
-    T_b_a : (4, 4, 4)
-        Translations of length 1: two rotations, each with both signs of the translation.
-    """
-    U, _, Vt = np.linalg.svd(E)
-    U = U * np.sign(np.linalg.det(U))
-    Vt = Vt * np.sign(np.linalg.det(Vt))
-    W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    R = np.array([U @ W @ Vt, U @ W.T @ Vt])
-    t = np.array([U[:, 2], -U[:, 2]])
-    return se3.from_parts(R[[0, 0, 1, 1]], t[[0, 1, 0, 1]])
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class HomographyPoses:
     """The poses that a homography of a plane allows, M of them: four, or one where it is a mere rotation.
@@ -134,7 +89,7 @@ def decompose_homography(H_b_a: FloatArray, K: FloatArray) -> HomographyPoses:
     """Return the poses and planes that a homography of pixels allows. Ma, section 5.3.3.
 
     The sign of `H_b_a` is chosen so that its determinant is positive, which it is where both cameras are on the same
-    side of the plane. Two of the four poses are ruled out by the positive depth of the points: see `cheirality_vote`.
+    side of the plane. Two of the four poses are ruled out by the positive depth of the points.
 
     Parameters
     ----------
@@ -163,67 +118,3 @@ def decompose_homography(H_b_a: FloatArray, K: FloatArray) -> HomographyPoses:
         poses += [se3.from_parts(R, t), se3.from_parts(R, -t)]
         normals += [normal, -normal]
     return HomographyPoses(np.array(poses), np.array(normals))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CheiralityVote:
-    """Which of several candidate poses puts the most points in front of both cameras.
-
-    Attributes
-    ----------
-    counts : (M,) int64
-        Good points of each candidate.
-    best : int
-        Index of the winner (the first of equals).
-    T_b_a : (4, 4)
-        The winner.
-    points : TwoViewPoints
-        Triangulated with the winner, in the frame of camera a.
-    good : (N,) bool
-        Of the winner: in front of both cameras and within the gate in both images.
-    """
-
-    counts: IntArray
-    best: int
-    T_b_a: FloatArray
-    points: TwoViewPoints
-    good: BoolArray
-
-    @property
-    def runner_up_ratio(self) -> float:
-        """Good points of the second best candidate over those of the best: near 1 the choice is ambiguous."""
-        ordered = np.sort(self.counts)
-        return float(ordered[-2] / max(int(ordered[-1]), 1)) if len(ordered) > 1 else 0.0
-
-
-def cheirality_vote(
-    T_b_a: FloatArray,
-    uv_a: FloatArray,
-    uv_b: FloatArray,
-    K: FloatArray,
-    *,
-    sigma_px: float | FloatArray = 1.0,
-    chi2_gate: float = CHI2_95_2DOF,
-) -> CheiralityVote:
-    """Triangulate the matches with every candidate pose and count the points that are where they can be.
-
-    Parameters
-    ----------
-    T_b_a : (M, 4, 4)
-        Candidates, none with zero translation.
-    uv_a, uv_b : (N, 2)
-    K : (3, 3)
-    sigma_px : float or (N,)
-        Standard deviation of the pixels.
-    chi2_gate : float
-        Of the squared whitened reprojection error in each image.
-    """
-    results = []
-    gate = chi2_gate * np.square(sigma_px)
-    for T in T_b_a:
-        points = triangulate_two_view(uv_a, uv_b, K, np.eye(4), se3.inverse(T))
-        good = (points.depth_a > 0) & (points.depth_b > 0) & (points.error2_a < gate) & (points.error2_b < gate)
-        results.append((points, good))
-    counts = np.array([np.count_nonzero(good) for _, good in results], np.int64)
-    best = int(np.argmax(counts))
-    return CheiralityVote(counts, best, np.array(T_b_a[best]), *results[best])
