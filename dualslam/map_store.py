@@ -13,11 +13,20 @@ from numpy.typing import NDArray
 from dualslam.atlas import Atlas, Link, LinkKind
 from dualslam.core.errors import InputError
 from dualslam.core.submap import Submap
-from dualslam.io.map_files import load_map, save_map, submap_from_arrays, submap_to_arrays
+from dualslam.io.map_files import (
+    Arrays,
+    load_arrays,
+    load_map,
+    load_metadata,
+    save_map,
+    submap_from_arrays,
+    submap_to_arrays,
+)
 from dualslam.io.run_folder import MAP
 from dualslam.trajectory import FramePose
 
-LINKS, FRAMES = "links", "frames"
+LINKS, FRAMES, SUBMAP = "links", "frames", "submap_"
+_DAMAGE = (KeyError, ValueError, IndexError, TypeError)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,12 +37,17 @@ class StoredMap:
     poses: dict[int, FramePose]
 
 
+def submap_path(folder: Path, submap_id: int) -> Path:
+    """Where the arrays of a submap are in a ``map`` folder."""
+    return folder / f"{SUBMAP}{submap_id:02d}.npz"
+
+
 class _Groups(Mapping[str, dict[str, NDArray[Any]]]):
     """Groups of arrays of which those of a submap are made when they are asked for: one copy in memory at a time."""
 
     def __init__(self, submaps: Mapping[int, Submap]) -> None:
         self.small: dict[str, dict[str, NDArray[Any]]] = {}
-        self._submaps = {f"submap_{m:02d}": submap for m, submap in submaps.items()}
+        self._submaps = {f"{SUBMAP}{m:02d}": submap for m, submap in submaps.items()}
 
     def __getitem__(self, name: str) -> dict[str, NDArray[Any]]:
         return self.small[name] if name in self.small else submap_to_arrays(self._submaps[name])
@@ -82,15 +96,35 @@ def load_atlas(folder: str | Path) -> StoredMap:
         atlas = Atlas()
         for name in sorted(groups.keys() - {LINKS, FRAMES}):
             atlas.add(submap_from_arrays(groups[name]))
-        links, frames = groups[LINKS], groups[FRAMES]
-        kinds, keyframes = metadata["link_kinds"], metadata["link_keyframes"]
-        for (a, b), S_a_b, covariance, kind, ids in zip(
-            links["ab"].tolist(), links["S_a_b"], links["covariance"], kinds, keyframes, strict=True
-        ):
-            atlas.link(Link(a, b, S_a_b, covariance, LinkKind(kind), tuple(ids)))
+        for link in _links(groups[LINKS], metadata):
+            atlas.link(link)
+        frames = groups[FRAMES]
         columns = (frames[name].tolist() for name in ("index", "timestamp_s", "submap", "keyframe"))
         rows = zip(*columns, frames["T_kf_cam"], strict=True)
         poses = {index: FramePose(index, t, m, k, T_kf_cam) for index, t, m, k, T_kf_cam in rows}
-    except (KeyError, ValueError, IndexError) as error:
+    except _DAMAGE as error:
         raise InputError(f"{folder} is no map of this version, or is damaged: {error}.") from error
     return StoredMap(atlas, poses)
+
+
+def load_links(folder: str | Path) -> tuple[list[int], list[Link]]:
+    """Read the ids of a map's submaps and the links between them, from its ``map`` folder, and nothing larger.
+
+    Raises
+    ------
+    InputError
+        If there is no map, or it is damaged.
+    """
+    folder = Path(folder)
+    groups, metadata = load_metadata(folder)
+    try:
+        ids = sorted(int(name.removeprefix(SUBMAP)) for name in groups if name not in (LINKS, FRAMES))
+        return ids, _links(load_arrays(folder / f"{LINKS}.npz"), metadata)
+    except _DAMAGE as error:
+        raise InputError(f"{folder} is no map of this version, or is damaged: {error}.") from error
+
+
+def _links(arrays: Arrays, metadata: Mapping[str, Any]) -> list[Link]:
+    columns = arrays["ab"].tolist(), arrays["S_a_b"], arrays["covariance"]
+    rows = zip(*columns, metadata["link_kinds"], metadata["link_keyframes"], strict=True)
+    return [Link(a, b, S_a_b, C, LinkKind(kind), tuple(ids)) for (a, b), S_a_b, C, kind, ids in rows]

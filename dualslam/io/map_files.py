@@ -6,7 +6,7 @@ import json
 import math
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -47,12 +47,12 @@ def save_arrays(path: str | Path, arrays: Arrays) -> None:
         np.savez(file, allow_pickle=False, **{name: np.asarray(a) for name, a in arrays.items()})
 
 
-def load_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Read an ``.npz`` of `save_arrays`; a file that would need unpickling is refused."""
+def load_arrays(path: str | Path, names: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
+    """Read an ``.npz`` of `save_arrays`, or some of its arrays; a file that would need unpickling is refused."""
     try:
         # Opened here, as numpy leaves the file open where it is no archive.
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+            return {name: archive[name] for name in (archive.files if names is None else names)}
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; check the path.") from None
     except (OSError, ValueError, zipfile.BadZipFile, zlib.error, EOFError, KeyError, TypeError, AttributeError) as e:
@@ -74,13 +74,22 @@ def save_map(folder: str | Path, arrays: Mapping[str, Arrays], metadata: Mapping
 def load_map(folder: str | Path) -> tuple[dict[str, dict[str, NDArray[Any]]], dict[str, Any]]:
     """Read what `save_map` wrote: groups of arrays, and metadata."""
     folder = Path(folder)
-    text = read_text(folder / METADATA)
+    groups, metadata = load_metadata(folder)
+    return {group: load_arrays(folder / f"{group}.npz") for group in groups}, metadata
+
+
+def load_metadata(folder: str | Path) -> tuple[list[str], dict[str, Any]]:
+    """Read the names of the groups that `save_map` wrote, and the metadata, but no arrays."""
+    path = Path(folder) / METADATA
+    text = read_text(path)
     try:
         document = json.loads(text)
         groups, metadata = list(document["groups"]), dict(document["metadata"])
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError):
-        raise InputError(f"{folder / METADATA} is not the metadata of a map, or is damaged.") from None
-    return {group: load_arrays(folder / f"{group}.npz") for group in groups}, metadata
+        if not all(isinstance(group, str) for group in groups):
+            raise TypeError("a group is named by a word")
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{path} is not the metadata of a map, or is damaged.") from None
+    return groups, metadata
 
 
 def to_plain(value: Any) -> Any:

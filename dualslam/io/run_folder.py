@@ -255,11 +255,15 @@ def read_events(path: str | Path) -> list[dict[str, Any]]:
     events = []
     for number, line in enumerate(lines, 1):
         try:
-            events.append(json.loads(line))
+            event = json.loads(line)
         except json.JSONDecodeError:
             if number < len(lines):
                 raise InputError(f"{path}, line {number} is not valid JSON.") from None
             log.warning("%s: the last line is cut off and was left out", path)
+            break
+        if not isinstance(event, dict) or "event" not in event:
+            raise InputError(f"{path}, line {number} is not an event.")
+        events.append(event)
     return events
 
 

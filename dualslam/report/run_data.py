@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from dualslam.atlas import Atlas, Link, LinkKind
+from dualslam.atlas import Atlas
+from dualslam.core import strict_yaml
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, FrameStatus, IntArray
 from dualslam.io import run_folder
-from dualslam.io.map_files import METADATA
+from dualslam.io.map_files import METADATA, load_arrays
 from dualslam.io.run_folder import FrameRow, read_events, read_frames, unlinked_submaps
 from dualslam.io.trajectory_files import Trajectory, associate, nearest_in_time, read_text, read_tum
+from dualslam.map_store import load_links, submap_path
 
 MAX_TRUTH_DT_S = 0.02
 """Largest gap in time between a frame and its true pose, as in the evaluation."""
 MAX_POINTS = 2500
 MAX_VIEW_DISTANCE_MU = 8.0
 """Landmarks farther from the camera that made them (the start's median depth is 1) are left out of the pictures."""
+_POINT_ARRAYS = ("landmarks_xyz_mu", "landmarks_distance_mu", "landmarks_alive")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,7 +114,7 @@ def read_run(path: str | Path) -> RunData:
     Raises
     ------
     InputError
-        If it is none, or the run did not come to its end.
+        If it is none, the run did not come to its end, or a file is damaged.
     """
     path = Path(path)
     if not (path / run_folder.SUMMARY).is_file():
@@ -120,15 +122,14 @@ def read_run(path: str | Path) -> RunData:
         raise InputError(f"{path} is not the folder of a finished run: {missing}.")
     rows = read_frames(path / run_folder.FRAMES)
     times = np.array([row.timestamp_s for row in rows])
-    summary = json.loads(read_text(path / run_folder.SUMMARY))
     config_text = read_text(path / run_folder.CONFIG)
     truth_file = path / run_folder.GROUND_TRUTH
     return RunData(
         path=path,
         rows=rows,
         events=read_events(path / run_folder.EVENTS),
-        summary=summary,
-        config=yaml.safe_load(config_text) or {},
+        summary=_mapping(path / run_folder.SUMMARY, json.loads),
+        config=_mapping(path / run_folder.CONFIG, strict_yaml.loads),
         config_text=config_text,
         main=_on_rows(read_tum(path / run_folder.TRAJECTORY, allow_empty=True), times),
         unlinked={m: _on_rows(read_tum(file), times) for m, file in unlinked_submaps(path).items()},
@@ -136,6 +137,18 @@ def read_run(path: str | Path) -> RunData:
         points=_map_points(path / run_folder.MAP, {row.submap for row in rows if row.in_main_map}),
         samples=run_folder.read_samples(path),
     )
+
+
+def _mapping(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
+    """Read a file that holds names and their values."""
+    text = read_text(path)
+    try:
+        found = parse(text)
+    except ValueError as error:
+        raise InputError(f"{path} is damaged: {error}.") from None
+    if not isinstance(found, dict):
+        raise InputError(f"{path} is not what a run writes: it holds no names with values.")
+    return found
 
 
 def _no_rows() -> PosedRows:
@@ -165,28 +178,22 @@ def _map_points(folder: Path, submap_ids: set[int | None]) -> FloatArray:
     component, S_world_submap = _gauge(folder, ids)
     clouds = [np.zeros((0, 3))]
     for m in component:
-        with np.load(folder / f"submap_{m:02d}.npz", allow_pickle=False) as arrays:
-            near = arrays["landmarks_distance_mu"] < MAX_VIEW_DISTANCE_MU
-            xyz = arrays["landmarks_xyz_mu"][arrays["landmarks_alive"] & near]
+        arrays = load_arrays(submap_path(folder, m), _POINT_ARRAYS)
+        xyz, distance_mu, alive = (arrays[name] for name in _POINT_ARRAYS)
         S = S_world_submap[m]
-        clouds.append(xyz @ S[:3, :3].T + S[:3, 3])
+        clouds.append(xyz[alive & (distance_mu < MAX_VIEW_DISTANCE_MU)] @ S[:3, :3].T + S[:3, 3])
     points = np.concatenate(clouds)
     return points[:: max(1, len(points) // MAX_POINTS)]
 
 
 def _gauge(folder: Path, ids: list[int]) -> tuple[list[int], Mapping[int, FloatArray]]:
     """Return the main map's submaps, and the transform of each into its world."""
+    stored, links = load_links(folder)
     atlas = Atlas()
-    document = json.loads(read_text(folder / METADATA))
-    with np.load(folder / "links.npz", allow_pickle=False) as arrays:
-        kinds = document["metadata"]["link_kinds"]
-        for (a, b), S_a_b, C, kind in zip(
-            arrays["ab"].tolist(), arrays["S_a_b"], arrays["covariance"], kinds, strict=True
-        ):
-            atlas.link(Link(a, b, S_a_b, C, LinkKind(kind)))
-    stored = {int(name.removeprefix("submap_")) for name in document["groups"] if name.startswith("submap_")}
+    for link in links:
+        atlas.link(link)
     component = {ids[0]}
-    while grown := {m for link in atlas.links for m in (link.a, link.b) if {link.a, link.b} & component} - component:
+    while grown := {m for link in links for m in (link.a, link.b) if {link.a, link.b} & component} - component:
         component |= grown
-    ordered = sorted(component & stored)
+    ordered = sorted(component & set(stored))
     return ordered, atlas.S_world_submap(ordered)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 from dualslam.cli import main
 from dualslam.report import comparison_page, comparison_table, read_run
 from dualslam.report.compare import run_names
+from tests.cli.conftest import _own_environment  # noqa: F401 (used by every test)
 from tests.report.conftest import N_FRAMES, MakeRun
 from tests.report.test_report import Outline
 
@@ -73,3 +75,32 @@ def test_runs_without_a_map_are_compared_all_the_same(make_run: MakeRun) -> None
     page = comparison_page([none, none])
     assert "None of the runs has a map." in Outline(page).text
     assert run_names([none, none]) == ["1 none", "2 none"]
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("summary.json", "{"),
+        ("summary.json", "[]"),
+        ("map/map.json", "{"),
+        ("map/map.json", '{"groups": [3], "metadata": {}}'),
+        ("map/links.npz", "x"),
+        ("map/submap_00.npz", "x"),
+        ("events.jsonl", "3\n"),
+        ("config.yaml", "seed: [\n"),
+        ("config.yaml", "- 1\n"),
+        ("frames.csv", "x\n"),
+    ],
+)
+def test_a_damaged_file_is_named(
+    pair: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], file: str, content: str
+) -> None:
+    run = tmp_path / "damaged"
+    shutil.copytree(pair[0], run)
+    assert (run / file).exists()
+    (run / file).write_text(content)
+    assert main(["compare", str(run), str(pair[1]), "--out", str(tmp_path / "page.html")]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert str(run / file) in captured.err or (file.startswith("map/") and str(run / "map") in captured.err)
+    assert not (tmp_path / "page.html").exists()
