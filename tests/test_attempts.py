@@ -191,4 +191,4 @@ def test_a_black_out_on_the_road_is_leapt(attempt: str) -> None:
     translation, rotation = pose_errors(main.T_world_cam, truth[main.index])
     length = np.linalg.norm(np.diff(truth[6:, :3, 3], axis=0), axis=1).sum()
     assert translation.max() < 0.03 * length
-    assert rotation.max() < 0.01
+    assert rotation.max() < np.radians(1.0)  # a third of what makes a link wrong
