@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from dualslam.core.types import Frame
 from dualslam.evaluation.failure_lab import corrupted
 from dualslam.frame_records import FrameResult
 from dualslam.io.run_folder import RunFolder, RunRecord
+from dualslam.io.sequence import Selection
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.map_store import save_atlas
 from dualslam.report import SampleKeeper, read_run, report_page
@@ -83,6 +84,7 @@ def run_to_folder(
     Exception
         Whatever the system raised, once what it had found until then is written; a note on it says where.
     """
+    given = _given(sequence, realtime)
     sequence = corrupted(sequence, config.corruptions)
     system = (build or build_system)(config, sequence.camera)
     with RunFolder(out, overwrite=overwrite) as folder:
@@ -102,7 +104,7 @@ def run_to_folder(
             system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap_id)
         _write_new_events(system, folder, n_events)
         try:
-            summary = _write_results(system, report, config, sequence, folder)
+            summary = _write_results(system, report, config, sequence, folder, given)
         except Exception as error:
             if report.bug is None:
                 raise
@@ -115,13 +117,24 @@ def run_to_folder(
     return Outcome(Path(out), summary, report, system)
 
 
+def _given(sequence: Sequence, realtime: bool) -> dict[str, Any]:
+    """Return what a run takes besides its config, without which the config does not give the same run again."""
+    selection: Selection | None = getattr(sequence, "selection", None)  # not every sequence has one
+    return {
+        "sequence": sequence.name,
+        "selection": None if selection is None else asdict(selection),
+        "realtime": realtime,
+        "camera": sequence.camera.to_dict(),
+    }
+
+
 def _write_results(
-    system: System, report: RunReport, config: Config, sequence: Sequence, folder: RunFolder
+    system: System, report: RunReport, config: Config, sequence: Sequence, folder: RunFolder, given: dict[str, Any]
 ) -> dict[str, Any]:
-    """Write all that comes at the end of a run, and return the summary."""
+    """Write all that comes at the end of a run, and return the summary, which begins with what was given."""
     trajectories = trajectories_of(system)
     truth: Trajectory | None = getattr(sequence, "ground_truth", None)
-    summary = {"sequence": sequence.name} | summarise(system, report, trajectories, config, truth)
+    summary = given | summarise(system, report, trajectories, config, truth)
     rows = frame_rows(system, trajectories.main, report.dropped)
     folder.write(RunRecord(rows, trajectories.main, trajectories.unlinked, summary))
     if truth is not None:

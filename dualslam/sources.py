@@ -78,6 +78,7 @@ class WorldSequence:
         Of the frames that are read, so the stride counts.
     ground_truth : Trajectory
         Of the whole world, metres.
+    selection : Selection
     source_indices : (N,) int64
     frame_timestamps : (N,) float64
     """
@@ -85,6 +86,7 @@ class WorldSequence:
     def __init__(self, world: SyntheticSequence, selection: Selection | None = None) -> None:
         selection = selection or Selection()
         self._world = world
+        self.selection = selection
         self.name = world.name
         self.camera: Camera = world.camera
         self.rate_hz = world.rate_hz / selection.stride

@@ -110,6 +110,7 @@ class RecordedSequence:
         Frames a second as they are read, so the stride counts.
     ground_truth : Trajectory or None
         All that the source has, whatever the selection.
+    selection : Selection
     source_indices : (M,) int64
         Index in the source of each frame that is read, in reading order.
     frame_timestamps : (M,) float64
@@ -129,7 +130,8 @@ class RecordedSequence:
         self.camera = camera
         self.ground_truth = recording.ground_truth
         self.source_timestamps = recording.timestamps_s
-        self.source_indices = (selection or Selection()).indices(len(recording.images), recording.name)
+        self.selection = selection or Selection()
+        self.source_indices = self.selection.indices(len(recording.images), recording.name)
         self.frame_timestamps = recording.timestamps_s[self.source_indices]
         self.exposure_s = None if recording.exposure_s is None else recording.exposure_s[self.source_indices]
         self.rate_hz = _rate(self.frame_timestamps)

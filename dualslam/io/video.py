@@ -200,20 +200,20 @@ class WebcamSequence:
         self.name = f"webcam_{number}"
         self.camera = camera
         self.rate_hz = rate_hz / selection.stride
-        self._selection = selection
+        self.selection = selection
         self._grey = grey
         self._connect = connect
 
     def __len__(self) -> int:
-        if self._selection.max_frames is None:
+        if self.selection.max_frames is None:
             raise TypeError(f"{self.name} is live: it has no length")
-        return self._selection.max_frames
+        return self.selection.max_frames
 
     def __iter__(self) -> Iterator[Frame]:
-        return read_ahead(self._capture_frames(), _LIVE_QUEUE, drop_oldest=self._selection.max_frames is None)
+        return read_ahead(self._capture_frames(), _LIVE_QUEUE, drop_oldest=self.selection.max_frames is None)
 
     def _capture_frames(self) -> Iterator[Frame]:
-        wanted = self._selection
+        wanted = self.selection
         capture = self._connect()
         # Time of day at the start, then a clock that never steps back.
         epoch_s = time.time() - time.monotonic()

@@ -57,6 +57,8 @@ def _warnings(run: RunData) -> Markup:
     words = []
     if run.summary.get("interrupted"):
         words.append("This run was interrupted: the page shows what it had found by then.")
+    if run.summary.get("crashed"):
+        words.append("This run crashed: the page shows what it had found by then.")
     unreadable, dropped = run.count(FrameStatus.UNREADABLE), run.count(FrameStatus.DROPPED)
     if unreadable:
         words.append(f"{count(unreadable, 'image')} could not be read.")
