@@ -102,7 +102,7 @@ class Calibration:
             solved = graph.rebuild(changed)
         except (InputError, SolverError) as error:
             return Failure(FailureReason.SOLVER, str(error), numbers)
-        changed.apply_estimate(solved.keyframe_ids, solved.T_submap_kf, solved.landmark_ids, solved.xyz_mu)
+        changed.apply_estimate(*solved.values)
         before = submap.copy()
         submap.take_over(changed)
         self._camera, self._refined_in, self._log_focal_sigma = camera, submap.id, log_focal_sigma

@@ -147,10 +147,8 @@ def _add_landmarks(merged: Submap, base: Submap, moved: Submap, id_of: IntArray)
     seen = np.bincount(landmark[_held_by(merged, kf)], minlength=len(moved.landmarks))
     new = np.flatnonzero((id_of == NO_LANDMARK) & moved.landmarks["alive"] & (seen >= 2))
     new = new[new >= n]
-    columns = {name: column[new] for name, column in moved.landmarks.columns().items()}
-    columns["replaced_by"] = np.full(len(new), NO_LANDMARK)
     id_of = id_of.copy()
-    id_of[new] = merged.landmarks.append(len(new), **columns)
+    id_of[new] = merged.copy_landmarks(moved, new)
     return id_of
 
 

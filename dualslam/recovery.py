@@ -206,7 +206,7 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float
         estimate = graph.update(submap)
     except SolverError as error:
         return Failure(FailureReason.SOLVER, str(error))
-    submap.apply_estimate(estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu)
+    submap.apply_estimate(*estimate.values)
     walker = attempt.new_odometry(job, submap, graph)
     walker.start_at(job.newest_id)
     relinker = Relinker(submap, job.lost, job.onsets, parts.link, parts.config)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.core.submap import NO_LANDMARK, Submap
-from dualslam.core.types import IntArray
 
 
 def next_submap(full: Submap, submap_id: int, n_shared: int) -> Submap:
@@ -35,7 +34,7 @@ def next_submap(full: Submap, submap_id: int, n_shared: int) -> Submap:
         ids = full.landmark_of[k]
         n_seen[ids[ids >= 0]] += 1
     old = old[n_seen[old] >= 2]
-    _copy_landmarks(full, twin, old)
+    twin.copy_landmarks(full, old)
     new_id = np.full(len(full.landmarks), NO_LANDMARK, np.int64)
     new_id[old] = np.arange(len(old))
     for k in shared:
@@ -45,9 +44,3 @@ def next_submap(full: Submap, submap_id: int, n_shared: int) -> Submap:
         twin.add_observations(k, feature[kept], new_id[ids[feature[kept]]])
     twin.gauge = (shared[0], shared[-1])
     return twin
-
-
-def _copy_landmarks(full: Submap, twin: Submap, old: IntArray) -> None:
-    columns = {name: column[old] for name, column in full.landmarks.columns().items()}
-    columns["replaced_by"] = np.full(len(old), NO_LANDMARK)
-    twin.landmarks.append(len(old), **columns)

@@ -19,7 +19,7 @@ from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph
 from dualslam.core.solving import solve
 from dualslam.core.submap import NO_LANDMARK, Submap
-from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
+from dualslam.core.types import BoolArray, Failure, FailureReason, IntArray
 from dualslam.linking import LinkEstimate
 
 Relink = Callable[[Submap, Submap, int | None], LinkEstimate | Failure]
@@ -179,7 +179,7 @@ def graft_keyframes(old: Submap, new: Submap, link: LinkEstimate, n_keyframes: i
     fresh = _unpaired(old, new, grafted, shared, landmark_of)
     for k in grafted:
         new.add_keyframe(old.keyframes[k], sim3.act_on_pose(S_new_old, old.T_submap_kf[k]))
-    landmark_of[fresh] = _copy_landmarks(old, new, fresh, S_new_old)
+    landmark_of[fresh] = new.copy_landmarks(old, fresh, S_new_old)
     n_observations = sum(_copy_observations(old, new, k, landmark_of) for k in (*grafted, *shared))
     return SeamReport(tuple(grafted), len(link.landmark_pairs), len(fresh), n_observations)
 
@@ -206,15 +206,6 @@ def _unpaired(old: Submap, new: Submap, grafted: list[int], shared: list[int], l
         if k in new.landmark_of:
             disputed[ids[feature[new.landmark_of[k][feature] >= 0]]] = True
     return np.flatnonzero((n_seen >= 2) & old.landmarks["alive"] & (landmark_of == NO_LANDMARK) & ~disputed)
-
-
-def _copy_landmarks(old: Submap, new: Submap, ids: IntArray, S_new_old: FloatArray) -> IntArray:
-    columns = {name: column[ids] for name, column in old.landmarks.columns().items()}
-    columns["xyz_mu"] = sim3.act(S_new_old, columns["xyz_mu"])
-    columns["normal"] = columns["normal"] @ sim3.rotation(S_new_old).T
-    columns["distance_mu"] = columns["distance_mu"] * float(sim3.scale(S_new_old))
-    columns["replaced_by"] = np.full(len(ids), NO_LANDMARK)
-    return new.landmarks.append(len(ids), **columns)
 
 
 def _copy_observations(old: Submap, new: Submap, k: int, landmark_of: IntArray) -> int:

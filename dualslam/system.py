@@ -136,7 +136,7 @@ class System:
                 estimate = graph.update(submap)
         except SolverError as error:
             return Failure(FailureReason.SOLVER, str(error), start.numbers)
-        submap.apply_estimate(estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu)
+        submap.apply_estimate(*estimate.values)
         kind = EventKind.INITIALISED if not self.atlas.submaps else EventKind.REINITIALISED
         self.atlas.add(submap)
         for k, keyframe in submap.keyframes.items():
@@ -249,7 +249,7 @@ class System:
         submap = live.submap
         try:
             final = live.graph.full_estimate(submap)
-            submap.apply_estimate(final.keyframe_ids, final.T_submap_kf, final.landmark_ids, final.xyz_mu)
+            submap.apply_estimate(*final.values)
         except SolverError:
             log.warning("submap %d is archived as it stands: its graph gives no estimate", submap.id)
         # A submap that rolled over and was lost at once has no frame of its own: its newest keyframe stands for it.

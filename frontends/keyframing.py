@@ -50,7 +50,7 @@ def parallax_deg(track: Track, submap: Submap, reference_id: int) -> float:
     """Angle under which the baseline to a keyframe is seen from the scene's median depth, degrees."""
     ids = track.landmark_ids[track.landmark_ids >= 0]
     T_cam_submap = track.T_cam_submap
-    depth = submap.landmarks["xyz_mu"][ids] @ T_cam_submap[2, :3] + T_cam_submap[2, 3]
+    depth = submap.depths(ids, T_cam_submap)
     centre = se3.inverse(T_cam_submap)[:3, 3]
     baseline = float(np.linalg.norm(centre - submap.T_submap_kf[reference_id][:3, 3]))
     return float(np.degrees(np.arctan2(baseline, max(float(np.median(depth)), 1e-12))))

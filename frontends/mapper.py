@@ -80,13 +80,6 @@ class Mapper:
         self._refresh_descriptions(view.index)
         return MappingReport(len(new), n_merged, n_culled, n_extended)
 
-    def remove_outliers(self, rows: IntArray) -> None:
-        """Drop observations that the graph found to disagree, and landmarks left with fewer than two."""
-        submap = self._submap
-        touched = np.unique(submap.observations["landmark"][rows])
-        submap.remove_observations(rows)
-        submap.remove_landmarks(touched[submap.n_observations(touched) < 2])
-
     # --- steps
 
     def _neighbours(self, keyframe_id: int) -> list[int]:
@@ -99,8 +92,7 @@ class Mapper:
         if covisible:
             return covisible
         # Beyond a leap hardly a landmark may be known: what the frames on the other side see is found by its features.
-        by_time = sorted(submap.keyframes, key=lambda k: (abs(k - keyframe_id), k))
-        return [k for k in by_time if k != keyframe_id][: self._config.triangulate_against]
+        return [k for k in submap.keyframes_near(keyframe_id) if k != keyframe_id][: self._config.triangulate_against]
 
     def _cull_young(self) -> int:
         """Cull landmarks on probation that tracking does not find, or that too few keyframes came to see."""
@@ -214,7 +206,7 @@ class Mapper:
         if len(ids) == 0:
             return np.inf
         T_cam_submap = se3.inverse(submap.T_submap_kf[k])
-        return float(np.median(submap.landmarks["xyz_mu"][ids] @ T_cam_submap[2, :3] + T_cam_submap[2, 3]))
+        return float(np.median(submap.depths(ids, T_cam_submap)))
 
     def _scales_agree(
         self, a: Features, b: Features, fa: IntArray, fb: IntArray, depth_a: FloatArray, depth_b: FloatArray

@@ -134,7 +134,7 @@ class PnpOdometry:
     def start_at(self, keyframe_id: int) -> None:
         """Begin at a keyframe of the submap: it and its neighbours in time give the first points."""
         self._live.start_at(keyframe_id)
-        nearest = sorted(self.submap.keyframes, key=lambda k: (abs(k - keyframe_id), k))[:SEED_KEYFRAMES]
+        nearest = self.submap.keyframes_near(keyframe_id)[:SEED_KEYFRAMES]
         for k in reversed(nearest):
             if k in self._views:
                 self._map.put(k, k, se3.inverse(self.submap.T_submap_kf[k]))

@@ -121,7 +121,7 @@ class Tracker:
 
     def track_at(self, view: View, pose: GivenPose) -> Track:
         """Take a pose as it is, and look for the landmarks of the keyframes nearest in time under it."""
-        keyframe_ids = self._nearest_keyframes(view.index, self._config.local_keyframes)
+        keyframe_ids = self._submap.keyframes_near(view.index)[: self._config.local_keyframes]
         self._local = LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(keyframe_ids))
         landmark_ids = np.full(len(view.features), NO_LANDMARK, np.int64)
         grid = FeatureGrid.build(view.features.uv_rect_px)
@@ -154,7 +154,7 @@ class Tracker:
 
         The tracker goes on from there only if it is told to `take` the track.
         """
-        keyframe_ids = self._nearest_keyframes(view.index, self._config.local_keyframes)
+        keyframe_ids = self._submap.keyframes_near(view.index)[: self._config.local_keyframes]
         self._local = LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(keyframe_ids))
         grid = FeatureGrid.build(view.features.uv_rect_px)
         nothing = np.full(len(view.features), NO_LANDMARK, np.int64)
@@ -203,7 +203,7 @@ class Tracker:
     def _pose_from_wide_matches(self, view: View) -> tuple[FloatArray, IntArray] | Failure:
         """Match the whole image against the recent keyframes, pose by PnP."""
         submap, best = self._submap, Failure(FailureReason.TOO_FEW_MATCHES, "no keyframe matched")
-        for k in self._nearest_keyframes(view.index, self._config.wide_keyframes):
+        for k in self._submap.keyframes_near(view.index)[: self._config.wide_keyframes]:
             has_landmark = np.flatnonzero(submap.landmark_of[k] >= 0)
             matches = self._frontend.match_wide(submap.keyframes[k].features.take(has_landmark), view.features)
             if len(matches) < PNP_MIN_MATCHES:
@@ -318,8 +318,3 @@ class Tracker:
         keyframe_ids, _ = self._submap.covisible(landmark_ids)
         nearest = keyframe_ids[: self._config.local_keyframes]
         return LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(nearest))
-
-    def _nearest_keyframes(self, frame_index: int, n: int) -> list[int]:
-        """Keyframes nearest in time, nearest first."""
-        by_time = sorted(self._submap.keyframes, key=lambda k: (abs(k - frame_index), k))
-        return by_time[:n]

@@ -124,6 +124,11 @@ class GraphEstimate:
     rebuilt: bool
     seconds: float
 
+    @property
+    def values(self) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
+        """Arguments of `Submap.apply_estimate`."""
+        return self.keyframe_ids, self.T_submap_kf, self.landmark_ids, self.xyz_mu
+
 
 class SubmapGraph(Protocol):
     """The factor graph of one submap. The submap's arrays are the record, the graph follows them."""

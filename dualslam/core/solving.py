@@ -21,8 +21,6 @@ def solve(submap: Submap, graph: SubmapGraph, near_optimum: bool = False) -> int
     SolverError
     """
     estimate = graph.rebuild(submap, near_optimum)
-    submap.apply_estimate(estimate.keyframe_ids, estimate.T_submap_kf, estimate.landmark_ids, estimate.xyz_mu)
-    touched = submap.observations["landmark"][estimate.outlier_rows]
-    submap.remove_observations(estimate.outlier_rows)
-    submap.remove_landmarks(touched[submap.n_observations(touched) < 2])
+    submap.apply_estimate(*estimate.values)
+    submap.remove_outliers(estimate.outlier_rows)
     return len(estimate.outlier_rows)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.geometry import se3
+from dualslam.core.geometry import se3, sim3
 from dualslam.core.tables import Table
 from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe, Start
 
@@ -123,7 +123,15 @@ class Submap:
         """Return (K, 4, 4) poses, camera to submap."""
         return np.array([self.T_submap_kf[int(k)] for k in keyframe_ids]).reshape(-1, 4, 4)
 
+    def keyframes_near(self, index: int) -> list[int]:
+        """Return all keyframes by their distance in time from frame `index`, the nearest first (ties: lower id)."""
+        return sorted(self.keyframes, key=lambda k: (abs(k - index), k))
+
     # --- landmarks
+
+    def depths(self, landmark_ids: IntArray, T_cam_submap: FloatArray) -> FloatArray:
+        """Return the depths (N,) of landmarks in a camera."""
+        return np.asarray(self.landmarks["xyz_mu"][landmark_ids] @ T_cam_submap[2, :3] + T_cam_submap[2, 3])
 
     def add_landmarks(
         self, xyz_mu: FloatArray, descriptors: NDArray[Any], scale: FloatArray, keyframe_id: int
@@ -144,6 +152,24 @@ class Submap:
             n_visible=1,
             n_found=1,
         )
+
+    def copy_landmarks(self, other: Submap, landmark_ids: IntArray, S_self_other: FloatArray | None = None) -> IntArray:
+        """Append copies of another submap's landmarks, without observations; return their ids here.
+
+        Parameters
+        ----------
+        other : Submap
+        landmark_ids : (N,) int64
+        S_self_other : (4, 4), optional
+            Similarity that takes them here; by default they stay where they are.
+        """
+        columns = {name: column[landmark_ids] for name, column in other.landmarks.columns().items()}
+        columns["replaced_by"] = np.full(len(landmark_ids), NO_LANDMARK)
+        if S_self_other is not None:
+            columns["xyz_mu"] = sim3.act(S_self_other, columns["xyz_mu"])
+            columns["normal"] = columns["normal"] @ sim3.rotation(S_self_other).T
+            columns["distance_mu"] = columns["distance_mu"] * float(sim3.scale(S_self_other))
+        return self.landmarks.append(len(landmark_ids), **columns)
 
     def remove_landmarks(self, landmark_ids: IntArray) -> None:
         """Cull landmarks and their observations."""
@@ -213,6 +239,12 @@ class Submap:
         for k in np.unique(obs["kf"][rows]).tolist():
             if k in self.landmark_of:
                 self.landmark_of[k][obs["feature"][rows[obs["kf"][rows] == k]]] = NO_LANDMARK
+
+    def remove_outliers(self, rows: IntArray) -> None:
+        """Drop observations that a solution contradicts, and landmarks left with fewer than two."""
+        touched = np.unique(self.observations["landmark"][rows])
+        self.remove_observations(rows)
+        self.remove_landmarks(touched[self.n_observations(touched) < 2])
 
     def rows_of_landmarks(self, landmark_ids: IntArray) -> IntArray:
         """Return the live observation rows of a set of landmarks."""

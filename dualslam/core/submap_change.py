@@ -51,9 +51,6 @@ def _depth_ratios(before: Submap, after: Submap, k: int, n: int) -> FloatArray:
     ids = before.landmark_of[k]
     ids = ids[(ids >= 0) & (ids < n)]
     ids = ids[before.landmarks["alive"][ids] & after.landmarks["alive"][ids]]
-    depths = []
-    for submap in (before, after):
-        T_cam_submap = se3.inverse(submap.T_submap_kf[k])
-        depths.append(submap.landmarks["xyz_mu"][ids] @ T_cam_submap[2, :3] + T_cam_submap[2, 3])
+    depths = [submap.depths(ids, se3.inverse(submap.T_submap_kf[k])) for submap in (before, after)]
     in_front = (depths[0] > 0) & (depths[1] > 0)
     return np.asarray(depths[1][in_front] / depths[0][in_front], np.float64)

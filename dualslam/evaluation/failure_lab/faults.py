@@ -160,8 +160,7 @@ def wrong_pose(track: Track, submap: Submap, fault: Corruption) -> FloatArray:
     axis, direction = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
     angle_rad = np.radians(fault.level)
     ids = track.landmark_ids[track.landmark_ids >= 0]
-    xyz_mu = submap.landmarks["xyz_mu"][ids]
-    depth_mu = float(np.median(xyz_mu @ track.T_cam_submap[2, :3] + track.T_cam_submap[2, 3])) if len(ids) else 1.0
+    depth_mu = float(np.median(submap.depths(ids, track.T_cam_submap))) if len(ids) else 1.0
     T_error = np.eye(4)
     T_error[:3, :3] = so3.exp(angle_rad * axis)
     T_error[:3, 3] = np.sin(angle_rad) * depth_mu * direction
