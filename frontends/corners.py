@@ -146,20 +146,36 @@ def refine_corners(patches: NDArray[np.uint8]) -> tuple[FloatArray, BoolArray]:
     response = (grey @ _dog_weights()).reshape(-1, 5, 5)
     response *= np.where(response[:, 2:3, 2:3] < 0, -1, 1)
     v, u = np.divmod(response[:, 1:4, 1:4].reshape(-1, 9).argmax(axis=1), 3)
-    offset, found = _quadratic_peak(sliding_window_view(response, (3, 3), axis=(1, 2))[np.arange(len(u)), v, u])
+    offset, found = quadratic_peak(
+        sliding_window_view(response, (3, 3), axis=(1, 2))[np.arange(len(u)), v, u], MIN_CURVATURE
+    )
     offset += np.stack([u - 1, v - 1], axis=1)
     return np.where(found[:, None], offset, 0.0), found
 
 
-def _quadratic_peak(response: NDArray[np.float32]) -> tuple[FloatArray, BoolArray]:
-    """Maximum of the parabola through each 3 x 3 neighbourhood (N, 3, 3), and whether it lies within 0.75 px."""
+def quadratic_peak(response: NDArray[np.floating], min_curvature: float = 0.0) -> tuple[FloatArray, BoolArray]:
+    """Maximum of the parabola through each 3 x 3 neighbourhood, and whether it lies within 0.75 px.
+
+    Parameters
+    ----------
+    response : (N, 3, 3)
+        The middle is the highest, or nearly.
+    min_curvature : float
+        By so much a peak curves downwards at least, in both directions together.
+
+    Returns
+    -------
+    offset : (N, 2) float64
+        (du, dv) from the middle; anything where there is no such maximum.
+    found : (N,) bool
+    """
     r = response.astype(np.float64)
     gradient_u, gradient_v = (r[:, 1, 2] - r[:, 1, 0]) / 2, (r[:, 2, 1] - r[:, 0, 1]) / 2
     uu, vv = r[:, 1, 2] - 2 * r[:, 1, 1] + r[:, 1, 0], r[:, 2, 1] - 2 * r[:, 1, 1] + r[:, 0, 1]
     uv = (r[:, 2, 2] - r[:, 2, 0] - r[:, 0, 2] + r[:, 0, 0]) / 4
     determinant = uu * vv - uv**2
-    # Curved downwards in every direction, by more than rounding.
-    peaked = (determinant > 0) & (uu + vv < -MIN_CURVATURE)
+    # Curved downwards in every direction.
+    peaked = (determinant > 0) & (uu + vv < -min_curvature)
     safe = np.where(peaked, determinant, 1.0)
     offset = np.stack([uv * gradient_v - vv * gradient_u, uv * gradient_u - uu * gradient_v], axis=1) / safe[:, None]
     return offset, peaked & (np.abs(offset) <= 0.75).all(axis=1)

@@ -15,9 +15,9 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import in_front, triangulate_n_view
 from dualslam.core.submap import Submap
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Matches
+from frontends.gates import CHI2_2DOF_95
 
 NO_TRACK = -1
-CHI2_2DOF_95 = 5.991
 MAX_DEPTH_SIGMA = 0.25
 """Relative uncertainty of its depth up to which a point serves to find a pose (as for landmarks in the graph)."""
 

@@ -28,9 +28,10 @@ from dualslam.core.types import (
     Start,
     View,
 )
+from frontends.gates import CHI2_2DOF_95
 from frontends.motion_statistics import match_by_motion, nearest_search
 from frontends.resection import resect
-from frontends.two_view_hypotheses import CHI2_2, propose_relative_poses
+from frontends.two_view_hypotheses import propose_relative_poses
 
 LAGS = (2, 4, 8, 16, 32, 64)  # frames back that are tried as the first view
 N_WITNESSES = 3  # frames between the two views that must agree
@@ -157,8 +158,8 @@ class Initialiser:
         good = (
             (points.depth_a > 0)
             & (points.depth_b > 0)
-            & (points.error2_a < CHI2_2 * a.features.sigma_px[fa] ** 2)
-            & (points.error2_b < CHI2_2 * b.features.sigma_px[fb] ** 2)
+            & (points.error2_a < CHI2_2DOF_95 * a.features.sigma_px[fa] ** 2)
+            & (points.error2_b < CHI2_2DOF_95 * b.features.sigma_px[fb] ** 2)
         )
         angle = np.degrees(np.arccos(np.clip(points.cos_parallax[good], -1, 1)))
         # Points without parallax are no points of the map: their depth is anything.
@@ -231,7 +232,7 @@ class Initialiser:
             result = self._adjuster(problem)
         except SolverError as error:
             return Failure(FailureReason.SOLVER, str(error), numbers)
-        inlier = result.chi2 < CHI2_2
+        inlier = result.chi2 < CHI2_2DOF_95
         n_bad = np.bincount(point_of[~inlier], minlength=len(xyz))
         direction = direction_sigma_deg(problem, result.T_submap_kf, result.xyz_mu, inlier)
         numbers = {**numbers, "chi2": float(np.median(result.chi2) / 1.386), "direction_sigma_deg": direction}

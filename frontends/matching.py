@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Matches
+from frontends.gates import CHI2_1DOF_95
 from frontends.groups import NO_MATCHES, best_pairs, best_per_group, consistent_rotation
-
-CHI2_1DOF_95 = 3.841
-"""Squared whitened distance to a line that 95 % of true matches do not exceed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,12 +28,12 @@ from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import BundleAdjuster, Frontend, KeyframeReport, SubmapGraph
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray, Matches, Track, View
+from frontends.gates import CHI2_1DOF_95, CHI2_2DOF_99, MIN_CONSENSUS
 from frontends.guest_map import GuestMap, triangulate
-from frontends.matching import CHI2_1DOF_95
 from frontends.resection import resect
 from frontends.tracker import GivenPose
 from frontends.visual import VisualFrontEnd
-from frontends.wide_pose import CHI2_2DOF_99, MIN_MATCHES, WidePose, estimate_wide_pose
+from frontends.wide_pose import WidePose, estimate_wide_pose
 
 Extract = Callable[[View], Features | Failure]
 
@@ -324,13 +324,13 @@ class PnpOdometry:
         point_of = np.full(len(a), -1)
         point_of[first.rows] = np.arange(len(first.rows))
         tracked = point_of[matches[:, 0]] >= 0
-        if tracked.sum() < MIN_MATCHES:
+        if tracked.sum() < MIN_CONSENSUS:
             return 0.0
         xyz = first.pose.xyz_mu[first.pose.inliers][point_of[matches[tracked, 0]]]
         uv, _ = project_points(K, second.pose.T_cam_submap, xyz)
         error2 = ((uv - uv_b[tracked]) ** 2).sum(axis=1)
         share = float((error2 < CHI2_2DOF_99 * variance[tracked]).mean())
-        if (~tracked).sum() < MIN_MATCHES:
+        if (~tracked).sum() < MIN_CONSENSUS:
             return share
         T_b_a = second.pose.T_cam_submap @ se3.inverse(first.pose.T_cam_submap)
         return min(share, _static_share(uv_a[~tracked], uv_b[~tracked], variance[~tracked], K, T_b_a))

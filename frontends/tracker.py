@@ -15,13 +15,13 @@ from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
 from dualslam.core.submap import NO_LANDMARK, Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
+from frontends.gates import CHI2_2DOF_99, MIN_CONSENSUS
 from frontends.local_map import LocalMap, Prediction
 from frontends.matching import FeatureGrid, match_projected
 from frontends.resection import resect
 
 WIDER = 2.5  # second guided search: this many times the first radius
-GIVEN_POSE_CHI2 = 4 * 9.210  # 99 % with 2 degrees of freedom, and the pose off by as much as a pixel
-PNP_MIN_MATCHES = 12  # below this a RANSAC consensus of a 3-point solver is no evidence
+GIVEN_POSE_CHI2 = 4 * CHI2_2DOF_99  # 99 % with 2 degrees of freedom, and the pose off by as much as a pixel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,7 +206,7 @@ class Tracker:
         for k in self._submap.keyframes_near(view.index)[: self._config.wide_keyframes]:
             has_landmark = np.flatnonzero(submap.landmark_of[k] >= 0)
             matches = self._frontend.match_wide(submap.keyframes[k].features.take(has_landmark), view.features)
-            if len(matches) < PNP_MIN_MATCHES:
+            if len(matches) < MIN_CONSENSUS:
                 continue
             ids = submap.landmark_of[k][has_landmark[matches.index[:, 0]]]
             feature = matches.index[:, 1]

@@ -14,10 +14,8 @@ from dualslam.core.geometry.two_view import (
     sampson_error,
 )
 from dualslam.core.types import FloatArray
+from frontends.gates import CHI2_1DOF_95, CHI2_2DOF_95
 from frontends.resection import poselib_camera
-
-CHI2_1 = 3.841  # chi-square, 1 degree of freedom, 95 %: distance to an epipolar line
-CHI2_2 = 5.991  # chi-square, 2 degrees of freedom, 95 %: distance to a point
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,8 +57,8 @@ def propose_relative_poses(
     options = {"max_reproj_error": 3.0 * sigma, "max_iterations": 1000, "min_iterations": 100, "seed": seed}
     H_b_a, _ = poselib.estimate_homography(uv_a_px, uv_b_px, options, {})
     variance = sigma_px**2
-    score_e = _score(sampson_error(fundamental_from_pose(K, T_b_a), uv_a_px, uv_b_px) / variance, CHI2_1)
-    score_h = _score(homography_transfer_error(H_b_a, uv_a_px, uv_b_px).mean(axis=1) / variance, CHI2_2)
+    score_e = _score(sampson_error(fundamental_from_pose(K, T_b_a), uv_a_px, uv_b_px) / variance, CHI2_1DOF_95)
+    score_h = _score(homography_transfer_error(H_b_a, uv_a_px, uv_b_px).mean(axis=1) / variance, CHI2_2DOF_95)
     share = score_h / max(score_e + score_h, 1e-12)
     candidates = [_unit_baseline(T_b_a)]
     if share > homography_ratio:
@@ -75,4 +73,4 @@ def _unit_baseline(T_b_a: FloatArray) -> FloatArray:
 
 
 def _score(squared: FloatArray, gate: float) -> float:
-    return float(np.sum(np.where(squared < gate, CHI2_2 - squared, 0.0)))
+    return float(np.sum(np.where(squared < gate, CHI2_2DOF_95 - squared, 0.0)))

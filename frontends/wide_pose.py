@@ -22,12 +22,11 @@ from dualslam.core.geometry.projection import projection_jacobians
 from dualslam.core.geometry.triangulation import triangulate_n_view, triangulate_two_view
 from dualslam.core.interfaces import BundleAdjuster, BundleProblem
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
+from frontends.gates import CHI2_2DOF_99, MIN_CONSENSUS
 from frontends.guest_map import TrackViews, triangulate
 from frontends.resection import resect
 from frontends.two_view_hypotheses import propose_relative_poses
 
-CHI2_2DOF_99 = 9.210
-MIN_MATCHES = 12  # below this a RANSAC consensus of a 3-point solver is no evidence
 HESSIAN_INFLATION = 1.5  # poses of the known frames have errors too, and pixels of neighbours err alike
 
 
@@ -90,8 +89,8 @@ def estimate_wide_pose(
     seed : int
     """
     n = len(uv_px)
-    if n < MIN_MATCHES:
-        return Failure(FailureReason.TOO_FEW_MATCHES, f"{n} wide matches, {MIN_MATCHES} needed")
+    if n < MIN_CONSENSUS:
+        return Failure(FailureReason.TOO_FEW_MATCHES, f"{n} wide matches, {MIN_CONSENSUS} needed")
     hypotheses = [
         _from_points(known, uv_px, sigma_px, K, size_px, seed),
         _from_two_views(known, uv_px, sigma_px, K, size_px, seed),
@@ -112,7 +111,7 @@ def _from_points(
     known: TrackViews, uv_px: FloatArray, sigma_px: FloatArray, K: FloatArray, size_px: tuple[int, int], seed: int
 ) -> FloatArray | None:
     xyz, good = triangulate(known, K)
-    if good.sum() < MIN_MATCHES:
+    if good.sum() < MIN_CONSENSUS:
         return None
     return resect(K, size_px, uv_px[good], xyz[good], float(np.median(sigma_px[good])), seed)
 
@@ -123,7 +122,7 @@ def _from_two_views(
     """Essential matrix with the known frame that shares most tracks, its translation's length from the others."""
     v = int(known.visible.sum(axis=0).argmax())
     shared = known.visible[:, v]
-    if shared.sum() < MIN_MATCHES:
+    if shared.sum() < MIN_CONSENSUS:
         return None
     uv_v = known.uv_px[shared, v]
     sigma = np.hypot(known.sigma_px[shared, v], sigma_px[shared])
@@ -156,7 +155,7 @@ def _length(xyz: FloatArray, uv_px: FloatArray, seen: BoolArray, T_others_v: Flo
     s = np.einsum("ij,ij->i", e, d) / np.maximum(e2, 1e-300)
     # Pixels move by about |e| / a_z for a relative change of s; where that is nothing, s is anything.
     weight = np.where(a[:, 2] > 0, np.sqrt(e2) / np.where(a[:, 2] > 0, a[:, 2], 1.0), 0.0)
-    if len(s) < MIN_MATCHES or not weight.sum() > 0:
+    if len(s) < MIN_CONSENSUS or not weight.sum() > 0:
         return None
     order = np.argsort(s, kind="stable")
     half = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
@@ -185,7 +184,7 @@ def _adjust(
     used = inliers
     for _ in range(2):
         used = inliers & (chi2 < 16 * CHI2_2DOF_99).all(axis=1)
-        if used.sum() < MIN_MATCHES:
+        if used.sum() < MIN_CONSENSUS:
             return None
         row, view = np.nonzero(visible & used[:, None])
         point = (np.cumsum(used) - 1)[row]
@@ -201,7 +200,7 @@ def _adjust(
         chi2 = np.where(visible, points.error2 / sigma**2, 0.0)
         in_front = ((points.depth > 0) | ~visible).all(axis=1) & np.isfinite(xyz).all(axis=1)
         inliers = in_front & (np.nan_to_num(chi2, nan=np.inf) < CHI2_2DOF_99).all(axis=1)
-    if inliers.sum() < MIN_MATCHES:
+    if inliers.sum() < MIN_CONSENSUS:
         return None
     mean = float(chi2[inliers].sum() / (2 * visible[inliers].sum() - 3 * inliers.sum()).clip(1))
     covariance, scale_sigma = _uncertainty(K, T, xyz[inliers], sigma[inliers], visible[inliers])

@@ -12,7 +12,7 @@ from kornia.geometry.subpix import nms2d
 from torch.nn.functional import interpolate
 
 from dualslam.core.types import BoolArray, FloatArray, IntArray
-from frontends.corners import grades, select_spread, share_out
+from frontends.corners import grades, quadratic_peak, select_spread, share_out
 from frontends.kornia.checkpoints import AFFNET, HARDNET, KEYNET, ORINET
 from frontends.kornia.options import KorniaOptions
 from frontends.kornia.weights import WeightSource
@@ -176,13 +176,5 @@ def _between_pixels(peak: torch.Tensor, response: torch.Tensor) -> tuple[FloatAr
     patch = response[v[:, None, None] + step[:, None], u[:, None, None] + step]
     xy = torch.stack([u, v], dim=1).double().cpu().numpy()
     r = patch.double().cpu().numpy()
-    gradient_u, gradient_v = (r[:, 1, 2] - r[:, 1, 0]) / 2, (r[:, 2, 1] - r[:, 0, 1]) / 2
-    uu, vv = r[:, 1, 2] - 2 * r[:, 1, 1] + r[:, 1, 0], r[:, 2, 1] - 2 * r[:, 1, 1] + r[:, 0, 1]
-    uv = (r[:, 2, 2] - r[:, 2, 0] - r[:, 0, 2] + r[:, 0, 0]) / 4
-    determinant = uu * vv - uv**2
-    # A strict maximum curves downwards along both axes; in between it may not.
-    peaked = determinant > 0
-    safe = np.where(peaked, determinant, 1.0)
-    offset = np.stack([uv * gradient_v - vv * gradient_u, uv * gradient_u - uu * gradient_v], axis=1) / safe[:, None]
-    refined: BoolArray = peaked & (np.abs(offset) <= 0.75).all(axis=1)
+    offset, refined = quadratic_peak(r)
     return xy, np.where(refined[:, None], offset, 0.0), refined, r[:, 1, 1]

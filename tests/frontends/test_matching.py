@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from dualslam.core.types import Features, FloatArray, Matches
-from frontends.matching import CHI2_1DOF_95, FeatureGrid, match_epipolar, match_projected, ray_segments
+from frontends.gates import CHI2_1DOF_95
+from frontends.matching import FeatureGrid, match_epipolar, match_projected, ray_segments
 from frontends.orb import OrbFrontend
 from tests.frontends.conftest import made_up_features
 
