@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from pydantic import Field
 
 from dualslam.core.types import Features, Matches
 from frontends.motion_statistics import THRESHOLD, match_by_motion
 from frontends.orb import OrbFrontend, OrbOptions
-from frontends.registry import parse_options
 
 
 class GmsOptions(OrbOptions):
@@ -35,21 +31,17 @@ class GmsFrontend(OrbFrontend):
     """
 
     name = "gms"
+    options: GmsOptions
+    options_model = GmsOptions
 
     def __init__(self, n_features: int = 1500, options: GmsOptions | None = None) -> None:
-        self._motion = options or GmsOptions()
-        super().__init__(n_features, self._motion)
+        super().__init__(n_features, options)
         # The cells about a cell are where they are expected to within half a cell: at a distance of one cell, a turn by
         # 30 degrees or a zoom by 1.5. A step of 45 degrees leaves 22.5, a step of 1.41 in size 1.2.
-        self.max_turn_deg = 180.0 if self._motion.rotation else 30.0
-        self.max_zoom = 1.7 if self._motion.zoom else 1.4
-
-    @classmethod
-    def from_options(cls, n_features: int, options: Mapping[str, Any]) -> GmsFrontend:
-        """Build from the config; ConfigError names an option that is unknown or out of range."""
-        return cls(n_features, parse_options(GmsOptions, cls.name, options))
+        self.max_turn_deg = 180.0 if self.options.rotation else 30.0
+        self.max_zoom = 1.7 if self.options.zoom else 1.4
 
     def match_wide(self, a: Features, b: Features) -> Matches:
         """Compare all with all, and keep the nearest that move as their neighbours do."""
-        motion = self._motion
+        motion = self.options
         return match_by_motion(self, a, b, rotation=motion.rotation, zoom=motion.zoom, threshold=motion.threshold)

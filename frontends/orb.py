@@ -24,8 +24,7 @@ So 80 with a guide, beyond which far more wrong ones come in than right ones are
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -38,7 +37,7 @@ from dualslam.core.types import Features, FloatArray, IntArray, Matches
 from frontends.corners import detect_corners, refine_corners, select_spread, share_out
 from frontends.groups import consistent_rotation, mutual_best
 from frontends.images import to_grey
-from frontends.registry import parse_options
+from frontends.optioned import OptionedFrontend
 
 PATCH_RADIUS_PX = 15
 """Radius of the disc whose intensity centroid gives the orientation, in pixels of the level (ORB, section 3.2)."""
@@ -73,7 +72,7 @@ class OrbOptions(StrictModel):
     """`match_wide`: greatest distance of the best match over that of the second best."""
 
 
-class OrbFrontend:
+class OrbFrontend(OptionedFrontend):
     """FAST corners, intensity-centroid orientation, rotated BRIEF descriptors of 256 bits. Implements `Frontend`.
 
     Parameters
@@ -84,22 +83,18 @@ class OrbFrontend:
     """
 
     name = "orb"
+    options: OrbOptions
+    options_model = OrbOptions
     max_turn_deg: float = 180.0
     max_zoom: float = 1.7
 
     def __init__(self, n_features: int = 1500, options: OrbOptions | None = None) -> None:
-        self.options = options or OrbOptions()
-        self.n_features = n_features
+        super().__init__(n_features, options)
         self.scale_factor = self.options.scale_factor
         self.n_octaves = self.options.n_octaves
         self.max_distance = self.options.max_distance
         self.max_distance_strict = self.options.max_distance_strict
         self._moments = _moment_weights()
-
-    @classmethod
-    def from_options(cls, n_features: int, options: Mapping[str, Any]) -> OrbFrontend:
-        """Build from the config; ConfigError names an option that is unknown or out of range."""
-        return cls(n_features, parse_options(OrbOptions, cls.name, options))
 
     def extract(self, image: NDArray[np.uint8]) -> Features:
         """Detect and describe up to `n_features` corners, the finest octave first.

@@ -23,7 +23,6 @@ So 0.55 with a guide, and 0.40 without.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import cv2
@@ -36,7 +35,7 @@ from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Match
 from frontends.corners import grades, select_spread, share_out
 from frontends.groups import consistent_rotation, mutual_best
 from frontends.images import to_grey
-from frontends.registry import parse_options
+from frontends.optioned import OptionedFrontend
 
 DESCRIPTOR_LENGTH = 128
 UNIT = 512
@@ -78,7 +77,7 @@ class SiftOptions(StrictModel):
     """`match_wide`: greatest distance of the best match over that of the second best (Lowe, figure 11)."""
 
 
-class SiftFrontend:
+class SiftFrontend(OptionedFrontend):
     """Difference-of-Gaussian extrema, gradient orientation, RootSIFT descriptors. Implements `Frontend`.
 
     Parameters
@@ -89,21 +88,17 @@ class SiftFrontend:
     """
 
     name = "sift"
+    options: SiftOptions
+    options_model = SiftOptions
     max_turn_deg = 180.0
     max_zoom = 2.0
 
     def __init__(self, n_features: int = 1500, options: SiftOptions | None = None) -> None:
-        self.options = options or SiftOptions()
-        self.n_features = n_features
+        super().__init__(n_features, options)
         self.scale_factor = float(2.0 ** (1.0 / self.options.levels_per_doubling))
         self.n_octaves = self.options.n_octaves
         self.max_distance = self.options.max_distance
         self.max_distance_strict = self.options.max_distance_strict
-
-    @classmethod
-    def from_options(cls, n_features: int, options: Mapping[str, Any]) -> SiftFrontend:
-        """Build from the config; ConfigError names an option that is unknown or out of range."""
-        return cls(n_features, parse_options(SiftOptions, cls.name, options))
 
     def extract(self, image: NDArray[np.uint8]) -> Features:
         """Detect and describe up to `n_features` extrema, the finest octave first.

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -20,7 +19,7 @@ from frontends.kornia.networks import Network
 from frontends.kornia.options import LEVELS_ZOOM, NETWORK_TURN_DEG, NETWORK_ZOOM, KorniaOptions
 from frontends.kornia.runtime import DeviceCopies, choose_device, inference
 from frontends.kornia.weights import WeightSource
-from frontends.registry import parse_options
+from frontends.optioned import OptionedFrontend
 
 MIN_SIDE_PX = 33
 """Smaller images have no features: the patches of a descriptor, and the networks' strides, are as large."""
@@ -30,7 +29,7 @@ UNREFINED = 1.5
 """Noise of a maximum that stays at its pixel, times that of the others."""
 
 
-class KorniaFrontend:
+class KorniaFrontend(OptionedFrontend):
     """Detectors, descriptors and matchers of kornia.feature, on the CPU or a CUDA device. Implements `Frontend`.
 
     Descriptors are float32 unit vectors, and distances those between them.
@@ -48,10 +47,11 @@ class KorniaFrontend:
     """
 
     name = "kornia"
+    options: KorniaOptions
+    options_model = KorniaOptions
 
     def __init__(self, n_features: int = 1500, options: KorniaOptions | None = None) -> None:
-        self.options = options or KorniaOptions()
-        self.n_features = n_features
+        super().__init__(n_features, options)
         noise = self.options.noise
         self.max_distance, self.max_distance_strict = noise.max_distance, noise.max_distance_strict
         self._sigma_px = noise.sigma_px
@@ -79,11 +79,6 @@ class KorniaFrontend:
             self._levels = LevelFeatures(options, self.n_features, self._device, source)
             self._extract = self._by_levels
         self._match = build_matcher(options, self._device)
-
-    @classmethod
-    def from_options(cls, n_features: int, options: Mapping[str, Any]) -> KorniaFrontend:
-        """Build from the config; ConfigError names an option that is unknown, out of range or cannot be met."""
-        return cls(n_features, parse_options(KorniaOptions, cls.name, options))
 
     def __reduce__(self) -> tuple[type[KorniaFrontend], tuple[int, KorniaOptions]]:
         """Go to another process as the options: it builds its own and reads the weights itself."""
