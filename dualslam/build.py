@@ -104,17 +104,19 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
                 lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px)
             ),
             calibration=calibration,
-            recovery=recovery or recovery_executor(config, size_px, faults),
+            recovery=recovery or recovery_executor(config, size_px, faults, frontend),
         ),
         config,
     )
 
 
-def recovery_executor(config: Config, size_px: tuple[int, int], faults: FaultScript) -> RecoveryExecutor:
+def recovery_executor(
+    config: Config, size_px: tuple[int, int], faults: FaultScript, frontend: Frontend
+) -> RecoveryExecutor:
     """Build what runs walks back in time: in this process, or in workers, which are started at once."""
     recovery = config.recovery
     # Built here in any case: a mistake in the config is told at once, not by a worker.
-    parts = recovery_parts(config, size_px)
+    parts = recovery_parts(config, size_px, frontend=frontend)
     if recovery.workers == 0:
         return faults.around_inline(InlineExecutor(parts))
     make_parts = partial(recovery_parts, config, size_px, WORKER_BUDGET * recovery.time_limit_s)
@@ -122,15 +124,19 @@ def recovery_executor(config: Config, size_px: tuple[int, int], faults: FaultScr
     return WorkerExecutor(make_parts, recovery.workers, *limits, on_start=faults.kill_worker)
 
 
-def recovery_parts(config: Config, size_px: tuple[int, int], budget_s: float | None = None) -> RecoveryParts:
+def recovery_parts(
+    config: Config, size_px: tuple[int, int], budget_s: float | None = None, frontend: Frontend | None = None
+) -> RecoveryParts:
     """Build what a walk back in time is made of, for images of this width and height; see `RecoveryParts.budget_s`.
+
+    `frontend`: the live one, where this process has it already: it may hold networks.
 
     Raises
     ------
     ConfigError
         If a front end that an attempt names is not known, or its options are wrong.
     """
-    frontend = create_frontend(config.frontend)
+    frontend = frontend or create_frontend(config.frontend)
 
     def live(submap: Submap, graph: SubmapGraph) -> VisualFrontEnd:
         return VisualFrontEnd(frontend, config, submap, graph, size_px)
