@@ -40,12 +40,7 @@ def config_of(args: argparse.Namespace) -> Config:
 
 
 def _read_corruptions(path: Path) -> list[Any]:
-    try:
-        items = strict_yaml.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"--corrupt {path}: the file cannot be read ({error.strerror})") from error
-    except ValueError as error:
-        raise ConfigError(f"--corrupt {path}: {error}") from error
+    items = strict_yaml.read(path, "the file", f"--corrupt {path}")
     if not isinstance(items, list):
         raise ConfigError(
             f"--corrupt {path}: corruptions are a list, such as - {{kind: blackout, start: 100, length: 10}}"

@@ -114,12 +114,7 @@ def dump_config(config: BaseModel) -> str:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        data = strict_yaml.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: the configuration cannot be read ({error.strerror})") from error
-    except ValueError as error:
-        raise ConfigError(f"{path}: {error}") from error
+    data = strict_yaml.read(path, "the configuration")
     if data is None:
         return {}
     if not isinstance(data, dict):

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 import yaml
+
+from dualslam.core.errors import ConfigError
 
 _SCALARS: list[tuple[str, str, str]] = [
     ("null", r"null|Null|NULL|~|", "~nN"),
@@ -64,6 +67,31 @@ _Dumper.yaml_implicit_resolvers = _resolvers()
 
 def _error(problem: str, node: yaml.Node) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+
+
+def read(path: Path, what: str, source: str = "") -> Any:
+    """Read a file of YAML.
+
+    Parameters
+    ----------
+    path : Path
+    what : str
+        What the file is, for the error: ``the configuration``.
+    source : str
+        What to call the file there; its path if empty.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be read, or is no YAML of this kind.
+    """
+    source = source or str(path)
+    try:
+        return loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{source}: {what} cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise ConfigError(f"{source}: {error}") from error
 
 
 def loads(text: str) -> Any:

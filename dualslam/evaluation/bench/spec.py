@@ -193,12 +193,7 @@ def load_spec(path: str | Path) -> BenchSpec:
     ConfigError
         One sentence: where, which field, what is wrong, and the nearest known field.
     """
-    try:
-        data = strict_yaml.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: the bench cannot be read ({error.strerror})") from error
-    except ValueError as error:
-        raise ConfigError(f"{path}: {error}") from error
+    data = strict_yaml.read(Path(path), "the bench")
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: a bench is a mapping with name, sequences and variants")
     return model_from_dict(BenchSpec, data, str(path))
