@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from dualslam.atlas import Link, LinkKind
@@ -66,6 +66,15 @@ class InlineExecutor:
         return self.poll()
 
 
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """How a submap was lost: suspected from frame `onset` on, why, and the first frame without a pose."""
+
+    onset: int
+    cause: str
+    first_frame: int
+
+
 class Recoveries:
     """Starts a walk back for each new submap, and merges what it found at a frame boundary.
 
@@ -94,8 +103,7 @@ class Recoveries:
         self._new_graph = new_graph
         self._calibration = calibration
         self._config = config
-        self._onsets: dict[int, int] = {}  # lost submaps that are not linked yet, and the frame of their loss
-        self._losses: dict[int, tuple[str, int]] = {}  # why, and the first frame without a pose
+        self._lost: dict[int, Loss] = {}  # submaps that are not linked yet
         self._began: dict[int, float] = {}  # when, by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
         self._starts: dict[int, int] = {}  # the keyframe that its first walk started from
@@ -104,15 +112,14 @@ class Recoveries:
     def declare_lost(self, submap_id: int, onset: int, cause: str, first_lost: int) -> None:
         """Let the walks to come look for a submap: lost at frame `first_lost`, suspected from `onset` on."""
         if self._config.enabled:
-            self._onsets[submap_id] = onset
-            self._losses[submap_id] = cause, first_lost
+            self._lost[submap_id] = Loss(onset, cause, first_lost)
 
     def start(self, submap: Submap, newest: View, now: View | None = None) -> None:
         """Start the walk back from a new submap: over the frames without a pose, then on into the lost submaps.
 
         It begins at its keyframe `newest`, also where it is made again later (`now`).
         """
-        atlas, onsets = self._record.atlas, dict(self._onsets)
+        atlas, onsets = self._record.atlas, {m: loss.onset for m, loss in self._lost.items()}
         if onsets:
             self._circumstances[submap.id] = self._circumstances_of_loss()
             numbers = {**self._circumstances[submap.id], **self._buffer.numbers}
@@ -143,12 +150,12 @@ class Recoveries:
         Only while the buffer still holds frames that a lost map saw.
         """
         tried_with = self._unlinked.get(submap.id)
-        if tried_with is None or submap.id in self._began or not self._onsets:
+        if tried_with is None or submap.id in self._began or not self._lost:
             return
         if not any(tried_with < n <= len(submap.keyframes) for n in self._config.retry_keyframes):
             return
         del self._unlinked[submap.id]
-        lost = {k for m in self._onsets for k in self._record.atlas.submaps[m].keyframes}
+        lost = {k for m in self._lost for k in self._record.atlas.submaps[m].keyframes}
         own = [view for view in self._buffer if view.index in submap.keyframes]
         if not own or not any(view.index in lost for view in self._buffer):
             return
@@ -186,10 +193,10 @@ class Recoveries:
 
     def _circumstances_of_loss(self) -> dict[str, Any]:
         """Why the newest of the lost maps was lost, and how many frames are buffered of before (k) and since (k_r)."""
-        cause, first_lost = self._losses[max(self._onsets)]
+        loss = self._lost[max(self._lost)]
         indices = [view.index for view in self._buffer]
-        k = indices.index(first_lost) if first_lost in indices else 0
-        return {"cause": cause, "k": k, "k_r": len(indices) - k}
+        k = indices.index(loss.first_frame) if loss.first_frame in indices else 0
+        return {"cause": loss.cause, "k": k, "k_r": len(indices) - k}
 
     def _failed(self, job: RecoveryJob, now: Moment, failure: Failure, seconds: float) -> None:
         self._record.event(
@@ -350,7 +357,7 @@ class Recoveries:
         settled = {old_id}
         if live is not None:
             settled.update(next(c for c in self._record.atlas.components() if live.submap.id in c))
-        self._onsets = {m: onset for m, onset in self._onsets.items() if m not in settled}
+        self._lost = {m: loss for m, loss in self._lost.items() if m not in settled}
 
     def _was_lost(self, index: int, old_id: int) -> bool:
         tracked = self._record.rows[index].status is FrameStatus.TRACKED

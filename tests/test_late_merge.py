@@ -134,7 +134,7 @@ def test_two_walks_overlap(twice_lost: PointWorld) -> None:
     assert system.events.of_kind(EventKind.RECOVERY_STARTED)[1].frame < first.frame < second.frame
     assert system.events.of_kind(EventKind.RECOVERY_STARTED)[1].data["lost"] == [0, 1]
     assert_one_right_map(system, twice_lost, twice_lost.covered)
-    assert not system._recoveries._onsets  # all is one map: nothing is left to look for
+    assert not system._recoveries._lost  # all is one map: nothing is left to look for
 
 
 def prediction_errors(world: PointWorld, polls: int) -> tuple[System, dict[int, FloatArray]]:
