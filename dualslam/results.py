@@ -15,10 +15,10 @@ from dualslam.atlas import LinkKind
 from dualslam.core.config import Config
 from dualslam.core.events import EventKind
 from dualslam.core.types import FrameStatus
-from dualslam.evaluation.trajectory_metrics import MAX_DT_S, score_trajectory
+from dualslam.evaluation.trajectory_metrics import score_trajectory
 from dualslam.frame_buffer import MB
 from dualslam.io.run_folder import FrameRow, PosedFrames
-from dualslam.io.trajectory_files import Trajectory, associate
+from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
 from dualslam.runner import RunReport
 from dualslam.system import System
 from dualslam.trajectory import compose

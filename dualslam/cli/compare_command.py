@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
 from dualslam.core.errors import OutputError
 from dualslam.io.atomic import write_text
-from dualslam.report import comparison_page, comparison_table, read_run
+from dualslam.report import RunData, comparison_page, comparison_table, read_run
 
 
 def execute(args: argparse.Namespace) -> int:
     """Print a table of the runs' numbers, and write the page."""
     if args.out.exists() and not args.overwrite:
         raise OutputError(f"{args.out} is there already; name another with --out, or give --overwrite.")
-    runs = [read_run(path) for path in args.runs]
-    write_text(args.out, comparison_page(runs))
-    if not args.quiet:
-        print(table_text(comparison_table(runs)))
-        print(f"page in {args.out}", flush=True)
+    present([read_run(path) for path in args.runs], args.out, args.quiet)
     return 0
+
+
+def present(runs: Sequence[RunData], page: Path, quiet: bool) -> None:
+    """Write the page of a comparison, and print its table."""
+    write_text(page, comparison_page(runs))
+    if not quiet:
+        print(table_text(comparison_table(runs)))
+        print(f"page in {page}", flush=True)
 
 
 def table_text(rows: Sequence[Sequence[str]]) -> str:

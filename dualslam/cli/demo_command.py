@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from dualslam.cli import logs
-from dualslam.cli.compare_command import table_text
+from dualslam.cli.compare_command import present
 from dualslam.cli.configuration import config_of
 from dualslam.cli.console import progress
 from dualslam.cli.run_command import conclude
 from dualslam.core.config import Config
 from dualslam.core.errors import InputError, OutputError
-from dualslam.io.atomic import write_text
-from dualslam.report import comparison_page, comparison_table, read_run
+from dualslam.report import read_run
 from dualslam.session import run_to_folder
 from dualslam.sources import WorldSequence, make_world
 
@@ -50,10 +49,7 @@ def execute(args: argparse.Namespace) -> int:
         if outcome.report.interrupted:
             return status
         runs.append(read_run(outcome.out))
-    write_text(page, comparison_page(runs))
-    if not args.quiet:
-        print(table_text(comparison_table(runs)))
-        print(f"page in {page}", flush=True)
+    present(runs, page, args.quiet)
     return status
 
 

@@ -17,8 +17,7 @@ from dualslam.atlas import Atlas, Link, LinkKind
 from dualslam.core.geometry import sim3, so3
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
-from dualslam.evaluation.trajectory_metrics import MAX_DT_S
-from dualslam.io.trajectory_files import Trajectory, associate
+from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
 from dualslam.trajectory import FramePose
 
 WRONG_SCALE, WRONG_ROTATION_DEG, WRONG_POSITION = 0.05, 3.0, 0.05

@@ -14,14 +14,12 @@ import numpy as np
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray
 from dualslam.io.run_folder import TRAJECTORY, unlinked_submaps
-from dualslam.io.trajectory_files import Trajectory, associate, nearest_in_time, read_tum
+from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate, nearest_in_time, read_tum
 
 Alignment = Literal["sim3", "se3"]
 
 MIN_POSES = 10
 """Fewer poses with ground truth than this are counted, but not scored."""
-MAX_DT_S = 0.02
-"""Largest gap in time between a pose and its ground truth."""
 RPE_INTERVAL_S = 1.0
 # Pairs in which the true camera moved less than this share of the median motion have no meaningful error in percent.
 _MIN_MOTION = 0.05

@@ -13,6 +13,9 @@ from dualslam.core.geometry.so3 import matrix_from_quat_xyzw, quat_xyzw_from_mat
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.io.atomic import write_text
 
+MAX_DT_S = 0.02
+"""Largest gap in time between a frame and its true pose."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure, FloatArray, FrameStatus
 from dualslam.report.canvas import Canvas
 from dualslam.report.markup import Markup, document, join, number, tag
 from dualslam.report.page import headline
-from dualslam.report.placement import Placed, act, align, extent, plane_from_above
+from dualslam.report.placement import Placed, align, extent, plane_from_above
 from dualslam.report.run_data import PosedRows, RunData
 from dualslam.report.statuses import MEANING, WITHOUT_POSE, count, span, stretches
 
@@ -179,7 +180,7 @@ def _bring_together(runs: Sequence[RunData]) -> _Overlay:
 def _place(placed: dict[int, Placed], i: int, posed: PosedRows, truth: PosedRows, identity: bool = False) -> None:
     S = np.eye(4) if identity else align(posed, truth)
     if not isinstance(S, Failure):
-        placed[i] = Placed(None, posed.row, act(S, posed.xyz), np.full(len(posed), np.nan))
+        placed[i] = Placed(None, posed.row, sim3.act(S, posed.xyz), np.full(len(posed), np.nan))
 
 
 def _on_rows_of(reference: RunData, run: RunData) -> PosedRows:

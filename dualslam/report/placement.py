@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.core.geometry import sim3
 from dualslam.core.geometry.umeyama import umeyama
 from dualslam.core.types import Failure, FloatArray, IntArray
 from dualslam.report.run_data import PosedRows, RunData
@@ -83,7 +84,7 @@ def place(run: RunData) -> Scene:
             continue
         placed.append(_placed(m, posed, S_truth_map, run.truth))
         if m is None:
-            points = act(S_truth_map, run.points)
+            points = sim3.act(S_truth_map, run.points)
     note = "Each map is aligned to the truth by one similarity, as for the ATE."
     if apart:
         note += " A map with too little motion to be aligned is drawn apart."
@@ -96,11 +97,6 @@ def align(posed: PosedRows, truth: PosedRows) -> FloatArray | Failure:
     _, a, b = np.intersect1d(posed.row, truth.row, return_indices=True)
     alignment = umeyama(posed.xyz[a], truth.xyz[b])
     return alignment.S_dst_src if not isinstance(alignment, Failure) else alignment
-
-
-def act(S: FloatArray, xyz: FloatArray) -> FloatArray:
-    """Apply a similarity to points (N, 3)."""
-    return np.asarray(xyz @ S[:3, :3].T + S[:3, 3], np.float64)
 
 
 def plane_from_above(xyz: FloatArray, down: FloatArray) -> tuple[FloatArray, str]:
@@ -130,7 +126,7 @@ def plane_from_above(xyz: FloatArray, down: FloatArray) -> tuple[FloatArray, str
 
 
 def _placed(submap: int | None, posed: PosedRows, S_truth_map: FloatArray, truth: PosedRows) -> Placed:
-    xyz = act(S_truth_map, posed.xyz)
+    xyz = sim3.act(S_truth_map, posed.xyz)
     error = np.full(len(posed), np.nan)
     _, a, b = np.intersect1d(posed.row, truth.row, return_indices=True)
     error[a] = np.linalg.norm(xyz[a] - truth.xyz[b], axis=1)

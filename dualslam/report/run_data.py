@@ -13,15 +13,14 @@ import numpy as np
 from dualslam.atlas import Atlas
 from dualslam.core import strict_yaml
 from dualslam.core.errors import InputError
+from dualslam.core.geometry import sim3
 from dualslam.core.types import FloatArray, FrameStatus, IntArray
 from dualslam.io import run_folder
 from dualslam.io.map_files import METADATA, load_arrays
 from dualslam.io.run_folder import FrameRow, read_events, read_frames, unlinked_submaps
-from dualslam.io.trajectory_files import Trajectory, associate, nearest_in_time, read_text, read_tum
+from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate, nearest_in_time, read_text, read_tum
 from dualslam.map_store import load_links, submap_path
 
-MAX_TRUTH_DT_S = 0.02
-"""Largest gap in time between a frame and its true pose, as in the evaluation."""
 MAX_POINTS = 2500
 MAX_VIEW_DISTANCE_MU = 8.0
 """Landmarks farther from the camera that made them (the start's median depth is 1) are left out of the pictures."""
@@ -166,7 +165,7 @@ def _on_rows(trajectory: Trajectory, times_s: FloatArray) -> PosedRows:
 
 
 def _truth_on_rows(truth: Trajectory, times_s: FloatArray) -> PosedRows:
-    pose, near = associate(truth.timestamps_s, times_s, MAX_TRUTH_DT_S)
+    pose, near = associate(truth.timestamps_s, times_s, MAX_DT_S)
     return PosedRows(np.flatnonzero(near), truth.T_world_cam[pose[near]])
 
 
@@ -180,8 +179,7 @@ def _map_points(folder: Path, submap_ids: set[int | None]) -> FloatArray:
     for m in component:
         arrays = load_arrays(submap_path(folder, m), _POINT_ARRAYS)
         xyz, distance_mu, alive = (arrays[name] for name in _POINT_ARRAYS)
-        S = S_world_submap[m]
-        clouds.append(xyz[alive & (distance_mu < MAX_VIEW_DISTANCE_MU)] @ S[:3, :3].T + S[:3, 3])
+        clouds.append(sim3.act(S_world_submap[m], xyz[alive & (distance_mu < MAX_VIEW_DISTANCE_MU)]))
     points = np.concatenate(clouds)
     return points[:: max(1, len(points) // MAX_POINTS)]
 

@@ -11,9 +11,9 @@ import numpy as np
 from dualslam.core.events import Event, EventKind
 from dualslam.core.types import FloatArray, FrameStatus
 from dualslam.evaluation.bench.record import STATUS_LETTERS, Breakage
-from dualslam.evaluation.trajectory_metrics import MAX_DT_S, MIN_POSES, align_points, score_trajectory
+from dualslam.evaluation.trajectory_metrics import MIN_POSES, align_points, score_trajectory
 from dualslam.io.run_folder import FrameRow, PosedFrames
-from dualslam.io.trajectory_files import Trajectory, associate
+from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
 
 # Ground truth of fewer of the posed frames than this does not tell how long the path is: it is there in parts alone.
 _WHOLE_TRUTH = 0.9
