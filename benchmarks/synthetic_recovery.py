@@ -62,6 +62,8 @@ def run_once(job: tuple[str, str, int], settings: dict[str, Any]) -> dict[str, A
     made = script(kind, scene, rng, n_frames, rate_hz)
     world = make_sequence(scene, n_frames, seed, WIDTH, HEIGHT, events=made["events"])
     values = {"seed": seed, "frontend": {"n_features": FEATURES}, "corruptions": made["corruptions"]}
+    if kind == "wrong_pose":  # the map would refuse it, and nothing would be corrupted
+        values["health"] = {"max_refused": 1.0}
     config = config_from_dict(values | settings, "synthetic_recovery")
     began = time.process_time()
     system = build_system(config, world.camera)

@@ -112,11 +112,16 @@ class HealthMonitor:
             self._jump.append(jump2)
         return verdict
 
-    def note_keyframe(self, report: KeyframeReport) -> None:
+    def note_keyframe(self, report: KeyframeReport | Failure) -> None:
         """Hold what the graph made of the newest frame against it: its newest factors' chi-square, a solver failure."""
         if not self._frames:
             return
-        newest, signs, estimate = self._frames[-1], [], report.estimate
+        newest, signs = self._frames[-1], []
+        if isinstance(report, Failure):
+            numbers = {**newest.numbers, **report.numbers}
+            self._frames[-1] = replace(newest, signs=(*newest.signs, report.reason), failed=True, numbers=numbers)
+            return
+        estimate = report.estimate
         if estimate.chi2_newest > self._config.max_keyframe_chi2 * _level(self._chi2, 1.0):
             signs.append(FailureReason.CHI_SQUARE)
         if report.solver_failed:

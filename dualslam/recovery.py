@@ -328,23 +328,28 @@ def walk_back(
     """
     n_failed = 0
     for view in views:
-        track = judge(walker.track(view))
-        if isinstance(track, Failure):
-            n_failed += 1
-            yield WalkStep(view, track, None)
-            if n_failed > max_leap_frames:
-                return
-            continue
-        n_failed = 0
-        wanted = view.index in keyframe_ids and view.index not in walker.submap.keyframes
-        report = None
-        if wanted or walker.keyframe_due(track):
-            try:
-                report = walker.insert_keyframe(track)
-            except SolverError as error:
-                log.warning("the walk back ends: %s", error)
-                return
-        yield WalkStep(view, track, report)
+        try:
+            step = _walk_one(walker, view, judge(walker.track(view)), view.index in keyframe_ids)
+        except SolverError as error:
+            log.warning("the walk back ends: %s", error)
+            return
+        yield step
+        n_failed = 0 if step.track else n_failed + 1
+        if n_failed > max_leap_frames:
+            return
+
+
+def _walk_one(walker: VisualOdometry, view: View, track: Track | Failure, is_wanted: bool) -> WalkStep:
+    """Make a frame that was posed a keyframe where it is wanted or due."""
+    if isinstance(track, Failure):
+        return WalkStep(view, track, None)
+    known = view.index in walker.submap.keyframes
+    if not (is_wanted and not known) and not walker.keyframe_due(track):
+        return WalkStep(view, track, None)
+    report = walker.insert_keyframe(track)
+    if isinstance(report, Failure):
+        return WalkStep(view, report, None)
+    return WalkStep(view, track, report)
 
 
 class Relinker:

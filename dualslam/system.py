@@ -192,8 +192,10 @@ class System:
                     report = odometry.insert_keyframe(track)
             except SolverError as error:
                 return Failure(FailureReason.SOLVER, str(error))
-            self.timer.add("graph (in mapping)", report.estimate.seconds)
             self._health.note_keyframe(report)
+            if isinstance(report, Failure):
+                return report
+            self.timer.add("graph (in mapping)", report.estimate.seconds)
             if report.estimate.rebuilt:
                 self._record.event(EventKind.GRAPH_REBUILT, view, odometry.submap.id)
         pose = FramePose(

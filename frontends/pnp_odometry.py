@@ -123,9 +123,11 @@ class PnpOdometry:
         """Whether the frame should become a keyframe: in any case after a leap, which only its landmarks tie down."""
         return track.wide or self._live.keyframe_due(track)
 
-    def insert_keyframe(self, track: Track) -> KeyframeReport:
+    def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
         """Make the frame a keyframe and solve the graph."""
         report = self._live.insert_keyframe(track)
+        if isinstance(report, Failure):
+            return report
         self._map.put(track.view.index, track.view.index, se3.inverse(self.submap.T_submap_kf[track.view.index]))
         return report
 

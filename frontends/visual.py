@@ -15,7 +15,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend, KeyframeReport, SubmapGraph
 from dualslam.core.submap import Submap
 from dualslam.core.submap_change import change_of_frame
-from dualslam.core.types import Failure, FloatArray, Track, View
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from frontends.keyframing import keyframe_due
 from frontends.mapper import Mapper
 from frontends.tracker import GivenPose, Tracker
@@ -96,19 +96,43 @@ class VisualFrontEnd:
         """Whether the frame should become a keyframe."""
         return keyframe_due(track, self.submap, self._reference_id, self._config.keyframes)
 
-    def insert_keyframe(self, track: Track) -> KeyframeReport:
-        """Make the frame a keyframe: extend the map, solve its graph, drop what the solution contradicts."""
+    def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
+        """Make the frame a keyframe: extend the map, solve its graph, drop what the solution contradicts.
+
+        Where that is most of what the frame was tracked by, the frame's pose is wrong: the map is left without it.
+        """
         mapping = self._mapper.insert(track)
+        matched = self._rows_matched_by(track)
         rebuild = self._rebuild_due(track)
         estimate = self.graph.rebuild(self.submap) if rebuild else self.graph.update(self.submap)
         self.submap.apply_estimate(*estimate.values)
         self.submap.remove_outliers(estimate.outlier_rows)
+        n_refused = int(np.isin(matched, estimate.outlier_rows).sum())
+        if n_refused > self._config.health.max_refused * len(matched):
+            self._withdraw(track.view.index)
+            detail = f"the map contradicts {n_refused} of {len(matched)} matches of keyframe {track.view.index}"
+            return Failure(FailureReason.CHI_SQUARE, detail, {"n_refused": float(n_refused)})
         self._meet(track.view.index)
         culled = self._cull_keyframe()
         self._tracker.refresh()
         return KeyframeReport(
             mapping, estimate, len(estimate.outlier_rows), culled, solver_failed=estimate.rebuilt and not rebuild
         )
+
+    def _rows_matched_by(self, track: Track) -> IntArray:
+        """Return the observations by which a keyframe's frame was tracked (not those that mapping added)."""
+        obs = self.submap.observations
+        in_keyframe = (obs["kf"] == track.view.index) & obs["alive"]
+        return np.flatnonzero(in_keyframe & np.isin(obs["landmark"], track.landmark_ids[track.landmark_ids >= 0]))
+
+    def _withdraw(self, keyframe_id: int) -> None:
+        """Take a keyframe that the map contradicts out again, with the landmarks that only its pose placed."""
+        submap = self.submap
+        born_here = submap.landmarks["alive"] & (submap.landmarks["first_kf"] == keyframe_id)
+        submap.remove_landmarks(np.flatnonzero(born_here))
+        submap.remove_keyframe(keyframe_id, self._reference_id)
+        submap.apply_estimate(*self.graph.update(submap).values)
+        self._tracker.refresh()
 
     def _rebuild_due(self, track: Track) -> bool:
         """Whether the frame contradicts the map so much that the incremental estimate is to be made anew in batch."""

@@ -27,7 +27,8 @@ def run(degrees: float, seed: int) -> tuple[System, PointWorld]:
     world = PointWorld(cloud(), hand_held(N), covered=COVERED)
     # All points stay in view here, and few keyframes are needed; a link stands on four healthy ones at least.
     many = {"keyframes": {"max_parallax_deg": 2.0}, "mapping": {"redundant_ratio": 1.0}}
-    system = system_in(world, recovery={"enabled": True}, **many)
+    # And the map takes in whatever pose it is told, or there would be no corrupted tail.
+    system = system_in(world, recovery={"enabled": True}, health={"max_refused": 1.0}, **many)
     fault = Corruption(
         kind=CorruptionKind.WRONG_POSE, start=FORCED.start, length=len(FORCED), strength=degrees, seed=seed
     )

@@ -127,6 +127,9 @@ class HealthConfig(StrictModel):
     max_keyframe_chi2: float = Field(2.0, gt=0)
     """Early sign: chi-square of the graph's newest factors over its degrees of freedom, relative to that level. They
     hold outliers that no one has sorted out yet, and no quantile is known for them."""
+    max_refused: float = Field(0.5, ge=0, le=1)
+    """Share of a new keyframe's matches that its graph may refuse: where the map contradicts the majority, the pose
+    is wrong, and the keyframe is taken out again before the map grows about it. 1 lets every pose in."""
     level_frames: int = Field(60, ge=10)
     """Healthy frames on which the level of the chi-square and the error of the motion model are measured."""
     sign_weight: int = Field(4, ge=1)

@@ -349,6 +349,6 @@ class VisualOdometry(Protocol):
         """Whether the frame should become a keyframe."""
         ...
 
-    def insert_keyframe(self, track: Track) -> KeyframeReport:
+    def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
         """Make the frame a keyframe and solve the graph."""
         ...

@@ -123,7 +123,7 @@ class _FaultyOdometry:
         known = track.view.index in self._inner.submap.keyframes
         return (forced and not known) or self._inner.keyframe_due(track)
 
-    def insert_keyframe(self, track: Track) -> KeyframeReport:
+    def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
         if self._script.solver_fails(track.view.index):
             raise SolverError(f"frame {track.view.index}: the failure lab lets the solver fail here")
         return self._inner.insert_keyframe(track)

@@ -22,9 +22,9 @@ from tests.point_world import PointWorld, cloud, hand_held, system_in
 N = 45
 
 
-def run(*corruptions: dict[str, object]) -> System:
+def run(*corruptions: dict[str, object], **settings: object) -> System:
     world = PointWorld(cloud(), hand_held(N))
-    system = system_in(world)
+    system = system_in(world, **settings)
     script = FaultScript([Corruption.model_validate(c) for c in corruptions])
     system._parts = replace(
         system._parts,
@@ -79,9 +79,22 @@ def test_too_few_features_lose_the_track() -> None:
     assert system.rows[26].status is FrameStatus.TRACKED
 
 
-def test_a_wrong_pose_goes_into_the_map_as_a_keyframe() -> None:
+def test_a_wrong_pose_that_the_map_contradicts_is_taken_out_again() -> None:
+    """The frame is lost, for a reason that says so; nothing of it stays, and the next frames are as good as ever."""
+    clean, faulty = run(), run({"kind": "wrong_pose", "start": 25, "length": 1, "strength": 15})
+    assert faulty.rows[25].status is FrameStatus.LOST
+    assert [i for i in range(5, N) if faulty.rows[i].status is not FrameStatus.TRACKED] == [25]
+    assert not faulty.events.of_kind(EventKind.FAILED)
+    (submap,) = faulty.atlas.submaps.values()
+    assert 25 not in submap.keyframes
+    assert not (submap.landmarks["alive"] & (submap.landmarks["first_kf"] == 25)).any()
+    assert clean_to_faulty_deg(clean, faulty, 40) < 0.2
+
+
+def test_a_wrong_pose_goes_into_the_map_as_a_keyframe_where_nothing_is_refused() -> None:
     """By the angle that was asked for, and by as much of the depth; the frames before it are not touched."""
-    clean, faulty = run(), run({"kind": "wrong_pose", "start": 25, "length": 1, "strength": 8})
+    fault = {"kind": "wrong_pose", "start": 25, "length": 1, "strength": 8}
+    clean, faulty = run(), run(fault, health={"max_refused": 1.0})
     submap = faulty.atlas.submaps[0]
     assert 25 in submap.keyframes
     before = [i for i in clean.poses if i < 25]
