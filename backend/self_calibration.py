@@ -29,7 +29,7 @@ from backend import convert
 from backend.factors import baseline_factor, pose_prior
 from backend.membership import MIN_DEPTH_MU, compute_depth_sigmas, compute_residuals
 from backend.noise import PixelNoise
-from backend.solver import GTSAM_ERRORS
+from backend.solver import GTSAM_ERRORS, SolverFailure
 from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import Camera
 from dualslam.core.corrected_camera import LensCorrection, correction_of, given_camera
@@ -124,8 +124,7 @@ def estimate_correction(
         best = _optimise(problem, present.vector, prior, robust_k)
         correction, covariance = _weigh(best, prior, config.inflation * best.noise_ratio)
     except (*GTSAM_ERRORS, np.linalg.LinAlgError) as error:
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        return Failure(FailureReason.SOLVER, " ".join(lines[:2])[:200])
+        return Failure(FailureReason.SOLVER, str(SolverFailure.of(error)))
     off = correction - present.vector
     distance2 = float(off @ np.linalg.solve(covariance, off))
     estimate = CalibrationEstimate(

@@ -51,10 +51,13 @@ class SolverFailure(Exception):  # noqa: N818 - caught inside backend, never lea
     @classmethod
     def of(cls, error: Exception) -> SolverFailure:
         """Make one of an exception of GTSAM, whose text may name a variable."""
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        message = " ".join(lines[:2])[:200] if lines else type(error).__name__
         found = re.search(r"variable\s+(\d+)", str(error))
-        return cls(message, int(found.group(1)) if found else None)
+        key = int(found.group(1)) if found else None
+        if key is not None and "ndeterminate" in str(error):
+            kind, number = ("keyframe", convert.keyframe_of(key)) if convert.is_pose_key(key) else ("landmark", key)
+            return cls(f"nothing fixes {kind} {number}, or others that hang on it", key)
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        return cls(" ".join(lines[:2])[:200] if lines else type(error).__name__, key)
 
 
 class IncrementalSolver:
