@@ -8,7 +8,7 @@ from dualslam.core.types import Failure, FloatArray, FrameStatus
 
 
 @dataclass(slots=True)
-class FrameRow:
+class FrameRecord:
     """What became of one frame so far; a later walk back in time may still pose it."""
 
     index: int

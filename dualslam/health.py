@@ -16,6 +16,7 @@ import numpy as np
 from dualslam.core.config import HealthConfig
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import KeyframeReport
+from dualslam.core.support import find_lack_of_support
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track
 
 MEMORY_FRAMES = 300
@@ -38,15 +39,8 @@ def judge_track(track: Track | Failure, config: HealthConfig) -> Track | Failure
     """
     if isinstance(track, Failure):
         return track
-    numbers = {"n_matches": float(track.n_matches), "n_inliers": float(track.n_inliers), "chi2": track.chi2}
-    if track.n_inliers < config.min_inliers:
-        return Failure(FailureReason.TOO_FEW_INLIERS, f"{track.n_inliers} landmarks agree with the pose", numbers)
-    ratio = track.n_inliers / max(track.n_matches, 1)
-    if ratio < config.min_inlier_ratio:
-        return Failure(FailureReason.LOW_INLIER_RATIO, f"{ratio:.0%} of the matches agree with the pose", numbers)
-    if track.chi2 > config.max_chi2:
-        return Failure(FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {track.chi2:.1f}", numbers)
-    return track
+    lack = find_lack_of_support(track.n_inliers, track.n_matches, track.chi2, config)
+    return track if lack is None else lack
 
 
 @dataclass(frozen=True, slots=True)

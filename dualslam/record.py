@@ -9,7 +9,7 @@ from dualslam.atlas import Atlas
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.stage_timer import StageTimer
 from dualslam.core.types import FrameStatus
-from dualslam.frame_records import FrameRow
+from dualslam.frame_records import FrameRecord
 from dualslam.trajectory import FramePose
 
 
@@ -34,7 +34,7 @@ class Record:
     Attributes
     ----------
     atlas : Atlas
-    rows : dict of int to FrameRow
+    rows : dict of int to FrameRecord
         Every frame that was given to the system, by its index.
     poses : dict of int to FramePose
     events : EventLog
@@ -42,7 +42,7 @@ class Record:
     """
 
     atlas: Atlas = field(default_factory=Atlas)
-    rows: dict[int, FrameRow] = field(default_factory=dict)
+    rows: dict[int, FrameRecord] = field(default_factory=dict)
     poses: dict[int, FramePose] = field(default_factory=dict)
     events: EventLog = field(default_factory=EventLog)
     timer: StageTimer = field(default_factory=StageTimer)

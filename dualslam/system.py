@@ -20,7 +20,7 @@ from dualslam.core.interfaces import MapStarter, SubmapGraph, VisualOdometry
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, Start, Track, View
 from dualslam.frame_buffer import FrameBuffer
-from dualslam.frame_records import FrameResult, FrameRow
+from dualslam.frame_records import FrameRecord, FrameResult
 from dualslam.health import HealthMonitor, count_signs
 from dualslam.merging import carry_links
 from dualslam.record import Record
@@ -54,7 +54,7 @@ class System:
     Attributes
     ----------
     atlas : Atlas
-    rows : dict of int to FrameRow
+    rows : dict of int to FrameRecord
         Every frame that was given to `step`, by its index.
     poses : dict of int to FramePose
     events : EventLog
@@ -96,7 +96,7 @@ class System:
         FrameResult
         """
         started = time.perf_counter()
-        self.rows[frame.index] = FrameRow(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
+        self.rows[frame.index] = FrameRecord(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
         # 1. What walks back in time have found meanwhile comes into the map between two frames.
         self._recoveries.collect(self._live, frame)
         # 2. Features, into the buffer that a walk back in time will read.

@@ -16,7 +16,7 @@ itself, sees the same points where they should be.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import BundleAdjuster, Frontend, KeyframeReport, SubmapGraph
 from dualslam.core.submap import Submap
+from dualslam.core.support import find_lack_of_support
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray, Matches, Track, View
 from frontends.gates import CHI2_1DOF_95, CHI2_2DOF_99, MIN_CONSENSUS
 from frontends.guest_map import GuestMap, triangulate
@@ -238,9 +239,7 @@ class PnpOdometry:
         return GivenPose(found.T_cam_w, len(rows), found.n_inliers, chi2, found.covariance, wide=False)
 
     def _healthy(self, n_inliers: int, n_matches: int, chi2: float) -> bool:
-        health = self._config.health
-        enough = n_inliers >= max(health.min_inliers, health.min_inlier_ratio * n_matches)
-        return enough and chi2 <= health.max_chi2
+        return find_lack_of_support(n_inliers, n_matches, chi2, self._config.health) is None
 
     # --- over a gap
 
@@ -303,10 +302,9 @@ class PnpOdometry:
         limit = self._config.recovery.max_leap_scale_sigma
         if isinstance(wide, Failure):
             return wide
-        n = int(wide.inliers.sum())
-        if not self._healthy(n, len(wide.inliers), wide.chi2):
-            detail = f"{n} of {len(wide.inliers)} tracks agree, chi-square {wide.chi2:.1f}"
-            return Failure(FailureReason.TOO_FEW_INLIERS, detail, wide.numbers)
+        lack = find_lack_of_support(int(wide.inliers.sum()), len(wide.inliers), wide.chi2, self._config.health)
+        if lack is not None:
+            return replace(lack, numbers=wide.numbers)
         if wide.scale_sigma > limit:
             return Failure(FailureReason.SCALE, f"the scale beyond is known to {wide.scale_sigma:.1%}", wide.numbers)
         return wide

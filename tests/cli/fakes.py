@@ -14,7 +14,7 @@ from dualslam.core.stage_timer import StageTimer
 from dualslam.core.submap import Submap
 from dualslam.core.types import Features, FloatArray, Frame, FrameStatus, Keyframe
 from dualslam.frame_buffer import FrameBuffer
-from dualslam.frame_records import FrameResult, FrameRow
+from dualslam.frame_records import FrameRecord, FrameResult
 from dualslam.trajectory import FramePose
 
 NO_FEATURES = Features(
@@ -38,7 +38,7 @@ class FakeSystem:
         before_step: Callable[[Frame], None] = lambda frame: None,
     ) -> None:
         self.atlas = Atlas()
-        self.rows: dict[int, FrameRow] = {}
+        self.rows: dict[int, FrameRecord] = {}
         self.poses: dict[int, FramePose] = {}
         self.events = EventLog()
         self.timer = StageTimer()
@@ -70,7 +70,7 @@ class FakeSystem:
 
     def _result(self, frame: Frame, status: FrameStatus) -> FrameResult:
         submap_id = None if self._submap is None else self._submap.id
-        self.rows[frame.index] = FrameRow(frame.index, frame.timestamp_s, status, submap_id, 100, 90, 5.0)
+        self.rows[frame.index] = FrameRecord(frame.index, frame.timestamp_s, status, submap_id, 100, 90, 5.0)
         return FrameResult(frame.index, status, submap_id, None, 100, 90, 5.0, None)
 
 

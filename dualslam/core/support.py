@@ -1,0 +1,28 @@
+"""Whether enough of what a frame sees agrees with a pose."""
+
+from __future__ import annotations
+
+from dualslam.core.config import HealthConfig
+from dualslam.core.types import Failure, FailureReason
+
+
+def find_lack_of_support(n_inliers: int, n_matches: int, chi2: float, config: HealthConfig) -> Failure | None:
+    """Return what a pose lacks, or None where its matches explain it.
+
+    Parameters
+    ----------
+    n_inliers, n_matches : int
+        Matches that agree with the pose, and all of them.
+    chi2 : float
+        Of those that agree, over the degrees of freedom.
+    config : HealthConfig
+    """
+    numbers = {"n_matches": float(n_matches), "n_inliers": float(n_inliers), "chi2": chi2}
+    if n_inliers < config.min_inliers:
+        return Failure(FailureReason.TOO_FEW_INLIERS, f"{n_inliers} landmarks agree with the pose", numbers)
+    ratio = n_inliers / max(n_matches, 1)
+    if ratio < config.min_inlier_ratio:
+        return Failure(FailureReason.LOW_INLIER_RATIO, f"{ratio:.0%} of the matches agree with the pose", numbers)
+    if chi2 > config.max_chi2:
+        return Failure(FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {chi2:.1f}", numbers)
+    return None
