@@ -252,15 +252,18 @@ class Mapper:
         ids = submap.landmark_of[k][feature]
         if len(ids) == 0:
             return True
-        octave_of = dict(zip(ids.tolist(), submap.keyframes[k].features.octave[feature].tolist(), strict=True))
+        own = np.zeros(len(submap.landmarks), np.int64)
+        own[ids] = submap.keyframes[k].features.octave[feature]
         rows = submap.rows_of_landmarks(ids)
         obs = submap.observations
         rows = rows[obs["kf"][rows] != k]
+        rows = rows[np.argsort(obs["kf"][rows], kind="stable")]
+        others, starts = np.unique(obs["kf"][rows], return_index=True)
+        octaves = [
+            submap.keyframes[other].features.octave[obs["feature"][here]]
+            for other, here in zip(others.tolist(), np.split(rows, starts[1:]), strict=False)
+        ]
         landmark = obs["landmark"][rows]
-        octave = np.empty(len(rows), np.int64)
-        for other in np.unique(obs["kf"][rows]).tolist():
-            here = obs["kf"][rows] == other
-            octave[here] = submap.keyframes[other].features.octave[obs["feature"][rows[here]]]
-        own = np.array([octave_of[j] for j in landmark.tolist()])
-        as_fine = np.bincount(landmark[octave <= own + 1], minlength=len(submap.landmarks))
+        octave = np.concatenate(octaves) if octaves else landmark
+        as_fine = np.bincount(landmark[octave <= own[landmark] + 1], minlength=len(submap.landmarks))
         return float((as_fine[ids] >= N_OTHERS).mean()) > self._config.redundant_ratio

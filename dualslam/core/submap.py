@@ -180,17 +180,18 @@ class Submap:
 
     def merge_landmarks(self, keep: IntArray, drop: IntArray) -> None:
         """Make each ``drop[i]`` one with ``keep[i]``: its observations move over, save where both are in a keyframe."""
+        rows_of = self._rows_by_landmark([self.current_id(j) for j in (*keep.tolist(), *drop.tolist())])
         for kept, dropped in zip(keep.tolist(), drop.tolist(), strict=True):
             kept, dropped = self.current_id(kept), self.current_id(dropped)
             if kept == dropped:
                 continue
             obs = self.observations
-            rows = np.flatnonzero(obs["alive"] & (obs["landmark"] == dropped))
-            taken = obs["kf"][obs["alive"] & (obs["landmark"] == kept)]
+            rows, taken = rows_of[dropped], obs["kf"][rows_of[kept]]
             kf, feature = obs["kf"][rows], obs["feature"][rows]
             self.remove_observations(rows)
             free = ~np.isin(kf, taken)
-            self.add_observations(kf[free], feature[free], np.full(int(free.sum()), kept))
+            moved = self.add_observations(kf[free], feature[free], np.full(int(free.sum()), kept))
+            rows_of[kept] = np.concatenate((rows_of[kept], moved))
             lm = self.landmarks
             lm["alive"][dropped] = False
             lm["replaced_by"][dropped] = kept
@@ -250,6 +251,14 @@ class Submap:
         """Return the live observation rows of a set of landmarks."""
         wanted = self._mask(landmark_ids)
         return np.flatnonzero(self.observations["alive"] & wanted[self.observations["landmark"]])
+
+    def _rows_by_landmark(self, landmark_ids: list[int]) -> dict[int, IntArray]:
+        """Return the live observation rows of each landmark, ascending."""
+        rows = self.rows_of_landmarks(np.array(landmark_ids, np.int64))
+        rows = rows[np.argsort(self.observations["landmark"][rows], kind="stable")]
+        ids, starts = np.unique(self.observations["landmark"][rows], return_index=True)
+        found = dict(zip(ids.tolist(), np.split(rows, starts[1:]), strict=False))
+        return {j: found.get(j, rows[:0]) for j in landmark_ids}
 
     def n_observations(self, landmark_ids: IntArray) -> IntArray:
         """Return how many keyframes see each landmark."""
