@@ -21,7 +21,7 @@ from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Features, Frame, View
 from dualslam.evaluation.failure_lab import FaultScript
 from dualslam.health import judge_track
-from dualslam.linking import DescriptorMatcher, estimate_link
+from dualslam.linking import DescriptorMatcher, carry_to_live_end, estimate_link
 from dualslam.recoveries import InlineExecutor, RecoveryExecutor
 from dualslam.recovery import Attempt, RecoveryJob, RecoveryParts
 from dualslam.system import Components, System
@@ -150,6 +150,7 @@ def recovery_parts(
         link=lambda old, new, onset: estimate_link(
             old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
         ),
+        carry=lambda link, new, live: carry_to_live_end(link, new, live, config.linking),
         judge=lambda track: judge_track(track, config.health),
         config=config.recovery,
         fusion=config.fusion,

@@ -25,7 +25,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry
 from dualslam.core.submap import Submap
-from dualslam.core.types import Failure, FailureReason, Track, View
+from dualslam.core.types import Failure, FailureReason, IntArray, Track, View
 from dualslam.linking import LinkEstimate
 from dualslam.seam import SeamReport, refine_seam
 from dualslam.trajectory import FramePose
@@ -34,6 +34,7 @@ log = logging.getLogger(__name__)
 
 Judge = Callable[[Track | Failure], Track | Failure]
 Linker = Callable[[Submap, Submap, int | None], LinkEstimate | Failure]
+Carry = Callable[[LinkEstimate, Submap, IntArray], LinkEstimate | Failure]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,6 +130,7 @@ class RecoveryParts:
     attempts: tuple[Attempt, ...]
     new_graph: Callable[[], SubmapGraph]
     link: Linker
+    carry: Carry
     judge: Judge
     config: RecoveryConfig
     fusion: FusionConfig
@@ -237,16 +239,22 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float
 
 
 def _fused(tried: LinkTry, job: RecoveryJob, submap: Submap, attempt: str, parts: RecoveryParts) -> FoundLink | Failure:
-    """Refine the seam and with it the link; a failure where there is none, or where the refined seam contradicts it."""
-    link = tried.result
+    """Refine the seam and with it the link, which must hold as far as where the walk set out, before it and after."""
+    if isinstance(tried.result, Failure):
+        return tried.result
+    live = np.array(sorted(job.submap.keyframes))
+    link = parts.carry(tried.result, submap, live)
     if isinstance(link, Failure):
         return link
-    seam = refine_seam(job.lost[tried.old_id], submap, link, parts.new_graph, parts.link, parts.fusion)
+    seam = refine_seam(job.lost[tried.old_id], submap, tried.result, parts.new_graph, parts.link, parts.fusion)
     if isinstance(seam, Failure):
-        contradicted = seam.reason is FailureReason.CONTRADICTION
-        return seam if contradicted else FoundLink(tried.old_id, link, seam, attempt)
+        unrefined = seam.reason in (FailureReason.DISABLED, FailureReason.SOLVER)
+        return FoundLink(tried.old_id, link, seam, attempt) if unrefined else seam
+    link = parts.carry(seam.link, seam.submap, live)
+    if isinstance(link, Failure):
+        return link
     submap.take_over(seam.submap)
-    return FoundLink(tried.old_id, seam.link, seam.report, attempt)
+    return FoundLink(tried.old_id, link, seam.report, attempt)
 
 
 def _walked(walker: VisualOdometry, view: View, track: Track) -> WalkedFrame:

@@ -107,8 +107,8 @@ def refine_seam(
     Returns
     -------
     Seam or Failure
-        `CONTRADICTION` where the larger overlap gives another similarity: one of the two is wrong. All other reasons
-        say that the seam could not be refined.
+        `CONTRADICTION` where the larger overlap gives another similarity: one of the two is wrong. `DISABLED` and
+        `SOLVER` say that the seam could not be refined. All others that the larger overlap gives no link.
     """
     if config.seam_keyframes == 0:
         return Failure(FailureReason.DISABLED, "no keyframes of the old map are taken in")

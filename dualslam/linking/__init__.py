@@ -2,10 +2,19 @@
 
 In reading order: `correspondences` (which landmarks are the same), `estimate` (the decision, step by step), `timeline`
 (what the keyframes say one by one, in order of time), `shape` (how the maps differ beyond a similarity), `verify` (the
-gates); below them `pairs`, the matches as measurements.
+gates), `live_end` (whether the new map bears the link to where it is needed); below them `pairs`, the matches as
+measurements, and `rigidity`, how firmly a map holds its scale.
 """
 
 from dualslam.linking.correspondences import Correspondences, DescriptorMatcher, propose_correspondences
 from dualslam.linking.estimate import LinkEstimate, estimate_link
+from dualslam.linking.live_end import carry_to_live_end
 
-__all__ = ["Correspondences", "DescriptorMatcher", "LinkEstimate", "estimate_link", "propose_correspondences"]
+__all__ = [
+    "Correspondences",
+    "DescriptorMatcher",
+    "LinkEstimate",
+    "carry_to_live_end",
+    "estimate_link",
+    "propose_correspondences",
+]

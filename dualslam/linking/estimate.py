@@ -176,6 +176,16 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
     contradicted = ~consensus.votes.agrees[has_say & (pairs.keyframes < oldest)]
     if np.count_nonzero(contradicted) > config.max_misfits:
         return Failure(FailureReason.AGREEMENT, f"{np.count_nonzero(contradicted)} older keyframes disagree")
+    # Newer keyframes that nothing speaks against, and that part with it all the same: enough of them for another link.
+    whole = PairModel(all_pairs, old, new, config.deformation_sigma)
+    later = ask_keyframes(whole, consensus.estimate.S_dst_src, config)
+    agreeing = pairs.keyframes[consensus.keyframes]
+    newer = later.has_say & (all_pairs.keyframes > agreeing[-1])
+    parted = all_pairs.keyframes[newer & ~later.agrees & (all_pairs.keyframes < (np.inf if onset is None else onset))]
+    if len(parted) >= config.min_keyframes:
+        refused = verify.check_parting(old, new, agreeing, parted, config)
+        if refused is not None:
+            return refused
     # How far the maps' shapes differ beyond it: that is part of what is not known.
     S_old_new = consensus.estimate.S_dst_src
     shape = measure_shape(model, S_old_new, consensus.inliers, consensus.keyframes)
@@ -186,8 +196,7 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
     refused = _verify(model, old, consensus, covariance, shape, config)
     if refused is not None:
         return refused
-    whole = PairModel(all_pairs, old, new, config.deformation_sigma)
-    return _link(model, whole, consensus, covariance, shape, onset, limit, config)
+    return _link(model, whole, later, consensus, covariance, shape, onset, limit, config)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -312,6 +321,7 @@ def _verify(
 def _link(
     model: PairModel,
     whole: PairModel,
+    later: KeyframeVotes,
     consensus: _Consensus,
     covariance: FloatArray,
     shape: Shape,
@@ -319,12 +329,10 @@ def _link(
     limit: int | None,
     config: LinkingConfig,
 ) -> LinkEstimate:
-    """Pack a verified consensus."""
+    """Pack a verified consensus. `later`: what all keyframes say to it, asked of all pairs as the maps hold them."""
     c, estimate, votes = model.pairs, consensus.estimate, consensus.votes
     S = estimate.S_dst_src
-    # Beyond the keyframes that it stands on, all pairs are asked as the maps hold them.
     every = whole.pairs
-    later = ask_keyframes(whole, S, config)
     after = np.flatnonzero(later.has_say & (every.keyframes > c.keyframes[consensus.keyframes][-1]))
     misfits = np.flatnonzero(~later.agrees[after])
     change_point = int(every.keyframes[after[misfits[0]]]) if len(misfits) else None

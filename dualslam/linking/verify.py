@@ -9,8 +9,9 @@ import numpy as np
 from dualslam.core.config import LinkingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.submap import Submap
-from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
+from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking.pairs import PairModel
+from dualslam.linking.rigidity import scale_sigma_between
 from dualslam.linking.shape import Shape
 
 
@@ -62,6 +63,25 @@ def check_spread(
     if np.median(ranges) < config.min_depth_spread:
         return Failure(FailureReason.SPREAD, f"depths differ by {np.median(ranges):.1%}", numbers)
     return None
+
+
+def check_parting(
+    old: Submap, new: Submap, agreeing: IntArray, parted: IntArray, config: LinkingConfig
+) -> Failure | None:
+    """Refuse where maps that agree at some keyframes (ids) part at newer ones, unless it is the old one that gave way.
+
+    One of the two is bent in between. Is it the old one, the link holds and goes round its tail; is it the new one, the
+    link is true where it is measured and wrong at the live end, for which it is made. What parts them is shared out in
+    proportion to their variances between the two places, so the old map is to blame only where it is the looser one by
+    far.
+    """
+    sigma_old, sigma_new = (scale_sigma_between(m, agreeing, parted, config.pixel_chi2) for m in (old, new))
+    if math.isfinite(sigma_new) and sigma_old > config.gate_sigmas * sigma_new:
+        return None
+    numbers = {"parted": float(len(parted)), "change_point": float(parted[0])}
+    numbers |= {"held_old": sigma_old, "held_new": sigma_new}
+    detail = f"the maps part at {len(parted)} newer keyframes, and either may be the bent one"
+    return Failure(FailureReason.AGREEMENT, detail, numbers)
 
 
 def check_sigmas(

@@ -31,6 +31,8 @@ BATCH = 64
 """Hypotheses scored at a time."""
 N_REFINED = 5
 """How many of the best hypotheses are refined before one is chosen."""
+SAME_BASIN = 0.9
+"""Share of a hypothesis' inliers among those of a refined one at which the two are the same."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,10 +153,29 @@ def estimate_sim3_robust(
     hypotheses, n_tried = _ransac(problem, rng, chi2_gate, max_hypotheses, confidence, scale_bounds)
     if not len(hypotheses):
         return Failure(FailureReason.DEGENERATE, f"no triplet of {n} matches spans a plane", {"n": float(n)})
-    refined = [_refine(problem, S, chi2_gate) for S in hypotheses]
-    costs = [np.minimum(problem.mahalanobis2(S[None])[0], chi2_gate).sum() for S in refined]
-    S = refined[int(np.argmin(costs))]
+    S = _best_refined(problem, hypotheses, chi2_gate)
     return _judge(problem, S, rows, len(src), n_tried, chi2_gate, min_inliers, scale_bounds)
+
+
+def _best_refined(problem: _Sim3Problem, hypotheses: FloatArray, gate: float) -> FloatArray:
+    """Refine hypotheses, best first, and return the one of the least truncated cost.
+
+    One whose inliers are nearly all among those of a refined one would come to the same, and is passed over.
+    """
+    best: tuple[float, FloatArray] | None = None
+    found: list[BoolArray] = []
+    for hypothesis in hypotheses:
+        near = problem.mahalanobis2(hypothesis[None])[0] < gate
+        if any(np.count_nonzero(near & known) >= SAME_BASIN * np.count_nonzero(near) for known in found):
+            continue
+        S = _refine(problem, hypothesis, gate)
+        d2 = problem.mahalanobis2(S[None])[0]
+        cost = float(np.minimum(d2, gate).sum())
+        found.append(d2 < gate)
+        if best is None or cost < best[0]:
+            best = cost, S
+    assert best is not None
+    return best[1]
 
 
 def _ransac(

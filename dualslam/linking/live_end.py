@@ -1,0 +1,47 @@
+"""From the overlap, where a link is measured, to the new map's live end, for which it is made."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from dualslam.core.config import LinkingConfig
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.submap import Submap
+from dualslam.core.types import Failure, FailureReason, IntArray
+from dualslam.linking.estimate import LinkEstimate
+from dualslam.linking.rigidity import scale_sigma_between
+
+
+def carry_to_live_end(
+    link: LinkEstimate, new: Submap, live_keyframes: IntArray, config: LinkingConfig
+) -> LinkEstimate | Failure:
+    """Add to a link's covariance what the walk back has lost of the scale, and refuse it where that is too much.
+
+    Parameters
+    ----------
+    link : LinkEstimate
+    new : Submap
+        As the walk has left it.
+    live_keyframes : IntArray
+        Keyframes that it had before the walk (ids).
+    config : LinkingConfig
+
+    Returns
+    -------
+    LinkEstimate or Failure
+        With `sigma_scale` in its numbers as it is at the live end, and the walk's share of it, `sigma_scale_walk`.
+    """
+    walk = scale_sigma_between(new, link.agreeing_keyframes, live_keyframes, config.pixel_chi2)
+    sigma = math.hypot(link.numbers["sigma_scale"], walk)
+    numbers = {"sigma_scale": sigma, "sigma_scale_walk": walk}
+    if sigma > config.max_live_scale_sigma:
+        detail = f"scale known to {sigma:.1%} at the live end, {walk:.1%} of it by the walk"
+        return Failure(FailureReason.SCALE, detail, numbers)
+    # The live end grows and shrinks about the place where the maps overlap.
+    held = [k for k in link.agreeing_keyframes.tolist() if k in new.keyframes]
+    about = sim3.adjoint(se3.from_parts(np.eye(3), new.keyframe_poses(held)[:, :3, 3].mean(0)))
+    covariance = link.covariance + walk**2 * np.outer(about[:, 6], about[:, 6])
+    return replace(link, covariance=covariance, numbers=link.numbers | numbers)
