@@ -132,7 +132,7 @@ def _link_errors(outcome: Outcome, truth: Trajectory) -> tuple[LinkError, ...]:
     index = np.array([pose.index for pose in poses], np.int64)
     true = truth_by_frame(index, np.array([pose.timestamp_s for pose in poses]), truth) if poses else {}
     audits = audit_links(outcome.system.atlas, poses, true)
-    return tuple(LinkError(a.scale, a.rotation_deg, a.position) for a in audits if not isinstance(a, Failure))
+    return tuple(LinkError(a.worst_scale, a.rotation_deg, a.position) for a in audits if not isinstance(a, Failure))
 
 
 def _place(path: str, data: Path | None) -> str:

@@ -150,7 +150,7 @@ def recovery_parts(
         link=lambda old, new, onset: estimate_link(
             old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
         ),
-        carry=lambda link, new, live: carry_to_live_end(link, new, live, config.linking),
+        carry=lambda link, new, newest_id: carry_to_live_end(link, new, newest_id, config.linking),
         judge=lambda track: judge_track(track, config.health),
         config=config.recovery,
         fusion=config.fusion,

@@ -5,8 +5,7 @@ old map's poses or landmarks: a link must not confirm itself. What it takes from
 keyframes, so that both maps hold the same ones. Several attempts, each with poses from another front end, start from
 the same snapshot one after the other until one leads to a link; what one of them got wrong does not reach the next.
 
-It is a job: a function of a snapshot that nobody else changes, so that it can run beside the tracking, in a process of
-its own, and be merged (`dualslam.merging`) when it is ready.
+It is a job on a snapshot that nobody else changes: it can run in a process of its own, and be merged when it is ready.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry
 from dualslam.core.submap import Submap
-from dualslam.core.types import Failure, FailureReason, IntArray, Track, View
+from dualslam.core.types import Failure, FailureReason, Track, View
 from dualslam.linking import LinkEstimate
 from dualslam.seam import SeamReport, refine_seam
 from dualslam.trajectory import FramePose
@@ -34,7 +33,6 @@ log = logging.getLogger(__name__)
 
 Judge = Callable[[Track | Failure], Track | Failure]
 Linker = Callable[[Submap, Submap, int | None], LinkEstimate | Failure]
-Carry = Callable[[LinkEstimate, Submap, IntArray], LinkEstimate | Failure]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,7 +128,7 @@ class RecoveryParts:
     attempts: tuple[Attempt, ...]
     new_graph: Callable[[], SubmapGraph]
     link: Linker
-    carry: Carry
+    carry: Callable[[LinkEstimate, Submap, int], LinkEstimate | Failure]
     judge: Judge
     config: RecoveryConfig
     fusion: FusionConfig
@@ -239,18 +237,18 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float
 
 
 def _fused(tried: LinkTry, job: RecoveryJob, submap: Submap, attempt: str, parts: RecoveryParts) -> FoundLink | Failure:
-    """Refine the seam and with it the link, which must hold as far as where the walk set out, before it and after."""
-    if isinstance(tried.result, Failure):
-        return tried.result
-    live = np.array(sorted(job.submap.keyframes))
-    link = parts.carry(tried.result, submap, live)
+    """Refine the seam and with it the link, which must hold as far as where the walk set out."""
+    found = tried.result
+    if isinstance(found, Failure):
+        return found
+    link = parts.carry(found, submap, job.newest_id)
     if isinstance(link, Failure):
         return link
-    seam = refine_seam(job.lost[tried.old_id], submap, tried.result, parts.new_graph, parts.link, parts.fusion)
+    seam = refine_seam(job.lost[tried.old_id], submap, found, parts.new_graph, parts.link, parts.fusion)
     if isinstance(seam, Failure):
         unrefined = seam.reason in (FailureReason.DISABLED, FailureReason.SOLVER)
         return FoundLink(tried.old_id, link, seam, attempt) if unrefined else seam
-    link = parts.carry(seam.link, seam.submap, live)
+    link = parts.carry(seam.link, seam.submap, job.newest_id)
     if isinstance(link, Failure):
         return link
     submap.take_over(seam.submap)

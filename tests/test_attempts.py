@@ -176,7 +176,8 @@ def drive(attempts: list[str]) -> tuple[System, np.ndarray]:
 @pytest.mark.parametrize("attempt", ["sift", "leap"])
 def test_a_black_out_on_the_road_is_leapt(attempt: str) -> None:
     system, truth = drive([attempt])
-    (made,) = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)
+    # Just begun, the new map may hold its scale too loosely across the gap: then it is tried again two frames later.
+    made = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)[-1]
     assert made.data["leaps"] == 1
     (link,) = system.atlas.links
     scales = []

@@ -1,13 +1,18 @@
 """Is an accepted link true? Each similarity between two submaps against the one that ground truth gives.
 
 A monocular map drifts, so that no single similarity takes the whole of it to the truth. What a link claims is local:
-how the two maps lie to each other at their seam. Truth is taken there, from the frames of either map near it.
+how the two maps lie to each other at their seam. Truth is taken there, from the frames of either map near it, and from
+no more of them than it takes to tell: what drifts farther off, before or after, is not the link's doing.
+
+With one exception. A walk back leads from the new map's start to the seam, and a scale that it loses on the way makes a
+link wrong for all that comes after, however well it fits at the seam. So the scale is judged a second time at the new
+map's live end, by the first frames that the old map never saw.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -51,6 +56,9 @@ class LinkAudit:
         How well those frames fix the true similarity: an error that is no larger is none.
     n_old, n_new : int
         Frames of either map that truth was taken from.
+    live_scale, live_scale_sigma : float or None
+        Relative error of the scale that the link gives the new map's live end, and what truth tells of it there; none
+        where the new map has no frames beyond the old one.
     """
 
     old: int
@@ -63,6 +71,8 @@ class LinkAudit:
     rotation_sigma_deg: float
     n_old: int
     n_new: int
+    live_scale: float | None = None
+    live_scale_sigma: float | None = None
 
     @property
     def position(self) -> float:
@@ -79,7 +89,22 @@ class LinkAudit:
         """Whether it is one also for all that is not known of the truth."""
         return self._is_wrong(CERTAIN_SIGMAS)
 
+    @property
+    def worst_scale(self) -> float:
+        """The error of scale at the seam, or at the live end where it is surely wrong there and larger."""
+        return self._live_error if abs(self._live_error) > abs(self.scale) else self.scale
+
+    @property
+    def _live_error(self) -> float:
+        """Error at the live end, if it is surely wrong; slow motion tells too little there to count for less."""
+        if self.live_scale is None or self.live_scale_sigma is None:
+            return 0.0
+        surely = abs(self.live_scale) - CERTAIN_SIGMAS * self.live_scale_sigma > WRONG_SCALE
+        return self.live_scale if surely else 0.0
+
     def _is_wrong(self, sigmas: float) -> bool:
+        if self._live_error:
+            return True
         scale = abs(self.scale) - sigmas * self.scale_sigma
         rotation_deg = self.rotation_deg - sigmas * self.rotation_sigma_deg
         return scale > WRONG_SCALE or rotation_deg > WRONG_ROTATION_DEG or self.position > WRONG_POSITION
@@ -102,8 +127,9 @@ def audit_links(
         True ``T_world_cam`` by frame index, for the frames that have it.
     reach : int
         Truth is taken from the frames of either map among the keyframes that a link stands on, and so many before and
-        after them (in counts of the source's index), or twice or four times as many and so on: whatever tells the scale
-        best. Slow motion tells little of it, and what lies farther off has drifted away from the seam.
+        after them (in counts of the source's index). Where those do not tell whether the scale is wrong (slow motion
+        tells little of it), twice or four times as many and so on: the fewest that do, or else those that tell most.
+        The same at the live end.
     """
     posed = list(poses)
     return [audit_link(atlas, link, posed, truth, reach) for link in atlas.links if link.kind is LinkKind.RECOVERY]
@@ -116,17 +142,11 @@ def audit_link(
     if not link.keyframes:
         return Failure(FailureReason.TOO_FEW_MATCHES, f"link {link.a}-{link.b} names no keyframes")
     known = [{i: T for i, T in _poses_in(atlas.submaps[m], poses).items() if i in truth} for m in (link.a, link.b)]
-    # Slow motion tells little of scale, and far from the seam the maps have drifted: the reach that tells most.
-    best: tuple[float, list[Side]] | None = None
-    while best is None or reach <= MAX_REACH:
-        sides = _truth_about(link, known, truth, reach)
-        if isinstance(sides, Failure):
-            return sides
-        sigma = math.hypot(*(side.scale_sigma for side in sides))
-        if best is None or sigma < best[0]:
-            best = sigma, sides
-        reach *= 2
-    a, b = best[1]
+    sides = _fewest_that_tell(lambda reach: _truth_about(link, known, truth, reach), reach)
+    if isinstance(sides, Failure):
+        return sides
+    a, b = sides
+    live = _fewest_that_tell(lambda reach: _truth_beyond(known, truth, reach), reach)
     S_true = sim3.inverse(a.S_world_submap) @ b.S_world_submap
     S_link = link.S_a_b
     # In metres, where the truth of the old map puts them.
@@ -144,7 +164,39 @@ def audit_link(
         rotation_sigma_deg=math.degrees(math.hypot(a.rotation_sigma_rad, b.rotation_sigma_rad)),
         n_old=len(a.ids),
         n_new=len(b.ids),
+        **({} if isinstance(live, Failure) else _at_the_live_end(a, live[0], S_link)),
     )
+
+
+def _fewest_that_tell(truth_within: Callable[[int], list[Side] | Failure], reach: int) -> list[Side] | Failure:
+    """Widen the reach until truth tells a wrong scale from a right one; if it never does, where it tells most."""
+    best: tuple[float, list[Side] | Failure] | None = None
+    while best is None or (reach <= MAX_REACH and CERTAIN_SIGMAS * best[0] > WRONG_SCALE):
+        sides = truth_within(reach)
+        sigma = math.inf if isinstance(sides, Failure) else math.hypot(*(side.scale_sigma for side in sides))
+        if best is None or sigma < best[0]:
+            best = sigma, sides
+        reach *= 2
+    return best[1]
+
+
+def _truth_beyond(
+    known: list[dict[int, FloatArray]], truth: Mapping[int, FloatArray], reach: int
+) -> list[Side] | Failure:
+    """Lay the new map upon the truth by the first frames that the old one never saw."""
+    last = max(known[0])
+    ids = np.array(sorted(i for i in known[1] if last < i), np.int64)
+    ids = ids[: np.searchsorted(ids, ids[0] + reach, "right")] if len(ids) else ids
+    if len(ids) < MIN_FRAMES:
+        return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(ids)} frames beyond the old map have a true pose")
+    return [align_cameras(ids, np.array([known[1][int(i)] for i in ids]), np.array([truth[int(i)] for i in ids]))]
+
+
+def _at_the_live_end(old: Side, live: Side, S_link: FloatArray) -> dict[str, float]:
+    """Return the error of scale there, and its sigma."""
+    S_true = sim3.inverse(old.S_world_submap) @ live.S_world_submap
+    error = float(sim3.scale(S_link) / sim3.scale(S_true)) - 1.0
+    return {"live_scale": error, "live_scale_sigma": math.hypot(old.scale_sigma, live.scale_sigma)}
 
 
 def _truth_about(

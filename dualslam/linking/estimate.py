@@ -11,7 +11,7 @@ to the refinement, where they would count twice.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.random import Generator
@@ -133,6 +133,15 @@ class _Overlap:
     matcher: DescriptorMatcher | None
     onset: int | None
     config: LinkingConfig
+    _by_limit: dict[int, Correspondences] = field(default_factory=dict)
+
+    def pairs_before(self, limit: int | None) -> Correspondences:
+        """Return the pairs with the old map's points placed by keyframes before `limit` alone; asked for many times."""
+        if limit is None:
+            return self.pairs
+        if limit not in self._by_limit:
+            self._by_limit[limit] = propose_correspondences(self.old, self.new, self.matcher, limit)
+        return self._by_limit[limit]
 
 
 def _is_bent(refused: LinkEstimate | Failure) -> bool:
@@ -160,11 +169,10 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
     oldest = before[0]
     # The similarity on which the oldest of them agree, and how far it holds. What lies beyond has moved landmarks of
     # the healthy part too: place those anew without it, and ask again.
-    all_pairs = pairs = overlap.pairs
+    all_pairs = overlap.pairs
     limit = onset
     while True:
-        if limit is not None:
-            pairs = propose_correspondences(old, new, overlap.matcher, limit)
+        pairs = overlap.pairs_before(limit)
         model = PairModel(pairs, old, new, config.deformation_sigma)
         has_say = pairs.count_by_keyframe(np.ones(len(pairs.view_pair), bool)) >= config.min_pairs_per_keyframe
         consensus = _oldest_consensus(model, has_say & np.isin(pairs.keyframes, before), config, rng, limit)

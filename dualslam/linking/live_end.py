@@ -10,13 +10,13 @@ import numpy as np
 from dualslam.core.config import LinkingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.submap import Submap
-from dualslam.core.types import Failure, FailureReason, IntArray
+from dualslam.core.types import Failure, FailureReason
 from dualslam.linking.estimate import LinkEstimate
 from dualslam.linking.rigidity import scale_sigma_between
 
 
 def carry_to_live_end(
-    link: LinkEstimate, new: Submap, live_keyframes: IntArray, config: LinkingConfig
+    link: LinkEstimate, new: Submap, live_since: int, config: LinkingConfig
 ) -> LinkEstimate | Failure:
     """Add to a link's covariance what the walk back has lost of the scale, and refuse it where that is too much.
 
@@ -25,8 +25,8 @@ def carry_to_live_end(
     link : LinkEstimate
     new : Submap
         As the walk has left it.
-    live_keyframes : IntArray
-        Keyframes that it had before the walk (ids).
+    live_since : int
+        The keyframe that the walk set out from: it and those after it are the live end.
     config : LinkingConfig
 
     Returns
@@ -34,7 +34,8 @@ def carry_to_live_end(
     LinkEstimate or Failure
         With `sigma_scale` in its numbers as it is at the live end, and the walk's share of it, `sigma_scale_walk`.
     """
-    walk = scale_sigma_between(new, link.agreeing_keyframes, live_keyframes, config.pixel_chi2)
+    live = np.array([k for k in new.keyframes if k >= live_since], np.int64)
+    walk = scale_sigma_between(new, link.agreeing_keyframes, live, config.pixel_chi2)
     sigma = math.hypot(link.numbers["sigma_scale"], walk)
     numbers = {"sigma_scale": sigma, "sigma_scale_walk": walk}
     if sigma > config.max_live_scale_sigma:

@@ -35,18 +35,33 @@ def submap(m: int, S: FloatArray, frames: range, T_world_cam: FloatArray) -> Sub
     return made
 
 
-def audit(S_link: FloatArray, T_world_cam: FloatArray, tail: float = 1.0) -> LinkAudit:
-    """`tail`: scale of the old map from the seam on, about the seam: corrupted, which is not the link's fault."""
+def audit(
+    S_link: FloatArray,
+    T_world_cam: FloatArray,
+    tail: float = 1.0,
+    drift: tuple[int, float] = (N, 1.0),
+    noise: float = 0.0,
+) -> LinkAudit:
+    """Audit a link between two maps.
+
+    `tail`: scale of the old map from the seam on, about the seam: corrupted, which is not the link's fault. `drift`: a
+    frame, and the scale of the new map from there on. `noise`: of the new map's centres, in its unit.
+    """
     atlas = Atlas()
     old, new = submap(0, S_OLD_WORLD, range(36), T_world_cam), submap(1, S_NEW_WORLD, range(25, N), T_world_cam)
     pivot = old.T_submap_kf[SEAM[-1]][:3, 3].copy()
     for k in range(SEAM[-1] + 1, 36):
         old.T_submap_kf[k][:3, 3] = pivot + tail * (old.T_submap_kf[k][:3, 3] - pivot)
+    rng = np.random.default_rng(0)
+    since, scale = drift
+    pivot = new.T_submap_kf[min(since, N - 1)][:3, 3].copy()
+    for k, T in new.T_submap_kf.items():
+        T[:3, 3] = pivot + (scale if k > since else 1.0) * (T[:3, 3] - pivot) + noise * rng.normal(size=3)
     atlas.add(old)
     atlas.add(new)
     atlas.link(Link(0, 1, S_link, np.eye(7), LinkKind.RECOVERY, SEAM))
     poses = [FramePose(i, 0.1 * i, int(i >= 30), i, np.eye(4)) for i in range(N)]
-    (found,) = audit_links(atlas, poses, dict(enumerate(T_world_cam)))
+    (found,) = audit_links(atlas, poses, dict(enumerate(T_world_cam)), reach=4)
     assert isinstance(found, LinkAudit)
     return found
 
@@ -83,6 +98,28 @@ def test_a_wrong_place_is_given_in_metres_of_the_world() -> None:
     found = audit(shifted, world())
     assert found.position_m == pytest.approx(1.0)
     assert found.wrong == (1.0 / found.path_m > 0.05)
+
+
+def test_a_scale_that_was_lost_on_the_way_to_the_live_end_makes_the_link_wrong() -> None:
+    found = audit(S_OLD_NEW, world(), drift=(35, 1.2))
+    assert abs(found.scale) < 1e-9  # at the seam it is true
+    assert found.live_scale == pytest.approx(0.2)
+    assert found.wrong
+    assert found.surely_wrong
+    assert found.worst_scale == pytest.approx(0.2)
+
+
+def test_what_drifts_after_the_start_is_not_the_links_fault() -> None:
+    found = audit(S_OLD_NEW, world(), drift=(45, 1.5))
+    assert not found.wrong
+    assert abs(found.worst_scale) < 1e-9
+
+
+def test_no_more_frames_count_than_it_takes_to_tell() -> None:
+    wider = audit(S_OLD_NEW, world(), noise=0.05)
+    nearer = audit(S_OLD_NEW, world(), noise=0.001)
+    assert nearer.n_new < wider.n_new
+    assert 2.0 * nearer.scale_sigma < 0.05
 
 
 def test_the_truth_of_a_noisy_map_has_its_sigma() -> None:

@@ -106,7 +106,7 @@ def linked(layout: str = "street") -> tuple[Case, LinkEstimate]:
 
 def test_a_link_is_carried_to_the_live_end_with_what_the_walk_loses() -> None:
     case, link = linked()
-    carried = carry_to_live_end(link, case.new, THERE, CONFIG)
+    carried = carry_to_live_end(link, case.new, int(THERE[0]), CONFIG)
     assert isinstance(carried, LinkEstimate)
     assert carried.numbers["sigma_scale"] > link.numbers["sigma_scale"]
     wider = np.linalg.eigvalsh(carried.covariance - link.covariance)
@@ -118,7 +118,7 @@ def test_a_walk_that_hangs_by_few_landmarks_carries_no_link() -> None:
     """There are ties enough that nothing counts as torn."""
     case, link = linked()
     for n_ties in (CONFIG.min_ties + 2, 0):
-        refused = carry_to_live_end(link, thinned(case.new, 18 * FRAME_STEP, n_ties), THERE, CONFIG)
+        refused = carry_to_live_end(link, thinned(case.new, 18 * FRAME_STEP, n_ties), int(THERE[0]), CONFIG)
         assert isinstance(refused, Failure)
         assert refused.reason is FailureReason.SCALE
 
