@@ -32,6 +32,7 @@ from frontends.motion_statistics import nearest_search
 from frontends.pnp_odometry import PnpOdometry
 from frontends.registry import check_frontend
 from frontends.registry import create_frontend as create_frontend  # part of the Python interface
+from frontends.rolling_shutter import RollingShutter, straighten
 from frontends.visual import VisualFrontEnd
 
 ADJUST_ITERATIONS = 20
@@ -89,13 +90,16 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
         adjust=lambda submap: adjust_submap(submap, config.graph.robust_k),
     )
     faults = FaultScript(config.corruptions)
+    shutter = RollingShutter(frontend, config.camera, config.seed)
+
+    def straight_view_of(frame: Frame) -> View | Failure:
+        camera, needs_images = calibration.camera, config.recovery.needs_images
+        view = view_of(frame, frontend, camera, config.camera.model_sigma_px, needs_images)
+        return view if isinstance(view, Failure) else shutter.straightened(view, camera)
+
     return System(
         Components(
-            view_of=faults.around_views(
-                lambda frame: view_of(
-                    frame, frontend, calibration.camera, config.camera.model_sigma_px, config.recovery.needs_images
-                )
-            ),
+            view_of=faults.around_views(straight_view_of),
             new_starter=lambda: Initialiser(
                 frontend, bundle_adjust_arrays, config.initialiser, calibration.camera.K, size_px, config.seed
             ),
@@ -104,6 +108,7 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
                 lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px)
             ),
             calibration=calibration,
+            shutter=shutter,
             recovery=recovery or recovery_executor(config, size_px, faults, frontend),
         ),
         config,
@@ -175,7 +180,8 @@ def _attempt(
         def extract(view: View) -> Features | Failure:
             if view.image is None:
                 return Failure(FailureReason.UNREADABLE, "its image is no longer buffered")
-            return rectify(guest.extract(view.image.pixels()), job.camera, config.camera.model_sigma_px)
+            features = rectify(guest.extract(view.image.pixels()), job.camera, config.camera.model_sigma_px)
+            return features if view.turn_rad is None else straighten(features, job.camera, view.turn_rad)
 
         walker = live(submap, graph)
         walks_live = attempt.walk == "live"

@@ -16,7 +16,7 @@ from dualslam.core.config import Config
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
-from dualslam.core.interfaces import MapStarter, SubmapGraph, VisualOdometry
+from dualslam.core.interfaces import MapStarter, Shutter, SubmapGraph, VisualOdometry
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, Start, Track, View
 from dualslam.frame_buffer import FrameBuffer
@@ -40,6 +40,7 @@ class Components:
     new_graph: Callable[[], SubmapGraph]
     new_odometry: Callable[[Submap, SubmapGraph], VisualOdometry]
     calibration: Calibration
+    shutter: Shutter
     recovery: RecoveryExecutor
 
     @property
@@ -119,6 +120,9 @@ class System:
     # --- initialising
 
     def _initialise(self, view: View) -> Track | Failure:
+        with self.timer.measure("shutter"):
+            if self._parts.shutter.learns(view, self._parts.calibration.camera):
+                view = self._straighten(view)
         with self.timer.measure("initialisation"):
             start = self._starter.add(view)
         if isinstance(start, Failure):
@@ -126,6 +130,17 @@ class System:
                 self._record.event(EventKind.INITIALISATION_REFUSED, view, None, reason=start.detail, **start.numbers)
             return start
         return self._begin_submap(start, view)
+
+    def _straighten(self, view: View) -> View:
+        """Take the shutter that was found out of the frames so far; the starter begins anew. Returns the view's own."""
+        shutter, camera = self._parts.shutter, self._parts.calibration.camera
+        self._record.event(EventKind.SHUTTER_FOUND, view, None, readout_s=shutter.readout_s)
+        self.buffer.map(lambda buffered: shutter.straightened(buffered, camera))
+        self._starter = self._parts.new_starter()
+        *waiting, newest = (v for v in self.buffer if self.rows[v.index].submap_id is None)
+        for earlier in waiting:
+            self._starter.collect(earlier)
+        return newest
 
     def _begin_submap(self, start: Start, view: View) -> Track | Failure:
         """Make a submap of a start, and pose the frames before and between by walking back in time over the buffer."""

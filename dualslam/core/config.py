@@ -29,6 +29,12 @@ class CameraConfig(StrictModel):
     model_sigma_px: float = Field(0.8, ge=0)
     """Error of the camera model itself at a pixel (one sigma), beside the noise of the features: chequerboard
     calibrations and rectified data sets are off by half a pixel to a pixel towards the rim of the image."""
+    readout_s: float | None = Field(None, ge=0, le=0.1)
+    """Time between reading the first and the last row of an image: 0 for a global shutter, about 0.03 for webcams and
+    the first Kinect. None: the frames in which there is no map are asked for it."""
+    readout_evidence: float = Field(144.0, gt=0)
+    """Chi-square by which a rolling shutter must explain those frames better than a global one: three sigmas, where
+    neighbouring pixels err alike and all errors count for four times what they seem (`calibration.inflation`)."""
 
 
 class InitialiserConfig(StrictModel):

@@ -21,6 +21,7 @@ class EventKind(StrEnum):
     GRAPH_REBUILT = "graph_rebuilt"
     CALIBRATED = "calibrated"
     CALIBRATION_KEPT = "calibration_kept"
+    SHUTTER_FOUND = "shutter_found"
     UNREADABLE = "unreadable"
     RECOVERY_STARTED = "recovery_started"
     RECOVERY_ATTEMPT = "recovery_attempt"

@@ -314,6 +314,23 @@ class MapStarter(Protocol):
         ...
 
 
+class Shutter(Protocol):
+    """Knows or finds how an image is read row by row, and takes that out of the frames' features."""
+
+    @property
+    def readout_s(self) -> float:
+        """Time between reading the first and the last row; 0: all at once, or not known yet."""
+        ...
+
+    def straightened(self, view: View, camera: Camera) -> View:
+        """Return a frame's view as if all rows had been read at once. Frames come in the order of the sequence."""
+        ...
+
+    def learns(self, view: View, camera: Camera) -> bool:
+        """Whether this view, found while there is no map, tells the readout time for the first time."""
+        ...
+
+
 class VisualOdometry(Protocol):
     """Tracks frames against one submap and extends it by keyframes, in whatever order of time the frames come."""
 

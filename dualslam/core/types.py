@@ -61,7 +61,7 @@ class Features:
     Attributes
     ----------
     uv_px : (N, 2) float64
-        Where the front end found them in the image.
+        Where the front end found them in the image; where it was read row by row, as if at the time of its middle row.
     uv_rect_px : (N, 2) float64
         The same, with lens distortion removed: pixels of the camera's pinhole equivalent. All geometry uses these.
     sigma_px : (N,) float64
@@ -118,12 +118,15 @@ class View:
         Of the live front end.
     image : GreyImage or None
         For attempts at recovery that need other features; None where it was given up.
+    turn_rad : (3,) float64 or None
+        Rotation during the readout of the image that was taken out of the features; None: nothing was.
     """
 
     index: int
     timestamp_s: float
     features: Features
     image: GreyImage | None = None
+    turn_rad: FloatArray | None = None
 
     @property
     def nbytes(self) -> int:
