@@ -120,9 +120,14 @@ class System:
     # --- initialising
 
     def _initialise(self, view: View) -> Track | Failure:
+        shutter = self._parts.shutter
         with self.timer.measure("shutter"):
-            if self._parts.shutter.learns(view, self._parts.calibration.camera):
+            readout_s = shutter.readout_s
+            may_start = shutter.may_start(view, self._parts.calibration.camera)
+            if shutter.readout_s != readout_s:
                 view = self._straighten(view)
+        if not may_start:
+            return Failure(FailureReason.DOUBTFUL_INITIALISATION, "a fast turn, and the shutter is not known yet")
         with self.timer.measure("initialisation"):
             start = self._starter.add(view)
         if isinstance(start, Failure):

@@ -17,18 +17,22 @@ from dualslam.core.geometry import so3
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Features, FloatArray, View
+from frontends.gates import CHI2_1DOF_95
 from frontends.resection import poselib_camera
 from frontends.turning import turn_between
-from frontends.two_view_hypotheses import CHI2_1
 
 STEP_S = 0.005
 READOUTS_S = STEP_S * np.arange(8)
 """Readout times that are tried: up to all of the time between frames at 30 Hz."""
-TYPICAL_S, MIN_SHIFT_PX = 0.02, 3.0
-"""A pair of views is asked where so long a readout would shift its first and last rows by so much: several times what
-lens models get wrong, which could pass for it."""
-LAG, SPACING = 3, 4
-"""Frames between the two views of a pair, and between pairs: far enough for the turn to change."""
+TYPICAL = 4
+"""Place of the readout time, 0.02 s, that must be ruled out for a shutter to count as global."""
+MIN_SHIFT_PX = 3.0
+"""A view turns fast where so long a readout would shift its first and last rows by so much: several times what lens
+models get wrong. Only there can a readout be told from that, and only there does it matter."""
+LAG, SPACING = 3, 3
+"""Frames between the views of a pair, far enough for the turn to change; and between pairs, which do not overlap."""
+MAX_PAIRS = 60
+"""Pairs after which the best readout time is taken, however unsure: waiting costs more then."""
 MIN_MATCHES = 60
 MAX_GAP = 2.5
 """Of two times between frames, how much longer the later one may be for the turn to be carried on from one to the
@@ -57,21 +61,27 @@ def straighten(features: Features, camera: Camera, turn_rad: FloatArray) -> Feat
 
 
 class TurnMeter:
-    """How the camera turns at each frame, by matches to the frame before."""
+    """How the camera turns from frame to frame, by matches.
+
+    Attributes
+    ----------
+    between_rad_s : (3,) float64 or None
+        Between the two last views; None where it could not be told.
+    """
 
     def __init__(self, frontend: Frontend) -> None:
         self._frontend = frontend
         self._last: View | None = None
-        self._rate_rad_s: FloatArray | None = None
         self._gap_s = 0.0
+        self.between_rad_s: FloatArray | None = None
 
     def rate_rad_s(self, view: View, K: FloatArray) -> FloatArray:
         """Take the next view in; return its turn (3,), rad/s, in its own axes: zero where it cannot be told.
 
         Matches tell the turn half-way between two frames; half a frame more is carried on from the two last turns.
         """
-        last, before, gap_s = self._last, self._rate_rad_s, self._gap_s
-        self._last, self._rate_rad_s = view, None
+        last, before, gap_s = self._last, self.between_rad_s, self._gap_s
+        self._last, self.between_rad_s = view, None
         if last is None:
             return np.zeros(3)
         matches = self._frontend.match_wide(last.features, view.features)
@@ -80,7 +90,7 @@ class TurnMeter:
         self._gap_s = view.timestamp_s - last.timestamp_s
         if turn is None or self._gap_s == 0:
             return np.zeros(3) if before is None else before
-        self._rate_rad_s = rate = turn / self._gap_s
+        self.between_rad_s = rate = turn / self._gap_s
         if before is None or abs(self._gap_s) > MAX_GAP * abs(gap_s):
             return rate
         return np.asarray(rate + 0.5 * (rate - before), np.float64)
@@ -100,42 +110,67 @@ class ReadoutEstimator:
         self._frontend = frontend
         self._seed = seed
         self._min_evidence = min_evidence
-        self._recent: list[tuple[View, FloatArray]] = []
+        self._recent: list[tuple[View, FloatArray | None]] = []
         self._chi2 = np.zeros(len(READOUTS_S))
+        self._n_pairs = 0
         self._n_frames = 0
 
-    def add(self, view: View, rate_rad_s: FloatArray, camera: Camera) -> float | None:
-        """Take the next view and its turn in; return the readout time, s, once it is known not to be zero."""
-        self._recent = [*self._recent[-LAG:], (view, rate_rad_s)]
+    def add(self, view: View, before_rad_s: FloatArray | None, camera: Camera) -> float | None:
+        """Take the next view in, with the turn since the one before; return the readout time, s, once it is known."""
+        self._recent = [*self._recent[-LAG - 2 :], (view, before_rad_s)]
         self._n_frames += 1
-        if len(self._recent) <= LAG or self._n_frames % SPACING:
+        if len(self._recent) < LAG + 3 or self._n_frames % SPACING:
             return None
-        (a, rate_a), (b, rate_b) = self._recent[0], self._recent[-1]
-        rows_px = 0.5 * TYPICAL_S * camera.K[0, 0] * max(np.linalg.norm(rate_a), np.linalg.norm(rate_b))
-        if rows_px < MIN_SHIFT_PX:
+        (a, to_a), (_, from_a), (b, to_b), (_, from_b) = (self._recent[n] for n in (1, 2, -2, -1))
+        if to_a is None or from_a is None or to_b is None or from_b is None:
+            return None
+        # A frame's own turn is that half-way between the turns to it and from it.
+        rate_a, rate_b = 0.5 * (to_a + from_a), 0.5 * (to_b + from_b)
+        if not (_is_fast(rate_a, camera) or _is_fast(rate_b, camera)):
             return None
         matches = self._frontend.match_wide(a.features, b.features)
         if len(matches) < MIN_MATCHES:
             return None
         of_a, of_b = a.features.take(matches.index[:, 0]), b.features.take(matches.index[:, 1])
-        chi2 = [self._misfit(of_a, rate_a * s, of_b, rate_b * s, camera) for s in READOUTS_S]
-        self._chi2 += np.array(chi2) - min(chi2)
+        self._chi2 += self._misfits(of_a, rate_a, of_b, rate_b, camera)
+        self._n_pairs += 1
         best = int(np.argmin(self._chi2))
-        known = self._chi2[0] - self._chi2[best] > self._min_evidence
+        evidence = self._chi2[0 if best else TYPICAL] - self._chi2[best]
+        known = evidence > self._min_evidence or self._n_pairs >= MAX_PAIRS
         return _minimum(self._chi2, best) if known else None
 
-    def _misfit(self, a: Features, turn_a: FloatArray, b: Features, turn_b: FloatArray, camera: Camera) -> float:
-        """Return the truncated chi-square of the best relative pose of two straightened views."""
-        uv_a, uv_b = straighten(a, camera, turn_a).uv_rect_px, straighten(b, camera, turn_b).uv_rect_px
+    def _misfits(self, a: Features, rate_a: FloatArray, b: Features, rate_b: FloatArray, camera: Camera) -> FloatArray:
+        """Return the robust chi-square (T,) of the best relative pose of two views for each readout time.
+
+        Poses come from RANSAC with the shortest and with the longest time, and are refined with each: RANSAC's own
+        scatter would drown what the times differ by.
+        """
         sigma_px = np.sqrt(0.5 * (a.sigma_px**2 + b.sigma_px**2))
         lens = poselib_camera(camera.K, (camera.width, camera.height))
-        gate = 2.0 * float(np.median(sigma_px))
-        options = {"max_epipolar_error": gate, "max_iterations": 200, "min_iterations": 50, "seed": self._seed}
-        pose, _ = poselib.estimate_relative_pose(uv_a, uv_b, lens, lens, options, {})
-        T_b_a = np.eye(4)
-        T_b_a[:3] = pose.Rt
-        error2 = sampson_error(fundamental_from_pose(camera.K, T_b_a), uv_a, uv_b)
-        return float(np.minimum(error2 / sigma_px**2, CHI2_1).sum())
+        gate_px = CHI2_1DOF_95**0.5 * float(np.median(sigma_px))
+        straight = [
+            tuple(straighten(x, camera, s * rate).uv_rect_px for x, rate in ((a, rate_a), (b, rate_b)))
+            for s in READOUTS_S
+        ]
+        ransac = {"max_epipolar_error": gate_px, "max_iterations": 500, "min_iterations": 100, "seed": self._seed}
+        first = [poselib.estimate_relative_pose(*straight[n], lens, lens, ransac, {})[0] for n in (0, -1)]
+        refine = {"loss_type": "CAUCHY", "loss_scale": gate_px, "max_iterations": 25}
+        misfits = []
+        for uv_a, uv_b in straight:
+            of_pose = []
+            for start in first:
+                pose, _ = poselib.refine_relative_pose(uv_a, uv_b, start, lens, lens, refine)
+                T_b_a = np.eye(4)
+                T_b_a[:3] = pose.Rt
+                error2 = sampson_error(fundamental_from_pose(camera.K, T_b_a), uv_a, uv_b) / sigma_px**2
+                of_pose.append(float((CHI2_1DOF_95 * np.log1p(error2 / CHI2_1DOF_95)).sum()))
+            misfits.append(min(of_pose))
+        return np.array(misfits)
+
+
+def _is_fast(rate_rad_s: FloatArray, camera: Camera) -> bool:
+    """Whether a typical readout would shift the first and last rows of such a view by more than lens errors."""
+    return bool(0.5 * READOUTS_S[TYPICAL] * camera.K[0, 0] * np.linalg.norm(rate_rad_s) > MIN_SHIFT_PX)
 
 
 def _minimum(chi2: FloatArray, best: int) -> float:
@@ -170,16 +205,18 @@ class RollingShutter:
         turn_rad = self.readout_s * self._meter.rate_rad_s(view, camera.K)
         return replace(view, features=straighten(view.features, camera, turn_rad), turn_rad=turn_rad)
 
-    def learns(self, view: View, camera: Camera) -> bool:
-        """Whether this view, found while there is no map, tells the readout time for the first time.
+    def may_start(self, view: View, camera: Camera) -> bool:
+        """Whether a map may start from this view, found while there is none; what it tells of the shutter is taken in.
 
-        A map that lives needs no other pixels than those it is made of, and a camera whose maps live needs no other
-        shutter: so nobody asks then.
+        Of a camera that turns fast, with a shutter that nobody knows, the rows' shifts would pass for parallax. While
+        a map lives nobody asks: it needs no other pixels than those that it is made of.
         """
         if self._estimator is None:
-            return False
-        readout_s = self._estimator.add(view, self._meter.rate_rad_s(view, camera.K), camera)
+            return True
+        self._meter.rate_rad_s(view, camera.K)
+        turn = self._meter.between_rad_s
+        readout_s = self._estimator.add(view, turn, camera)
         if readout_s is None:
-            return False
+            return turn is None or not _is_fast(turn, camera)
         self.readout_s, self._estimator, self._meter = readout_s, None, TurnMeter(self._frontend)
         return True

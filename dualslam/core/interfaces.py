@@ -326,8 +326,8 @@ class Shutter(Protocol):
         """Return a frame's view as if all rows had been read at once. Frames come in the order of the sequence."""
         ...
 
-    def learns(self, view: View, camera: Camera) -> bool:
-        """Whether this view, found while there is no map, tells the readout time for the first time."""
+    def may_start(self, view: View, camera: Camera) -> bool:
+        """Whether a map may start from this view, found while there is none; `readout_s` may become known by it."""
         ...
 
 
