@@ -127,7 +127,7 @@ class System:
             if shutter.readout_s != readout_s:
                 view = self._straighten(view)
         if not may_start:
-            return Failure(FailureReason.DOUBTFUL_INITIALISATION, "a fast turn, and the shutter is not known yet")
+            return Failure(FailureReason.DOUBTFUL_INITIALISATION, "a fast turn before the shutter is known")
         with self.timer.measure("initialisation"):
             start = self._starter.add(view)
         if isinstance(start, Failure):

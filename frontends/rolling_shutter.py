@@ -31,6 +31,8 @@ MIN_SHIFT_PX = 3.0
 models get wrong. Only there can a readout be told from that, and only there does it matter."""
 LAG, SPACING = 3, 3
 """Frames between the views of a pair, far enough for the turn to change; and between pairs, which do not overlap."""
+SUSPICION = 1 / 9
+"""Share of the evidence that makes a rolling shutter likely: one sigma of three."""
 MAX_PAIRS = 60
 """Pairs after which the best readout time is taken, however unsure: waiting costs more then."""
 MIN_MATCHES = 60
@@ -104,6 +106,11 @@ class ReadoutEstimator:
     seed : int
     min_evidence : float
         See `CameraConfig.readout_evidence`.
+
+    Attributes
+    ----------
+    suspects : bool
+        Whether a rolling shutter is likely, though its time is not known yet.
     """
 
     def __init__(self, frontend: Frontend, seed: int, min_evidence: float) -> None:
@@ -113,6 +120,7 @@ class ReadoutEstimator:
         self._recent: list[tuple[View, FloatArray | None]] = []
         self._chi2 = np.zeros(len(READOUTS_S))
         self._n_pairs = 0
+        self.suspects = False
         self._n_frames = 0
 
     def add(self, view: View, before_rad_s: FloatArray | None, camera: Camera) -> float | None:
@@ -136,6 +144,7 @@ class ReadoutEstimator:
         self._n_pairs += 1
         best = int(np.argmin(self._chi2))
         evidence = self._chi2[0 if best else TYPICAL] - self._chi2[best]
+        self.suspects = best > 0 and evidence > SUSPICION * self._min_evidence
         known = evidence > self._min_evidence or self._n_pairs >= MAX_PAIRS
         return _minimum(self._chi2, best) if known else None
 
@@ -208,8 +217,8 @@ class RollingShutter:
     def may_start(self, view: View, camera: Camera) -> bool:
         """Whether a map may start from this view, found while there is none; what it tells of the shutter is taken in.
 
-        Of a camera that turns fast, with a shutter that nobody knows, the rows' shifts would pass for parallax. While
-        a map lives nobody asks: it needs no other pixels than those that it is made of.
+        Of a camera that turns fast, with a shutter that is likely to roll, the rows' shifts would pass for parallax.
+        While a map lives nobody asks: it needs no other pixels than those that it is made of.
         """
         if self._estimator is None:
             return True
@@ -217,6 +226,6 @@ class RollingShutter:
         turn = self._meter.between_rad_s
         readout_s = self._estimator.add(view, turn, camera)
         if readout_s is None:
-            return turn is None or not _is_fast(turn, camera)
+            return not self._estimator.suspects or turn is None or not _is_fast(turn, camera)
         self.readout_s, self._estimator, self._meter = readout_s, None, TurnMeter(self._frontend)
         return True

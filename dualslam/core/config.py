@@ -31,8 +31,8 @@ class CameraConfig(StrictModel):
     calibrations and rectified data sets are off by half a pixel to a pixel towards the rim of the image."""
     readout_s: float | None = Field(None, ge=0, le=0.1)
     """Time between reading the first and the last row of an image: 0 for a global shutter, about 0.03 for webcams and
-    the first Kinect. None: the frames in which there is no map are asked for it, and until it is known no map starts
-    from a fast turn."""
+    the first Kinect. None: the frames in which there is no map are asked for it, and where one that
+    rolls is likely, no map starts from a fast turn until it is known."""
     readout_evidence: float = Field(144.0, gt=0)
     """Chi-square by which a rolling shutter must explain frames better than a global one, or a global one better than
     0.02 s, to be known: three sigmas, with errors four times what they seem, as neighbouring pixels err alike."""
