@@ -17,23 +17,7 @@ By default iSAM2 eliminates last whatever the new factors touch: here the 250 la
 dense block of some 800 columns. Naming the newest poses instead leaves the landmarks to go first, each a clique of its
 own. The price is that ``enablePartialRelinearizationCheck``, which walks down from the root and stops at the first
 clique that stands still, no longer reaches them: new landmarks kept the linearisation of their triangulation and the
-newest pose suffered. All variables are therefore checked, once a keyframe, in the step that follows the one with the
-new factors.
-
-In a room, where all keyframes see each other, it is the relinearised poses that cost, and not the news. Replayed from
-7-Scenes, keyframes 31 to 90 (CPU time on a busy machine; chi2 and cost as above):
-
-======================================================  ============  ====  =====
-thresholds of poses (rad, submap units), and when       ms an update  chi2  cost
-======================================================  ============  ====  =====
-0.0005, 0.0025; every third time in both steps          472           0.66  1.3 %
-0.002, 0.01; the same                                   301           0.65  1.3 %
-0.002, 0.01; in the second step alone                   291           0.65  1.2 %
-0.004, 0.02, and landmarks 0.04 in the place of 0.005   (190)         0.76  5.5 %
-0.002, 0.01; the second step left out                   (170)         0.80  1.6 %
-======================================================  ============  ====  =====
-
-The last two were replayed to keyframe 110 (base there: 496, 0.68, 1.5 %).
+newest pose suffered. All variables are therefore checked, but not each time.
 """
 
 from __future__ import annotations
@@ -48,12 +32,9 @@ from backend import convert
 from backend.bayes_tree import BayesTree, UpdateStatistics, parse_bayes_tree
 from dualslam.core.types import FloatArray, IntArray
 
-POSE_THRESHOLDS = (0.002, 0.01)
-"""Relinearise a pose that moved by more: rotation in rad, translation in submap units (median initial depth 1). What a
-linear factor leaves out goes with the square: 0.01 of the depth are 0.07 px at a focal length of 700 px. Each pose that
-is relinearised takes along whatever it sees."""
+POSE_THRESHOLDS = (0.0005, 0.0025)
+"""Relinearise a pose that moved by more: rotation in rad, translation in submap units (median initial depth 1)."""
 POINT_THRESHOLD_MU = 0.005
-"""The same for a landmark, which takes along nothing."""
 N_LAST = 30
 """So many of the newest poses are eliminated last."""
 GTSAM_ERRORS = (RuntimeError, ValueError, IndexError)

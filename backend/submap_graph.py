@@ -33,6 +33,9 @@ logger = logging.getLogger(__name__)
 HOLD_ROTATION_RAD, HOLD_TRANSLATION_MU = 0.01, 0.02
 """Sigmas of the loose prior that holds a keyframe with too few ties where it is."""
 REBUILD_ATTEMPTS = 8
+RELINEARISE_EVERY = 3
+MISFIT_CHI2 = 1.2
+"""Each third update relinearises, and each that follows one whose newest observations fit worse than this."""
 FAR_MU = 200.0
 """A point this far from its camera (the median initial depth is 1) is looked at again before the next solution."""
 MEDIAN_CHI2_2DOF = 1.386
@@ -77,6 +80,7 @@ class ISam2SubmapGraph:
         self._holds: dict[int, int] = {}
         self._suspects: IntArray = np.zeros(0, np.int64)
         self._n_updates = 0
+        self._misfit = False
         self.statistics: tuple[UpdateStatistics, ...] = ()
         """Of the steps that the last update took."""
 
@@ -233,9 +237,8 @@ class ISam2SubmapGraph:
     def _solve(self, solver: IncrementalSolver, submap: Submap, plan: Plan, changes: _Changes) -> None:
         """Let the solver take the changes in, and note the factor indices that it gives."""
         newest = list(submap.keyframes)[-N_LAST:]
-        # Where another step follows, that one relinearises: to do so before the news is in would be done in vain.
-        alone = self._config.extra_iterations == 0
-        indices = solver.update(changes.graph, changes.values, changes.remove, newest, relinearise=alone)
+        due = self._n_updates % RELINEARISE_EVERY == 0 or self._misfit
+        indices = solver.update(changes.graph, changes.values, changes.remove, newest, due)
         projections = len(indices) - len(changes.order)
         holds = projections - len(changes.new_holds)
         if changes.gauge is not self._gauge:
@@ -296,6 +299,7 @@ class ISam2SubmapGraph:
         chi2_newest = (
             float(np.minimum(newest, self._config.insert_sigmas**2).mean() / 2) if len(newest) else float("nan")
         )
+        self._misfit = chi2_newest > MISFIT_CHI2
         # Where the pixels are noisier than their sigmas say, the gate opens as much: it is there for outliers.
         noise = max(1.0, float(np.median(chi2)) / MEDIAN_CHI2_2DOF) if len(chi2) else 1.0
         outliers = row[chi2 > self._config.outlier_chi2 * noise]
