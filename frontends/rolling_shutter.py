@@ -145,8 +145,9 @@ class ReadoutEstimator:
         best = int(np.argmin(self._chi2))
         evidence = self._chi2[0 if best else TYPICAL] - self._chi2[best]
         self.suspects = best > 0 and evidence > SUSPICION * self._min_evidence
-        known = evidence > self._min_evidence or self._n_pairs >= MAX_PAIRS
-        return _minimum(self._chi2, best) if known else None
+        # A lowest value at the rim of what is tried is no minimum yet.
+        known = evidence > self._min_evidence and best < len(READOUTS_S) - 1
+        return _minimum(self._chi2, best) if known or self._n_pairs >= MAX_PAIRS else None
 
     def _misfits(self, a: Features, rate_a: FloatArray, b: Features, rate_b: FloatArray, camera: Camera) -> FloatArray:
         """Return the robust chi-square (T,) of the best relative pose of two views for each readout time.
