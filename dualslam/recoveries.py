@@ -107,7 +107,7 @@ class Recoveries:
         self._began: dict[int, float] = {}  # when, by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
         self._starts: dict[int, int] = {}  # the keyframe that its first walk started from
-        self._unlinked: dict[int, int] = {}  # how many keyframes it had when a walk from it last found no link
+        self._unlinked: dict[int, int] = {}  # how many live keyframes it had when a walk last found no link
 
     def declare_lost(self, submap_id: int, onset: int, cause: str, first_lost: int) -> None:
         """Let the walks to come look for a submap: lost at frame `first_lost`, suspected from `onset` on."""
@@ -152,7 +152,7 @@ class Recoveries:
         tried_with = self._unlinked.get(submap.id)
         if tried_with is None or submap.id in self._began or not self._lost:
             return
-        if not any(tried_with < n <= len(submap.keyframes) for n in self._config.retry_keyframes):
+        if not any(tried_with < n <= self._n_live(submap) for n in self._config.retry_keyframes):
             return
         del self._unlinked[submap.id]
         lost = {k for m in self._lost for k in self._record.atlas.submaps[m].keyframes}
@@ -161,6 +161,10 @@ class Recoveries:
             return
         first = self._starts[submap.id]
         self.start(submap, min(own, key=lambda view: (abs(view.index - first), view.index)), now)
+
+    def _n_live(self, submap: Submap) -> int:
+        """Count a submap's keyframes without those that walks back have added."""
+        return sum(k >= self._starts[submap.id] for k in submap.keyframes)
 
     def collect(self, live: VisualOdometry | None, now: Moment) -> None:
         """Merge the walks that have ended. `live` goes on in its submap as it is after that."""
@@ -176,7 +180,7 @@ class Recoveries:
         for job, result in outcomes:
             started_s = self._began.pop(job.submap.id)
             if job.onsets and (isinstance(result, Failure) or result.link is None):
-                self._unlinked[job.submap.id] = len(job.submap.keyframes)
+                self._unlinked[job.submap.id] = self._n_live(job.submap)
             if isinstance(result, Failure):
                 self._failed(job, now, result, time.perf_counter() - started_s)
                 continue

@@ -26,13 +26,13 @@ from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Track, View
 from dualslam.linking import LinkEstimate
+from dualslam.relinker import Linker, LinkTry, Relinker
 from dualslam.seam import SeamReport, refine_seam
 from dualslam.trajectory import FramePose
 
 log = logging.getLogger(__name__)
 
 Judge = Callable[[Track | Failure], Track | Failure]
-Linker = Callable[[Submap, Submap, int | None], LinkEstimate | Failure]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,6 +176,7 @@ class _Walk:
     n_leaped: int = 0  # frames without a pose between some that have one
     n_unusable: int = 0  # the last frames
     out_of_time: bool = False
+    given_up: bool = False
     why_unusable: str = ""
     why_not_linked: str = ""
 
@@ -184,6 +185,7 @@ class _Walk:
         if self.link is not None:
             return "linked"
         ended = "out of time" if self.out_of_time else self.why_unusable if self.n_unusable else "the buffer ends"
+        ended = "given up" if self.given_up else ended
         return f"{ended}; no link: {self.why_not_linked}" if self.why_not_linked else ended
 
     def note_unusable(self, failure: Failure) -> None:
@@ -228,8 +230,10 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float
                 walk.link = found
                 break
             walk.why_not_linked = found.detail
+            walk.given_up |= found.reason is FailureReason.SCALE_LOST
             walk.events.append(_refusal(tried, found, attempt.name, step.view, submap.id))
-        if walk.link is not None:
+        walk.given_up |= relinker.has_seen_enough
+        if walk.link is not None or walk.given_up:
             break
     if job.lost:
         walk.events.append(_event_of(job, walk, attempt.name, time.perf_counter() - started))
@@ -305,15 +309,6 @@ class WalkStep:
     report: KeyframeReport | None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LinkTry:
-    """One try to link the growing submap with an older one."""
-
-    old_id: int
-    n_shared: int
-    result: LinkEstimate | Failure
-
-
 def walk_back(
     walker: VisualOdometry, views: Iterable[View], judge: Judge, keyframe_ids: set[int], max_leap_frames: int
 ) -> Iterator[WalkStep]:
@@ -356,45 +351,3 @@ def _walk_one(walker: VisualOdometry, view: View, track: Track | Failure, is_wan
     if isinstance(report, Failure):
         return WalkStep(view, report, None)
     return WalkStep(view, track, report)
-
-
-class Relinker:
-    """Tries, at each new keyframe of a walk, to link the growing submap with those that it has come to overlap.
-
-    Parameters
-    ----------
-    submap : Submap
-        The growing one.
-    lost : dict of int to Submap
-    onsets : dict of int to int
-        For each lost submap the frame from which on it is suspected to be corrupted.
-    linker : callable
-    config : RecoveryConfig
-    """
-
-    def __init__(
-        self,
-        submap: Submap,
-        lost: dict[int, Submap],
-        onsets: dict[int, int],
-        linker: Linker,
-        config: RecoveryConfig,
-    ) -> None:
-        self._submap = submap
-        self._linker = linker
-        self._config = config
-        self._onsets = onsets
-        self._old = [lost[m] for m in sorted(lost)]
-
-    @property
-    def keyframe_ids(self) -> set[int]:
-        """Keyframes of the lost submaps."""
-        return {k for old in self._old for k in old.keyframes}
-
-    def attempts(self, keyframe_id: int) -> Iterator[LinkTry]:
-        """Try each lost submap that holds the newest keyframe of the walk, the latest lost one first."""
-        for old in reversed(self._old):
-            shared = old.keyframes.keys() & self._submap.keyframes.keys()
-            if keyframe_id not in shared or len(shared) < self._config.min_shared_keyframes:
-                continue
-            yield LinkTry(old.id, len(shared), self._linker(old, self._submap, self._onsets[old.id]))

@@ -125,7 +125,7 @@ class TestRetry:
     @staticmethod
     def run(n_failing: int, **recovery: object) -> System:
         world = PointWorld(cloud(), hand_held(90), covered=COVERED)
-        system = system_in(world, recovery={"attempts": ["live"], "retry_keyframes": [6], **recovery})
+        system = system_in(world, recovery={"attempts": ["live"], "retry_keyframes": [4], **recovery})
         system._recoveries._executor = OutOfTimeAtFirst(system, n_failing)
         for frame in world.frames():
             system.step(frame)
@@ -154,7 +154,7 @@ class TestRetry:
 
     def test_nothing_is_looked_for_that_the_buffer_does_not_hold(self) -> None:
         world = PointWorld(cloud(), hand_held(90), covered=COVERED)
-        system = system_in(world, recovery={"attempts": ["live"], "retry_keyframes": [6]}, buffer={"duration_s": 0.2})
+        system = system_in(world, recovery={"attempts": ["live"], "retry_keyframes": [4]}, buffer={"duration_s": 0.2})
         system._recoveries._executor = OutOfTimeAtFirst(system, 9)
         for frame in world.frames():
             system.step(frame)

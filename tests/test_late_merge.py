@@ -206,8 +206,9 @@ def test_a_recovery_that_fails_costs_its_link_only(world: PointWorld) -> None:
     for frame in world.frames():
         system.step(frame)
     system.finish()
-    _, failed = system.events.of_kind(EventKind.RECOVERY_FAILED)
-    assert (failed.submap, failed.data["lost"], failed.data["reason"]) == (1, [0], "worker")
+    _, *failed = system.events.of_kind(EventKind.RECOVERY_FAILED)  # the first: of the frames before the first map
+    assert failed
+    assert all((f.submap, f.data["lost"], f.data["reason"]) == (1, [0], "worker") for f in failed)
     assert system.atlas.components() == [[0], [1]]
     (again,) = system.events.of_kind(EventKind.REINITIALISED)
     assert all(system.rows[i].status is FrameStatus.TRACKED for i in range(again.frame, 90))

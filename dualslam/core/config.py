@@ -200,10 +200,14 @@ class RecoveryConfig(StrictModel):
     max_leap_scale_sigma: float = Field(0.025, gt=0)
     """Largest standard deviation (relative) of the scale beyond a leap, by the Hessian of its wide matches: all that is
     mapped beyond inherits the error, and 5 %, two of these, is a wrong link."""
-    retry_keyframes: tuple[int, ...] = (10, 20)
-    """Keyframes of the new map at which a recovery that found no link is tried again: it knows depths better then."""
+    retry_keyframes: tuple[int, ...] = (5, 15)
+    """Keyframes of the new map, from its start on, at which a recovery that found no link is tried again: it
+    knows depths better then."""
     min_shared_keyframes: int = Field(4, ge=2)
     """Keyframes that both maps must hold before a link is tried."""
+    max_shared_keyframes: int = Field(40, ge=4)
+    """Healthy keyframes of a lost map that a walk holds when its last try to link them is made: ten times what a link
+    must stand on. A walk that fits none of so many is bent, and going on bends it further."""
     workers: int = Field(0, ge=0, le=16)
     """Processes in which walks back run beside the tracking, which never waits for them (`--workers`). 0: inline, in
     the tracking process, which waits: the only way in which the same seed gives the same trajectory."""

@@ -242,6 +242,7 @@ class FailureReason(StrEnum):
     SOLVER = "solver"
     UNREADABLE = "unreadable"
     SCALE = "scale"
+    SCALE_LOST = "scale_lost"
     SPREAD = "spread"
     AGREEMENT = "agreement"
     CONTRADICTION = "contradiction"

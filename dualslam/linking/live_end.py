@@ -14,6 +14,9 @@ from dualslam.core.types import Failure, FailureReason
 from dualslam.linking.estimate import LinkEstimate
 from dualslam.linking.rigidity import scale_sigma_between
 
+HOPELESS = 3.0
+"""Times the bound: more keyframes at the far end make the walk's share smaller, down to what it lost on the way."""
+
 
 def carry_to_live_end(
     link: LinkEstimate, new: Submap, live_since: int, config: LinkingConfig
@@ -39,8 +42,11 @@ def carry_to_live_end(
     sigma = math.hypot(link.numbers["sigma_scale"], walk)
     numbers = {"sigma_scale": sigma, "sigma_scale_walk": walk}
     if sigma > config.max_live_scale_sigma:
-        detail = f"scale known to {sigma:.1%} at the live end, {walk:.1%} of it by the walk"
-        return Failure(FailureReason.SCALE, detail, numbers)
+        detail = "nothing holds the scale between the overlap and the live end"
+        if math.isfinite(walk):
+            detail = f"scale known to {sigma:.1%} at the live end, {walk:.1%} of it by the walk"
+        hopeless = walk > HOPELESS * config.max_live_scale_sigma
+        return Failure(FailureReason.SCALE_LOST if hopeless else FailureReason.SCALE, detail, numbers)
     # The live end grows and shrinks about the place where the maps overlap.
     held = [k for k in link.agreeing_keyframes.tolist() if k in new.keyframes]
     about = sim3.adjoint(se3.from_parts(np.eye(3), new.keyframe_poses(held)[:, :3, 3].mean(0)))
