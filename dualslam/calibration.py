@@ -91,8 +91,7 @@ class Calibration:
             return estimate
         numbers = estimate.numbers
         log_focal_sigma = float(np.sqrt(estimate.covariance[0, 0]))
-        sharper = log_focal_sigma < self._config.update_sigma_ratio * self._log_focal_sigma
-        if not estimate.accepted and not (self._refined_in == submap.id and sharper):
+        if not estimate.accepted and not (self._refined_in == submap.id and self._is_much_surer(log_focal_sigma)):
             return Failure(FailureReason.CHI_SQUARE, "no significant change", numbers)
         try:
             camera = correct(self._camera, estimate.correction)
@@ -107,6 +106,12 @@ class Calibration:
         submap.take_over(changed)
         self._camera, self._refined_in, self._log_focal_sigma = camera, submap.id, log_focal_sigma
         return Refinement(graph, before, numbers)
+
+    def _is_much_surer(self, log_focal_sigma: float) -> bool:
+        """Whether an answer is worth a change that is not significant: only where the present one was hardly sure."""
+        config, present = self._config, self._log_focal_sigma
+        hardly_sure = present > config.max_sigma_ratio * config.log_focal_sigma
+        return hardly_sure and log_focal_sigma < config.update_sigma_ratio * present
 
     def rectified(self, view: View) -> View:
         """Return a view with the pixels of the present camera; features without a place there keep their old one."""

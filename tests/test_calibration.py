@@ -79,11 +79,14 @@ class TestRefine:
         for a, b in zip(before, snapshot(submap), strict=True):
             assert a == b if isinstance(a, dict) else np.array_equal(a, b)  # type: ignore[arg-type]
 
-    @pytest.mark.parametrize(("log_focal_sigma", "changes"), [(0.004, True), (0.008, False)])
-    def test_a_changed_camera_follows_an_answer_that_is_twice_as_sure(
-        self, log_focal_sigma: float, changes: bool
+    @pytest.mark.parametrize(
+        ("first_sigma", "log_focal_sigma", "changes"),
+        [(0.015, 0.006, True), (0.015, 0.012, False), (0.008, 0.003, False)],
+    )
+    def test_a_changed_camera_follows_an_answer_that_is_twice_as_sure_unless_it_was_sure_itself(
+        self, first_sigma: float, log_focal_sigma: float, changes: bool
     ) -> None:
-        near, covariance = LensCorrection(log_focal=RIGHT_AGAIN.log_focal + 0.01), np.diag([0.01**2, 1, 1, 1, 1])
+        near, covariance = LensCorrection(log_focal=RIGHT_AGAIN.log_focal + 0.01), np.diag([first_sigma**2, 1, 1, 1, 1])
         answers = [
             replace(estimate_of(near, accepted=True), covariance=covariance),
             replace(

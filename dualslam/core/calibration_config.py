@@ -48,8 +48,9 @@ class CalibrationConfig(StrictModel):
     """Standard deviations that count as far. The worst answer seen was off by five of its own: they are too small along
     the valley in which focal length and k1 make up for each other."""
     update_sigma_ratio: float = Field(0.7, gt=0, le=1)
-    """A camera that was changed is changed again, however little, where the new sigma of the focal length is below this
-    share of the one that it was changed with: twice the information."""
+    """A camera that was changed on an answer that was not even sure by `max_sigma_ratio` is changed again, however
+    little, where the new sigma of the focal length is below this share of that answer's: twice the information. One
+    that was sure stays, until another is significantly different."""
     min_distance2: float = Field(20.5, gt=0)
     """Squared Mahalanobis distance from the present calibration above which the new one is taken: chi-square, 5 degrees
     of freedom, 99.9 %."""
