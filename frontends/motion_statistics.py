@@ -186,11 +186,10 @@ def _supported_nearest(
 ) -> IntArray:
     """Rows of a whose nearest of b moves as its neighbours do."""
     cells = int(np.clip(np.sqrt(len(a) / MIN_PER_CELL), 1, CELLS))
-    uv_b = b.uv_px[nearest]
+    # What a rolling shutter shifted may lie beyond the rim, once that is taken out: it counts to the cell there.
+    uv_a, uv_b = (np.clip(uv, 0.0, np.array(size_px) - 1.0) for uv in (a.uv_px, b.uv_px[nearest]))
     return np.flatnonzero(
-        supported_matches(
-            a.uv_px, uv_b, size_px, size_px, rotation=rotation, zoom=zoom, threshold=threshold, cells=cells
-        )
+        supported_matches(uv_a, uv_b, size_px, size_px, rotation=rotation, zoom=zoom, threshold=threshold, cells=cells)
     )
 
 

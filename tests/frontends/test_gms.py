@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +100,15 @@ def test_few_features_are_matched_on_larger_cells(image: NDArray[np.uint8]) -> N
     a, b = frontend.extract(image), frontend.extract(warped(image, 1.0, 3.0)[0])
     few = a.take(np.arange(0, len(a), 10))
     assert len(frontend.match_wide(few, b)) > 40
+
+
+def test_pixels_that_lie_beyond_the_rim_are_matched_too(image: NDArray[np.uint8]) -> None:
+    """As they do where a rolling shutter was taken out of an image."""
+    frontend = GmsFrontend(1000)
+    a, b = frontend.extract(image), frontend.extract(warped(image, 1.0, 3.0)[0])
+    shifted = [replace(features, uv_px=features.uv_px - (12.0, 40.0)) for features in (a, b)]
+    assert min(features.uv_px.min() for features in shifted) < 0
+    assert len(frontend.match_wide(*shifted)) > 0.9 * len(frontend.match_wide(a, b))
 
 
 def test_options_are_those_of_orb_and_its_own() -> None:
