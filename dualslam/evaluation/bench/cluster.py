@@ -43,9 +43,10 @@ def run_on_cluster(run_trial: RunTrial, trials: Iterable[Trial], address: str) -
         # Not pure: a trial writes its folder, so that a result of an earlier bench must not stand in for it.
         futures = {client.submit(run_trial, trial, pure=False): trial for trial in trials}
         for future in as_completed(futures, loop=client.loop):
-            trial = futures[future]
-            if future.status == "finished":
+            # Where a worker has died with a result that was not fetched yet, this waits for the trial to be run again.
+            lost = future.exception()
+            if lost is None:
                 yield future.result()
             else:
                 # The trial itself catches its exceptions: this is a worker that died with it, time and again.
-                yield blank_record(trial, TrialOutcome.CRASHED, f"lost on the cluster: {future.exception()!r}"[:500])
+                yield blank_record(futures[future], TrialOutcome.CRASHED, f"lost on the cluster: {lost!r}"[:500])
