@@ -18,7 +18,7 @@ from dualslam.session import run_to_folder
 from dualslam.sources import WorldSequence, make_world
 
 MIN_FRAMES = 60
-BLACKOUT_FRAMES = 15
+BLACKOUT_FRAMES = 12
 WORLD_SEED = 0
 
 

@@ -44,7 +44,7 @@ def test_demo_shows_recovery_off_against_on(out: Path, capsys: pytest.CaptureFix
     command = ["demo", "--frames", str(N), "--out", str(out)]
     assert main(command) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert "covered in frames 16 to 30" in lines[0]
+    assert "covered in frames 16 to 27" in lines[0]
     assert (lines[1], lines[3]) == ("Recovery off:", "Recovery on:")
     assert "2 submaps, 1 failure" in lines[2]
     assert lines[4].endswith(f"results in {out / 'on'}")
