@@ -344,10 +344,8 @@ def _walk_one(walker: VisualOdometry, view: View, track: Track | Failure, is_wan
     """Make a frame that was posed a keyframe where it is wanted or due."""
     if isinstance(track, Failure):
         return WalkStep(view, track, None)
-    known = view.index in walker.submap.keyframes
-    if not (is_wanted and not known) and not walker.keyframe_due(track):
+    is_new = view.index not in walker.submap.keyframes
+    if not ((is_wanted and is_new) or walker.keyframe_due(track)):
         return WalkStep(view, track, None)
     report = walker.insert_keyframe(track)
-    if isinstance(report, Failure):
-        return WalkStep(view, report, None)
-    return WalkStep(view, track, report)
+    return WalkStep(view, report, None) if isinstance(report, Failure) else WalkStep(view, track, report)

@@ -16,7 +16,7 @@ from scipy import sparse
 
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.alignment import COVARIANCE_INFLATION
-from dualslam.core.geometry.projection import projection_jacobians
+from dualslam.core.geometry.projection import project_points, projection_jacobians
 from dualslam.core.submap import Submap
 from dualslam.core.types import FloatArray, IntArray
 
@@ -110,11 +110,10 @@ def _linearise(submap: Submap, ids: IntArray, pixel_chi2: float) -> _Problem:
     J_pose, J_point, good = np.zeros((len(rows), 2, 6)), np.zeros((len(rows), 2, 3)), np.zeros(len(rows), bool)
     for f in range(len(ids)):
         seen = np.flatnonzero(kf == f)
-        p = se3.act(T[f], all_xyz[seen])
-        seen, p = seen[p[:, 2] > 0], p[p[:, 2] > 0]
+        seen = seen[submap.depths(obs["landmark"][rows[seen]], T[f]) > 0]
         J_pose[seen], J_point[seen] = projection_jacobians(submap.K, T[f], all_xyz[seen])
-        off = p[:, :2] / p[:, 2:] * np.diag(submap.K)[:2] + submap.K[:2, 2] - uv[seen]
-        good[seen] = (off**2).sum(1) < pixel_chi2 * sigma[seen] ** 2
+        predicted, _ = project_points(submap.K, T[f], all_xyz[seen])
+        good[seen] = ((predicted - uv[seen]) ** 2).sum(1) < pixel_chi2 * sigma[seen] ** 2
     # A point seen once says nothing of the poses.
     landmark = obs["landmark"][rows]
     good &= np.bincount(landmark[good], minlength=len(submap.landmarks))[landmark] >= 2
