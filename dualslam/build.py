@@ -26,6 +26,7 @@ from dualslam.recoveries import InlineExecutor, RecoveryExecutor
 from dualslam.recovery import Attempt, RecoveryJob, RecoveryParts
 from dualslam.system import Components, System
 from dualslam.worker import WorkerExecutor
+from frontends.image_features import ImageFeatures
 from frontends.images import to_grey
 from frontends.initialiser import Initialiser
 from frontends.motion_statistics import nearest_search
@@ -148,9 +149,7 @@ def recovery_parts(
 
     matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
     return RecoveryParts(
-        attempts=tuple(
-            _attempt(attempt, n, config, live, size_px) for n, attempt in enumerate(config.recovery.attempts)
-        ),
+        attempts=_attempts(config, live, size_px),
         new_graph=lambda: ISam2SubmapGraph(config.graph),
         link=lambda old, new, onset: estimate_link(
             old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
@@ -163,29 +162,44 @@ def recovery_parts(
     )
 
 
-def _attempt(
+def _attempts(
+    config: Config, live: Callable[[Submap, SubmapGraph], VisualFrontEnd], size_px: tuple[int, int]
+) -> tuple[Attempt, ...]:
+    """Build the attempts; those with the same guest share what it finds in the images."""
+    guests: dict[str, ImageFeatures] = {}  # by their settings
+    attempts = []
+    for number, attempt in enumerate(config.recovery.attempts):
+        if attempt.is_live:
+            attempts.append(Attempt(attempt.name, lambda job, submap, graph: live(submap, graph)))
+            continue
+        wanted = _guest(attempt)
+        key = wanted.model_dump_json()
+        if key not in guests:
+            with _naming_attempt(number):
+                guests[key] = ImageFeatures(create_frontend(wanted))
+        attempts.append(_attempt_with(guests[key], attempt, config, live, size_px))
+    return tuple(attempts)
+
+
+def _attempt_with(
+    guest: ImageFeatures,
     attempt: AttemptConfig,
-    number: int,
     config: Config,
     live: Callable[[Submap, SubmapGraph], VisualFrontEnd],
     size_px: tuple[int, int],
 ) -> Attempt:
-    """Build one attempt: the live front end itself, or another one that gives it its poses."""
-    if attempt.is_live:
-        return Attempt(attempt.name, lambda job, submap, graph: live(submap, graph))
-    with _naming_attempt(number):
-        guest = create_frontend(_guest(attempt))
+    """Build an attempt in which another front end gives the live one its poses."""
 
     def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> PnpOdometry:
         def extract(view: View) -> Features | Failure:
             if view.image is None:
                 return Failure(FailureReason.UNREADABLE, "its image is no longer buffered")
-            features = rectify(guest.extract(view.image.pixels()), job.camera, config.camera.model_sigma_px)
+            features = rectify(guest.of(view.image), job.camera, config.camera.model_sigma_px)
             return features if view.turn_rad is None else straighten(features, job.camera, view.turn_rad)
 
         walker = live(submap, graph)
         walks_live = attempt.walk == "live"
-        return PnpOdometry(walker, guest, extract, job.own, bundle_adjust_arrays, config, size_px, walks_live)
+        return PnpOdometry(walker, guest.frontend, extract, job.own, bundle_adjust_arrays, config, size_px, walks_live)
 
     return Attempt(attempt.name, new_odometry)
 

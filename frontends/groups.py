@@ -86,7 +86,6 @@ def mutual_best(distances: NDArray[Any], ratio: float, max_distance: float) -> M
     Parameters
     ----------
     distances : (N, M) uint16 or float
-        Scratch: written to, and put back as it was on return.
     ratio : float
         Greatest best distance over second best, row-wise.
     max_distance : float
@@ -94,15 +93,22 @@ def mutual_best(distances: NDArray[Any], ratio: float, max_distance: float) -> M
     n_rows, n_columns = distances.shape
     if n_rows == 0 or n_columns == 0:
         return NO_MATCHES
-    rows, columns = np.arange(n_rows), distances.argmin(axis=1)
-    best = distances[rows, columns]
-    keep = (distances.argmin(axis=0)[columns] == rows) & (best <= max_distance)
+    columns = distances.argmin(axis=1)
+    best = distances[np.arange(n_rows), columns]
+    # The whole matrix is read once, and then only what the candidates that are left have in it.
+    rows = np.flatnonzero(best <= max_distance)
     if n_columns > 1:
         # Hiding the best and taking the minimum again is ten times cheaper than a partition.
-        distances[rows, columns] = distances.max() + 1
-        keep &= best <= ratio * distances.min(axis=1)
-        distances[rows, columns] = best
-    return Matches(np.stack([rows[keep], columns[keep]], axis=1), best[keep].astype(np.float64))
+        others = distances[rows]
+        others[np.arange(len(rows)), columns[rows]] = _highest(others.dtype)
+        rows = rows[best[rows] <= ratio * others.min(axis=1)]
+    if len(rows):
+        rows = rows[distances.take(columns[rows], axis=1).argmin(axis=0) == rows]
+    return Matches(np.stack([rows, columns[rows]], axis=1), best[rows].astype(np.float64))
+
+
+def _highest(kind: np.dtype[Any]) -> float:
+    return float(np.iinfo(kind).max) if np.issubdtype(kind, np.integer) else np.inf
 
 
 def consistent_rotation(turn_rad: FloatArray, tolerance_rad: float = np.radians(30.0), n_min: int = 8) -> BoolArray:

@@ -190,12 +190,13 @@ def _root(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def _squared_matrix(a: NDArray[np.generic], b: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Squared distances of all pairs in steps, (N, M).
+    """Squared distances of all pairs in steps, (N, M), as one product: [a, |a|^2, 1] [-2 b, 1, |b|^2]^T.
 
     Single precision is exact: all terms are whole numbers below 2^24, in whatever order they are added.
     """
-    wide_a, wide_b = a.astype(np.float32), b.astype(np.float32)
-    squared = wide_a @ (-2.0 * wide_b.T)
-    squared += np.einsum("ij,ij->i", wide_a, wide_a)[:, None]
-    squared += np.einsum("ij,ij->i", wide_b, wide_b)
-    return np.asarray(squared)
+    wide_a, wide_b = (np.ones((len(each), DESCRIPTOR_LENGTH + 2), np.float32) for each in (a, b))
+    wide_a[:, :DESCRIPTOR_LENGTH], wide_b[:, :DESCRIPTOR_LENGTH] = a, b
+    wide_a[:, -2] = np.einsum("ij,ij->i", wide_a[:, :DESCRIPTOR_LENGTH], wide_a[:, :DESCRIPTOR_LENGTH])
+    wide_b[:, -1] = np.einsum("ij,ij->i", wide_b[:, :DESCRIPTOR_LENGTH], wide_b[:, :DESCRIPTOR_LENGTH])
+    wide_b[:, :DESCRIPTOR_LENGTH] *= -2.0
+    return np.asarray(wide_a @ wide_b.T)
