@@ -107,6 +107,20 @@ class _Votes:
     identical: BoolArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchedLandmarks:
+    """Pairs of landmarks, one to one, fixed by their views or not.
+
+    `pair_of_vote`: the pair of each vote, or -1 where it was not kept; `covariance_new`: of the new map's points.
+    """
+
+    votes: _Votes
+    landmark_old: IntArray
+    landmark_new: IntArray
+    pair_of_vote: IntArray
+    covariance_new: FloatArray
+
+
 def shared_keyframes(old: Submap, new: Submap) -> list[int]:
     """Return the ids of the keyframes (source frames) that both submaps hold, ascending."""
     return sorted(old.keyframes.keys() & new.keyframes.keys())
@@ -136,14 +150,25 @@ def propose_correspondences(
     Correspondences
         Possibly empty.
     """
+    return place_pairs(old, new, match_landmarks(old, new, matcher), old_before)
+
+
+def match_landmarks(old: Submap, new: Submap, matcher: DescriptorMatcher | None) -> MatchedLandmarks:
+    """Find which landmarks are one, as `propose_correspondences` says, wherever their points are."""
     votes = _concatenate([_votes_of_keyframe(old, new, k, matcher) for k in shared_keyframes(old, new)])
-    kept, pair_of_vote = _one_to_one(votes, len(new.landmarks))
-    landmark_old, landmark_new = kept
+    (landmark_old, landmark_new), pair_of_vote = _one_to_one(votes, len(new.landmarks))
+    covariance_new = _covariances(new, landmark_new, new.landmarks["xyz_mu"][landmark_new], None)
+    return MatchedLandmarks(votes, landmark_old, landmark_new, pair_of_vote, covariance_new)
+
+
+def place_pairs(old: Submap, new: Submap, matched: MatchedLandmarks, old_before: int | None) -> Correspondences:
+    """Return the pairs whose points are fixed by their views, those of the old map by the keyframes before one."""
+    votes, landmark_old, landmark_new = matched.votes, matched.landmark_old, matched.landmark_new
+    pair_of_vote, covariance_new = matched.pair_of_vote, matched.covariance_new
     xyz_old, xyz_new = old.landmarks["xyz_mu"][landmark_old], new.landmarks["xyz_mu"][landmark_new]
     if old_before is not None:
         xyz_old = _place_anew(old, landmark_old, old_before)
     covariance_old = _covariances(old, landmark_old, xyz_old, old_before)
-    covariance_new = _covariances(new, landmark_new, xyz_new, None)
     finite = np.isfinite(np.stack([covariance_old, covariance_new])).all((0, 2, 3))
     fixed = np.asarray(finite, np.bool_)
     row = np.where(fixed, np.cumsum(fixed) - 1, -1)
@@ -261,9 +286,10 @@ def _match_near(a: Features, b: Features, matcher: DescriptorMatcher) -> tuple[I
     nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
     if not len(a) or not len(b) or a.descriptors.shape[1:] != b.descriptors.shape[1:]:
         return nothing
-    apart2 = ((a.uv_rect_px[:, None] - b.uv_rect_px[None]) ** 2).sum(-1)
-    radius = matcher.radius_px * np.minimum(a.scale[:, None], b.scale[None])
-    i, j = np.nonzero(apart2 < radius**2)
+    i, j = _near_columns(a.uv_rect_px[:, 0], b.uv_rect_px[:, 0], matcher.radius_px * min(a.scale.max(), b.scale.max()))
+    apart2 = ((a.uv_rect_px[i] - b.uv_rect_px[j]) ** 2).sum(-1)
+    near = apart2 < (matcher.radius_px * np.minimum(a.scale[i], b.scale[j])) ** 2
+    i, j, apart2 = i[near], j[near], apart2[near]
     if not len(i):
         return nothing
     d = np.asarray(matcher.distance(a.descriptors[i], b.descriptors[j]), np.float64)
@@ -271,9 +297,20 @@ def _match_near(a: Features, b: Features, matcher: DescriptorMatcher) -> tuple[I
     np.minimum.at(best_a, i, d)
     np.minimum.at(best_b, j, d)
     mutual = np.flatnonzero((d <= best_a[i]) & (d <= best_b[j]) & (d <= matcher.max_distance))
-    mutual = mutual[np.lexsort((apart2[i[mutual], j[mutual]], d[mutual]))]  # equal descriptors: the nearer pixels
+    mutual = mutual[np.lexsort((apart2[mutual], d[mutual]))]  # equal descriptors: the nearer pixels
     keep = _first_in_both(i[mutual], j[mutual])
     return i[mutual[keep]], j[mutual[keep]], d[mutual[keep]]
+
+
+def _near_columns(a: FloatArray, b: FloatArray, radius: float) -> tuple[IntArray, IntArray]:
+    """Return all pairs (i, j) with ``|a[i] - b[j]| <= radius``, ascending."""
+    order = np.argsort(b, kind="stable")
+    first, last = np.searchsorted(b[order], a - radius), np.searchsorted(b[order], a + radius, side="right")
+    n = last - first
+    i = np.repeat(np.arange(len(a)), n)
+    j = order[np.arange(len(i)) - np.repeat(np.cumsum(n) - n - first, n)]
+    ascending = np.lexsort((j, i))
+    return i, j[ascending]
 
 
 def _first_in_both(a: IntArray, b: IntArray) -> IntArray:

@@ -22,7 +22,13 @@ from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
 from dualslam.core.submap import Submap
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking import verify
-from dualslam.linking.correspondences import Correspondences, DescriptorMatcher, propose_correspondences
+from dualslam.linking.correspondences import (
+    Correspondences,
+    DescriptorMatcher,
+    MatchedLandmarks,
+    match_landmarks,
+    place_pairs,
+)
 from dualslam.linking.pairs import PairModel
 from dualslam.linking.shape import Shape, deformation_covariance, measure_shape
 from dualslam.linking.timeline import KeyframeVotes, ask_keyframes, find_tears, leading_run
@@ -95,7 +101,8 @@ def estimate_link(
         decide: walk on. All other reasons are refusals of this overlap.
     """
     # 1. Which landmarks are the same.
-    pairs = propose_correspondences(old, new, matcher)
+    matched = match_landmarks(old, new, matcher)
+    pairs = place_pairs(old, new, matched, None)
     if len(pairs) < config.min_inliers:
         return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(pairs)} pairs, {config.min_inliers} needed")
     # 2. Which keyframes may be trusted: those older than what is suspected, by others or by a tear in the old map.
@@ -114,7 +121,7 @@ def estimate_link(
     if np.count_nonzero(trusted) < config.min_keyframes:
         return _needs_older(int(np.count_nonzero(trusted)), config, onset)
     # 3. All of them, or the parts of a long overlap on which both maps have the same shape.
-    overlap = _Overlap(old, new, pairs, matcher, onset, config)
+    overlap = _Overlap(old, new, matched, pairs, onset, config)
     refused = link = _link_over(overlap, pairs.keyframes[trusted], rng)
     for before in _parts(pairs.keyframes[trusted], config) if _is_bent(refused) else ():
         link = _link_over(overlap, before, rng)
@@ -129,8 +136,8 @@ class _Overlap:
 
     old: Submap
     new: Submap
+    matched: MatchedLandmarks
     pairs: Correspondences
-    matcher: DescriptorMatcher | None
     onset: int | None
     config: LinkingConfig
     _by_limit: dict[int, Correspondences] = field(default_factory=dict)
@@ -140,7 +147,7 @@ class _Overlap:
         if limit is None:
             return self.pairs
         if limit not in self._by_limit:
-            self._by_limit[limit] = propose_correspondences(self.old, self.new, self.matcher, limit)
+            self._by_limit[limit] = place_pairs(self.old, self.new, self.matched, limit)
         return self._by_limit[limit]
 
 

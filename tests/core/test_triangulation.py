@@ -105,6 +105,24 @@ def test_n_views_exact_with_gaps() -> None:
     assert (points.min_cos_parallax[~enough] == 1.0).all()
 
 
+def test_views_that_do_not_see_a_point_make_no_difference() -> None:
+    """Each point of many views is where its own two views alone place it, and its numbers stand under these."""
+    T_cam_w, _, uv = five_views(5)
+    rng = np.random.default_rng(5)
+    uv = uv + 0.5 * rng.normal(size=uv.shape)
+    views = np.sort(np.argsort(rng.random(uv.shape[:2]), axis=1)[:, :2], axis=1)
+    visible = np.zeros(uv.shape[:2], bool)
+    np.put_along_axis(visible, views, True, 1)
+    points = triangulate_n_view(uv, K, T_cam_w, visible)
+    for i, own in enumerate(views):
+        alone = triangulate_n_view(uv[i : i + 1, own], K, T_cam_w[own])
+        np.testing.assert_allclose(points.xyz[i], alone.xyz[0], rtol=1e-8)
+        np.testing.assert_allclose(points.depth[i, own], alone.depth[0], rtol=1e-8)
+        np.testing.assert_allclose(points.error2[i, own], alone.error2[0], rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(points.min_cos_parallax[i], alone.min_cos_parallax[0], rtol=1e-12)
+    assert np.isnan(points.depth[~visible]).all()
+
+
 def test_n_views_minimise_the_reprojection_error() -> None:
     """With noise: SciPy finds nothing lower, and two views agree with the two-view function."""
     T_cam_w, xyz, uv = five_views(4)

@@ -185,14 +185,16 @@ def triangulate_n_view(
     """
     n, n_views = uv.shape[:2]
     seen = np.ones((n, n_views), bool) if visible is None else np.asarray(visible, bool)
+    # Each point's own views come first, and no more columns than one of them needs: of many views most see little.
+    column = np.argsort(~seen, axis=1, kind="stable")[:, : max(int(seen.sum(1).max(initial=0)), 1)]
+    seen, uv = np.take_along_axis(seen, column, 1), np.take_along_axis(uv, column[..., None], 1)
     w = np.repeat(seen[..., None], 2, -1).astype(np.float64)
     focal, centre = np.array([K[0, 0], K[1, 1]]), K[:2, 2]
     x = np.where(seen[..., None], (uv - centre) / focal, 0.0)
-    reference = np.argmax(seen, axis=1)
     T_w_cam = se3.inverse(T_cam_w)
-    T_view_ref = T_cam_w[None, :] @ T_w_cam[:, None]
-    unit = max(float(np.abs(T_view_ref[..., :3, 3]).max()), 1e-300)
-    T = T_view_ref[reference]
+    T_w_ref = T_w_cam[column[:, 0]]
+    T = T_cam_w[column] @ T_w_ref[:, None]
+    unit = max(float(np.abs(T[..., :3, 3]).max(initial=0.0)), 1e-300)
     M = np.concatenate([T[..., :3, :2], T[..., :3, 3:] / unit], -1)
     c = T[..., :3, 2]
     # In each view q = M (alpha, beta, rho) + c is the point up to scale; x q_z = q_x is linear.
@@ -206,13 +208,18 @@ def triangulate_n_view(
     rho = np.where(np.abs(point[:, 2]) < MIN_INVERSE_DEPTH, MIN_INVERSE_DEPTH, point[:, 2]) / unit
     p_ref = np.stack([point[:, 0], point[:, 1], np.ones(n)], -1) / rho[:, None]
     nowhere = np.where(seen, 0.0, np.nan)
-    error2 = (((x - q[..., :2]) * focal) ** 2).sum(-1) + nowhere
-    cos = _widest_parallax(x, seen, T_w_cam[:, :3, :3])
-    return NViewPoints(se3.act_each(T_w_cam[reference], p_ref), q[..., 2] / rho[:, None] + nowhere, error2, cos)
+    depth, error2 = np.full((2, n, n_views), np.nan)
+    np.put_along_axis(depth, column, q[..., 2] / rho[:, None] + nowhere, 1)
+    np.put_along_axis(error2, column, (((x - q[..., :2]) * focal) ** 2).sum(-1) + nowhere, 1)
+    cos = _widest_parallax(x, seen, T_w_cam[column][..., :3, :3])
+    return NViewPoints(se3.act_each(T_w_ref, p_ref), depth, error2, cos)
 
 
 def _widest_parallax(x: FloatArray, seen: BoolArray, R_w_cam: FloatArray) -> FloatArray:
-    """Return the smallest cosine (N,) between any two rays of each point; x (N, V, 2) is normalised."""
+    """Return the smallest cosine (N,) between any two rays of each point.
+
+    `x` (N, V, 2) is normalised, `R_w_cam` (N, V, 3, 3).
+    """
     rays = (R_w_cam @ np.concatenate([x, np.ones_like(x[..., :1])], -1)[..., None])[..., 0]
     rays /= np.sqrt((rays * rays).sum(-1, keepdims=True))
     both = seen[:, :, None] & seen[:, None, :] & ~np.eye(x.shape[1], dtype=bool)
