@@ -63,7 +63,12 @@ class _Optimum:
 
 
 def estimate_calibration(
-    submap: Submap, camera: Camera, config: CalibrationConfig, robust_k: float = 1.345, seed: int = 0
+    submap: Submap,
+    camera: Camera,
+    config: CalibrationConfig,
+    robust_k: float = 1.345,
+    seed: int = 0,
+    present_covariance: FloatArray | None = None,
 ) -> CalibrationEstimate | Failure:
     """Ask a submap about its camera.
 
@@ -78,6 +83,8 @@ def estimate_calibration(
         Huber threshold in sigmas.
     seed : int
         Of the choice among landmarks, where there are too many.
+    present_covariance : (5, 5), optional
+        Of the correction that `camera` has, if it was estimated.
 
     Returns
     -------
@@ -95,7 +102,7 @@ def estimate_calibration(
     problem = make_problem(submap, window, camera, config.max_observations, seed)
     if len(problem.kf) < MIN_OBSERVATIONS:
         return Failure(FailureReason.TOO_FEW_INLIERS, f"{len(problem.kf)} observations in {len(window)} keyframes")
-    return estimate_correction(problem, camera.width, correction_of(camera), config, robust_k)
+    return estimate_correction(problem, camera.width, correction_of(camera), config, robust_k, present_covariance)
 
 
 def estimate_correction(
@@ -104,8 +111,13 @@ def estimate_correction(
     present: LensCorrection,
     config: CalibrationConfig,
     robust_k: float = 1.345,
+    present_covariance: FloatArray | None = None,
 ) -> CalibrationEstimate | Failure:
     """Estimate the correction of a camera, and judge it.
+
+    Against an earlier answer of the same map the test is one of two estimates: the covariance of their difference is
+    that of neither alone. It is at most the sum of both, as if each had data of its own, and that is what is asked for:
+    what they have in common, systematic errors first of all, does not tell which one is right.
 
     Parameters
     ----------
@@ -117,6 +129,8 @@ def estimate_correction(
         That the poses and points were made with.
     config : CalibrationConfig
     robust_k : float
+    present_covariance : (5, 5), optional
+        Of `present`, if it was estimated; the calibration that was given is taken at its word.
     """
     start = time.perf_counter()
     prior = prior_sigmas(problem, width_px, config)
@@ -126,7 +140,8 @@ def estimate_correction(
     except (*GTSAM_ERRORS, np.linalg.LinAlgError) as error:
         return Failure(FailureReason.SOLVER, str(SolverFailure.of(error)))
     off = correction - present.vector
-    distance2 = float(off @ np.linalg.solve(covariance, off))
+    of_difference = covariance if present_covariance is None else covariance + present_covariance
+    distance2 = float(off @ np.linalg.solve(of_difference, off))
     estimate = CalibrationEstimate(
         LensCorrection.of_vector(correction),
         covariance,
@@ -139,7 +154,7 @@ def estimate_correction(
         time.perf_counter() - start,
     )
     sigma = math.sqrt(covariance[0, 0])
-    far = abs(float(off[0])) > config.far_sigmas * sigma
+    far = abs(float(off[0])) > config.far_sigmas * math.sqrt(of_difference[0, 0])
     if sigma > (config.far_sigma_ratio if far else config.max_sigma_ratio) * prior[0]:
         return Failure(FailureReason.DEGENERATE, "the motion does not fix the focal length", estimate.numbers)
     if (np.abs(correction) > MAX_PRIOR_SIGMAS * prior).any():

@@ -85,8 +85,8 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
     calibration = Calibration(
         camera,
         config.calibration,
-        estimate=lambda submap, camera: estimate_calibration(
-            submap, camera, config.calibration, config.graph.robust_k, config.seed
+        estimate=lambda submap, camera, covariance: estimate_calibration(
+            submap, camera, config.calibration, config.graph.robust_k, config.seed, covariance
         ),
         adjust=lambda submap: adjust_submap(submap, config.graph.robust_k),
     )

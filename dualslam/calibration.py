@@ -12,7 +12,7 @@ from dualslam.core.corrected_camera import correct
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph
 from dualslam.core.submap import Submap
-from dualslam.core.types import Failure, FailureReason, Features, View
+from dualslam.core.types import Failure, FailureReason, Features, FloatArray, View
 
 RETRY_KEYFRAMES, RETRY_SHARE = 10, 0.25
 """Where the motion said nothing yet, a submap is asked again after so many more keyframes, or this share more."""
@@ -58,7 +58,7 @@ class Calibration:
         self._adjust = adjust
         self._due_at: dict[int, int] = {}
         self._refined_in: int | None = None
-        self._log_focal_sigma = np.inf  # of the change that the camera holds
+        self._covariance: FloatArray | None = None  # (5, 5), of the correction that the camera holds
 
     @property
     def camera(self) -> Camera:
@@ -84,14 +84,13 @@ class Calibration:
         """
         n = len(submap.keyframes)
         self._due_at[submap.id] = int(np.ceil(self._config.growth * n))
-        estimate = self._estimate(submap, self._camera)
+        estimate = self._estimate(submap, self._camera, self._covariance)
         if isinstance(estimate, Failure):
             if estimate.reason is FailureReason.DEGENERATE:
                 self._due_at[submap.id] = n + max(RETRY_KEYFRAMES, int(RETRY_SHARE * n))
             return estimate
         numbers = estimate.numbers
-        log_focal_sigma = float(np.sqrt(estimate.covariance[0, 0]))
-        if not estimate.accepted and not (self._refined_in == submap.id and self._is_much_surer(log_focal_sigma)):
+        if not estimate.accepted and not self._is_much_surer(estimate.covariance):
             return Failure(FailureReason.CHI_SQUARE, "no significant change", numbers)
         try:
             camera = correct(self._camera, estimate.correction)
@@ -104,14 +103,16 @@ class Calibration:
         changed.apply_estimate(*solved.values)
         before = submap.copy()
         submap.take_over(changed)
-        self._camera, self._refined_in, self._log_focal_sigma = camera, submap.id, log_focal_sigma
+        self._camera, self._refined_in, self._covariance = camera, submap.id, estimate.covariance
         return Refinement(graph, before, numbers)
 
-    def _is_much_surer(self, log_focal_sigma: float) -> bool:
+    def _is_much_surer(self, covariance: FloatArray) -> bool:
         """Whether an answer is worth a change that is not significant: only where the present one was hardly sure."""
-        config, present = self._config, self._log_focal_sigma
+        if self._covariance is None:
+            return False
+        config, present, found = self._config, *(float(np.sqrt(C[0, 0])) for C in (self._covariance, covariance))
         hardly_sure = present > config.max_sigma_ratio * config.log_focal_sigma
-        return hardly_sure and log_focal_sigma < config.update_sigma_ratio * present
+        return hardly_sure and found < config.update_sigma_ratio * present
 
     def rectified(self, view: View) -> View:
         """Return a view with the pixels of the present camera; features without a place there keep their old one."""

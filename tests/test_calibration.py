@@ -38,7 +38,7 @@ def calibration_that_finds(found: CalibrationEstimate | Failure) -> Calibration:
     return Calibration(
         wrong_camera(WRONG),
         CalibrationConfig(),
-        estimate=lambda submap, camera: found,
+        estimate=lambda *_: found,
         adjust=lambda submap: adjust_submap(submap, 1.345),
     )
 
@@ -97,18 +97,34 @@ class TestRefine:
         calibration = Calibration(
             wrong_camera(WRONG),
             CalibrationConfig(),
-            estimate=lambda submap, camera: answers.pop(0),
+            estimate=lambda *_: answers.pop(0),
             adjust=lambda submap: adjust_submap(submap, 1.345),
         )
         assert calibration.refine(submap, new_graph())
         assert bool(calibration.refine(submap, new_graph())) is changes
         assert correction_of(calibration.camera) == (RIGHT_AGAIN if changes else near)
 
+    def test_an_answer_is_asked_for_with_what_was_known_of_the_one_before(self) -> None:
+        asked_with: list[FloatArray | None] = []
+
+        def found(submap: Submap, camera: Camera, covariance: FloatArray | None) -> CalibrationEstimate:
+            asked_with.append(covariance)
+            return replace(estimate_of(RIGHT_AGAIN, len(asked_with) == 1), covariance=0.007**2 * np.eye(5))
+
+        submap = make_submap(wrong_camera(WRONG), turning=True, n=6)
+        calibration = Calibration(
+            wrong_camera(WRONG), CalibrationConfig(), found, lambda submap: adjust_submap(submap, 1.345)
+        )
+        assert calibration.refine(submap, new_graph())
+        assert not calibration.refine(submap, new_graph())
+        assert asked_with[0] is None
+        np.testing.assert_array_equal(asked_with[1], 0.007**2 * np.eye(5))
+
     def test_a_solver_that_fails_leaves_the_submap(self) -> None:
         def adjust(submap: Submap) -> None:
             raise SolverError("no")
 
-        def found(submap: Submap, camera: Camera) -> CalibrationEstimate:
+        def found(submap: Submap, camera: Camera, covariance: FloatArray | None) -> CalibrationEstimate:
             return estimate_of(RIGHT_AGAIN, accepted=True)
 
         submap = make_submap(wrong_camera(WRONG), turning=True, n=6)
@@ -119,7 +135,7 @@ class TestRefine:
 
     def test_when_it_is_due(self) -> None:
         submap = make_submap(TRUE, turning=True, n=30)
-        off = Calibration(TRUE, CalibrationConfig(refine=False), lambda s, c: Failure(FailureReason.SOLVER), print)
+        off = Calibration(TRUE, CalibrationConfig(refine=False), lambda *_: Failure(FailureReason.SOLVER), print)
         assert not off.is_due(submap)
         calibration = calibration_that_finds(estimate_of(RIGHT_AGAIN, accepted=False))
         assert calibration.is_due(submap)

@@ -229,7 +229,8 @@ class CalibrationEstimate:
     covariance : (5, 5)
         Of ``correction.vector``, inflated for the correlation of neighbouring observations.
     distance2 : float
-        Squared Mahalanobis distance from the correction that the submap was made with.
+        Squared Mahalanobis distance from the correction that the submap was made with, whose covariance counts too
+        where it was estimated.
     accepted : bool
         Whether it is significantly better than that.
     cost_before, cost_after : float
@@ -268,8 +269,13 @@ class CalibrationEstimate:
 class SelfCalibrator(Protocol):
     """Asks a submap about its camera, which is the one that rectified its features. The submap is not changed."""
 
-    def __call__(self, submap: Submap, camera: Camera) -> CalibrationEstimate | Failure:
-        """Estimate the correction of the calibration that was given, or say why it cannot be had."""
+    def __call__(
+        self, submap: Submap, camera: Camera, present_covariance: FloatArray | None
+    ) -> CalibrationEstimate | Failure:
+        """Estimate the correction of the calibration that was given, or say why it cannot be had.
+
+        `present_covariance`: (5, 5), of the correction that the camera has, if it was estimated.
+        """
         ...
 
 

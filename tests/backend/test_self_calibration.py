@@ -85,6 +85,24 @@ class TestEstimate:
         assert unsure.max_sigma_ratio * unsure.log_focal_sigma < estimate.numbers["log_focal_sigma"]
         assert bool(estimate) is counts
 
+    def test_another_answer_must_differ_by_more_than_is_unknown_of_both(self) -> None:
+        """An answer a little off, as the same map can give it: against itself the new one is sure, not against both."""
+        camera = wrong_camera()
+        submap = make_submap(camera, turning=True)
+        first = estimate_calibration(submap, camera, CONFIG)
+        assert first
+        # Five sigmas along a direction in which nothing else makes up for it.
+        values, vectors = np.linalg.eigh(first.covariance)
+        off = LensCorrection.of_vector(first.correction.vector + 5.0 * np.sqrt(values[-1]) * vectors[:, -1])
+        surely = estimate_calibration(submap, correct(camera, off), CONFIG)
+        of_both = estimate_calibration(submap, correct(camera, off), CONFIG, present_covariance=first.covariance)
+        assert surely
+        assert of_both
+        assert surely.accepted
+        assert not of_both.accepted
+        np.testing.assert_allclose(of_both.correction.vector, surely.correction.vector)
+        assert of_both.distance2 == pytest.approx(0.5 * surely.distance2, rel=0.05)
+
     def test_driving_straight_ahead_says_nothing(self) -> None:
         camera = wrong_camera()
         submap = make_submap(camera, turning=False)
