@@ -11,12 +11,12 @@ import numpy as np
 from backend.local_ba import bundle_adjust, bundle_adjust_arrays
 from backend.self_calibration import estimate_calibration
 from backend.submap_graph import ISam2SubmapGraph
-from dualslam.calibration import Calibration, rectify
+from dualslam.calibration import Calibration, check_camera, rectify
 from dualslam.core.camera import Camera
 from dualslam.core.config import AttemptConfig, Config, FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.grey_image import GreyImage
-from dualslam.core.interfaces import Frontend, SubmapGraph
+from dualslam.core.interfaces import Frontend, SelfCalibrator, SubmapGraph
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Features, Frame, View
 from dualslam.evaluation.failure_lab import FaultScript
@@ -85,9 +85,7 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
     calibration = Calibration(
         camera,
         config.calibration,
-        estimate=lambda submap, camera, covariance: estimate_calibration(
-            submap, camera, config.calibration, config.graph.robust_k, config.seed, covariance
-        ),
+        estimate=self_calibrator(config),
         adjust=lambda submap: adjust_submap(submap, config.graph.robust_k),
     )
     faults = FaultScript(config.corruptions)
@@ -113,6 +111,13 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
             recovery=recovery or recovery_executor(config, size_px, faults, frontend),
         ),
         config,
+    )
+
+
+def self_calibrator(config: Config) -> SelfCalibrator:
+    """Build what asks a submap about its camera."""
+    return lambda submap, camera, covariance: estimate_calibration(
+        submap, camera, config.calibration, config.graph.robust_k, config.seed, covariance
     )
 
 
@@ -155,6 +160,9 @@ def recovery_parts(
             old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
         ),
         carry=lambda link, new, newest_id: carry_to_live_end(link, new, newest_id, config.linking),
+        check_camera=lambda submap, camera, covariance: check_camera(
+            submap, camera, covariance, self_calibrator(config), config.calibration
+        ),
         judge=lambda track: judge_track(track, config.health),
         config=config.recovery,
         fusion=config.fusion,

@@ -1,4 +1,4 @@
-"""The camera as it is known now: when a submap is asked about it, and what changes with the answer."""
+"""The camera as it is known now: when a submap is asked about it, what changes with the answer, and what must wait."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import Camera
-from dualslam.core.corrected_camera import correct
+from dualslam.core.corrected_camera import correct, correction_of
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph
 from dualslam.core.submap import Submap
@@ -65,6 +65,11 @@ class Calibration:
         """The camera that the frames to come are rectified by."""
         return self._camera
 
+    @property
+    def covariance(self) -> FloatArray | None:
+        """(5, 5) of the correction that it has; none where it is as it was given."""
+        return self._covariance
+
     def is_due(self, submap: Submap) -> bool:
         """Whether it is time to ask this submap."""
         if self._refined_in not in (None, submap.id):
@@ -94,17 +99,32 @@ class Calibration:
             return Failure(FailureReason.CHI_SQUARE, "no significant change", numbers)
         try:
             camera = correct(self._camera, estimate.correction)
-            changed = submap.copy()
-            _change_camera(changed, camera)
-            self._adjust(changed)
-            solved = graph.rebuild(changed)
+            before = self._change(submap, camera, graph)
         except (InputError, SolverError) as error:
             return Failure(FailureReason.SOLVER, str(error), numbers)
+        self._camera, self._refined_in, self._covariance = camera, submap.id, estimate.covariance
+        return Refinement(graph, before, numbers)
+
+    def update(self, submap: Submap, graph: SubmapGraph) -> Submap | Failure:
+        """Change a submap that an earlier camera made to the present one; return a copy of it as it was.
+
+        It was the same lens: what a longer map says of it is true of this one too. Two maps of different cameras have
+        different shapes, and would not be linked.
+        """
+        try:
+            return self._change(submap, self._camera, graph)
+        except (InputError, SolverError) as error:
+            return Failure(FailureReason.SOLVER, str(error))
+
+    def _change(self, submap: Submap, camera: Camera, graph: SubmapGraph) -> Submap:
+        changed = submap.copy()
+        _change_camera(changed, camera)
+        self._adjust(changed)
+        solved = graph.rebuild(changed)
         changed.apply_estimate(*solved.values)
         before = submap.copy()
         submap.take_over(changed)
-        self._camera, self._refined_in, self._covariance = camera, submap.id, estimate.covariance
-        return Refinement(graph, before, numbers)
+        return before
 
     def _is_much_surer(self, covariance: FloatArray) -> bool:
         """Whether an answer is worth a change that is not significant: only where the present one was hardly sure."""
@@ -121,6 +141,36 @@ class Calibration:
         lost = ~np.isfinite(uv_rect_px).all(axis=1)
         uv_rect_px[lost] = features.uv_rect_px[lost]
         return replace(view, features=replace(features, uv_rect_px=uv_rect_px))
+
+
+def check_camera(
+    submap: Submap, camera: Camera, covariance: FloatArray | None, estimate: SelfCalibrator, config: CalibrationConfig
+) -> Failure | None:
+    """Refuse a submap that contradicts its camera, whether or not it says for sure which one it was.
+
+    A wrong camera bends a map wherever it turns: it may agree with another map of that camera on all that both have
+    seen, and say nothing of the scale beyond. What is asked is no more than whether the difference is chance.
+
+    Parameters
+    ----------
+    submap : Submap
+    camera : Camera
+        Which rectified its features.
+    covariance : (5, 5), optional
+        Of the correction that the camera has, if it was estimated.
+    estimate : SelfCalibrator
+    config : CalibrationConfig
+        Without `refine` the camera is taken at its word.
+    """
+    if not config.refine:
+        return None
+    numbers = estimate(submap, camera, covariance).numbers
+    if numbers.get("distance2", 0.0) <= config.min_distance2:
+        return None
+    off = numbers["log_focal"] - correction_of(camera).log_focal
+    sigma = numbers["log_focal_sigma"]
+    detail = f"the new map contradicts its camera: focal length {off:+.1%}, known to {sigma:.1%}"
+    return Failure(FailureReason.CAMERA, detail, {"log_focal": off, "distance2": numbers["distance2"]})
 
 
 def rectify(features: Features, camera: Camera, model_sigma_px: float) -> Features:

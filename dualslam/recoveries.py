@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from dualslam.atlas import Link, LinkKind
 from dualslam.calibration import Calibration
 from dualslam.carried_poses import carry_poses
+from dualslam.core.camera import Camera
 from dualslam.core.config import RecoveryConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
@@ -107,7 +108,12 @@ class Recoveries:
         self._began: dict[int, float] = {}  # when, by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
         self._starts: dict[int, int] = {}  # the keyframe that its first walk started from
-        self._unlinked: dict[int, int] = {}  # how many live keyframes it had when a walk last found no link
+        self._unlinked: dict[int, tuple[int, Camera]] = {}  # live keyframes, and camera, when a walk last found no link
+
+    @property
+    def waiting(self) -> list[int]:
+        """The lost submaps that are not linked yet."""
+        return sorted(self._lost)
 
     def declare_lost(self, submap_id: int, onset: int, cause: str, first_lost: int) -> None:
         """Let the walks to come look for a submap: lost at frame `first_lost`, suspected from `onset` on."""
@@ -139,20 +145,22 @@ class Recoveries:
             views=tuple(self._views_before(newest, submap, stop_at_posed=not onsets)),
             own=tuple(view for view in self._buffer if view.index in submap.keyframes),
             camera=self._calibration.camera,
+            camera_covariance=self._calibration.covariance,
         )
         self._began[submap.id] = time.perf_counter()
         self._starts.setdefault(submap.id, newest.index)
         self._executor.submit(job)
 
     def retry(self, submap: Submap, now: View) -> None:
-        """Walk back again where no link was found, once the new map has grown: it knows depths better then.
+        """Walk back again where no link was found, once the new map has grown or its camera was calibrated.
 
-        Only while the buffer still holds frames that a lost map saw.
+        It knows depths better then. Only while the buffer still holds frames that a lost map saw.
         """
-        tried_with = self._unlinked.get(submap.id)
-        if tried_with is None or submap.id in self._began or not self._lost:
+        if submap.id not in self._unlinked or submap.id in self._began or not self._lost:
             return
-        if not any(tried_with < n <= self._n_live(submap) for n in self._config.retry_keyframes):
+        tried_with, camera = self._unlinked[submap.id]
+        has_grown = any(tried_with < n <= self._n_live(submap) for n in self._config.retry_keyframes)
+        if not has_grown and camera == self._calibration.camera:
             return
         del self._unlinked[submap.id]
         lost = {k for m in self._lost for k in self._record.atlas.submaps[m].keyframes}
@@ -180,7 +188,7 @@ class Recoveries:
         for job, result in outcomes:
             started_s = self._began.pop(job.submap.id)
             if job.onsets and (isinstance(result, Failure) or result.link is None):
-                self._unlinked[job.submap.id] = self._n_live(job.submap)
+                self._unlinked[job.submap.id] = self._n_live(job.submap), job.camera
             if isinstance(result, Failure):
                 self._failed(job, now, result, time.perf_counter() - started_s)
                 continue

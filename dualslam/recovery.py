@@ -24,7 +24,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry
 from dualslam.core.submap import Submap
-from dualslam.core.types import Failure, FailureReason, Track, View
+from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
 from dualslam.linking import LinkEstimate
 from dualslam.relinker import Linker, LinkTry, Relinker
 from dualslam.seam import SeamReport, refine_seam
@@ -55,6 +55,8 @@ class RecoveryJob:
         Buffered views of the new submap's keyframes, `newest_id` included: for attempts that need their images.
     camera : Camera
         The one that rectified them.
+    camera_covariance : (5, 5) or None
+        Of the correction that it has, if it was estimated.
     """
 
     submap: Submap
@@ -64,6 +66,7 @@ class RecoveryJob:
     views: tuple[View, ...]
     own: tuple[View, ...]
     camera: Camera
+    camera_covariance: FloatArray | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,6 +132,7 @@ class RecoveryParts:
     new_graph: Callable[[], SubmapGraph]
     link: Linker
     carry: Callable[[LinkEstimate, Submap, int], LinkEstimate | Failure]
+    check_camera: Callable[[Submap, Camera, FloatArray | None], Failure | None]
     judge: Judge
     config: RecoveryConfig
     fusion: FusionConfig
@@ -155,7 +159,7 @@ def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Fai
         events += walk.events
         if best is None or walk.link is not None:
             best = walk
-        if walk.link is not None:
+        if walk.link is not None or walk.needs_camera:
             break
     if best is None:
         return problem
@@ -177,6 +181,7 @@ class _Walk:
     n_unusable: int = 0  # the last frames
     out_of_time: bool = False
     given_up: bool = False
+    needs_camera: bool = False  # no other walk would do better, before the camera is calibrated
     why_unusable: str = ""
     why_not_linked: str = ""
 
@@ -230,7 +235,8 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float
                 walk.link = found
                 break
             walk.why_not_linked = found.detail
-            walk.given_up |= found.reason is FailureReason.SCALE_LOST
+            walk.needs_camera |= found.reason is FailureReason.CAMERA
+            walk.given_up |= walk.needs_camera or found.reason is FailureReason.SCALE_LOST
             walk.events.append(_refusal(tried, found, attempt.name, step.view, submap.id))
         walk.given_up |= relinker.has_seen_enough
         if walk.link is not None or walk.given_up:
@@ -241,13 +247,16 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float
 
 
 def _fused(tried: LinkTry, job: RecoveryJob, submap: Submap, attempt: str, parts: RecoveryParts) -> FoundLink | Failure:
-    """Refine the seam and with it the link, which must hold as far as where the walk set out."""
+    """Refine the seam and with it the link, which must hold as far as where the walk set out, and beyond."""
     found = tried.result
     if isinstance(found, Failure):
         return found
     link = parts.carry(found, submap, job.newest_id)
     if isinstance(link, Failure):
         return link
+    contradicted = parts.check_camera(submap, job.camera, job.camera_covariance)
+    if contradicted is not None:
+        return contradicted
     seam = refine_seam(job.lost[tried.old_id], submap, found, parts.new_graph, parts.link, parts.fusion)
     if isinstance(seam, Failure):
         unrefined = seam.reason in (FailureReason.DISABLED, FailureReason.SOLVER)

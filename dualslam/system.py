@@ -225,7 +225,10 @@ class System:
         return track
 
     def _calibrate(self, live: VisualOdometry, view: View) -> None:
-        """Ask the submap about its camera. Where the answer is clear, submap, graph and buffer change to it."""
+        """Ask the submap about its camera. Where the answer is clear, submap, graph and buffer change to it.
+
+        So do the lost submaps that are to be linked with it.
+        """
         calibration = self._parts.calibration
         with self.timer.measure("calibration"):
             refined = calibration.refine(live.submap, self._parts.new_graph())
@@ -236,11 +239,25 @@ class System:
                 return
             live.adopt(refined.graph, refined.before)
             self.buffer.map(calibration.rectified)
-            for pose in carry_poses(self.poses.values(), refined.before, live.submap):
-                self.poses[pose.index] = pose
-            carry_anchors(refined.before, live.submap)
-            carry_links(self.atlas, refined.before, live.submap)
-        self._record.event(EventKind.CALIBRATED, view, live.submap.id, **refined.numbers)
+            self._carry(refined.before, live.submap)
+            changed = [m for m in self._recoveries.waiting if self._update_camera(self.atlas.submaps[m])]
+        self._record.event(EventKind.CALIBRATED, view, live.submap.id, lost=changed, **refined.numbers)
+
+    def _update_camera(self, lost: Submap) -> bool:
+        """Change a lost submap to the present camera, if it can be."""
+        before = self._parts.calibration.update(lost, self._parts.new_graph())
+        if isinstance(before, Failure):
+            log.warning("submap %d keeps its camera: %s", lost.id, before.detail)
+            return False
+        self._carry(before, lost)
+        return True
+
+    def _carry(self, before: Submap, submap: Submap) -> None:
+        """Let all that is known against a submap follow it where a calibration has bent it."""
+        for pose in carry_poses(self.poses.values(), before, submap):
+            self.poses[pose.index] = pose
+        carry_anchors(before, submap)
+        carry_links(self.atlas, before, submap)
 
     # --- failure
 

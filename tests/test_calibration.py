@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from backend.submap_graph import ISam2SubmapGraph
-from dualslam.build import adjust_submap, build_system
-from dualslam.calibration import Calibration, rectify
+from dualslam.build import adjust_submap, build_system, self_calibrator
+from dualslam.calibration import Calibration, check_camera, rectify
 from dualslam.carried_poses import carry_anchors, carry_poses
 from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import Camera
@@ -133,6 +133,22 @@ class TestRefine:
         np.testing.assert_array_equal(submap.K, wrong_camera(WRONG).K)
         assert correction_of(calibration.camera) == LensCorrection()
 
+    def test_another_map_of_the_same_lens_is_changed_as_well(self) -> None:
+        """Its own pixels say nothing for sure: it drives straight ahead."""
+        camera = wrong_camera(WRONG)
+        submap, other = make_submap(camera, turning=True, n=12), make_submap(camera, turning=False, n=12, seed=1)
+        calibration = calibration_that_finds(estimate_of(RIGHT_AGAIN, accepted=True))
+        assert calibration.refine(submap, new_graph())
+        before = calibration.update(other, new_graph())
+        assert before
+        np.testing.assert_allclose(before.K, camera.K)
+        np.testing.assert_allclose(other.K, TRUE.K, atol=1e-9)
+        for keyframe in other.keyframes.values():
+            uv_rect_px, _ = calibration.camera.rectify(keyframe.features.uv_px)
+            np.testing.assert_allclose(keyframe.features.uv_rect_px, uv_rect_px)
+        depth = [m.landmarks["xyz_mu"][:, 2].mean() / m.T_submap_kf[11][2, 3] for m in (before, other)]
+        assert abs(depth[1] / depth[0] - 1) < 0.05  # it is the same map still
+
     def test_when_it_is_due(self) -> None:
         submap = make_submap(TRUE, turning=True, n=30)
         off = Calibration(TRUE, CalibrationConfig(refine=False), lambda *_: Failure(FailureReason.SOLVER), print)
@@ -141,6 +157,43 @@ class TestRefine:
         assert calibration.is_due(submap)
         calibration.refine(submap, new_graph())
         assert not calibration.is_due(submap)
+
+
+class TestCheckCamera:
+    """What is asked of a map before it is linked."""
+
+    @staticmethod
+    def check(submap: Submap, camera: Camera, covariance: FloatArray | None = None, **settings: object) -> object:
+        config = Config.model_validate({"calibration": settings})
+        return check_camera(submap, camera, covariance, self_calibrator(config), config.calibration)
+
+    def test_a_map_of_the_right_camera_passes(self) -> None:
+        assert self.check(make_submap(TRUE, turning=True, n=10), TRUE) is None
+
+    def test_one_that_contradicts_it_does_not_though_it_is_not_sure_of_another(self) -> None:
+        camera = wrong_camera(1.06)
+        submap, settings = make_submap(camera, turning=True, n=6), {"inflation": 9.0}
+        answer = self_calibrator(Config.model_validate({"calibration": settings}))(submap, camera, None)
+        assert isinstance(answer, Failure)
+        assert answer.reason is FailureReason.DEGENERATE
+        refused = self.check(submap, camera, **settings)
+        assert isinstance(refused, Failure)
+        assert refused.reason is FailureReason.CAMERA
+        assert refused.numbers["log_focal"] == pytest.approx(-np.log(1.06), abs=0.02)
+
+    def test_nor_does_it_contradict_what_is_known_no_better(self) -> None:
+        camera = wrong_camera(1.03)
+        submap = make_submap(camera, turning=True, n=10)
+        assert self.check(submap, camera) is not None
+        assert self.check(submap, camera, np.diag([0.02, 5.0, 5.0, 0.02, 0.02]) ** 2) is None
+
+    def test_one_that_says_nothing_passes(self) -> None:
+        camera = wrong_camera(1.06)
+        assert self.check(make_submap(camera, turning=False, n=10), camera) is None
+
+    def test_it_is_not_asked_where_the_camera_is_taken_at_its_word(self) -> None:
+        camera = wrong_camera(1.06)
+        assert self.check(make_submap(camera, turning=True, n=10), camera, refine=False) is None
 
 
 def test_frames_between_keyframes_follow_a_map_that_bends() -> None:

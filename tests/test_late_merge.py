@@ -193,6 +193,41 @@ def test_the_camera_has_been_refined_meanwhile() -> None:
     assert rotation.max() < ROTATION_RAD
 
 
+def test_a_map_that_contradicts_its_camera_is_linked_after_both_have_been_calibrated() -> None:
+    settings = {
+        "calibration": {"first_keyframes": 20, "max_observations": 6000},
+        "keyframes": {"max_parallax_deg": 1.0},
+        "mapping": {"redundant_ratio": 1.0},
+        "camera": {"model_sigma_px": 0.0},
+        "recovery": {"attempts": ["live"]},
+    }
+    system, world = build_system(Config.model_validate(settings), wrong_camera(1.02)), CalibrationWorld()
+    calibration, rng = system._parts.calibration, np.random.default_rng(0)
+    covered = range(26, 38)
+
+    def view_of(frame: Frame) -> View:
+        if frame.index in covered:
+            return View(frame.index, frame.timestamp_s, random_features(rng))
+        return world.view(frame, calibration)
+
+    system._parts = replace(system._parts, view_of=view_of)
+    for i in range(75):
+        system.step(Frame(i, i / 30, None))
+    system.finish()
+    refused = system.events.of_kind(EventKind.LINK_REFUSED)
+    assert any(event.data["reason"] == "camera" for event in refused)
+    (calibrated,) = system.events.of_kind(EventKind.CALIBRATED)
+    assert calibrated.data["lost"] == [0]
+    (linked,) = system.events.of_kind(EventKind.LINKED)
+    assert linked.frame >= calibrated.frame > refused[0].frame
+    for submap in system.atlas.submaps.values():
+        np.testing.assert_array_equal(submap.K, calibration.camera.K)
+    main = trajectories_of(system).main
+    translation, rotation = pose_errors(main.T_world_cam, np.stack([world.T_world_cam(i) for i in main.index]))
+    assert translation.max() < POSITION_M
+    assert rotation.max() < ROTATION_RAD
+
+
 def test_the_run_ends_meanwhile(world: PointWorld) -> None:
     system = run(world, 1000)
     (ended,) = system.events.of_kind(EventKind.RECOVERY_ENDED)

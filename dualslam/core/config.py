@@ -202,7 +202,7 @@ class RecoveryConfig(StrictModel):
     mapped beyond inherits the error, and 5 %, two of these, is a wrong link."""
     retry_keyframes: tuple[int, ...] = (5, 15)
     """Keyframes of the new map, from its start on, at which a recovery that found no link is tried again: it
-    knows depths better then."""
+    knows depths better then. It is too when the camera has been calibrated since."""
     min_shared_keyframes: int = Field(4, ge=2)
     """Keyframes that both maps must hold before a link is tried."""
     max_shared_keyframes: int = Field(40, ge=4)

@@ -243,6 +243,7 @@ class FailureReason(StrEnum):
     UNREADABLE = "unreadable"
     SCALE = "scale"
     SCALE_LOST = "scale_lost"
+    CAMERA = "camera"
     SPREAD = "spread"
     AGREEMENT = "agreement"
     CONTRADICTION = "contradiction"
