@@ -20,7 +20,8 @@ from dualslam.io.trajectory_files import Trajectory
 from dualslam.synthetic import SyntheticSequence, make_sequence, parse_events
 
 SYNTHETIC = "synthetic:"
-DEFAULT_FRAMES = 300
+WORLD_NUMBERS = {"frames": 300, "seed": 0, "width": 640, "height": 480}
+"""What a synthetic source states in numbers, and what it takes where it does not."""
 RENDER_AHEAD_FRAMES = 4
 
 
@@ -40,7 +41,7 @@ def open_source(
     ----------
     source : path, str or int
         What `dualslam.io.open_sequence` takes, or ``synthetic:street`` or ``synthetic:room``, with options behind
-        commas: ``synthetic:street,frames=300,seed=1,events=FILE``.
+        commas: ``synthetic:street,frames=300,seed=1,width=640,height=480,events=FILE``.
     camera_file, fov_degrees : optional
         Calibration of a source that has none.
     start, stride, max_frames, reverse : optional
@@ -53,9 +54,7 @@ def open_source(
     if isinstance(source, str) and source.startswith(SYNTHETIC):
         if camera_file is not None or fov_degrees is not None:
             raise InputError(f"{source} has a camera of its own; leave out --camera and --fov.")
-        name, n_frames, seed, events = parse_world(source)
-        world = make_world(name, n_frames, seed, read_script(events) if events is not None else ())
-        return WorldSequence(world, Selection(start, stride, max_frames, reverse))
+        return WorldSequence(parse_world(source), Selection(start, stride, max_frames, reverse))
     return open_sequence(
         source,
         camera_file=camera_file,
@@ -102,7 +101,14 @@ class WorldSequence:
         return read_ahead(map(self._world.frame, self.source_indices.tolist()), RENDER_AHEAD_FRAMES)
 
 
-def make_world(name: str, n_frames: int, seed: int, events: Iterable[Any] = ()) -> SyntheticSequence:
+def make_world(
+    name: str,
+    n_frames: int,
+    seed: int,
+    events: Iterable[Any] = (),
+    width: int = WORLD_NUMBERS["width"],
+    height: int = WORLD_NUMBERS["height"],
+) -> SyntheticSequence:
     """Make a synthetic world; a wrong name or number is bad input here, as it comes from what a user names as source.
 
     Raises
@@ -110,7 +116,7 @@ def make_world(name: str, n_frames: int, seed: int, events: Iterable[Any] = ()) 
     InputError
     """
     try:
-        return make_sequence(name, n_frames, seed, events=events)
+        return make_sequence(name, n_frames, seed, width, height, events)
     except ConfigError as error:
         raise InputError(str(error)) from error
 
@@ -134,20 +140,25 @@ def read_script(path: str | Path) -> list[Mapping[str, Any]]:
     return items
 
 
-def parse_world(source: str) -> tuple[str, int, int, Path | None]:
-    """Read ``synthetic:NAME,key=value,...`` into the world's name, number of frames, seed and script of events."""
+def parse_world(source: str) -> SyntheticSequence:
+    """Make the world that ``synthetic:NAME,key=value,...`` names.
+
+    Raises
+    ------
+    InputError
+    """
     name, *pairs = source.removeprefix(SYNTHETIC).split(",")
-    n_frames, seed, events = DEFAULT_FRAMES, 0, None
+    numbers, events = dict(WORLD_NUMBERS), None
     for pair in pairs:
         key, _, value = pair.partition("=")
         if key == "events":
             events = Path(value)
-        elif key not in ("frames", "seed"):
-            raise InputError(f"{source}: a synthetic world has no option {key!r}; it has frames, seed and events.")
+        elif key not in numbers:
+            known = ", ".join(numbers)
+            raise InputError(f"{source}: a synthetic world has no option {key!r}; it has {known} and events.")
         elif not value.isdecimal():
             raise InputError(f"{source}: {key} must be a whole number, not {value!r}.")
-        elif key == "frames":
-            n_frames = int(value)
         else:
-            seed = int(value)
-    return name, n_frames, seed, events
+            numbers[key] = int(value)
+    script = read_script(events) if events is not None else ()
+    return make_world(name, numbers["frames"], numbers["seed"], script, numbers["width"], numbers["height"])

@@ -43,6 +43,7 @@ def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
         ("run synthetic:street,frames=x --out there", "frames must be a whole number, not 'x'"),
         ("run synthetic:street,frames=0 --out there", "n_frames is 0"),
         ("run synthetic:street,size=3 --out there", "no option 'size'"),
+        ("run synthetic:street,width=8 --out there", "width is 8"),
         ("run synthetic:street,events=none.yaml --out there", "none.yaml cannot be read"),
         ("run synthetic:street --out there --fov 70", "camera of its own"),
         ("run synthetic:street,frames=5 --out there --start 9", "start is 9"),
