@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import gtsam
@@ -29,6 +29,7 @@ from backend import convert
 from backend.factors import baseline_factor, pose_prior
 from backend.membership import MIN_DEPTH_MU, compute_depth_sigmas, compute_residuals
 from backend.noise import PixelNoise
+from backend.silence import silenced
 from backend.solver import GTSAM_ERRORS, SolverFailure
 from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import Camera
@@ -51,6 +52,8 @@ MIN_NOISE_RATIO = 0.05
 """Residuals smaller than this share of their sigmas would be an exact simulation."""
 CALIBRATION_KEY = 1 << 60
 MAX_ITERATIONS, TOLERANCE = 25, 1e-5
+MAX_DROPS = 3
+"""Times that it is tried again without points that went behind a camera."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,7 +138,7 @@ def estimate_correction(
     start = time.perf_counter()
     prior = prior_sigmas(problem, width_px, config)
     try:
-        best = _optimise(problem, present.vector, prior, robust_k)
+        best = _optimise_in_front(problem, present.vector, prior, robust_k)
         correction, covariance = _weigh(best, prior, config.inflation * best.noise_ratio)
     except (*GTSAM_ERRORS, np.linalg.LinAlgError) as error:
         return Failure(FailureReason.SOLVER, str(SolverFailure.of(error)))
@@ -247,6 +250,33 @@ def _mask(ids: IntArray, size: int) -> BoolArray:
 # --- the bundle adjustment
 
 
+class _BehindCameraError(RuntimeError):
+    """Points of the optimum lie behind a camera that saw them: the factor counts no error there, and fixes nothing."""
+
+    def __init__(self, points: IntArray) -> None:
+        super().__init__(f"{len(points)} points went behind their cameras")
+        self.points = points
+
+
+def _optimise_in_front(problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float) -> _Optimum:
+    """Minimise, without the few points that a step has put behind a camera."""
+    for _ in range(MAX_DROPS):
+        try:
+            return _optimise(problem, start, prior, robust_k)
+        except _BehindCameraError as error:
+            problem = _without(problem, error.points)
+    return _optimise(problem, start, prior, robust_k)
+
+
+def _without(problem: BundleProblem, points: IntArray) -> BundleProblem:
+    p, dropped = problem, _mask(points, len(problem.xyz_mu))
+    rows = ~dropped[p.point]
+    point = (np.cumsum(~dropped) - 1)[p.point[rows]]
+    return replace(
+        p, xyz_mu=p.xyz_mu[~dropped], kf=p.kf[rows], point=point, uv_px=p.uv_px[rows], sigma_px=p.sigma_px[rows]
+    )
+
+
 def _optimise(problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float) -> _Optimum:
     """Minimise over poses, points and calibration; the points are eliminated first, the calibration last."""
     p = problem
@@ -273,23 +303,33 @@ def _optimise(problem: BundleProblem, start: FloatArray, prior: FloatArray, robu
     params.setRelativeErrorTol(TOLERANCE)
     params.setLinearSolverType("SEQUENTIAL_CHOLESKY")
     params.setOrdering(gtsam.Ordering([*points.tolist(), *poses, CALIBRATION_KEY]))
-    before = float(graph.error(values))
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
-    result = optimizer.optimize()
+    with silenced():  # the factor prints each point that a step puts behind a camera
+        before = float(graph.error(values))
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+        result = optimizer.optimize()
+    T, xyz = convert.poses_of(result), convert.points_of(result)
+    behind = np.unique(p.point[_depths(p, T, xyz) <= MIN_DEPTH_MU])
+    if len(behind):
+        raise _BehindCameraError(behind)
     found = np.asarray(result.atCal3DS2(CALIBRATION_KEY).vector())
     correction, J = _from_cal3_ds2(found, p.K)
     marginal = np.asarray(gtsam.Marginals(graph, result).marginalCovariance(CALIBRATION_KEY))
-    noise_ratio = _noise_ratio(p, convert.poses_of(result), convert.points_of(result), correction)
+    noise_ratio = _noise_ratio(p, T, xyz, correction)
     return _Optimum(correction, J @ marginal @ J.T, noise_ratio, before, float(optimizer.error()))
+
+
+def _depths(problem: BundleProblem, T: FloatArray, xyz: FloatArray) -> FloatArray:
+    """Return the depth (R,) of each observed point in its camera."""
+    p = problem
+    return np.einsum("ri,ri->r", T[p.kf, :3, 2], xyz[p.point] - T[p.kf, :3, 3])
 
 
 def _noise_ratio(problem: BundleProblem, T: FloatArray, xyz: FloatArray, correction: FloatArray) -> float:
     """Return the ratio of the typical residual to its sigma."""
     p = problem
     p_cam = np.einsum("rji,rj->ri", T[p.kf, :3, :3], xyz[p.point] - T[p.kf, :3, 3])
-    front = p_cam[:, 2] > MIN_DEPTH_MU
-    uv = LensCorrection.of_vector(correction).distort_px(p.K, p_cam[front, :2] / p_cam[front, 2:])
-    chi2 = ((uv - p.uv_px[front]) ** 2).sum(1) / p.sigma_px[front] ** 2
+    uv = LensCorrection.of_vector(correction).distort_px(p.K, p_cam[:, :2] / p_cam[:, 2:])
+    chi2 = ((uv - p.uv_px) ** 2).sum(1) / p.sigma_px**2
     return max(MIN_NOISE_RATIO, math.sqrt(float(np.median(chi2)) / MEDIAN_CHI2_2DOF))
 
 

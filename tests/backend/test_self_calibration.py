@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -112,6 +114,25 @@ class TestEstimate:
         # Without the short cut over the turning the estimate itself has to say so.
         estimate = estimate_calibration(submap, camera, CalibrationConfig(min_rotation_deg=0))
         assert isinstance(estimate, Failure) or not estimate.accepted
+
+    def test_points_that_only_fit_behind_the_cameras_are_left_out_without_a_word(
+        self, capfd: pytest.CaptureFixture[str]
+    ) -> None:
+        camera = wrong_camera()
+        submap = make_submap(camera, turning=True)
+        problem = make_problem(submap, choose_window(submap, 60), camera, 15000)
+        T, uv_px, xyz = problem.T_submap_kf, problem.uv_px.copy(), problem.xyz_mu.copy()
+        for j in range(5):
+            rows = np.flatnonzero(problem.point == j)
+            kf = problem.kf[rows]
+            behind = T[kf[0], :3, 3] - (2.0 + j) * T[kf[0], :3, 2]
+            xyz[j] = T[kf[0], :3, 3] + 0.3 * T[kf[0], :3, 2]
+            p = np.einsum("rji,rj->ri", T[kf, :3, :3], behind - T[kf, :3, 3])
+            uv_px[rows] = p[:, :2] / p[:, 2:] * problem.K[0, 0] + problem.K[:2, 2]
+        estimate = estimate_correction(replace(problem, uv_px=uv_px, xyz_mu=xyz), WIDTH, LensCorrection(), CONFIG)
+        assert estimate
+        assert abs(estimate.correction.log_focal + np.log(1.03)) < 0.004
+        assert capfd.readouterr().out == ""
 
     def test_distortion_is_found(self) -> None:
         submap = make_submap(TRUE, turning=True)
