@@ -22,7 +22,7 @@ FOLDER = Path(__file__).parents[3] / "benchmarks"
 N = 60
 
 
-@pytest.mark.parametrize("name", ["kitti", "tum_mono", "failure_lab", "sample", "against_cpp", "smoke"])
+@pytest.mark.parametrize("name", ["kitti", "tum_mono", "failure_lab", "failures", "sample", "against_cpp", "smoke"])
 def test_every_bench_can_be_planned(name: str) -> None:
     spec = load_spec(FOLDER / f"{name}.yaml")
     assert (spec.name, spec.reference_name) == (name, "base")
