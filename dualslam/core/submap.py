@@ -185,11 +185,11 @@ class Submap:
             kept, dropped = self.current_id(kept), self.current_id(dropped)
             if kept == dropped:
                 continue
-            obs = self.observations
-            rows, taken = rows_of[dropped], obs["kf"][rows_of[kept]]
+            obs, rows = self.observations, rows_of[dropped]
             kf, feature = obs["kf"][rows], obs["feature"][rows]
+            taken = set(obs["kf"][rows_of[kept]].tolist())
             self.remove_observations(rows)
-            free = ~np.isin(kf, taken)
+            free = np.array([k not in taken for k in kf.tolist()], bool)
             moved = self.add_observations(kf[free], feature[free], np.full(int(free.sum()), kept))
             rows_of[kept] = np.concatenate((rows_of[kept], moved))
             lm = self.landmarks
