@@ -11,12 +11,13 @@ import numpy as np
 from backend.local_ba import bundle_adjust, bundle_adjust_arrays
 from backend.self_calibration import estimate_calibration
 from backend.submap_graph import ISam2SubmapGraph
-from dualslam.calibration import Calibration, check_camera, rectify
+from dualslam.calibration import Calibration, check_camera
 from dualslam.core.camera import Camera
 from dualslam.core.config import AttemptConfig, Config, FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend, SelfCalibrator, SubmapGraph
+from dualslam.core.rectification import rectify
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Features, Frame, View
 from dualslam.evaluation.failure_lab import FaultScript
@@ -31,6 +32,7 @@ from frontends.images import to_grey
 from frontends.initialiser import Initialiser
 from frontends.motion_statistics import nearest_search
 from frontends.pnp_odometry import PnpOdometry
+from frontends.refinding import Refinder
 from frontends.registry import check_frontend
 from frontends.registry import create_frontend as create_frontend  # part of the Python interface
 from frontends.rolling_shutter import RollingShutter, straighten
@@ -91,6 +93,11 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
     faults = FaultScript(config.corruptions)
     shutter = RollingShutter(frontend, config.camera, config.seed)
 
+    sigma_px = config.camera.model_sigma_px
+
+    def calibrated() -> Camera:
+        return calibration.camera
+
     def straight_view_of(frame: Frame) -> View | Failure:
         camera, needs_images = calibration.camera, config.recovery.needs_images
         view = view_of(frame, frontend, camera, config.camera.model_sigma_px, needs_images)
@@ -104,7 +111,9 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
             ),
             new_graph=lambda: ISam2SubmapGraph(config.graph),
             new_odometry=faults.around_odometry(
-                lambda submap, graph: VisualFrontEnd(frontend, config, submap, graph, size_px)
+                lambda submap, graph: VisualFrontEnd(
+                    frontend, config, submap, graph, size_px, Refinder(submap, frontend, calibrated, sigma_px)
+                )
             ),
             calibration=calibration,
             shutter=shutter,
@@ -149,8 +158,11 @@ def recovery_parts(
     """
     frontend = frontend or create_frontend(config.frontend)
 
-    def live(submap: Submap, graph: SubmapGraph) -> VisualFrontEnd:
-        return VisualFrontEnd(frontend, config, submap, graph, size_px)
+    def live(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> VisualFrontEnd:
+        refinder = Refinder(submap, frontend, lambda: job.camera, config.camera.model_sigma_px)
+        for view in sorted(job.own, key=lambda view: view.index, reverse=True):  # those next to the walk stay
+            refinder.remember(view)
+        return VisualFrontEnd(frontend, config, submap, graph, size_px, refinder)
 
     matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
     return RecoveryParts(
@@ -171,14 +183,14 @@ def recovery_parts(
 
 
 def _attempts(
-    config: Config, live: Callable[[Submap, SubmapGraph], VisualFrontEnd], size_px: tuple[int, int]
+    config: Config, live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd], size_px: tuple[int, int]
 ) -> tuple[Attempt, ...]:
     """Build the attempts; those with the same guest share what it finds in the images."""
     guests: dict[str, ImageFeatures] = {}  # by their settings
     attempts = []
     for number, attempt in enumerate(config.recovery.attempts):
         if attempt.is_live:
-            attempts.append(Attempt(attempt.name, lambda job, submap, graph: live(submap, graph)))
+            attempts.append(Attempt(attempt.name, live))
             continue
         wanted = _guest(attempt)
         key = wanted.model_dump_json()
@@ -193,7 +205,7 @@ def _attempt_with(
     guest: ImageFeatures,
     attempt: AttemptConfig,
     config: Config,
-    live: Callable[[Submap, SubmapGraph], VisualFrontEnd],
+    live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
     size_px: tuple[int, int],
 ) -> Attempt:
     """Build an attempt in which another front end gives the live one its poses."""
@@ -205,7 +217,7 @@ def _attempt_with(
             features = rectify(guest.of(view.image), job.camera, config.camera.model_sigma_px)
             return features if view.turn_rad is None else straighten(features, job.camera, view.turn_rad)
 
-        walker = live(submap, graph)
+        walker = live(job, submap, graph)
         walks_live = attempt.walk == "live"
         return PnpOdometry(walker, guest.frontend, extract, job.own, bundle_adjust_arrays, config, size_px, walks_live)
 

@@ -173,16 +173,6 @@ def check_camera(
     return Failure(FailureReason.CAMERA, detail, {"log_focal": off, "distance2": numbers["distance2"]})
 
 
-def rectify(features: Features, camera: Camera, model_sigma_px: float) -> Features:
-    """Move features to the camera's pinhole equivalent; those that it cannot hold are dropped."""
-    uv_rect_px, magnification = camera.rectify(features.uv_px)
-    # In steps of an eighth of an octave: the graph shares one noise model among all pixels of one sigma.
-    sigma_px = 2.0 ** (np.rint(8.0 * np.log2(np.hypot(features.sigma_px, model_sigma_px) * magnification)) / 8.0)
-    rectified = replace(features, uv_rect_px=uv_rect_px, sigma_px=sigma_px)
-    inside = np.isfinite(uv_rect_px).all(axis=1) & np.isfinite(magnification)
-    return rectified if inside.all() else rectified.take(inside)
-
-
 def _rectified_again(features: Features, camera: Camera) -> Features:
     """Return features with their pixels under another camera. None is dropped (observations name them by their row),
     and sigmas stay: a correction changes them by a few per cent.

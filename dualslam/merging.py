@@ -129,10 +129,8 @@ def _identify(merged: Submap, base: Submap, moved: Submap) -> IntArray:
             merged.merge_landmarks(np.array([kept]), np.array([j]))
     id_of[:n] = merged.current_ids(np.arange(n))
     id_of[n:] = merged.current_ids(id_of[n:])
-    kf, feature, landmark = _rows_since(base, moved)
+    kf, feature, landmark = _rows_with_a_place(merged, base, moved)
     for k in np.unique(kf).tolist():
-        if k not in merged.keyframes:
-            continue
         here = (kf == k) & (landmark >= n)
         there = merged.landmark_of[k][feature[here]]
         same = (there != NO_LANDMARK) & (id_of[landmark[here]] == NO_LANDMARK)
@@ -143,8 +141,8 @@ def _identify(merged: Submap, base: Submap, moved: Submap) -> IntArray:
 def _add_landmarks(merged: Submap, base: Submap, moved: Submap, id_of: IntArray) -> IntArray:
     """Append the walk's landmarks that are new and still seen by two keyframes; return the completed `id_of`."""
     n = len(base.landmarks)
-    kf, _, landmark = _rows_since(base, moved)
-    seen = np.bincount(landmark[_held_by(merged, kf)], minlength=len(moved.landmarks))
+    _, _, landmark = _rows_with_a_place(merged, base, moved)
+    seen = np.bincount(landmark, minlength=len(moved.landmarks))
     new = np.flatnonzero((id_of == NO_LANDMARK) & moved.landmarks["alive"] & (seen >= 2))
     new = new[new >= n]
     id_of = id_of.copy()
@@ -154,9 +152,9 @@ def _add_landmarks(merged: Submap, base: Submap, moved: Submap, id_of: IntArray)
 
 def _new_rows(merged: Submap, base: Submap, moved: Submap, id_of: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """Return keyframe, feature and landmark of the walk's observations that have a place in the merged submap."""
-    kf, feature, landmark = _rows_since(base, moved)
+    kf, feature, landmark = _rows_with_a_place(merged, base, moved)
     ids = id_of[landmark]
-    free = (ids != NO_LANDMARK) & _held_by(merged, kf)
+    free = ids != NO_LANDMARK
     for k in np.unique(kf[free]).tolist():
         here = np.flatnonzero(free & (kf == k))
         there = merged.landmark_of[k]
@@ -174,11 +172,18 @@ def _add_counts(merged: Submap, base: Submap, moved: Submap) -> None:
         merged.landmarks[name][own] += moved.landmarks[name][own] - base.landmarks[name][own]
 
 
-def _rows_since(base: Submap, moved: Submap) -> tuple[IntArray, IntArray, IntArray]:
-    """Keyframe, feature and landmark of the observations that the walk added and still holds."""
+def _rows_with_a_place(merged: Submap, base: Submap, moved: Submap) -> tuple[IntArray, IntArray, IntArray]:
+    """Keyframe, feature and landmark of what the walk observed and still holds, where `merged` has that feature too."""
     obs, n = moved.observations, len(base.observations)
     rows = n + np.flatnonzero(obs["alive"][n:])
-    return obs["kf"][rows], obs["feature"][rows], obs["landmark"][rows]
+    kf, feature, landmark = obs["kf"][rows], obs["feature"][rows], obs["landmark"][rows]
+    n_common = {
+        k: merged.keyframes[k].features.n_common(moved.keyframes[k].features)
+        for k in np.unique(kf).tolist()
+        if k in merged.keyframes
+    }
+    held = feature < np.array([n_common.get(k, 0) for k in kf.tolist()], np.int64)
+    return kf[held], feature[held], landmark[held]
 
 
 def _held_by(submap: Submap, kf: IntArray) -> BoolArray:

@@ -204,14 +204,23 @@ def _unpaired(old: Submap, new: Submap, grafted: list[int], shared: list[int], l
         feature = np.flatnonzero(ids >= 0)
         n_seen[ids[feature]] += 1
         if k in new.landmark_of:
+            feature = feature[feature < _n_common(old, new, k)]
             disputed[ids[feature[new.landmark_of[k][feature] >= 0]]] = True
     return np.flatnonzero((n_seen >= 2) & old.landmarks["alive"] & (landmark_of == NO_LANDMARK) & ~disputed)
 
 
 def _copy_observations(old: Submap, new: Submap, k: int, landmark_of: IntArray) -> int:
-    """Add what the old map's keyframe saw and the new map's does not hold yet; return how many that were."""
-    feature = np.flatnonzero(old.landmark_of[k] >= 0)
+    """Add what the old map's keyframe saw and the new map's does not hold yet; return how many that were.
+
+    Features that only the old map has in its keyframe stand behind those of the front end, and stay out.
+    """
+    feature = np.flatnonzero(old.landmark_of[k][: _n_common(old, new, k)] >= 0)
     ids = landmark_of[old.landmark_of[k][feature]]
     free = (ids >= 0) & (new.landmark_of[k][feature] == NO_LANDMARK) & ~np.isin(ids, new.landmark_of[k])
     new.add_observations(k, feature[free], ids[free])
     return int(free.sum())
+
+
+def _n_common(old: Submap, new: Submap, k: int) -> int:
+    """Return how many features of a keyframe both maps have, from the first on."""
+    return old.keyframes[k].features.n_common(new.keyframes[k].features)

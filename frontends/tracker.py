@@ -77,11 +77,12 @@ class Tracker:
         assert self._last is not None
         submap, last = self._submap, self._last
         ids = submap.current_ids(last.landmark_ids)
-        T_cam_submap = last.T_cam_submap
-        if last.view.index in submap.T_submap_kf:
-            T_cam_submap = se3.inverse(submap.T_submap_kf[last.view.index])
-            ids = submap.landmark_of[last.view.index].copy()
-        self._last = replace(last, landmark_ids=ids, T_cam_submap=T_cam_submap)
+        view, T_cam_submap = last.view, last.T_cam_submap
+        if view.index in submap.T_submap_kf:
+            T_cam_submap = se3.inverse(submap.T_submap_kf[view.index])
+            ids = submap.landmark_of[view.index].copy()
+            view = replace(view, features=submap.keyframes[view.index].features)  # it may have more than it came with
+        self._last = replace(last, view=view, landmark_ids=ids, T_cam_submap=T_cam_submap)
         self._local = self._local_map(ids[ids >= 0])
 
     def follow(self, S_now_then: FloatArray) -> None:

@@ -18,6 +18,7 @@ from dualslam.core.submap_change import change_of_frame
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from frontends.keyframing import keyframe_due
 from frontends.mapper import Mapper
+from frontends.refinding import Refinder
 from frontends.tracker import GivenPose, Tracker
 
 CULL_BEHIND = 2  # the newest keyframes are not judged redundant: the next ones may need them
@@ -25,16 +26,27 @@ N_CULL_CANDIDATES = 10  # of the covisible keyframes, the nearest in what they s
 
 
 class VisualFrontEnd:
-    """Tracks frames against a submap and extends it by keyframes."""
+    """Tracks frames against a submap and extends it by keyframes.
+
+    `refinder`: finds landmarks across gaps in the images themselves; without it features alone tie the keyframes there.
+    """
 
     def __init__(
-        self, frontend: Frontend, config: Config, submap: Submap, graph: SubmapGraph, size_px: tuple[int, int]
+        self,
+        frontend: Frontend,
+        config: Config,
+        submap: Submap,
+        graph: SubmapGraph,
+        size_px: tuple[int, int],
+        refinder: Refinder | None = None,
     ) -> None:
         self.submap = submap
         self.graph = graph
         self._config = config
         self._tracker = Tracker(frontend, config.tracking, submap, size_px, config.seed)
         self._mapper = Mapper(frontend, config.mapping, submap, size_px)
+        self._refinder = refinder
+        self._after_gap = False
         self._reference_id = -1
         self._since_rebuild = 0
         self._kept: frozenset[int] = frozenset()
@@ -69,6 +81,7 @@ class VisualFrontEnd:
     def track(self, view: View) -> Track | Failure:
         """Pose a frame against the submap."""
         track = self._tracker.track(view)
+        self._note_gap(track)
         if track and view.index in self.submap.keyframes:
             self._meet(view.index)
         return track
@@ -76,6 +89,7 @@ class VisualFrontEnd:
     def track_at(self, view: View, pose: GivenPose) -> Track:
         """Take a frame's pose from elsewhere, and find the submap's landmarks in it."""
         track = self._tracker.track_at(view, pose)
+        self._note_gap(track)
         if view.index in self.submap.keyframes:
             self._meet(view.index)
         return track
@@ -87,6 +101,7 @@ class VisualFrontEnd:
     def take(self, track: Track) -> None:
         """Go on from a track."""
         self._tracker.take(track)
+        self._note_gap(track)
 
     def relative_pose(self, track: Track) -> FloatArray:
         """Return ``T_kf_cam``, the track's pose relative to the reference keyframe."""
@@ -101,6 +116,7 @@ class VisualFrontEnd:
 
         Where that is most of what the frame was tracked by, the frame's pose is wrong: the map is left without it.
         """
+        track = self._refound(track)
         mapping = self._mapper.insert(track)
         matched = self._rows_matched_by(track)
         rebuild = self._rebuild_due(track)
@@ -118,6 +134,22 @@ class VisualFrontEnd:
         return KeyframeReport(
             mapping, estimate, len(estimate.outlier_rows), culled, solver_failed=estimate.rebuilt and not rebuild
         )
+
+    def _note_gap(self, track: Track | Failure) -> None:
+        """Keyframes beyond frames that found no pose, or one by wide matching alone, are to be tied to those before."""
+        refinder, after_gap, self._after_gap = self._refinder, self._after_gap, not track
+        if not isinstance(track, Failure) and refinder is not None and (track.wide or after_gap):
+            refinder.begin(track.view.index)
+
+    def _refound(self, track: Track) -> Track:
+        """Look for landmarks in the image itself where hardly any tie the new keyframe to those before it."""
+        if self._refinder is None:
+            return track
+        if np.count_nonzero(track.landmark_ids >= 0) < self._config.keyframes.weak_landmarks:
+            self._refinder.begin(track.view.index)
+        track = self._refinder.extend(track)
+        self._refinder.remember(track.view)
+        return track
 
     def _rows_matched_by(self, track: Track) -> IntArray:
         """Return the observations by which a keyframe's frame was tracked (not those that mapping added)."""

@@ -9,7 +9,7 @@ import pytest
 
 from backend.submap_graph import ISam2SubmapGraph
 from dualslam.build import adjust_submap, build_system, self_calibrator
-from dualslam.calibration import Calibration, check_camera, rectify
+from dualslam.calibration import Calibration, check_camera
 from dualslam.carried_poses import carry_anchors, carry_poses
 from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import Camera
@@ -19,6 +19,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, so3
 from dualslam.core.interfaces import CalibrationEstimate
+from dualslam.core.rectification import rectify
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Frame, View
 from dualslam.system import System

@@ -93,6 +93,17 @@ class Features:
         arrays = (self.uv_px, self.uv_rect_px, self.sigma_px, self.scale, self.octave, self.angle_rad, self.descriptors)
         return sum({id(array): array.nbytes for array in arrays}.values())
 
+    def n_common(self, other: Features) -> int:
+        """Return how many features, from the first on, are the same in another set of the same image.
+
+        A map may have found more in its keyframe than the front end had: those stand behind the front end's.
+        """
+        n = min(len(self), len(other))
+        if self is other:
+            return n
+        differ = (self.uv_px[:n] != other.uv_px[:n]).any(axis=1)
+        return int(differ.argmax()) if differ.any() else n
+
     def take(self, rows: NDArray[np.generic]) -> Features:
         """Return the features at `rows` (indices or a mask)."""
         return Features(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dualslam.core.types import Keyframe
+from dualslam.core.types import Features, Keyframe
 from dualslam.linking import DescriptorMatcher, propose_correspondences
 from dualslam.linking.correspondences import shared_keyframes
 from tests.linking.worlds import FRAME_STEP, Case, hamming, make_case, make_world
@@ -48,6 +48,28 @@ def test_pairs_by_identity_are_the_same_points(case):
     pairs = propose_correspondences(case.old, case.new)
     assert len(pairs) > 200
     assert pairs.shared_pixel.all()
+    a, b = point_of_landmark(case.old, pairs.landmark_old), point_of_landmark(case.new, pairs.landmark_new)
+    assert np.array_equal(a, b)
+
+
+def test_features_that_only_one_map_has_found_stand_apart(case):
+    """A keyframe may hold more features in one map: no row behind the common ones means the same point in both."""
+    n_before = len(propose_correspondences(case.old, case.new))
+    for submap, shift in ((case.old, 40.0), (case.new, 70.0)):
+        for k in shared_keyframes(case.old, case.new):
+            f = submap.keyframes[k].features
+            more = f.take(np.arange(5 if submap is case.old else 9))
+            uv = more.uv_px + shift
+            columns = {
+                name: np.concatenate([getattr(f, name), getattr(replace(more, uv_px=uv, uv_rect_px=uv), name)])
+                for name in ("uv_px", "uv_rect_px", "sigma_px", "scale", "octave", "angle_rad", "descriptors")
+            }
+            submap.keyframes[k] = Keyframe(k, 0.0, Features(**columns))
+            ids = np.setdiff1d(np.flatnonzero(submap.landmarks["alive"]), submap.landmark_of[k])[: len(more)]
+            submap.landmark_of[k] = np.concatenate([submap.landmark_of[k], np.full(len(more), -1)])
+            submap.add_observations(k, len(f) + np.arange(len(ids)), ids)
+    pairs = propose_correspondences(case.old, case.new)
+    assert len(pairs) > 0.98 * n_before
     a, b = point_of_landmark(case.old, pairs.landmark_old), point_of_landmark(case.new, pairs.landmark_new)
     assert np.array_equal(a, b)
 

@@ -1,0 +1,231 @@
+"""Landmarks of one side of a gap, found again on the other side in the images themselves.
+
+Beyond frames that could not be used (or after tracking has matched wide again) the map's scale hangs by the landmarks
+that are seen on both sides, and the detector finds few of the same points at half or twice the distance. With the pose
+now known about, each landmark's place and size there are too: the keyframes beyond the gap are searched for what the
+last keyframes before it saw, by its patch of the image, and what is found becomes a feature of theirs like any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dualslam.core.camera import Camera
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.projection import refine_pose
+from dualslam.core.geometry.triangulation import point_covariance
+from dualslam.core.grey_image import GreyImage
+from dualslam.core.interfaces import Frontend
+from dualslam.core.rectification import rectified_sigma
+from dualslam.core.submap import Submap
+from dualslam.core.types import Failure, Features, FloatArray, IntArray, Track, View
+from frontends.patches import HALF_PX, Pyramid, build_pyramid, match_patches
+
+RIM_KEYFRAMES = 6
+"""Keyframes before a gap whose landmarks are looked for beyond it."""
+FAR_KEYFRAMES = 8
+"""Keyframes beyond a gap in which they are: the wider these stand, the better they know the landmarks' depths."""
+KEPT_IMAGES = 12
+"""Those nearest in time to the latest keyframe: twice the rim, since not each keyframe is there to stay."""
+SEARCH_PX = 5.0
+"""About the predicted place, in pixels of the coarser image: as for guided matching, the pose is off by so much."""
+MAX_DEPTH_SIGMA = 0.1
+"""Relative, of a landmark that is looked for. There are more points far away than near, and of these the ones enter a
+map whose noise looks like parallax: on a rendered street, depths known to 5 % are right, to 12 % are 2 to 6 % too
+small, to 20 % 5 to 13 %. A hundred of them beyond a gap would not average that out, and pass it on as scale."""
+MAX_ZOOM = 4.0
+"""Beyond, a patch covers another part of the scene than its landmark stands for."""
+SIGMA_PX = 0.45
+"""Noise of a place, in pixels of the coarser image: half of what is found on a rendered street, at half the distance or
+twice, is nearer than 0.25 to 0.5 px of where it is in truth."""
+MAJORITY = 0.5
+"""Of the patches that are found must agree with one pose: below, it is chance that has found them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sought:
+    """N landmarks as one keyframe before the gap sees them."""
+
+    keyframe_id: int
+    landmark_ids: IntArray
+    features: Features
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """Rows of what was sought, and a feature for each."""
+
+    row: IntArray
+    features: Features
+
+
+class Refinder:
+    """Knows the images of a front end's latest keyframes, and whether a gap lies behind it.
+
+    Parameters
+    ----------
+    submap : Submap
+    frontend : Frontend
+        The live one.
+    camera : callable
+        The camera that rectifies the features now.
+    model_sigma_px : float
+        Error of its model, see `CameraConfig.model_sigma_px`.
+    """
+
+    def __init__(self, submap: Submap, frontend: Frontend, camera: Callable[[], Camera], model_sigma_px: float) -> None:
+        self._submap = submap
+        self._frontend = frontend
+        self._camera = camera
+        self._model_sigma_px = model_sigma_px
+        self._images: dict[int, GreyImage] = {}
+        self._rim: list[int] = []
+        self._levels: dict[int, Pyramid] = {}
+        self._n_left = 0
+
+    def remember(self, view: View) -> None:
+        """Keep the image of a keyframe; one that was straightened does not show its features where they are."""
+        if view.image is None or view.turn_rad is not None:
+            return
+        self._images[view.index] = view.image
+        for index in sorted(self._images, key=lambda i: abs(i - view.index))[KEPT_IMAGES:]:
+            del self._images[index]
+
+    def begin(self, index: int) -> None:
+        """Note that a gap lies between frame `index` and the keyframes so far."""
+        near = [k for k in self._submap.keyframes_near(index) if k in self._images and k != index]
+        self._rim, self._n_left = near[:RIM_KEYFRAMES], FAR_KEYFRAMES
+        self._levels = {k: levels for k, levels in self._levels.items() if k in self._rim}
+
+    def extend(self, track: Track) -> Track:
+        """Return a frame that is to become a keyframe with the landmarks from before the gap that its image shows.
+
+        Its features are those that it had, and behind them those that were found; its pose is refined with all.
+        """
+        view = track.view
+        if self._n_left == 0 or view.image is None or view.turn_rad is not None:
+            return track
+        self._n_left -= 1
+        levels = build_pyramid(view.image.pixels())
+        ids, features = [track.landmark_ids], [view.features]
+        for sought in self._sought(track):
+            found = self._find(sought, track, levels)
+            ids.append(sought.landmark_ids[found.row])
+            features.append(found.features)
+        return self._posed(track, _concatenate(features), np.concatenate(ids))
+
+    def _sought(self, track: Track) -> list[_Sought]:
+        """Return the landmarks of the rim that the frame lacks, each in the keyframe next to the gap that sees it."""
+        submap, taken = self._submap, track.landmark_ids
+        found = []
+        for k in self._rim:
+            if k not in submap.keyframes or k not in self._images:
+                continue
+            feature = np.flatnonzero(submap.landmark_of[k] >= 0)
+            feature = feature[~np.isin(submap.landmark_of[k][feature], taken)]
+            known = self._depth_sigmas(submap.landmark_of[k][feature], k) < MAX_DEPTH_SIGMA
+            feature = feature[known]
+            ids = submap.landmark_of[k][feature]
+            taken = np.concatenate([taken, ids])
+            found.append(_Sought(k, ids, submap.keyframes[k].features.take(feature)))
+        return found
+
+    def _depth_sigmas(self, landmark_ids: IntArray, keyframe_id: int) -> FloatArray:
+        """Return how well landmarks' depths in a keyframe are known (N,), relative, the poses taken as known."""
+        submap = self._submap
+        rows = submap.rows_of_landmarks(landmark_ids)
+        _, sigma = submap.observed_pixels(rows)
+        kf, view = np.unique(submap.observations["kf"][rows], return_inverse=True)
+        order = np.argsort(landmark_ids, kind="stable")
+        point = order[np.searchsorted(landmark_ids[order], submap.observations["landmark"][rows])]
+        xyz = submap.landmarks["xyz_mu"][landmark_ids]
+        T_kf_submap = se3.inverse(submap.keyframe_poses(kf))[view]
+        covariance = point_covariance(xyz, submap.K, point, T_kf_submap, sigma)
+        T_cam_submap = se3.inverse(submap.T_submap_kf[keyframe_id])
+        along = T_cam_submap[2, :3]
+        depth = xyz @ along + T_cam_submap[2, 3]
+        return np.asarray(np.sqrt(np.einsum("i,nij,j->n", along, covariance, along)) / np.maximum(depth, 1e-12))
+
+    def _find(self, sought: _Sought, track: Track, levels: Pyramid) -> _Found:
+        """Search the image for one keyframe's landmarks."""
+        camera = self._camera()
+        T_kf_submap = se3.inverse(self._submap.T_submap_kf[sought.keyframe_id])
+        T_cam_kf = track.T_cam_submap @ self._submap.T_submap_kf[sought.keyframe_id]
+        xyz = self._submap.landmarks["xyz_mu"][sought.landmark_ids]
+        uv_kf = sought.features.uv_px
+        depth = xyz @ T_kf_submap[2, :3] + T_kf_submap[2, 3]
+        uv, J = _predict(camera, uv_kf, depth, T_cam_kf)
+        zoom = _zoom(J)
+        margin = HALF_PX * np.maximum(zoom, 1.0)[:, None]
+        inside = ((uv > margin) & (uv < np.array([camera.width, camera.height]) - 1 - margin)).all(axis=1)
+        usable = np.flatnonzero(inside & (depth > 0) & (zoom > 1 / MAX_ZOOM) & (zoom < MAX_ZOOM))
+        matches = match_patches(
+            self._levels_of(sought.keyframe_id), levels, uv_kf[usable], uv[usable], J[usable], SEARCH_PX
+        )
+        row = usable[matches.row]
+        uv_rect, magnification = camera.rectify(matches.uv_px)
+        held = np.isfinite(uv_rect).all(axis=1) & np.isfinite(magnification)
+        row, uv_px, uv_rect = row[held], matches.uv_px[held], uv_rect[held]
+        sigma = rectified_sigma(SIGMA_PX * matches.spacing_px[held], magnification[held], self._model_sigma_px)
+        of = sought.features.take(row)
+        scale = np.maximum(of.scale * zoom[row], 1.0)
+        octave = np.rint(np.log(scale) / np.log(self._frontend.scale_factor)).astype(np.int64)
+        octave = np.minimum(octave, self._frontend.n_octaves - 1)
+        turn = np.arctan2(J[row, 1, 0] - J[row, 0, 1], J[row, 0, 0] + J[row, 1, 1])
+        features = Features(uv_px, uv_rect, sigma, scale, octave, of.angle_rad + turn, of.descriptors)
+        return _Found(row, features)
+
+    def _levels_of(self, keyframe_id: int) -> Pyramid:
+        if keyframe_id not in self._levels:
+            self._levels[keyframe_id] = build_pyramid(self._images[keyframe_id].pixels())
+        return self._levels[keyframe_id]
+
+    def _posed(self, track: Track, features: Features, landmark_ids: IntArray) -> Track:
+        """Pose the frame by all that was found, and leave out what does not agree."""
+        row = np.flatnonzero(landmark_ids >= 0)
+        estimate = refine_pose(
+            self._submap.K,
+            track.T_cam_submap,
+            self._submap.landmarks["xyz_mu"][landmark_ids[row]],
+            features.uv_rect_px[row],
+            features.sigma_px[row],
+        )
+        is_new = row >= len(track.view.features)
+        if isinstance(estimate, Failure) or estimate.inliers[is_new].sum() <= MAJORITY * is_new.sum():
+            return track
+        landmark_ids = landmark_ids.copy()
+        landmark_ids[row[~estimate.inliers]] = -1
+        kept = np.ones(len(features), bool)
+        kept[row[is_new & ~estimate.inliers]] = False
+        view = replace(track.view, features=features.take(kept))
+        return replace(track, view=view, T_cam_submap=estimate.T_cam_w, landmark_ids=landmark_ids[kept])
+
+
+def _predict(camera: Camera, uv_px: FloatArray, depth: FloatArray, T_b_a: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return where pixels (N, 2) of a, at a depth (N,), are in b, and by how much these move with those (N, 2, 2)."""
+    places = []
+    for step in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
+        rays = camera.unproject(uv_px + step)
+        p = rays * (depth / rays[:, 2])[:, None]
+        places.append(camera.project(p @ T_b_a[:3, :3].T + T_b_a[:3, 3]))
+    return places[0], np.stack([places[1] - places[0], places[2] - places[0]], axis=2)
+
+
+def _zoom(J: FloatArray) -> FloatArray:
+    """Return how much larger (N,) things are in the second image; NaN where they are not in it."""
+    return np.asarray(np.sqrt(np.abs(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0])))
+
+
+def _concatenate(parts: list[Features]) -> Features:
+    return Features(
+        np.concatenate([part.uv_px for part in parts]),
+        np.concatenate([part.uv_rect_px for part in parts]),
+        np.concatenate([part.sigma_px for part in parts]),
+        np.concatenate([part.scale for part in parts]),
+        np.concatenate([part.octave for part in parts]),
+        np.concatenate([part.angle_rad for part in parts]),
+        np.concatenate([part.descriptors for part in parts]),
+    )
