@@ -222,9 +222,9 @@ class Initialiser:
         self, views: list[View], T_first_cam: FloatArray, xyz: FloatArray, feature: IntArray, numbers: dict[str, float]
     ) -> Start | Failure:
         view_of, point_of = np.nonzero(feature >= 0)
-        seen = feature[view_of, point_of]
-        uv = np.array([views[v].features.uv_rect_px[f] for v, f in zip(view_of, seen, strict=True)])
-        sigma = np.array([views[v].features.sigma_px[f] for v, f in zip(view_of, seen, strict=True)])
+        seen = [view.features.take(rows[rows >= 0]) for view, rows in zip(views, feature, strict=True)]
+        uv = np.concatenate([features.uv_rect_px for features in seen])
+        sigma = np.concatenate([features.sigma_px for features in seen])
         fixed = np.zeros(len(views), bool)
         fixed[0] = True
         problem = BundleProblem(self._K, T_first_cam, fixed, xyz, view_of, point_of, uv, sigma)
