@@ -30,8 +30,9 @@ FAR_KEYFRAMES = 8
 """Keyframes beyond a gap in which they are: the wider these stand, the better they know the landmarks' depths."""
 KEPT_IMAGES = 12
 """Those nearest in time to the latest keyframe: twice the rim, since not each keyframe is there to stay."""
-SEARCH_PX = 5.0
-"""About the predicted place, in pixels of the coarser image: as for guided matching, the pose is off by so much."""
+SEARCH_RAD = 0.022
+"""About the predicted place, in the coarser image, as an angle: a pose from few matches is off by as much. Too small a
+search finds only what fits the pose that it started from."""
 MAX_DEPTH_SIGMA = 0.1
 """Relative, of a landmark that is looked for. There are more points far away than near, and of these the ones enter a
 map whose noise looks like parallax: on a rendered street, depths known to 5 % are right, to 12 % are 2 to 6 % too
@@ -163,7 +164,12 @@ class Refinder:
         inside = ((uv > margin) & (uv < np.array([camera.width, camera.height]) - 1 - margin)).all(axis=1)
         usable = np.flatnonzero(inside & (depth > 0) & (zoom > 1 / MAX_ZOOM) & (zoom < MAX_ZOOM))
         matches = match_patches(
-            self._levels_of(sought.keyframe_id), levels, uv_kf[usable], uv[usable], J[usable], SEARCH_PX
+            self._levels_of(sought.keyframe_id),
+            levels,
+            uv_kf[usable],
+            uv[usable],
+            J[usable],
+            SEARCH_RAD * camera.K[0, 0],
         )
         row = usable[matches.row]
         uv_rect, magnification = camera.rectify(matches.uv_px)
