@@ -99,8 +99,8 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
         return calibration.camera
 
     def straight_view_of(frame: Frame) -> View | Failure:
-        camera, needs_images = calibration.camera, config.recovery.needs_images
-        view = view_of(frame, frontend, camera, config.camera.model_sigma_px, needs_images)
+        camera = calibration.camera
+        view = view_of(frame, frontend, camera, config.camera.model_sigma_px)
         return view if isinstance(view, Failure) else shutter.straightened(view, camera)
 
     return System(
@@ -237,9 +237,7 @@ def _naming_attempt(number: int) -> Iterator[None]:
         raise ConfigError(f"recovery.attempts[{number}]: {error}") from error
 
 
-def view_of(
-    frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: float, keep_image: bool = False
-) -> View | Failure:
+def view_of(frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: float) -> View | Failure:
     """Find a frame's features and take the lens distortion out of them."""
     if frame.image is None:
         return Failure(FailureReason.UNREADABLE, frame.error)
@@ -250,8 +248,7 @@ def view_of(
             f"frame {frame.index} is {width}x{height}, the calibration is for {camera.width}x{camera.height}",
         )
     features = rectify(frontend.extract(frame.image), camera, model_sigma_px)
-    image = GreyImage.of(to_grey(frame.image)) if keep_image else None
-    return View(frame.index, frame.timestamp_s, features, image)
+    return View(frame.index, frame.timestamp_s, features, GreyImage.of(to_grey(frame.image)))
 
 
 def adjust_submap(submap: Submap, robust_k: float) -> None:

@@ -39,11 +39,6 @@ class TestConfig:
         (leap,) = config(attempts=["leap"]).attempts
         assert (leap.frontend, leap.walk, leap.name) == ("sift", "live", "leap (sift)")
 
-    def test_images_are_kept_only_where_an_attempt_reads_them(self) -> None:
-        assert config().needs_images
-        assert not config(attempts=["live"]).needs_images
-        assert not config(enabled=False).needs_images
-
     @pytest.mark.parametrize(
         ("attempts", "told"),
         [

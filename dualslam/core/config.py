@@ -217,11 +217,6 @@ class RecoveryConfig(StrictModel):
     finish_wait_s: float = Field(30.0, ge=0)
     """How long the end of the run waits for walks that are still under way."""
 
-    @property
-    def needs_images(self) -> bool:
-        """Whether an attempt reads the buffered images."""
-        return self.enabled and not all(attempt.is_live for attempt in self.attempts)
-
 
 class BufferConfig(StrictModel):
     """The frames that a walk back in time can still read."""

@@ -128,7 +128,7 @@ class View:
     features : Features
         Of the live front end.
     image : GreyImage or None
-        For attempts at recovery that need other features; None where it was given up.
+        For attempts at recovery that need other features, and to find landmarks again; None where it was given up.
     turn_rad : (3,) float64 or None
         Rotation during the readout of the image that was taken out of the features; None: nothing was.
     """
