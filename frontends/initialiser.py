@@ -35,6 +35,7 @@ from frontends.two_view_hypotheses import propose_relative_poses
 
 LAGS = (2, 4, 8, 16, 32, 64)  # frames back that are tried as the first view
 N_WITNESSES = 3  # frames between the two views that must agree
+NEAR = 0.5  # share of the points that a start needs at least which must be near: on a road these fix the motion
 RUNNER_UP = 0.75  # another pose that explains this share of the winner's points makes the start ambiguous
 
 
@@ -48,7 +49,8 @@ class _Pair:
     T_b_a: FloatArray
     xyz: FloatArray
     good: BoolArray
-    parallax_deg: float
+    parallax_deg: float  # median
+    n_near: int  # points with at least the parallax that is asked for
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,8 +145,9 @@ class Initialiser:
         }
         if n_good < self._config.min_points:
             return Failure(FailureReason.TOO_FEW_INLIERS, f"{n_good} points of {len(matches)} matches", numbers)
-        if best.parallax_deg < self._config.min_parallax_deg:
-            return Failure(FailureReason.LOW_PARALLAX, f"median parallax {best.parallax_deg:.2f} deg", numbers)
+        if best.n_near < NEAR * self._config.min_points:
+            detail = f"median parallax {best.parallax_deg:.2f} deg, {best.n_near} near points"
+            return Failure(FailureReason.LOW_PARALLAX, detail, numbers)
         for other in pairs[1:]:
             if int(other.good.sum()) > RUNNER_UP * n_good and _direction_angle_deg(best.T_b_a, other.T_b_a) > 10:
                 return Failure(FailureReason.AMBIGUOUS_MODEL, "two poses explain the views alike", numbers)
@@ -165,7 +168,8 @@ class Initialiser:
         # Points without parallax are no points of the map: their depth is anything.
         good[good] = angle > 0.5 * self._config.min_parallax_deg
         parallax = float(np.median(angle)) if len(angle) else 0.0
-        return _Pair(a, b, matches, T_b_a, points.xyz, good, parallax)
+        n_near = int((angle >= self._config.min_parallax_deg).sum())
+        return _Pair(a, b, matches, T_b_a, points.xyz, good, parallax, n_near)
 
     # --- witnesses and bundle adjustment
 

@@ -49,7 +49,8 @@ class InitialiserConfig(StrictModel):
     min_points: int = Field(50, ge=15)
     """Triangulated points that must survive the first bundle adjustment."""
     min_parallax_deg: float = Field(1.0, gt=0)
-    """Median angle under which the two cameras see the points, after the rotation is taken out."""
+    """Angle under which the two cameras must see half as many points as `min_points`, after the rotation is taken out.
+    However many more are far away: on a road most are, and the near ones fix the motion."""
     max_direction_sigma_deg: float = Field(1.5, gt=0)
     """Largest standard deviation (from the bundle adjustment's Hessian) of the direction of translation."""
     max_chi2: float = Field(2.5, gt=0)

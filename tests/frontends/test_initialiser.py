@@ -13,8 +13,8 @@ from frontends.orb import OrbFrontend
 from tests.point_world import CAMERA, SIZE_PX, PointWorld, cloud, path, pose_errors, random_features
 
 ROTATION_RAD = 0.01
-TRANSLATION = 0.03
-"""Of the baseline."""
+TRANSLATION = 3 * np.radians(InitialiserConfig().max_direction_sigma_deg)
+"""Of the baseline: three of the standard deviations that the direction may have."""
 
 
 def initialiser(**settings: float) -> Initialiser:
@@ -55,6 +55,20 @@ def test_start_is_right(step_m: FloatArray, turn_rad: FloatArray, seed: int) -> 
     assert translation.max() < TRANSLATION * baseline_m
     assert np.median(start.xyz[:, 2]) == pytest.approx(1.0)
     assert (start.feature[[0, -1]] >= 0).all()
+
+
+def test_near_points_start_a_map_however_many_are_far() -> None:
+    """As on a road: most of what is seen has no parallax, and the rest fixes the motion."""
+    xyz = np.concatenate([15 * cloud(900, 1), cloud(300)])
+    world = PointWorld(xyz, path(8, np.array([0, 0.03, 0.25]), np.array([0, 0.005, 0])))
+    start, refusals = feed(world.views())
+    assert start is not None
+    assert len(refusals) <= 4
+    assert start.numbers["parallax_deg"] < 0.5 * InitialiserConfig().min_parallax_deg
+    T_true = world.T_world_cam[[view.index for view in start.views]]
+    translation, rotation = pose_errors(start.T_first_cam, T_true)
+    assert rotation.max() < ROTATION_RAD
+    assert translation.max() < TRANSLATION * np.linalg.norm(T_true[-1, :3, 3] - T_true[0, :3, 3])
 
 
 @pytest.mark.parametrize("turn_rad", [[0, 0, 0], [0, 0.02, 0], [0.01, 0.01, 0.01]], ids=["still", "pan", "all axes"])
