@@ -219,7 +219,9 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float
     relinker = Relinker(submap, job.lost, job.onsets, parts.link, parts.config)
     walker.keep(relinker.keyframe_ids)  # redundant or not: linking stands on keyframes that both maps hold
     walk = _Walk(submap)
-    for step in walk_back(walker, job.views, parts.judge, relinker.keyframe_ids, parts.config.max_leap_frames):
+    # Frames before a start are worth a look each, however many show nothing; no map waits for the end of that walk.
+    max_leap_frames = parts.config.max_leap_frames if job.lost else len(job.views)
+    for step in walk_back(walker, job.views, parts.judge, relinker.keyframe_ids, max_leap_frames):
         walk.out_of_time = time.perf_counter() > until
         if walk.out_of_time:
             break

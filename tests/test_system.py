@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dualslam.core.config import RecoveryConfig
 from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, FrameStatus
 from dualslam.results import frame_rows, trajectories_of
@@ -68,6 +69,18 @@ def test_the_frames_before_the_start_are_posed_by_walking_back() -> None:
     assert all(system.rows[i].status is FrameStatus.TRACKED for i in range(40))
     indices, T = main_trajectory(system)
     assert indices == list(range(40))
+    assert_right(indices, T, world)
+
+
+def test_a_long_cover_before_the_start_hides_no_more_than_what_it_covers() -> None:
+    still = np.repeat(np.eye(4)[None], 50, 0)
+    moving = path(25, np.array([0.08, 0, 0.02]), np.array([0, -0.005, 0]))
+    covered = frozenset(range(5, 45))
+    assert len(covered) > RecoveryConfig().max_leap_frames
+    world = PointWorld(cloud(), np.concatenate([still, moving]), covered=covered)
+    system = run(world)
+    indices, T = main_trajectory(system)
+    assert indices == [i for i in range(75) if i not in covered]
     assert_right(indices, T, world)
 
 

@@ -192,7 +192,8 @@ class RecoveryConfig(StrictModel):
     enabled: bool = True
     """Off: a lost track ends the submap, and the next one stays apart from it."""
     max_leap_frames: int = Field(30, ge=0)
-    """Frames in a row that the walk may leap, because none of its keyframes can be matched in them."""
+    """Frames in a row that the walk may leap, because none of its keyframes can be matched in them. A walk that
+    links no map, but poses the frames before a start, goes on to the end of the buffer."""
     attempts: tuple[AttemptConfig, ...] = Field(
         (AttemptConfig(), AttemptConfig(frontend="sift", walk="live"), AttemptConfig(frontend="sift")), min_length=1
     )
