@@ -198,7 +198,7 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
     newer = later.has_say & (all_pairs.keyframes > agreeing[-1])
     parted = all_pairs.keyframes[newer & ~later.agrees & (all_pairs.keyframes < (np.inf if onset is None else onset))]
     if len(parted) >= config.min_keyframes:
-        refused = verify.check_parting(old, new, agreeing, parted, config)
+        refused = verify.check_parting(whole, consensus.estimate.S_dst_src, old, new, agreeing, parted, config)
         if refused is not None:
             return refused
     # How far the maps' shapes differ beyond it: that is part of what is not known.

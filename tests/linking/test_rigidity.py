@@ -12,6 +12,8 @@ from dualslam.core.solving import solve
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking import DescriptorMatcher, LinkEstimate, carry_to_live_end, estimate, estimate_link
+from dualslam.linking.correspondences import propose_correspondences
+from dualslam.linking.pairs import PairModel
 from dualslam.linking.rigidity import scale_sigma_between
 from dualslam.linking.verify import check_parting
 from tests.linking.worlds import (
@@ -162,12 +164,32 @@ def test_without_the_gate_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     assert any(made), made
 
 
+AGREEING, PARTED = FRAME_STEP * np.arange(8), FRAME_STEP * np.arange(13, 19)
+
+
+def blame(case: Case, old: Submap, new: Submap) -> Failure | None:
+    model = PairModel(propose_correspondences(old, new, MATCHER), old, new, CONFIG.deformation_sigma)
+    return check_parting(model, case.S_old_new, old, new, AGREEING, PARTED, CONFIG)
+
+
 def test_the_old_map_is_to_blame_where_it_hangs_loose() -> None:
     case, _ = bent_walk(0, 0.05)
-    agreeing, parted = FRAME_STEP * np.arange(8), FRAME_STEP * np.arange(13, 19)
     loose = thinned(case.old, 10 * FRAME_STEP, 0)
-    assert check_parting(loose, case.new, agreeing, parted, CONFIG) is None
+    assert blame(case, loose, case.new) is None
     for old, new in ((case.old, case.new), (case.old, thinned(case.new, 10 * FRAME_STEP, 0)), (loose, loose)):
-        refused = check_parting(old, new, agreeing, parted, CONFIG)
+        refused = blame(case, old, new)
         assert refused is not None
         assert refused.reason is FailureReason.AGREEMENT
+
+
+@pytest.mark.parametrize(("rate", "is_possible"), [(0.01, True), (0.05, False)])
+def test_it_is_not_where_the_maps_part_by_more_than_it_leaves_open(rate: float, is_possible: bool) -> None:
+    """Two landmarks hold the old map to 7 %: that explains a few per cent, and not a quarter."""
+    case, _ = bent_walk(0, rate)
+    loose = thinned(case.old, 10 * FRAME_STEP, 2)
+    sigmas = [scale_sigma_between(m, AGREEING, PARTED, CONFIG.pixel_chi2) for m in (loose, case.new)]
+    assert CONFIG.gate_sigmas * sigmas[1] < sigmas[0] < 0.1
+    refused = blame(case, loose, case.new)
+    assert (refused is None) is is_possible
+    if refused is not None:
+        assert abs(refused.numbers["log_scale"]) > 3 * sigmas[0]
