@@ -120,18 +120,19 @@ def twice_lost() -> PointWorld:
 def test_the_live_map_has_been_lost_meanwhile(twice_lost: PointWorld) -> None:
     """The result goes into the archived map, before the next one starts."""
     system = run(twice_lost, 25, **DENSE)
-    first, second = system.events.of_kind(EventKind.RECOVERY_ENDED)
+    first, *later = system.events.of_kind(EventKind.RECOVERY_ENDED)  # one that finds no link is made again
     _, failed = system.events.of_kind(EventKind.FAILED)
     assert failed.frame < first.frame < system.events.of_kind(EventKind.REINITIALISED)[1].frame
-    assert (first.submap, second.submap) == (1, 2)
+    assert first.submap == 1
+    assert {ended.submap for ended in later} == {2}
     assert_one_right_map(system, twice_lost, twice_lost.covered)
 
 
 def test_two_walks_overlap(twice_lost: PointWorld) -> None:
     """The second starts from a copy of the lost map that the first one's result is not in yet."""
     system = run(twice_lost, 33, **DENSE)
-    first, second = system.events.of_kind(EventKind.RECOVERY_ENDED)
-    assert system.events.of_kind(EventKind.RECOVERY_STARTED)[1].frame < first.frame < second.frame
+    first, *later = system.events.of_kind(EventKind.RECOVERY_ENDED)
+    assert system.events.of_kind(EventKind.RECOVERY_STARTED)[1].frame < first.frame < later[0].frame
     assert system.events.of_kind(EventKind.RECOVERY_STARTED)[1].data["lost"] == [0, 1]
     assert_one_right_map(system, twice_lost, twice_lost.covered)
     assert not system._recoveries._lost  # all is one map: nothing is left to look for
