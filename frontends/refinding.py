@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.core.camera import Camera
+from dualslam.core.columns import concatenate
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import refine_pose
 from dualslam.core.geometry.triangulation import point_covariance
@@ -116,7 +117,7 @@ class Refinder:
             found = self._find(sought, track, levels)
             ids.append(sought.landmark_ids[found.row])
             features.append(found.features)
-        return self._posed(track, _concatenate(features), np.concatenate(ids))
+        return self._posed(track, concatenate(features), np.concatenate(ids))
 
     def _sought(self, track: Track) -> list[_Sought]:
         """Return the landmarks of the rim that the frame lacks, each in the keyframe next to the gap that sees it."""
@@ -146,8 +147,7 @@ class Refinder:
         T_kf_submap = se3.inverse(submap.keyframe_poses(kf))[view]
         covariance = point_covariance(xyz, submap.K, point, T_kf_submap, sigma)
         T_cam_submap = se3.inverse(submap.T_submap_kf[keyframe_id])
-        along = T_cam_submap[2, :3]
-        depth = xyz @ along + T_cam_submap[2, 3]
+        along, depth = T_cam_submap[2, :3], submap.depths(landmark_ids, T_cam_submap)
         return np.asarray(np.sqrt(np.einsum("i,nij,j->n", along, covariance, along)) / np.maximum(depth, 1e-12))
 
     def _find(self, sought: _Sought, track: Track, levels: Pyramid) -> _Found:
@@ -155,9 +155,8 @@ class Refinder:
         camera = self._camera()
         T_kf_submap = se3.inverse(self._submap.T_submap_kf[sought.keyframe_id])
         T_cam_kf = track.T_cam_submap @ self._submap.T_submap_kf[sought.keyframe_id]
-        xyz = self._submap.landmarks["xyz_mu"][sought.landmark_ids]
         uv_kf = sought.features.uv_px
-        depth = xyz @ T_kf_submap[2, :3] + T_kf_submap[2, 3]
+        depth = self._submap.depths(sought.landmark_ids, T_kf_submap)
         uv, J = _predict(camera, uv_kf, depth, T_cam_kf)
         zoom = _zoom(J)
         margin = HALF_PX * np.maximum(zoom, 1.0)[:, None]
@@ -223,15 +222,3 @@ def _predict(camera: Camera, uv_px: FloatArray, depth: FloatArray, T_b_a: FloatA
 def _zoom(J: FloatArray) -> FloatArray:
     """Return how much larger (N,) things are in the second image; NaN where they are not in it."""
     return np.asarray(np.sqrt(np.abs(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0])))
-
-
-def _concatenate(parts: list[Features]) -> Features:
-    return Features(
-        np.concatenate([part.uv_px for part in parts]),
-        np.concatenate([part.uv_rect_px for part in parts]),
-        np.concatenate([part.sigma_px for part in parts]),
-        np.concatenate([part.scale for part in parts]),
-        np.concatenate([part.octave for part in parts]),
-        np.concatenate([part.angle_rad for part in parts]),
-        np.concatenate([part.descriptors for part in parts]),
-    )

@@ -158,6 +158,20 @@ def test_tracking_goes_on_with_no_jump_that_the_motion_model_could_not_explain(w
     assert all((errors[i] <= 1.2 * usual).all() for i in range(ended.frame, ended.frame + 3))
 
 
+def miscalibrated(f: float, covered: range, settings: dict[str, object]) -> tuple[System, CalibrationWorld]:
+    """Build a system that is told a focal length `f` times too long, before a lens that is covered for a while."""
+    system, world = build_system(Config.model_validate(settings), wrong_camera(f)), CalibrationWorld()
+    calibration, rng = system._parts.calibration, np.random.default_rng(0)
+
+    def view_of(frame: Frame) -> View:
+        if frame.index in covered:
+            return View(frame.index, frame.timestamp_s, random_features(rng))
+        return world.view(frame, calibration)
+
+    system._parts = replace(system._parts, view_of=view_of)
+    return system, world
+
+
 def test_the_camera_has_been_refined_meanwhile() -> None:
     """What the walk saw by the old camera is merged by the pixels of the new one, and fits the map as it is now."""
     settings = {
@@ -166,16 +180,8 @@ def test_the_camera_has_been_refined_meanwhile() -> None:
         "mapping": {"redundant_ratio": 1.0},
         "camera": {"model_sigma_px": 0.0},
     }
-    system, world = build_system(Config.model_validate(settings), wrong_camera(1.03)), CalibrationWorld()
-    calibration, rng = system._parts.calibration, np.random.default_rng(0)
     covered = range(12, 26)
-
-    def view_of(frame: Frame) -> View:
-        if frame.index in covered:
-            return View(frame.index, frame.timestamp_s, random_features(rng))
-        return world.view(frame, calibration)
-
-    system._parts = replace(system._parts, view_of=view_of)
+    system, world = miscalibrated(1.03, covered, settings)
     system._recoveries._executor = LateExecutor(system._recoveries._executor, 34)
     for i in range(75):
         system.step(Frame(i, i / 30, None))
@@ -185,7 +191,7 @@ def test_the_camera_has_been_refined_meanwhile() -> None:
     submap = system.atlas.submaps[1]
     assert min(submap.keyframes) < min(covered)
     for keyframe in submap.keyframes.values():
-        uv_rect_px, _ = calibration.camera.rectify(keyframe.features.uv_px)
+        uv_rect_px, _ = system._parts.calibration.camera.rectify(keyframe.features.uv_px)
         np.testing.assert_allclose(keyframe.features.uv_rect_px, uv_rect_px)
     ids = sorted(submap.keyframes)
     truth = np.stack([world.T_world_cam(k) for k in ids])
@@ -202,16 +208,7 @@ def test_a_map_that_contradicts_its_camera_is_linked_after_both_have_been_calibr
         "camera": {"model_sigma_px": 0.0},
         "recovery": {"attempts": ["live"]},
     }
-    system, world = build_system(Config.model_validate(settings), wrong_camera(1.02)), CalibrationWorld()
-    calibration, rng = system._parts.calibration, np.random.default_rng(0)
-    covered = range(26, 38)
-
-    def view_of(frame: Frame) -> View:
-        if frame.index in covered:
-            return View(frame.index, frame.timestamp_s, random_features(rng))
-        return world.view(frame, calibration)
-
-    system._parts = replace(system._parts, view_of=view_of)
+    system, world = miscalibrated(1.02, range(26, 38), settings)
     for i in range(75):
         system.step(Frame(i, i / 30, None))
     system.finish()
@@ -222,7 +219,7 @@ def test_a_map_that_contradicts_its_camera_is_linked_after_both_have_been_calibr
     (linked,) = system.events.of_kind(EventKind.LINKED)
     assert linked.frame >= calibrated.frame > refused[0].frame
     for submap in system.atlas.submaps.values():
-        np.testing.assert_array_equal(submap.K, calibration.camera.K)
+        np.testing.assert_array_equal(submap.K, system._parts.calibration.camera.K)
     main = trajectories_of(system).main
     translation, rotation = pose_errors(main.T_world_cam, np.stack([world.T_world_cam(i) for i in main.index]))
     assert translation.max() < POSITION_M

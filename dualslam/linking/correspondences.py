@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.columns import concatenate
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import point_covariance, triangulate_n_view
 from dualslam.core.submap import Submap
@@ -346,13 +347,4 @@ def _one_to_one(votes: _Votes, n_new: int) -> tuple[tuple[IntArray, IntArray], I
 def _concatenate(parts: list[_Votes]) -> _Votes:
     """Stack the votes of several keyframes."""
     ints, floats, bools = np.zeros(0, np.int64), np.zeros(0), np.zeros(0, bool)
-    parts = [_Votes(ints, ints, ints, ints, ints, floats, bools), *parts]
-    return _Votes(
-        np.concatenate([p.keyframe for p in parts]),
-        np.concatenate([p.feature_old for p in parts]),
-        np.concatenate([p.feature_new for p in parts]),
-        np.concatenate([p.landmark_old for p in parts]),
-        np.concatenate([p.landmark_new for p in parts]),
-        np.concatenate([p.distance for p in parts]),
-        np.concatenate([p.identical for p in parts]),
-    )
+    return concatenate([_Votes(ints, ints, ints, ints, ints, floats, bools), *parts])

@@ -52,9 +52,7 @@ def check_spread(
     numbers = {"spread_u": float(share[0]), "spread_v": float(share[1])}
     if share.min() < config.min_image_spread:
         return Failure(FailureReason.SPREAD, f"{share.min():.0%} of the image is covered", numbers)
-    T = model.T_kf_old[c.view_keyframe]
-    xyz = c.xyz_old[c.view_pair]
-    depth = (T[:, 2, :3] * xyz).sum(1) + T[:, 2, 3]
+    depth, _ = model.depths()
     ranges = []
     for k in np.flatnonzero(keyframes).tolist():
         near, middle, far = np.percentile(depth[views & (c.view_keyframe == k)], [10, 50, 90])
@@ -97,15 +95,9 @@ def check_parting(
 
 def _log_scale_at(model: PairModel, keyframes: IntArray) -> float:
     """Return the log of the scale of the old map to the new one, as some keyframes (ids) see their points."""
-    c = model.pairs
-    rows = np.flatnonzero(np.isin(c.keyframes, keyframes)[c.view_keyframe])
-    kf, pair = c.view_keyframe[rows], c.view_pair[rows]
-    depths = [
-        np.einsum("ri,ri->r", T[kf, 2, :3], xyz[pair]) + T[kf, 2, 3]
-        for T, xyz in ((model.T_kf_old, c.xyz_old), (model.T_kf_new, c.xyz_new))
-    ]
-    seen = (depths[0] > 0) & (depths[1] > 0)
-    return float(np.median(np.log(depths[0][seen] / depths[1][seen]))) if seen.any() else math.inf
+    in_old, in_new = model.depths()
+    seen = np.isin(model.pairs.keyframes, keyframes)[model.pairs.view_keyframe] & (in_old > 0) & (in_new > 0)
+    return float(np.median(np.log(in_old[seen] / in_new[seen]))) if seen.any() else math.inf
 
 
 def check_sigmas(
