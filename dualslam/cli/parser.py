@@ -42,6 +42,7 @@ def _build_parser() -> _Parser:
     _add_run(commands)
     _add_eval(commands)
     _add_compare(commands)
+    _add_view(commands)
     _add_render(commands)
     _add_config(commands)
     _add_demo(commands)
@@ -116,6 +117,13 @@ def _add_compare(commands: argparse._SubParsersAction[_Parser]) -> None:
         "--out", metavar="FILE", type=Path, default=Path("compare.html"), help="page to write (default: compare.html)"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace the page that is there")
+
+
+def _add_view(commands: argparse._SubParsersAction[_Parser]) -> None:
+    parser, _ = _command(commands, "view", "Play a run in the Rerun viewer: camera, map, statuses, numbers, events.")
+    parser.add_argument("run", metavar="RUN", type=Path, help="a run folder")
+    parser.add_argument("--save", metavar="FILE", type=Path, help="write the recording (.rrd) instead of opening it")
+    parser.add_argument("--overwrite", action="store_true", help="replace the recording that is there")
 
 
 def _add_render(commands: argparse._SubParsersAction[_Parser]) -> None:

@@ -8,6 +8,7 @@ from dualslam.core.config import Config
 from dualslam.core.types import FrameStatus
 from dualslam.io.run_folder import EVENTS
 from dualslam.report.charts import latency_histogram, stage_table
+from dualslam.report.event_words import event_words
 from dualslam.report.failures import failures_section, stories
 from dualslam.report.markup import Markup, document, duration, join, number, tag
 from dualslam.report.run_data import RunData
@@ -17,7 +18,6 @@ from dualslam.report.top_view import top_view
 
 MAX_EVENTS = 500
 """A bound on the size of the page."""
-_EVENT_FIELDS = frozenset({"event", "frame", "timestamp_s", "submap"})
 
 
 def report_page(run: RunData) -> str:
@@ -143,7 +143,7 @@ def _events(run: RunData) -> Markup:
             tag("td", f"{event.get('timestamp_s', 0.0):.2f} s", data_label="time", cls="num"),
             tag("td", str(event.get("event", "")).replace("_", " "), data_label="event"),
             tag("td", "-" if event.get("submap") is None else str(event["submap"]), data_label="submap", cls="num"),
-            tag("td", _event_words(event), data_label="what belongs to it", cls="words"),
+            tag("td", event_words(event), data_label="what belongs to it", cls="words"),
         )
         for event in run.events[:MAX_EVENTS]
     ]
@@ -153,15 +153,6 @@ def _events(run: RunData) -> Markup:
     if len(run.events) > MAX_EVENTS:
         words += f", of which the first {MAX_EVENTS} are here and all in {EVENTS}"
     return tag("details", tag("summary", words), tag("div", table, cls="scroll"))
-
-
-def _event_words(event: dict[str, Any]) -> str:
-    def shown(value: object) -> str:
-        if isinstance(value, list):
-            return "[" + ", ".join(map(shown, value)) + "]"
-        return number(value, 4) if isinstance(value, float) else str(value)
-
-    return ", ".join(f"{k} {shown(v)}" for k, v in event.items() if k not in _EVENT_FIELDS and v is not None)
 
 
 def _footer(run: RunData) -> Markup:

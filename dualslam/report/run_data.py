@@ -174,7 +174,7 @@ def _map_points(folder: Path, submap_ids: set[int | None]) -> FloatArray:
     ids = sorted(m for m in submap_ids if m is not None)
     if not ids or not (folder / METADATA).is_file():
         return np.zeros((0, 3))
-    component, S_world_submap = _gauge(folder, ids)
+    component, S_world_submap = linked_submaps(folder, ids)
     clouds = [np.zeros((0, 3))]
     for m in component:
         arrays = load_arrays(submap_path(folder, m), _POINT_ARRAYS)
@@ -184,8 +184,8 @@ def _map_points(folder: Path, submap_ids: set[int | None]) -> FloatArray:
     return points[:: max(1, len(points) // MAX_POINTS)]
 
 
-def _gauge(folder: Path, ids: list[int]) -> tuple[list[int], Mapping[int, FloatArray]]:
-    """Return the main map's submaps, and the transform of each into its world."""
+def linked_submaps(folder: Path, ids: list[int]) -> tuple[list[int], Mapping[int, FloatArray]]:
+    """Return the submaps of a map that are linked with the first of `ids`, and the transform of each into its world."""
     stored, links = load_links(folder)
     atlas = Atlas()
     for link in links:

@@ -59,6 +59,7 @@ def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
         ("config --frontend sift --set initialiser.matching=gms", "initialiser.matching: gms takes a front end with"),
         ("config --set seed", "write key.path=value"),
         ("eval nowhere nowhere", "nowhere does not exist"),
+        ("view nowhere --save there", "nowhere is not the folder of a finished run"),
         ("render lake --out there", "invalid choice: 'lake'"),
         ("render street --out there --frames 0", "at least 1"),
         ("render street --out there --events none.yaml", "none.yaml cannot be read"),
@@ -75,7 +76,7 @@ def test_bad_usage_is_one_sentence_and_status_2(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("command", ["", "run ", "eval ", "render ", "config ", "demo "])
+@pytest.mark.parametrize("command", ["", "run ", "eval ", "view ", "render ", "config ", "demo "])
 def test_help_is_there_for_every_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*command.split(), "--help"]) == 0
     assert "usage: dualslam" in capsys.readouterr().out
@@ -137,7 +138,7 @@ def test_warnings_wait_until_the_input_has_proved_good(
     assert "WARNING" in capsys.readouterr().err
 
 
-HEAVY = ("torch", "kornia", "matplotlib", "cv2", "gtsam", "numpy", "scipy", "pydantic", "rich", "yaml")
+HEAVY = ("torch", "kornia", "matplotlib", "rerun", "cv2", "gtsam", "numpy", "scipy", "pydantic", "rich", "yaml")
 
 
 @pytest.mark.parametrize("statement", ["import dualslam", "import dualslam.cli", "from dualslam import limit_threads"])
@@ -158,7 +159,7 @@ def test_every_public_name_is_there() -> None:
 def test_importing_everything_public_leaves_extras_alone() -> None:
     code = "import sys, dualslam; [getattr(dualslam, n) for n in dualslam.__all__]; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not {"torch", "kornia", "matplotlib", "pandas"} & set(done.stdout.split())
+    assert not {"torch", "kornia", "matplotlib", "pandas", "rerun"} & set(done.stdout.split())
 
 
 def test_limit_threads_leaves_what_the_user_has_set() -> None:

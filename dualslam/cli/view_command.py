@@ -1,0 +1,35 @@
+"""`dualslam view`: a finished run in the Rerun viewer, or as a recording for it."""
+
+from __future__ import annotations
+
+import argparse
+
+from dualslam.core.errors import InputError, OutputError
+from dualslam.io.atomic import atomic_file
+from dualslam.report.run_data import RunData, read_run
+from dualslam.report.viewer import has_display, open_viewer
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Write the recording of a run, or open the viewer with it."""
+    if args.save is None and not has_display():
+        raise InputError("there is no display to open a viewer on; write the recording with --save FILE.")
+    if args.save is not None and args.save.exists() and not args.overwrite:
+        raise OutputError(f"{args.save} is there already; name another with --save, or give --overwrite.")
+    recording = _record(read_run(args.run))
+    if args.save is None:
+        open_viewer(recording)
+        return 0
+    with atomic_file(args.save) as file:
+        file.write(recording)
+    if not args.quiet:
+        print(f"recording in {args.save}; open it with rerun {args.save}", flush=True)
+    return 0
+
+
+def _record(run: RunData) -> bytes:
+    try:
+        from dualslam.report.recording import make_recording
+    except ImportError as error:
+        raise InputError('dualslam view needs the Rerun viewer: pip install "dualslam[view]".') from error
+    return make_recording(run)

@@ -1,0 +1,180 @@
+"""A finished run in time and space, as arrays: what a viewer plays. Nothing here knows the viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.core.camera import Camera, camera_from_dict
+from dualslam.core.errors import ConfigError, InputError
+from dualslam.core.geometry import sim3
+from dualslam.core.types import Failure, FloatArray, FrameStatus, IntArray
+from dualslam.io.map_files import METADATA, load_arrays
+from dualslam.io.run_folder import EVENTS, MAP, SUMMARY, FrameRow
+from dualslam.map_store import submap_path
+from dualslam.report.placement import align
+from dualslam.report.run_data import MAX_VIEW_DISTANCE_MU, PosedRows, RunData, linked_submaps
+from dualslam.report.statuses import WITHOUT_POSE
+
+_ARRAYS = (
+    "landmarks_xyz_mu",
+    "landmarks_distance_mu",
+    "landmarks_alive",
+    "landmarks_first_kf",
+    "kf_id",
+    "kf_T_submap_kf",
+)
+_NO_XYZ = np.zeros((0, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Appearing:
+    """Points that appear one by one and stay.
+
+    Attributes
+    ----------
+    row : (N,) int64
+        The frame at which each appears, ascending: a row of `Playback.rows`.
+    xyz : (N, 3) float64
+    submap : (N,) int64
+    """
+
+    row: IntArray
+    xyz: FloatArray
+    submap: IntArray
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Space:
+    """One frame of reference with all that stands in it, in the unit of its map.
+
+    Attributes
+    ----------
+    submap : int or None
+        None for the main map; a submap that is not linked to it has a space of its own.
+    posed : PosedRows
+        Poses as the trajectory file has them.
+    keyframes, landmarks : Appearing
+        Camera centres at their own frames; landmarks at the keyframe that first described them. Landmarks that were far
+        from it are left out, as in the pictures of the report.
+    truth_xyz : (T, 3) float64
+        True camera centres, taken into this space by one similarity; empty where there are none.
+    """
+
+    submap: int | None
+    posed: PosedRows
+    keyframes: Appearing
+    landmarks: Appearing
+    truth_xyz: FloatArray
+
+    @property
+    def size(self) -> float:
+        """Length of the diagonal of the box around the cameras."""
+        return float(np.linalg.norm(np.ptp(self.posed.xyz, axis=0))) if len(self.posed) else 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Playback:
+    """A run as it is played.
+
+    Attributes
+    ----------
+    rows : list of FrameRow
+        Every input frame, ascending in time (a run may have read them backwards).
+    camera : Camera
+    spaces : list of Space
+        The main map first; it is there even if it is empty.
+    """
+
+    rows: list[FrameRow]
+    camera: Camera
+    spaces: list[Space]
+
+
+def play(run: RunData) -> Playback:
+    """Lay a run out in time and space.
+
+    Raises
+    ------
+    InputError
+        If the map or an event is damaged or is not of these frames, or the run does not name its camera.
+    """
+    if not all("timestamp_s" in event and "frame" in event for event in run.events):
+        raise InputError(f"{run.path / EVENTS} is damaged: an event has no frame or no time.")
+    order = np.argsort([row.timestamp_s for row in run.rows], kind="stable")
+    rows = [run.rows[i] for i in order.tolist()]
+    at = np.empty(len(order), np.int64)
+    at[order] = np.arange(len(order))
+    truth = _moved(run.truth, at)
+    main = _moved(run.main, at)
+    spaces = [_space(run, rows, None, main, truth)]
+    spaces += [_space(run, rows, m, _moved(posed, at), truth) for m, posed in run.unlinked.items()]
+    return Playback(rows, _camera(run), spaces)
+
+
+def segments(posed: PosedRows) -> tuple[IntArray, FloatArray]:
+    """Return the pieces of the way between neighbouring frames: rows (S,) at which they end, and ends (S, 2, 3).
+
+    Where frames in between have no pose in this map there is no piece: the way over a gap is not known.
+    """
+    joined = np.flatnonzero(np.diff(posed.row) == 1)
+    return posed.row[joined + 1], np.stack([posed.xyz[joined], posed.xyz[joined + 1]], axis=1)
+
+
+def camera_statuses(playback: Playback, space: Space) -> list[FrameStatus | None]:
+    """Return for each frame its status as the camera of one space shows it; None where its pose is in another map."""
+    here = set(space.posed.row.tolist())
+    return [row.status if i in here or row.status in WITHOUT_POSE else None for i, row in enumerate(playback.rows)]
+
+
+def _moved(posed: PosedRows, at: IntArray) -> PosedRows:
+    """Return poses by their rows in another order: row i is now row ``at[i]``."""
+    row = at[posed.row]
+    ascending = np.argsort(row, kind="stable")
+    return PosedRows(row[ascending], posed.T_map_cam[ascending])
+
+
+def _space(run: RunData, rows: Sequence[FrameRow], submap: int | None, posed: PosedRows, truth: PosedRows) -> Space:
+    S_truth_map = align(posed, truth)
+    xyz = _NO_XYZ if isinstance(S_truth_map, Failure) else sim3.act(sim3.inverse(S_truth_map), truth.xyz)
+    return Space(submap, posed, *_map_parts(run, rows, submap), xyz)
+
+
+def _map_parts(run: RunData, rows: Sequence[FrameRow], submap: int | None) -> tuple[Appearing, Appearing]:
+    """Read the keyframes and landmarks of the main map, or of one submap in its own frame."""
+    folder = run.path / MAP
+    ids = [submap] if submap is not None else sorted({r.submap for r in rows if r.in_main_map and r.submap is not None})
+    if not ids or not (folder / METADATA).is_file():
+        return _appear([], {}), _appear([], {})
+    component, S_world_submap = ([submap], {submap: np.eye(4)}) if submap is not None else linked_submaps(folder, ids)
+    row_of = {row.index: i for i, row in enumerate(rows)}
+    keyframes, landmarks = [], []
+    for m in component:
+        xyz, distance_mu, alive, first_kf, kf_id, T_submap_kf = load_arrays(submap_path(folder, m), _ARRAYS).values()
+        shown = alive & (distance_mu < MAX_VIEW_DISTANCE_MU)
+        keyframes.append((m, kf_id, sim3.act(S_world_submap[m], T_submap_kf[:, :3, 3])))
+        landmarks.append((m, first_kf[shown], sim3.act(S_world_submap[m], xyz[shown])))
+    try:
+        return _appear(keyframes, row_of), _appear(landmarks, row_of)
+    except KeyError as error:
+        raise InputError(f"{folder} is not the map of this run: its keyframe {error} is no frame of it.") from None
+
+
+def _appear(parts: Sequence[tuple[int, IntArray, FloatArray]], row_of: dict[int, int]) -> Appearing:
+    row = np.array([row_of[k] for _, frames, _ in parts for k in frames.tolist()], np.int64)
+    xyz = np.concatenate([_NO_XYZ, *(xyz for _, _, xyz in parts)])
+    submap = np.concatenate([np.zeros(0, np.int64), *(np.full(len(frames), m) for m, frames, _ in parts)])
+    order = np.argsort(row, kind="stable")
+    return Appearing(row[order], xyz[order], submap[order])
+
+
+def _camera(run: RunData) -> Camera:
+    try:
+        return camera_from_dict(run.summary["camera"])
+    except (KeyError, TypeError, ValueError, ConfigError, InputError) as error:
+        raise InputError(f"{run.path / SUMMARY} does not name the camera of the run: {error}.") from None

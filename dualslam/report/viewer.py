@@ -1,0 +1,58 @@
+"""The window of the Rerun viewer, a program of its own: it is started, watched, and told to call nobody."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from dualslam.core.errors import OutputError
+
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
+_RERUN = (sys.executable, "-m", "rerun")
+# A viewer of its own on a free port, which other machines cannot reach, without the welcome page that loads examples.
+_WINDOW = ("--port", "auto", "--bind", "127.0.0.1", "--hide-welcome-screen")
+_PROXIES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY")
+_NOWHERE = "http://127.0.0.1:9"
+"""The port named `discard`, where nobody answers."""
+
+
+def has_display() -> bool:
+    """Whether a window can be opened."""
+    return any(os.environ.get(name) for name in DISPLAYS)
+
+
+def open_viewer(recording: bytes) -> None:
+    """Show the content of an ``.rrd`` file, and wait until the window is closed.
+
+    The viewer sends usage data, and asks for newer versions, unless its settings forbid it. It gets settings of its own
+    that forbid the one, so that those of the user stay as they are, and a way out that leads nowhere for the other.
+
+    Raises
+    ------
+    OutputError
+        If the viewer cannot be started.
+    """
+    with tempfile.TemporaryDirectory(prefix="dualslam-view-") as folder:
+        file = Path(folder) / "run.rrd"
+        file.write_bytes(recording)
+        environment = os.environ | _alone(folder)
+        for words in (("analytics", "disable"), (*_WINDOW, str(file))):
+            done = subprocess.run([*_RERUN, *words], env=environment, capture_output=True, text=True, check=False)
+            if done.returncode != 0:
+                raise OutputError(f"the viewer did not open ({_reason(done.stderr)}); write the recording with --save.")
+
+
+def _alone(folder: str) -> dict[str, str]:
+    """Return the environment of a program that keeps its settings in a folder and reaches no other machine."""
+    nowhere = {spelt: _NOWHERE for name in _PROXIES for spelt in (name, name.lower())}
+    return nowhere | {"NO_PROXY": "", "no_proxy": "", "XDG_CONFIG_HOME": folder, "XDG_DATA_HOME": folder}
+
+
+def _reason(stderr: str) -> str:
+    """Return the line that says most of what a program complained about."""
+    lines = [line.strip() for line in stderr.splitlines() if line.strip()]
+    errors = [line for line in lines if "error" in line.lower()]
+    return (errors or lines or ["it does not say why"])[0]
