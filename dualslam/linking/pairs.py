@@ -58,14 +58,17 @@ class PairModel:
         covariance = self.covariance_old + A @ self.covariance_new @ A.T
         return symmetric3.quadratic_inverse(symmetric3.planes(covariance), residual.T)
 
-    def depths(self) -> tuple[FloatArray, FloatArray]:
-        """Return the depth (V,) of each view's point in its keyframe: in the old map, and in the new one."""
-        c, k = self.pairs, self.pairs.view_keyframe
-        T_old, T_new = self.T_kf_old[k], self.T_kf_new[k]
-        return (
-            (T_old[:, 2, :3] * c.xyz_old[c.view_pair]).sum(1) + T_old[:, 2, 3],
-            (T_new[:, 2, :3] * c.xyz_new[c.view_pair]).sum(1) + T_new[:, 2, 3],
-        )
+    def depths_old(self) -> FloatArray:
+        """Return the depth (V,) of each view's point in its keyframe, in the old map."""
+        return self._depths(self.T_kf_old, self.pairs.xyz_old)
+
+    def depths_new(self) -> FloatArray:
+        """Return the same in the new map."""
+        return self._depths(self.T_kf_new, self.pairs.xyz_new)
+
+    def _depths(self, T_kf_map: FloatArray, xyz: FloatArray) -> FloatArray:
+        T = T_kf_map[self.pairs.view_keyframe]
+        return np.asarray((T[:, 2, :3] * xyz[self.pairs.view_pair]).sum(1) + T[:, 2, 3])
 
     def reprojection2(self, S_old_new: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return squared whitened residuals (V,) of the new points in the old map's keyframes, and the other way.

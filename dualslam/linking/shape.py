@@ -125,8 +125,6 @@ def _halves(model: PairModel, inliers: BoolArray, keyframes: BoolArray) -> dict[
     c = model.pairs
     n = len(c)
     views = inliers[c.view_pair] & keyframes[c.view_keyframe]
-    T = model.T_kf_old[c.view_keyframe]
-    depth_view = (T[:, 2, :3] * c.xyz_old[c.view_pair]).sum(1) + T[:, 2, 3]
     count = np.maximum(np.bincount(c.view_pair[views], minlength=n), 1)
 
     def mean(values: FloatArray) -> FloatArray:
@@ -136,7 +134,7 @@ def _halves(model: PairModel, inliers: BoolArray, keyframes: BoolArray) -> dict[
     for low, high, value in (
         ("left", "right", mean(c.uv_old[:, 0])),
         ("upper", "lower", mean(c.uv_old[:, 1])),
-        ("near", "far", mean(depth_view)),
+        ("near", "far", mean(model.depths_old())),
         ("early", "late", mean(c.view_keyframe.astype(np.float64))),
     ):
         below = value <= np.median(value[inliers])

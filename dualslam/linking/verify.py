@@ -52,7 +52,7 @@ def check_spread(
     numbers = {"spread_u": float(share[0]), "spread_v": float(share[1])}
     if share.min() < config.min_image_spread:
         return Failure(FailureReason.SPREAD, f"{share.min():.0%} of the image is covered", numbers)
-    depth, _ = model.depths()
+    depth = model.depths_old()
     ranges = []
     for k in np.flatnonzero(keyframes).tolist():
         near, middle, far = np.percentile(depth[views & (c.view_keyframe == k)], [10, 50, 90])
@@ -95,7 +95,7 @@ def check_parting(
 
 def _log_scale_at(model: PairModel, keyframes: IntArray) -> float:
     """Return the log of the scale of the old map to the new one, as some keyframes (ids) see their points."""
-    in_old, in_new = model.depths()
+    in_old, in_new = model.depths_old(), model.depths_new()
     seen = np.isin(model.pairs.keyframes, keyframes)[model.pairs.view_keyframe] & (in_old > 0) & (in_new > 0)
     return float(np.median(np.log(in_old[seen] / in_new[seen]))) if seen.any() else math.inf
 
