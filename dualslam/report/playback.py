@@ -15,7 +15,7 @@ from dualslam.io.map_files import METADATA, load_arrays
 from dualslam.io.run_folder import EVENTS, MAP, SUMMARY, FrameRow
 from dualslam.map_store import submap_path
 from dualslam.report.placement import align
-from dualslam.report.run_data import MAX_VIEW_DISTANCE_MU, PosedRows, RunData, linked_submaps
+from dualslam.report.run_data import PosedRows, RunData, are_shown, linked_submaps
 from dualslam.report.statuses import WITHOUT_POSE
 
 _ARRAYS = (
@@ -148,17 +148,17 @@ def _space(run: RunData, rows: Sequence[FrameRow], submap: int | None, posed: Po
 def _map_parts(run: RunData, rows: Sequence[FrameRow], submap: int | None) -> tuple[Appearing, Appearing]:
     """Read the keyframes and landmarks of the main map, or of one submap in its own frame."""
     folder = run.path / MAP
-    ids = [submap] if submap is not None else sorted({r.submap for r in rows if r.in_main_map and r.submap is not None})
-    if not ids or not (folder / METADATA).is_file():
-        return _appear([], {}), _appear([], {})
-    component, S_world_submap = ([submap], {submap: np.eye(4)}) if submap is not None else linked_submaps(folder, ids)
+    if submap is None:
+        component, S_world_submap = linked_submaps(folder, {row.submap for row in rows if row.in_main_map})
+    else:
+        component, S_world_submap = [submap] if (folder / METADATA).is_file() else [], {submap: np.eye(4)}
     row_of = {row.index: i for i, row in enumerate(rows)}
     keyframes, landmarks = [], []
     for m in component:
-        xyz, distance_mu, alive, first_kf, kf_id, T_submap_kf = load_arrays(submap_path(folder, m), _ARRAYS).values()
-        shown = alive & (distance_mu < MAX_VIEW_DISTANCE_MU)
-        keyframes.append((m, kf_id, sim3.act(S_world_submap[m], T_submap_kf[:, :3, 3])))
-        landmarks.append((m, first_kf[shown], sim3.act(S_world_submap[m], xyz[shown])))
+        arrays, S = load_arrays(submap_path(folder, m), _ARRAYS), S_world_submap[m]
+        shown = are_shown(arrays)
+        keyframes.append((m, arrays["kf_id"], sim3.act(S, arrays["kf_T_submap_kf"][:, :3, 3])))
+        landmarks.append((m, arrays["landmarks_first_kf"][shown], sim3.act(S, arrays["landmarks_xyz_mu"][shown])))
     try:
         return _appear(keyframes, row_of), _appear(landmarks, row_of)
     except KeyError as error:

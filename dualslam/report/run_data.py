@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dualslam.atlas import Atlas
 from dualslam.core import strict_yaml
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import sim3
-from dualslam.core.types import FloatArray, FrameStatus, IntArray
+from dualslam.core.types import BoolArray, FloatArray, FrameStatus, IntArray
 from dualslam.io import run_folder
 from dualslam.io.map_files import METADATA, load_arrays
 from dualslam.io.run_folder import FrameRow, read_events, read_frames, unlinked_submaps
@@ -171,21 +172,28 @@ def _truth_on_rows(truth: Trajectory, times_s: FloatArray) -> PosedRows:
 
 def _map_points(folder: Path, submap_ids: set[int | None]) -> FloatArray:
     """Read landmarks of the main map in its frame: the arrays that are needed, of the many that a map holds."""
-    ids = sorted(m for m in submap_ids if m is not None)
-    if not ids or not (folder / METADATA).is_file():
-        return np.zeros((0, 3))
-    component, S_world_submap = linked_submaps(folder, ids)
+    component, S_world_submap = linked_submaps(folder, submap_ids)
     clouds = [np.zeros((0, 3))]
     for m in component:
         arrays = load_arrays(submap_path(folder, m), _POINT_ARRAYS)
-        xyz, distance_mu, alive = (arrays[name] for name in _POINT_ARRAYS)
-        clouds.append(sim3.act(S_world_submap[m], xyz[alive & (distance_mu < MAX_VIEW_DISTANCE_MU)]))
+        clouds.append(sim3.act(S_world_submap[m], arrays["landmarks_xyz_mu"][are_shown(arrays)]))
     points = np.concatenate(clouds)
     return points[:: max(1, len(points) // MAX_POINTS)]
 
 
-def linked_submaps(folder: Path, ids: list[int]) -> tuple[list[int], Mapping[int, FloatArray]]:
-    """Return the submaps of a map that are linked with the first of `ids`, and the transform of each into its world."""
+def are_shown(arrays: Mapping[str, NDArray[Any]]) -> BoolArray:
+    """Return which landmarks of a stored submap belong into a picture."""
+    return np.asarray(arrays["landmarks_alive"] & (arrays["landmarks_distance_mu"] < MAX_VIEW_DISTANCE_MU))
+
+
+def linked_submaps(folder: Path, submap_ids: set[int | None]) -> tuple[list[int], Mapping[int, FloatArray]]:
+    """Return the submaps that are linked with the first of some, and the transform of each into their world.
+
+    None where there is no map, or no submap to begin with.
+    """
+    ids = sorted(m for m in submap_ids if m is not None)
+    if not ids or not (folder / METADATA).is_file():
+        return [], {}
     stored, links = load_links(folder)
     atlas = Atlas()
     for link in links:
