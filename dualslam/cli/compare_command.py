@@ -6,15 +6,14 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from dualslam.core.errors import OutputError
+from dualslam.cli.outputs import check_free
 from dualslam.io.atomic import write_text
 from dualslam.report import RunData, comparison_page, comparison_table, read_run
 
 
 def execute(args: argparse.Namespace) -> int:
     """Print a table of the runs' numbers, and write the page."""
-    if args.out.exists() and not args.overwrite:
-        raise OutputError(f"{args.out} is there already; name another with --out, or give --overwrite.")
+    check_free(args.out, args.overwrite, "another with --out")
     present([read_run(path) for path in args.runs], args.out, args.quiet)
     return 0
 

@@ -10,9 +10,10 @@ from dualslam.cli import logs
 from dualslam.cli.compare_command import present
 from dualslam.cli.configuration import config_of
 from dualslam.cli.console import progress
+from dualslam.cli.outputs import check_free
 from dualslam.cli.run_command import conclude
 from dualslam.core.config import Config
-from dualslam.core.errors import InputError, OutputError
+from dualslam.core.errors import InputError
 from dualslam.report import read_run
 from dualslam.session import run_to_folder
 from dualslam.sources import WorldSequence, make_world
@@ -28,8 +29,7 @@ def execute(args: argparse.Namespace) -> int:
         raise InputError(f"--frames {args.frames}: the demo needs at least {MIN_FRAMES} to lose track and start again.")
     config = config_of(args)
     page: Path = args.out / "compare.html"
-    if page.exists() and not args.overwrite:
-        raise OutputError(f"{page} is there already; name another folder with --out, or give --overwrite.")
+    check_free(page, args.overwrite, "another folder with --out")
     covered: dict[str, Any] = {"kind": "blackout", "start": args.frames // 2, "length": BLACKOUT_FRAMES}
     sequence = WorldSequence(make_world("street", args.frames, WORLD_SEED, [covered]))
     if not args.quiet:

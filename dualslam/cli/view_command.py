@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from dualslam.core.errors import InputError, OutputError
+from dualslam.cli.outputs import check_free
+from dualslam.core.errors import InputError
 from dualslam.io.atomic import atomic_file
 from dualslam.report.run_data import RunData, read_run
 from dualslam.report.viewer import has_display, open_viewer
@@ -14,8 +15,8 @@ def execute(args: argparse.Namespace) -> int:
     """Write the recording of a run, or open the viewer with it."""
     if args.save is None and not has_display():
         raise InputError("there is no display to open a viewer on; write the recording with --save FILE.")
-    if args.save is not None and args.save.exists() and not args.overwrite:
-        raise OutputError(f"{args.save} is there already; name another with --save, or give --overwrite.")
+    if args.save is not None:
+        check_free(args.save, args.overwrite, "another with --save")
     recording = _record(read_run(args.run))
     if args.save is None:
         open_viewer(recording)
