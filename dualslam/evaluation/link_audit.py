@@ -56,9 +56,13 @@ class LinkAudit:
         How well those frames fix the true similarity: an error that is no larger is none.
     n_old, n_new : int
         Frames of either map that truth was taken from.
+    frames_old, frames_new : (int, int)
+        The first and the last of those frames, in either map.
     live_scale, live_scale_sigma : float or None
         Relative error of the scale that the link gives the new map's live end, and what truth tells of it there; none
         where the new map has no frames beyond the old one.
+    frames_live : (int, int) or None
+        The first and the last frame of that end.
     """
 
     old: int
@@ -71,8 +75,11 @@ class LinkAudit:
     rotation_sigma_deg: float
     n_old: int
     n_new: int
+    frames_old: tuple[int, int]
+    frames_new: tuple[int, int]
     live_scale: float | None = None
     live_scale_sigma: float | None = None
+    frames_live: tuple[int, int] | None = None
 
     @property
     def position(self) -> float:
@@ -164,6 +171,8 @@ def audit_link(
         rotation_sigma_deg=math.degrees(math.hypot(a.rotation_sigma_rad, b.rotation_sigma_rad)),
         n_old=len(a.ids),
         n_new=len(b.ids),
+        frames_old=a.span,
+        frames_new=b.span,
         **({} if isinstance(live, Failure) else _at_the_live_end(a, live[0], S_link)),
     )
 
@@ -192,11 +201,57 @@ def _truth_beyond(
     return [align_cameras(ids, np.array([known[1][int(i)] for i in ids]), np.array([truth[int(i)] for i in ids]))]
 
 
-def _at_the_live_end(old: Side, live: Side, S_link: FloatArray) -> dict[str, float]:
-    """Return the error of scale there, and its sigma."""
+def _at_the_live_end(old: Side, live: Side, S_link: FloatArray) -> dict[str, Any]:
+    """Return the error of scale there, its sigma, and where it is."""
     S_true = sim3.inverse(old.S_world_submap) @ live.S_world_submap
     error = float(sim3.scale(S_link) / sim3.scale(S_true)) - 1.0
-    return {"live_scale": error, "live_scale_sigma": math.hypot(old.scale_sigma, live.scale_sigma)}
+    sigma = math.hypot(old.scale_sigma, live.scale_sigma)
+    return {"live_scale": error, "live_scale_sigma": sigma, "frames_live": live.span}
+
+
+@dataclass(frozen=True, slots=True)
+class UnbrokenAudit:
+    """The errors of scale that an audit finds where there is no link: one map, the same frames, the same truth.
+
+    Attributes
+    ----------
+    scale : float
+        Relative, as `LinkAudit.scale`.
+    live_scale : float or None
+        As `LinkAudit.live_scale`.
+    """
+
+    scale: float
+    live_scale: float | None
+
+
+def audit_unbroken(
+    audit: LinkAudit, T_submap_cam: Mapping[int, FloatArray], truth: Mapping[int, FloatArray]
+) -> UnbrokenAudit | Failure:
+    """Audit a map that never broke at the places where a link was audited: the control of that audit.
+
+    A map drifts, and truth itself may lie otherwise than the cameras do (7-Scenes: the poses of a depth camera). What
+    is found here, too, is not the link's doing.
+
+    Parameters
+    ----------
+    audit : LinkAudit
+    T_submap_cam : mapping of int to (4, 4)
+        Of the map that never broke, by frame index.
+    truth : mapping of int to (4, 4)
+        As for `audit_links`.
+    """
+    sides: list[Side] = []
+    for span in (audit.frames_old, audit.frames_new, audit.frames_live):
+        if span is None:
+            continue
+        ids = np.array(sorted(i for i in T_submap_cam if span[0] <= i <= span[1] and i in truth), np.int64)
+        if len(ids) < MIN_FRAMES:
+            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(ids)} frames of the unbroken map have a true pose")
+        estimated, true = (np.array([poses[int(i)] for i in ids]) for poses in (T_submap_cam, truth))
+        sides.append(align_cameras(ids, estimated, true))
+    old, new, *live = (float(sim3.scale(side.S_world_submap)) for side in sides)
+    return UnbrokenAudit(old / new - 1.0, old / live[0] - 1.0 if live else None)
 
 
 def _truth_about(
@@ -222,6 +277,11 @@ class Side:
     centres: FloatArray
     scale_sigma: float
     rotation_sigma_rad: float
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """The first and the last frame."""
+        return int(self.ids[0]), int(self.ids[-1])
 
 
 def _poses_in(submap: Submap, poses: list[FramePose]) -> dict[int, FloatArray]:

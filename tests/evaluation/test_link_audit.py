@@ -8,8 +8,8 @@ import pytest
 from dualslam.atlas import Atlas, Link, LinkKind
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.submap import Submap
-from dualslam.core.types import FloatArray, Keyframe
-from dualslam.evaluation.link_audit import LinkAudit, audit_links, truth_by_frame
+from dualslam.core.types import Failure, FloatArray, Keyframe
+from dualslam.evaluation.link_audit import LinkAudit, UnbrokenAudit, audit_links, audit_unbroken, truth_by_frame
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.trajectory import FramePose
 from tests.point_world import path, random_features
@@ -113,6 +113,28 @@ def test_what_drifts_after_the_start_is_not_the_links_fault() -> None:
     found = audit(S_OLD_NEW, world(), drift=(45, 1.5))
     assert not found.wrong
     assert abs(found.worst_scale) < 1e-9
+
+
+@pytest.mark.parametrize(("bent", "error"), [(1.0, 0.0), (1.2, 1 / 1.2 - 1)])
+def test_a_map_that_never_broke_is_audited_at_the_same_places(bent: float, error: float) -> None:
+    T = world()
+    found = audit(S_OLD_NEW, T, drift=(35, 1.2))
+    assert found.frames_live is not None
+    first = found.frames_live[0]
+    assert found.frames_old[1] < first
+    whole = sim3.act_on_pose(S_NEW_WORLD, T)
+    pivot = whole[first, :3, 3].copy()  # from the live end on it is stretched
+    whole[first:, :3, 3] = pivot + (whole[first:, :3, 3] - pivot) / bent
+    control = audit_unbroken(found, dict(enumerate(whole)), dict(enumerate(T)))
+    assert isinstance(control, UnbrokenAudit)
+    assert abs(control.scale) < 1e-9
+    assert control.live_scale == pytest.approx(error, abs=1e-9)
+
+
+def test_a_map_without_frames_where_the_link_is_says_nothing() -> None:
+    T = world()
+    found = audit(S_OLD_NEW, T)
+    assert isinstance(audit_unbroken(found, {0: np.eye(4)}, dict(enumerate(T))), Failure)
 
 
 def test_no_more_frames_count_than_it_takes_to_tell() -> None:
