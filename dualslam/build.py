@@ -21,9 +21,9 @@ from dualslam.core.rectification import rectify
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Features, Frame, View
 from dualslam.evaluation.failure_lab import FaultScript
+from dualslam.executor import InlineExecutor, RecoveryExecutor
 from dualslam.health import judge_track
 from dualslam.linking import DescriptorMatcher, carry_to_live_end, estimate_link
-from dualslam.recoveries import InlineExecutor, RecoveryExecutor
 from dualslam.recovery import Attempt, RecoveryJob, RecoveryParts
 from dualslam.system import Components, System
 from dualslam.worker import WorkerExecutor
@@ -162,7 +162,8 @@ def recovery_parts(
         refinder = Refinder(submap, frontend, lambda: job.camera, config.camera.model_sigma_px)
         for view in sorted(job.own, key=lambda view: view.index, reverse=True):  # those next to the walk stay
             refinder.remember(view)
-        return VisualFrontEnd(frontend, config, submap, graph, size_px, refinder)
+        n_covering = 0 if job.lost else config.recovery.covering_keyframes
+        return VisualFrontEnd(frontend, config, submap, graph, size_px, refinder, n_covering)
 
     matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
     return RecoveryParts(

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from itertools import takewhile
+from typing import Any
 
 from dualslam.atlas import Link, LinkKind
 from dualslam.calibration import Calibration
 from dualslam.carried_poses import carry_poses
-from dualslam.core.camera import Camera
 from dualslam.core.config import RecoveryConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
@@ -20,51 +20,14 @@ from dualslam.core.solving import solve
 from dualslam.core.submap import Submap
 from dualslam.core.submap_change import change_of_frame
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus, Keyframe, View
-from dualslam.direction import reads_backwards, recover
+from dualslam.direction import reads_backwards
+from dualslam.executor import Outcome, RecoveryExecutor
 from dualslam.frame_buffer import FrameBuffer
 from dualslam.merging import Merged, carry_links, merge_recovery
 from dualslam.record import Moment, Record
-from dualslam.recovery import FoundLink, RecoveryJob, RecoveryParts, RecoveryResult, WalkedFrame
+from dualslam.recovery import FoundLink, RecoveryJob, RecoveryResult, WalkedFrame
+from dualslam.retries import RetrySchedule, way_to_gaps
 from dualslam.seam import gauge_at_seam
-
-Outcome = tuple[RecoveryJob, RecoveryResult | Failure]
-
-
-class RecoveryExecutor(Protocol):
-    """Runs jobs, somewhere: the system neither knows where nor waits for them."""
-
-    def submit(self, job: RecoveryJob) -> None:
-        """Take a job on."""
-        ...
-
-    def poll(self) -> list[Outcome]:
-        """Return what has ended since the last call."""
-        ...
-
-    def finish(self) -> list[Outcome]:
-        """Take no more jobs, and return what came of all that are left."""
-        ...
-
-
-class InlineExecutor:
-    """Runs each job when it is submitted: one process, deterministic."""
-
-    def __init__(self, parts: RecoveryParts) -> None:
-        self._parts = parts
-        self._done: list[Outcome] = []
-
-    def submit(self, job: RecoveryJob) -> None:
-        """Run the job."""
-        self._done.append((job, recover(job, self._parts)))
-
-    def poll(self) -> list[Outcome]:
-        """Return what has run since the last call."""
-        done, self._done = self._done, []
-        return done
-
-    def finish(self) -> list[Outcome]:
-        """Return what has run since the last call."""
-        return self.poll()
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +37,15 @@ class Loss:
     onset: int
     cause: str
     first_frame: int
+
+
+@dataclass(frozen=True, slots=True)
+class _UnderWay:
+    """A walk that has begun: when, with how many live keyframes, and whether it is not the submap's first."""
+
+    began_s: float
+    n_live: int
+    again: bool
 
 
 class Recoveries:
@@ -105,10 +77,9 @@ class Recoveries:
         self._calibration = calibration
         self._config = config
         self._lost: dict[int, Loss] = {}  # submaps that are not linked yet
-        self._began: dict[int, float] = {}  # when, by the new submap's id
+        self._under_way: dict[int, _UnderWay] = {}  # by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
-        self._starts: dict[int, int] = {}  # the keyframe that its first walk started from
-        self._unlinked: dict[int, tuple[int, Camera]] = {}  # live keyframes, and camera, when a walk last found no link
+        self._retries = RetrySchedule(config.retry_keyframes)
 
     @property
     def waiting(self) -> list[int]:
@@ -125,7 +96,7 @@ class Recoveries:
 
         It begins at its keyframe `newest`, also where it is made again later (`now`).
         """
-        atlas, onsets = self._record.atlas, {m: loss.onset for m, loss in self._lost.items()}
+        onsets = {m: loss.onset for m, loss in self._lost.items()}
         if onsets:
             self._circumstances[submap.id] = self._circumstances_of_loss()
             numbers = {**self._circumstances[submap.id], **self._buffer.numbers}
@@ -137,42 +108,52 @@ class Recoveries:
                 again=now is not None,
                 **numbers,
             )
+        views = self._views_before(newest, submap, stop_at_posed=not onsets)
+        self._submit(submap, newest, views, onsets, now)
+
+    def retry(self, submap: Submap, now: View) -> None:
+        """Walk back again where something was left to find, once the new map has grown or its camera was calibrated.
+
+        A link, while the buffer holds frames that a lost map saw; else poses of buffered frames that have none.
+        """
+        if submap.id in self._under_way or not self._retries.take_if_due(submap, now.index, self._calibration.camera):
+            return
+        lost = {k for m in self._lost for k in self._record.atlas.submaps[m].keyframes}
+        own = [view for view in self._buffer if view.index in submap.keyframes]
+        if own and any(view.index in lost for view in self._buffer):
+            first = self._retries.start_of(submap, now.index)
+            self.start(submap, min(own, key=lambda view: (abs(view.index - first), view.index)), now)
+        elif way := self._way_to_gaps(submap):
+            self._submit(submap, way[0], way[1:], {}, now)
+
+    def _submit(
+        self, submap: Submap, newest: View, views: Iterable[View], onsets: dict[int, int], now: View | None
+    ) -> None:
         job = RecoveryJob(
             submap=submap.copy(),
             newest_id=newest.index,
-            lost={m: atlas.submaps[m].copy() for m in onsets},
+            lost={m: self._record.atlas.submaps[m].copy() for m in onsets},
             onsets=onsets,
-            views=tuple(self._views_before(newest, submap, stop_at_posed=not onsets)),
+            views=tuple(views),
             own=tuple(view for view in self._buffer if view.index in submap.keyframes),
             camera=self._calibration.camera,
             camera_covariance=self._calibration.covariance,
         )
-        self._began[submap.id] = time.perf_counter()
-        self._starts.setdefault(submap.id, newest.index)
+        self._retries.start_of(submap, newest.index)
+        n_live = self._retries.n_live(submap, (now or newest).index)
+        self._under_way[submap.id] = _UnderWay(time.perf_counter(), n_live, again=now is not None)
         self._executor.submit(job)
 
-    def retry(self, submap: Submap, now: View) -> None:
-        """Walk back again where no link was found, once the new map has grown or its camera was calibrated.
+    def _way_to_gaps(self, submap: Submap) -> list[View]:
+        """Return the buffered frames without a pose, and what leads to them from the submap; the latest first.
 
-        It knows depths better then. Only while the buffer still holds frames that a lost map saw.
+        What another map has posed that is not linked with this one, and all that is older, is not this one's to pose.
         """
-        if submap.id not in self._unlinked or submap.id in self._began or not self._lost:
-            return
-        tried_with, camera = self._unlinked[submap.id]
-        has_grown = any(tried_with < n <= self._n_live(submap) for n in self._config.retry_keyframes)
-        if not has_grown and camera == self._calibration.camera:
-            return
-        del self._unlinked[submap.id]
-        lost = {k for m in self._lost for k in self._record.atlas.submaps[m].keyframes}
-        own = [view for view in self._buffer if view.index in submap.keyframes]
-        if not own or not any(view.index in lost for view in self._buffer):
-            return
-        first = self._starts[submap.id]
-        self.start(submap, min(own, key=lambda view: (abs(view.index - first), view.index)), now)
-
-    def _n_live(self, submap: Submap) -> int:
-        """Count a submap's keyframes without those that walks back have added."""
-        return sum(k >= self._starts[submap.id] for k in submap.keyframes)
+        poses, own = self._record.poses, next(c for c in self._record.atlas.components() if submap.id in c)
+        views = takewhile(
+            lambda view: view.index not in poses or poses[view.index].submap_id in own, reversed(tuple(self._buffer))
+        )
+        return way_to_gaps(tuple(views), poses.keys(), submap.keyframes.keys())
 
     def collect(self, live: VisualOdometry | None, now: Moment) -> None:
         """Merge the walks that have ended. `live` goes on in its submap as it is after that."""
@@ -186,15 +167,25 @@ class Recoveries:
 
     def _take(self, outcomes: list[Outcome], live: VisualOdometry | None, now: Moment) -> None:
         for job, result in outcomes:
-            started_s = self._began.pop(job.submap.id)
-            if job.onsets and (isinstance(result, Failure) or result.link is None):
-                self._unlinked[job.submap.id] = self._n_live(job.submap), job.camera
+            walk = self._under_way.pop(job.submap.id)
             if isinstance(result, Failure):
-                self._failed(job, now, result, time.perf_counter() - started_s)
-                continue
-            self._record.timer.add("walk back", result.cpu_s)
-            with self._record.timer.measure("merging"):
-                self._take_in(job, result, live, now, started_s)
+                self._failed(job, now, result, time.perf_counter() - walk.began_s)
+            else:
+                self._record.timer.add("walk back", result.cpu_s)
+            if walk.again and not job.onsets and not self._poses_any(result):
+                continue  # the last one for these frames; what it would add to the map is not worth a solution
+            if not isinstance(result, Failure):
+                with self._record.timer.measure("merging"):
+                    self._take_in(job, result, live, now, walk.began_s)
+            unlinked = bool(job.onsets) and (isinstance(result, Failure) or result.link is None)
+            if unlinked or self._way_to_gaps(self._record.atlas.submaps[job.submap.id]):
+                self._retries.leave_open(job.submap.id, walk.n_live, job.camera)
+
+    def _poses_any(self, result: RecoveryResult | Failure) -> bool:
+        """Whether a walk has found a pose for a frame that has none."""
+        if isinstance(result, Failure):
+            return False
+        return any(frame.pose.index not in self._record.poses for frame in result.frames)
 
     def _views_before(self, newest: View, submap: Submap, stop_at_posed: bool) -> Iterator[View]:
         for view in self._buffer.backwards_from(newest.index):

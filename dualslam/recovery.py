@@ -27,6 +27,7 @@ from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
 from dualslam.linking import LinkEstimate
 from dualslam.relinker import Linker, LinkTry, Relinker
+from dualslam.retries import way_to_gaps
 from dualslam.seam import SeamReport, refine_seam
 from dualslam.trajectory import FramePose
 
@@ -50,7 +51,8 @@ class RecoveryJob:
     onsets : dict of int to int
         For each of them the frame from which on it is suspected to be corrupted.
     views : tuple of View
-        What is buffered, latest first, from the frame before `newest_id` on.
+        What is buffered, latest first, from the frame before `newest_id` on. Where a walk is made again for the sake of
+        frames without a pose: those, and what leads to them.
     own : tuple of View
         Buffered views of the new submap's keyframes, `newest_id` included: for attempts that need their images.
     camera : Camera
@@ -164,7 +166,7 @@ def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Fai
     if best is None:
         return problem
     seconds, cpu_s = time.perf_counter() - started, time.thread_time() - cpu_started
-    return RecoveryResult(best.submap, tuple(best.frames), best.link, tuple(events), seconds, cpu_s)
+    return RecoveryResult(best.submap, tuple(best.frames.values()), best.link, tuple(events), seconds, cpu_s)
 
 
 @dataclass(slots=True, eq=False)
@@ -172,7 +174,7 @@ class _Walk:
     """What one attempt has come to so far."""
 
     submap: Submap
-    frames: list[WalkedFrame] = field(default_factory=list)
+    frames: dict[int, WalkedFrame] = field(default_factory=dict)  # in the order in which they were posed first
     events: list[Event] = field(default_factory=list)
     link: FoundLink | None = None
     n_keyframes: int = 0
@@ -198,7 +200,7 @@ class _Walk:
         self.why_unusable = failure.detail or str(failure.reason)
 
     def note_posed(self, frame: WalkedFrame, new_keyframe: bool) -> None:
-        self.frames.append(frame)
+        self.frames.setdefault(frame.pose.index, frame)
         self.n_keyframes += new_keyframe
         self.n_leaps += self.n_unusable > 0
         self.n_leaped += self.n_unusable
@@ -221,7 +223,8 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float
     walk = _Walk(submap)
     # Frames before a start are worth a look each, however many show nothing; no map waits for the end of that walk.
     max_leap_frames = parts.config.max_leap_frames if job.lost else len(job.views)
-    for step in walk_back(walker, job.views, parts.judge, relinker.keyframe_ids, max_leap_frames):
+    views = job.views if job.lost else _there_and_back(job.views, walk)
+    for step in walk_back(walker, views, parts.judge, relinker.keyframe_ids, max_leap_frames):
         walk.out_of_time = time.perf_counter() > until
         if walk.out_of_time:
             break
@@ -246,6 +249,15 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float
     if job.lost:
         walk.events.append(_event_of(job, walk, attempt.name, time.perf_counter() - started))
     return walk
+
+
+def _there_and_back(views: tuple[View, ...], walk: _Walk) -> Iterator[View]:
+    """Yield the views, and then, the other way round, those that the walk has found no pose for.
+
+    A camera that turns away slowly and back at once is lost on the way back in time, and followed on the way there.
+    """
+    yield from views
+    yield from way_to_gaps(views[::-1], walk.frames, walk.submap.keyframes)
 
 
 def _fused(tried: LinkTry, job: RecoveryJob, submap: Submap, attempt: str, parts: RecoveryParts) -> FoundLink | Failure:
@@ -293,16 +305,17 @@ def _refusal(tried: LinkTry, failure: Failure, attempt: str, view: View, submap_
 def _event_of(job: RecoveryJob, walk: _Walk, attempt: str, seconds: float) -> Event:
     """One attempt in one line, at the frame where it ended."""
     by_index = {view.index: view for view in (*job.own, *job.views)}
-    last = walk.frames[-1].pose.index if walk.frames else job.newest_id
+    frames = list(walk.frames.values())
+    last = frames[-1].pose.index if frames else job.newest_id
     data: dict[str, Any] = {
         "attempt": attempt,
-        "frames": len(walk.frames),
+        "frames": len(frames),
         "new_keyframes": walk.n_keyframes,
         "leaps": walk.n_leaps,
         "leaped_frames": walk.n_leaped,
         "unusable_at_end": walk.n_unusable,
-        "matches": sum(frame.n_matches for frame in walk.frames),
-        "inliers": sum(frame.n_inliers for frame in walk.frames),
+        "matches": sum(frame.n_matches for frame in frames),
+        "inliers": sum(frame.n_inliers for frame in frames),
         "verdict": walk.verdict,
         "seconds": seconds,
     }

@@ -19,12 +19,13 @@ from dualslam.core.geometry import se3
 from dualslam.core.interfaces import MapStarter, Shutter, SubmapGraph, VisualOdometry
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, Start, Track, View
+from dualslam.executor import RecoveryExecutor
 from dualslam.frame_buffer import FrameBuffer
 from dualslam.frame_records import FrameRecord, FrameResult
 from dualslam.health import HealthMonitor, count_signs
 from dualslam.merging import carry_links
 from dualslam.record import Record
-from dualslam.recoveries import Recoveries, RecoveryExecutor
+from dualslam.recoveries import Recoveries
 from dualslam.rollover import next_submap
 from dualslam.trajectory import FramePose
 

@@ -22,7 +22,7 @@ from threading import Thread
 
 from dualslam.core.types import Failure, FailureReason
 from dualslam.direction import recover
-from dualslam.recoveries import Outcome
+from dualslam.executor import Outcome
 from dualslam.recovery import RecoveryJob, RecoveryParts, RecoveryResult
 
 log = logging.getLogger(__name__)
@@ -137,7 +137,7 @@ class _Task:
 
 
 class WorkerExecutor:
-    """The `dualslam.recoveries.RecoveryExecutor` whose jobs run in processes of their own.
+    """The `dualslam.executor.RecoveryExecutor` whose jobs run in processes of their own.
 
     Parameters
     ----------

@@ -13,6 +13,24 @@ from dualslam.core.types import FloatArray, IntArray
 VIEW_COSINE_MIN = 0.5  # a patch seen from more than 60 degrees off its mean direction does not look the same
 
 
+def covering_keyframes(submap: Submap, at_most: int, min_new: int) -> list[int]:
+    """Return few keyframes that together show most of the map.
+
+    Each shows the most landmarks that those before it do not (ties: lower id), and `min_new` of them at least.
+    """
+    seen = np.zeros(len(submap.landmarks), bool)
+    left = {k: submap.landmark_of[k][submap.landmark_of[k] >= 0] for k in sorted(submap.keyframes)}
+    chosen: list[int] = []
+    while left and len(chosen) < at_most:
+        n_new = {k: np.count_nonzero(~seen[ids]) for k, ids in left.items()}
+        best = max(n_new, key=lambda k: n_new[k])
+        if n_new[best] < min_new:
+            break
+        seen[left.pop(best)] = True
+        chosen.append(best)
+    return chosen
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
     """Where landmarks should be seen: rows of the local map, rectified pixels, and the octave of their patch."""

@@ -16,7 +16,7 @@ from dualslam.core.interfaces import Frontend
 from dualslam.core.submap import NO_LANDMARK, Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from frontends.gates import CHI2_2DOF_99, MIN_CONSENSUS
-from frontends.local_map import LocalMap, Prediction
+from frontends.local_map import LocalMap, Prediction, covering_keyframes
 from frontends.matching import FeatureGrid, match_projected
 from frontends.resection import resect
 
@@ -48,16 +48,26 @@ class GivenPose:
 
 
 class Tracker:
-    """Tracks frames against one submap, one after the other, in whatever direction of time they come."""
+    """Tracks frames against one submap, one after the other, in whatever direction of time they come.
+
+    `n_covering`: beyond the keyframes nearest in time, wide matching tries so many that show the most of the map.
+    """
 
     def __init__(
-        self, frontend: Frontend, config: TrackingConfig, submap: Submap, size_px: tuple[int, int], seed: int
+        self,
+        frontend: Frontend,
+        config: TrackingConfig,
+        submap: Submap,
+        size_px: tuple[int, int],
+        seed: int,
+        n_covering: int = 0,
     ) -> None:
         self._frontend = frontend
         self._config = config
         self._submap = submap
         self._size_px = size_px
         self._seed = seed
+        self._n_covering = n_covering
         self._last: Track | None = None
         self._velocity: tuple[FloatArray, float] | None = None
         self._local: LocalMap | None = None
@@ -202,9 +212,9 @@ class Tracker:
         return self._refine(view, T_predicted, ids[rows], local.xyz_mu[rows], feature)
 
     def _pose_from_wide_matches(self, view: View) -> tuple[FloatArray, IntArray] | Failure:
-        """Match the whole image against the recent keyframes, pose by PnP."""
+        """Match the whole image against one keyframe after the other, pose by PnP."""
         submap, best = self._submap, Failure(FailureReason.TOO_FEW_MATCHES, "no keyframe matched")
-        for k in self._submap.keyframes_near(view.index)[: self._config.wide_keyframes]:
+        for k in self._wide_keyframes(view.index):
             has_landmark = np.flatnonzero(submap.landmark_of[k] >= 0)
             matches = self._frontend.match_wide(submap.keyframes[k].features.take(has_landmark), view.features)
             if len(matches) < MIN_CONSENSUS:
@@ -220,6 +230,13 @@ class Tracker:
             assert isinstance(found, Failure)
             best = found
         return best
+
+    def _wide_keyframes(self, index: int) -> list[int]:
+        near = self._submap.keyframes_near(index)[: self._config.wide_keyframes]
+        if self._n_covering == 0:
+            return near
+        covering = covering_keyframes(self._submap, self._n_covering, self._config.min_inliers)
+        return [*near, *(k for k in covering if k not in near)]
 
     def _refine(
         self, view: View, T_start: FloatArray, ids: IntArray, xyz_mu: FloatArray, feature: IntArray

@@ -29,6 +29,7 @@ class VisualFrontEnd:
     """Tracks frames against a submap and extends it by keyframes.
 
     `refinder`: finds landmarks across gaps in the images themselves; without it features alone tie the keyframes there.
+    `n_covering`: see `Tracker`.
     """
 
     def __init__(
@@ -39,11 +40,12 @@ class VisualFrontEnd:
         graph: SubmapGraph,
         size_px: tuple[int, int],
         refinder: Refinder | None = None,
+        n_covering: int = 0,
     ) -> None:
         self.submap = submap
         self.graph = graph
         self._config = config
-        self._tracker = Tracker(frontend, config.tracking, submap, size_px, config.seed)
+        self._tracker = Tracker(frontend, config.tracking, submap, size_px, config.seed, n_covering)
         self._mapper = Mapper(frontend, config.mapping, submap, size_px)
         self._refinder = refinder
         self._after_gap = False

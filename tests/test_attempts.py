@@ -13,7 +13,7 @@ from dualslam.core.config import AttemptConfig, Config, RecoveryConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import sim3
-from dualslam.recoveries import InlineExecutor, Outcome
+from dualslam.executor import InlineExecutor, Outcome
 from dualslam.recovery import RecoveryJob
 from dualslam.results import trajectories_of
 from dualslam.synthetic import Event as Spoil

@@ -12,7 +12,7 @@ from dualslam.core.config import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, View
-from dualslam.recoveries import Outcome, RecoveryExecutor
+from dualslam.executor import Outcome, RecoveryExecutor
 from dualslam.recovery import RecoveryJob
 from dualslam.results import trajectories_of
 from dualslam.system import System

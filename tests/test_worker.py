@@ -16,7 +16,7 @@ from dualslam.build import recovery_parts
 from dualslam.core.config import Config
 from dualslam.core.events import EventKind
 from dualslam.core.types import Failure, FailureReason
-from dualslam.recoveries import Outcome
+from dualslam.executor import Outcome
 from dualslam.recovery import RecoveryJob, RecoveryResult, run_recovery
 from dualslam.results import trajectories_of
 from dualslam.worker import WorkerExecutor

@@ -203,8 +203,13 @@ class RecoveryConfig(StrictModel):
     """Largest standard deviation (relative) of the scale beyond a leap, by the Hessian of its wide matches: all that is
     mapped beyond inherits the error, and 5 %, two of these, is a wrong link."""
     retry_keyframes: tuple[int, ...] = (5, 15)
-    """Keyframes of the new map, from its start on, at which a recovery that found no link is tried again: it
-    knows depths better then. It is too when the camera has been calibrated since."""
+    """Keyframes of the new map, from its start on, at which a walk back that has found no link, or left buffered frames
+    without a pose, is made again: the map knows depths better then, and more of the scene. It is too when the camera
+    has been calibrated since. One for poses alone that finds none is the last."""
+    covering_keyframes: int = Field(20, ge=0)
+    """Keyframes that a walk which only poses frames matches widely at most, beyond those nearest in time
+    (`tracking.wide_keyframes`): the ones that together show the most of the map, since in a gap the camera may have
+    looked anywhere. Each costs about 2 ms of CPU for a frame that is not found."""
     min_shared_keyframes: int = Field(4, ge=2)
     """Keyframes that both maps must hold before a link is tried."""
     max_shared_keyframes: int = Field(40, ge=4)

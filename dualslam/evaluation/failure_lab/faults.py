@@ -20,7 +20,7 @@ from dualslam.core.geometry import so3
 from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, Track, View
-from dualslam.recoveries import Outcome, RecoveryExecutor
+from dualslam.executor import Outcome, RecoveryExecutor
 from dualslam.recovery import RecoveryJob
 
 _KINDS = INTERNAL_KINDS | {CorruptionKind.FEW_FEATURES}
