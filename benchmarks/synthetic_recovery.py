@@ -53,6 +53,7 @@ def script(kind: str, scene: str, rng: np.random.Generator, n_frames: int, rate_
 def run_once(job: tuple[str, str, int], settings: dict[str, Any]) -> dict[str, Any]:
     """Run one world, and measure."""
     limit_threads()
+    from dualslam.evaluation.link_audit import LinkAudit, audit_links
     from dualslam.synthetic import make_sequence
 
     scene, kind, seed = job
@@ -66,10 +67,14 @@ def run_once(job: tuple[str, str, int], settings: dict[str, Any]) -> dict[str, A
         values["health"] = {"max_refused": 1.0}
     began = time.process_time()
     system = run(world, values | settings)
-    found = {"scene": scene, "kind": kind, "seed": seed} | measure(system, world, time.process_time() - began)
-    if found["links"]:
+    cpu_s = time.process_time() - began
+    audits = audit_links(system.atlas, system.poses.values(), truth_of(world))
+    found = {"scene": scene, "kind": kind, "seed": seed} | measure(system, world, audits, cpu_s)
+    links = [audit for audit in audits if isinstance(audit, LinkAudit)]
+    if links:
         whole = make_sequence(scene, n_frames, seed, WIDTH, HEIGHT, events=[])
-        add_controls(found["links"], run(whole, values | {"corruptions": []} | settings), whole)
+        controls = audit_again(links, run(whole, values | {"corruptions": []} | settings), whole)
+        found["links"] = [link | control for link, control in zip(found["links"], controls, strict=True)]
     return found
 
 
@@ -85,30 +90,32 @@ def run(world: Any, values: dict[str, Any]) -> Any:
     return system
 
 
-def add_controls(links: list[dict[str, Any]], unbroken: Any, world: Any) -> None:
-    """Write to each link what the same audit finds in a map that never broke, if that was one map."""
-    from dualslam.evaluation.link_audit import LinkAudit, audit_unbroken
+def truth_of(world: Any) -> dict[int, np.ndarray]:
+    """Return the true poses of a world's frames."""
+    return dict(enumerate(world.ground_truth_T_world_cam))
 
-    truth = dict(enumerate(world.ground_truth_T_world_cam))
+
+def audit_again(links: list[Any], unbroken: Any, world: Any) -> list[dict[str, float | None]]:
+    """Return for each link what the same audit finds in a map that never broke, if that was one map."""
+    from dualslam.evaluation.link_audit import audit_unbroken
+
     submaps = unbroken.atlas.submaps
     T = {p.index: submaps[0].resolve_anchor(p.keyframe_id, p.T_kf_cam) for p in unbroken.poses.values()}
-    for link in links:
-        fields = {name: link[name] for name in LinkAudit.__dataclass_fields__}
-        control = audit_unbroken(LinkAudit(**fields), T, truth) if len(submaps) == 1 else None
-        link["unbroken_scale"] = getattr(control, "scale", None)
-        link["unbroken_live_scale"] = getattr(control, "live_scale", None)
+    controls = [audit_unbroken(link, T, truth_of(world)) if len(submaps) == 1 else None for link in links]
+    return [
+        {"unbroken_scale": getattr(c, "scale", None), "unbroken_live_scale": getattr(c, "live_scale", None)}
+        for c in controls
+    ]
 
 
-def measure(system: Any, world: Any, cpu_s: float) -> dict[str, Any]:
+def measure(system: Any, world: Any, audits: list[Any], cpu_s: float) -> dict[str, Any]:
     """Return the numbers of a finished run."""
     from dualslam.core.events import EventKind
-    from dualslam.evaluation.link_audit import audit_links
     from dualslam.evaluation.map_jumps import find_map_jumps
     from dualslam.evaluation.trajectory_metrics import align_points
     from dualslam.results import trajectories_of
 
-    truth = dict(enumerate(world.ground_truth_T_world_cam))
-    audits = audit_links(system.atlas, system.poses.values(), truth)
+    truth = truth_of(world)
     main = trajectories_of(system).main
     started = min((i for i in system.poses), default=0)
     possible = [i for i in world.indices.tolist() if i >= started]

@@ -177,38 +177,6 @@ def audit_link(
     )
 
 
-def _fewest_that_tell(truth_within: Callable[[int], list[Side] | Failure], reach: int) -> list[Side] | Failure:
-    """Widen the reach until truth tells a wrong scale from a right one; if it never does, where it tells most."""
-    best: tuple[float, list[Side] | Failure] | None = None
-    while best is None or (reach <= MAX_REACH and CERTAIN_SIGMAS * best[0] > WRONG_SCALE):
-        sides = truth_within(reach)
-        sigma = math.inf if isinstance(sides, Failure) else math.hypot(*(side.scale_sigma for side in sides))
-        if best is None or sigma < best[0]:
-            best = sigma, sides
-        reach *= 2
-    return best[1]
-
-
-def _truth_beyond(
-    known: list[dict[int, FloatArray]], truth: Mapping[int, FloatArray], reach: int
-) -> list[Side] | Failure:
-    """Lay the new map upon the truth by the first frames that the old one never saw."""
-    last = max(known[0])
-    ids = np.array(sorted(i for i in known[1] if last < i), np.int64)
-    ids = ids[: np.searchsorted(ids, ids[0] + reach, "right")] if len(ids) else ids
-    if len(ids) < MIN_FRAMES:
-        return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(ids)} frames beyond the old map have a true pose")
-    return [align_cameras(ids, np.array([known[1][int(i)] for i in ids]), np.array([truth[int(i)] for i in ids]))]
-
-
-def _at_the_live_end(old: Side, live: Side, S_link: FloatArray) -> dict[str, Any]:
-    """Return the error of scale there, its sigma, and where it is."""
-    S_true = sim3.inverse(old.S_world_submap) @ live.S_world_submap
-    error = float(sim3.scale(S_link) / sim3.scale(S_true)) - 1.0
-    sigma = math.hypot(old.scale_sigma, live.scale_sigma)
-    return {"live_scale": error, "live_scale_sigma": sigma, "frames_live": live.span}
-
-
 @dataclass(frozen=True, slots=True)
 class UnbrokenAudit:
     """The errors of scale that an audit finds where there is no link: one map, the same frames, the same truth.
@@ -245,13 +213,42 @@ def audit_unbroken(
     for span in (audit.frames_old, audit.frames_new, audit.frames_live):
         if span is None:
             continue
-        ids = np.array(sorted(i for i in T_submap_cam if span[0] <= i <= span[1] and i in truth), np.int64)
-        if len(ids) < MIN_FRAMES:
-            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(ids)} frames of the unbroken map have a true pose")
-        estimated, true = (np.array([poses[int(i)] for i in ids]) for poses in (T_submap_cam, truth))
-        sides.append(align_cameras(ids, estimated, true))
+        side = _lay_upon_truth(T_submap_cam, truth, span, "of the unbroken map")
+        if isinstance(side, Failure):
+            return side
+        sides.append(side)
     old, new, *live = (float(sim3.scale(side.S_world_submap)) for side in sides)
     return UnbrokenAudit(old / new - 1.0, old / live[0] - 1.0 if live else None)
+
+
+def _fewest_that_tell(truth_within: Callable[[int], list[Side] | Failure], reach: int) -> list[Side] | Failure:
+    """Widen the reach until truth tells a wrong scale from a right one; if it never does, where it tells most."""
+    best: tuple[float, list[Side] | Failure] | None = None
+    while best is None or (reach <= MAX_REACH and CERTAIN_SIGMAS * best[0] > WRONG_SCALE):
+        sides = truth_within(reach)
+        sigma = math.inf if isinstance(sides, Failure) else math.hypot(*(side.scale_sigma for side in sides))
+        if best is None or sigma < best[0]:
+            best = sigma, sides
+        reach *= 2
+    return best[1]
+
+
+def _truth_beyond(
+    known: list[dict[int, FloatArray]], truth: Mapping[int, FloatArray], reach: int
+) -> list[Side] | Failure:
+    """Lay the new map upon the truth by the first frames that the old one never saw."""
+    last = max(known[0])
+    first = min((i for i in known[1] if last < i), default=last + 1)
+    live = _lay_upon_truth(known[1], truth, (first, first + reach), "beyond the old map")
+    return live if isinstance(live, Failure) else [live]
+
+
+def _at_the_live_end(old: Side, live: Side, S_link: FloatArray) -> dict[str, Any]:
+    """Return the error of scale there, its sigma, and where it is."""
+    S_true = sim3.inverse(old.S_world_submap) @ live.S_world_submap
+    error = float(sim3.scale(S_link) / sim3.scale(S_true)) - 1.0
+    sigma = math.hypot(old.scale_sigma, live.scale_sigma)
+    return {"live_scale": error, "live_scale_sigma": sigma, "frames_live": live.span}
 
 
 def _truth_about(
@@ -259,12 +256,12 @@ def _truth_about(
 ) -> list[Side] | Failure:
     """Lay either map upon the truth by its frames near the seam: of the old one none that the link left behind."""
     first, handover = min(link.keyframes) - reach, max(link.keyframes)
-    sides = []
+    sides: list[Side] = []
     for m, T_est, last in ((link.a, known[0], handover), (link.b, known[1], handover + reach)):
-        ids = np.array(sorted(i for i in T_est if first <= i <= last), np.int64)
-        if len(ids) < MIN_FRAMES:
-            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(ids)} frames of submap {m} have a true pose")
-        sides.append(align_cameras(ids, np.array([T_est[int(i)] for i in ids]), np.array([truth[int(i)] for i in ids])))
+        side = _lay_upon_truth(T_est, truth, (first, last), f"of submap {m}")
+        if isinstance(side, Failure):
+            return side
+        sides.append(side)
     return sides
 
 
@@ -282,6 +279,16 @@ class Side:
     def span(self) -> tuple[int, int]:
         """The first and the last frame."""
         return int(self.ids[0]), int(self.ids[-1])
+
+
+def _lay_upon_truth(
+    T_submap_cam: Mapping[int, FloatArray], truth: Mapping[int, FloatArray], span: tuple[int, int], where: str
+) -> Side | Failure:
+    """Lay a map upon the truth by its frames from the first to the last of a span that have a true pose."""
+    ids = np.array(sorted(i for i in T_submap_cam if span[0] <= i <= span[1] and i in truth), np.int64)
+    if len(ids) < MIN_FRAMES:
+        return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(ids)} frames {where} have a true pose")
+    return align_cameras(ids, *(np.array([poses[int(i)] for i in ids]) for poses in (T_submap_cam, truth)))
 
 
 def _poses_in(submap: Submap, poses: list[FramePose]) -> dict[int, FloatArray]:
