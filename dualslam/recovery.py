@@ -283,9 +283,7 @@ def _fused(tried: LinkTry, job: RecoveryJob, submap: Submap, attempt: str, parts
 
 
 def _walked(walker: VisualOdometry, view: View, track: Track) -> WalkedFrame:
-    # A keyframe stands where the graph has put it, which after a leap is not where it was first taken to be.
-    is_keyframe = view.index == walker.reference_id
-    T_kf_cam = np.eye(4) if is_keyframe else walker.relative_pose(track)
+    T_kf_cam = walker.relative_pose(track)
     pose = FramePose(view.index, view.timestamp_s, walker.submap.id, walker.reference_id, T_kf_cam)
     return WalkedFrame(pose, track.n_matches, track.n_inliers)
 

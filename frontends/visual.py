@@ -106,7 +106,12 @@ class VisualFrontEnd:
         self._note_gap(track)
 
     def relative_pose(self, track: Track) -> FloatArray:
-        """Return ``T_kf_cam``, the track's pose relative to the reference keyframe."""
+        """Return ``T_kf_cam``, the track's pose relative to the reference keyframe.
+
+        The reference keyframe itself stands where the graph has put it, not where its frame was tracked.
+        """
+        if track.view.index == self._reference_id:
+            return np.eye(4)
         return se3.inverse(self.submap.T_submap_kf[self._reference_id]) @ se3.inverse(track.T_cam_submap)
 
     def keyframe_due(self, track: Track) -> bool:

@@ -365,7 +365,7 @@ class VisualOdometry(Protocol):
         ...
 
     def relative_pose(self, track: Track) -> FloatArray:
-        """Return ``T_kf_cam``: the track's pose relative to the reference keyframe."""
+        """Return ``T_kf_cam``: the track's pose relative to the reference keyframe; its own is the identity."""
         ...
 
     def keyframe_due(self, track: Track) -> bool:

@@ -172,6 +172,8 @@ class TestMapping:
             if live.keyframe_due(track):
                 live.insert_keyframe(track)
             relative[i] = (live.reference_id, live.relative_pose(track))
+            # A keyframe stands where the graph has put it, not where it was tracked.
+            assert (live.reference_id == i) == np.array_equal(relative[i][1], np.eye(4))
         T = np.stack([live.submap.resolve_anchor(k, T_kf_cam) for k, T_kf_cam in relative.values()])
         translation, rotation = pose_errors(T, world.T_world_cam[list(relative)])
         assert translation.max() < POSITION_M
