@@ -21,6 +21,11 @@ _DOG_SIGMAS_PX = (1.0, 1.6)
 """Wide enough to be smooth under FAST's noise, narrow enough to stay at the corner."""
 _DOG_REACH_PX = 6
 """Radius of the filter."""
+_DOG_CURVATURE_NOISE = 0.165
+"""Standard deviation of the filter's second difference along an axis, relative to that of white noise in the image."""
+_STANDS_OUT_SIGMAS = 3.0
+"""By so many the least curvature of a peak differs from none. Of the corners of noise alone 3 % reach that: FAST
+chooses the boldest."""
 
 
 def detect_corners(
@@ -140,17 +145,47 @@ def refine_corners(patches: NDArray[np.uint8]) -> tuple[FloatArray, BoolArray]:
         (du, dv) in pixels of the level, at most 1.75; zero where there is no extremum.
     found : (N,) bool
     """
+    response, middle = _peaks(patches)
+    offset, found = quadratic_peak(response, MIN_CURVATURE)
+    offset += middle
+    return np.where(found[:, None], offset, 0.0), found
+
+
+def stand_out(patches: NDArray[np.uint8], noise: FloatArray) -> BoolArray:
+    """Which corners (N,) are placed by the scene, and not by the image's noise.
+
+    What tells is how the extremum that `refine_corners` looks for curves in the direction in which it curves least: in
+    a soft image, and along an edge in any, not more than noise makes it.
+
+    Parameters
+    ----------
+    patches : (N, S, S) uint8
+        As for `refine_corners`.
+    noise : (N,) float64
+        Its standard deviation about each of them, grey levels.
+    """
+    least = _least_curvature(_peaks(patches)[0])
+    return np.asarray(least > _STANDS_OUT_SIGMAS * _DOG_CURVATURE_NOISE * noise)
+
+
+def _peaks(patches: NDArray[np.uint8]) -> tuple[NDArray[np.float32], IntArray]:
+    """Difference of Gaussians about its extremum beside each patch's centre (N, 3, 3), upwards, and where that is."""
     centre, reach = patches.shape[1] // 2, _DOG_REACH_PX + 2
     part = slice(centre - reach, centre + reach + 1)
     grey = patches[:, part, part].reshape(len(patches), (2 * reach + 1) ** 2).astype(np.float32)
     response = (grey @ _dog_weights()).reshape(-1, 5, 5)
     response *= np.where(response[:, 2:3, 2:3] < 0, -1, 1)
     v, u = np.divmod(response[:, 1:4, 1:4].reshape(-1, 9).argmax(axis=1), 3)
-    offset, found = quadratic_peak(
-        sliding_window_view(response, (3, 3), axis=(1, 2))[np.arange(len(u)), v, u], MIN_CURVATURE
-    )
-    offset += np.stack([u - 1, v - 1], axis=1)
-    return np.where(found[:, None], offset, 0.0), found
+    peaks = sliding_window_view(response, (3, 3), axis=(1, 2))[np.arange(len(u)), v, u]
+    return peaks, np.stack([u - 1, v - 1], axis=1)
+
+
+def _least_curvature(response: NDArray[np.floating]) -> FloatArray:
+    """By how much each 3 x 3 neighbourhood (N, 3, 3) curves downwards at its middle, where it does so least."""
+    r = response.astype(np.float64)
+    uu, vv = r[:, 1, 2] - 2 * r[:, 1, 1] + r[:, 1, 0], r[:, 2, 1] - 2 * r[:, 1, 1] + r[:, 0, 1]
+    uv = (r[:, 2, 2] - r[:, 2, 0] - r[:, 0, 2] + r[:, 0, 0]) / 4
+    return np.asarray(-(uu + vv) / 2 - np.hypot((uu - vv) / 2, uv))
 
 
 def quadratic_peak(response: NDArray[np.floating], min_curvature: float = 0.0) -> tuple[FloatArray, BoolArray]:

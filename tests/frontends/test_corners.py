@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from frontends.corners import detect_corners, refine_corners, select_spread, share_out
+from frontends.corners import detect_corners, refine_corners, select_spread, share_out, stand_out
 from tests.frontends.conftest import textured
 
 
@@ -68,3 +68,20 @@ def test_refine_stays_where_there_is_nothing() -> None:
         offset, found = refine_corners(patches)
         assert not found.any()
         assert (offset == 0).all()
+
+
+def test_corners_of_noise_do_not_stand_out_and_those_of_the_scene_do() -> None:
+    rng = np.random.default_rng(5)
+    noise = np.clip(np.rint(120 + 2.0 * rng.standard_normal((480, 640))), 0, 255).astype(np.uint8)
+    xy, _ = detect_corners(noise, (4,), 16, 32)
+    of_noise = np.array([noise[y - 15 : y + 16, x - 15 : x + 16] for x, y in xy.tolist()])
+    assert len(of_noise) > 200
+    assert stand_out(of_noise, np.full(len(of_noise), 2.0)).mean() < 0.06
+    v, u = np.mgrid[-15:16, -15:16]
+    grain = 2.0 * rng.standard_normal((200, 31, 31))
+    blobs = np.rint(100 + 60 * np.exp(-(u**2 + v**2) / (2 * 1.5**2)) + grain).astype(np.uint8)
+    assert stand_out(blobs, np.full(200, 2.0)).all()
+    # An edge is no place: along it noise decides.
+    edges = np.rint(np.where(u > 0, 160, 80) + grain).astype(np.uint8)
+    assert stand_out(edges, np.full(200, 2.0)).mean() < 0.06
+    assert stand_out(blobs[:0], np.empty(0)).shape == (0,)

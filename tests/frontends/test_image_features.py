@@ -13,6 +13,7 @@ from dualslam.core.types import Features
 from frontends import image_features
 from frontends.image_features import ImageFeatures
 from frontends.orb import OrbFrontend
+from tests.frontends.conftest import textured
 
 
 class CountingFrontend(OrbFrontend):
@@ -23,13 +24,13 @@ class CountingFrontend(OrbFrontend):
         return super().extract(image)
 
 
-def noise_image(seed: int) -> GreyImage:
-    return GreyImage.of(np.random.default_rng(seed).integers(0, 255, (80, 100)).astype(np.uint8))
+def some_image(seed: int) -> GreyImage:
+    return GreyImage.of(textured(160, 200, seed))
 
 
 def test_an_image_is_looked_at_once() -> None:
     frontend = CountingFrontend(100)
-    features, images = ImageFeatures(frontend), [noise_image(seed) for seed in range(3)]
+    features, images = ImageFeatures(frontend), [some_image(seed) for seed in range(3)]
     first = [features.of(image) for image in images]
     again = [features.of(image) for image in reversed(images)]
     assert frontend.n_calls == 3
@@ -39,7 +40,7 @@ def test_an_image_is_looked_at_once() -> None:
 
 def test_what_was_not_used_for_longest_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
     frontend = CountingFrontend(100)
-    features, images = ImageFeatures(frontend), [noise_image(seed) for seed in range(3)]
+    features, images = ImageFeatures(frontend), [some_image(seed) for seed in range(3)]
     monkeypatch.setattr(image_features, "MAX_BYTES", 2.5 * frontend.extract(images[0].pixels()).nbytes)
     for image in (images[0], images[1], images[0], images[2]):
         features.of(image)
@@ -54,8 +55,8 @@ def test_what_was_not_used_for_longest_makes_room(monkeypatch: pytest.MonkeyPatc
 def test_features_go_with_their_image() -> None:
     frontend = CountingFrontend(100)
     features = ImageFeatures(frontend)
-    features.of(noise_image(0))
+    features.of(some_image(0))
     gc.collect()
-    features.of(noise_image(0))
+    features.of(some_image(0))
     assert frontend.n_calls == 2
     assert len(features) == 0
