@@ -249,7 +249,6 @@ class ISam2SubmapGraph:
         factors = np.empty(len(changes.order), np.int64)
         factors[changes.order] = indices[projections:]
         self._ledger.commit(plan, factors)
-        # One Gauss-Newton step leaves the newest landmarks short of their optimum, and good rows look like outliers.
         steps = [solver.statistics]
         for _ in range(self._config.extra_iterations):
             solver.iterate(newest)

@@ -115,12 +115,12 @@ class HealthMonitor:
             numbers = {**newest.numbers, **report.numbers}
             self._frames[-1] = replace(newest, signs=(*newest.signs, report.reason), failed=True, numbers=numbers)
             return
-        estimate = report.estimate
-        if estimate.chi2_newest > self._config.max_keyframe_chi2 * _level(self._chi2, 1.0):
+        chi2 = report.posed.chi2_newest
+        if chi2 > self._config.max_keyframe_chi2 * _level(self._chi2, 1.0):
             signs.append(FailureReason.CHI_SQUARE)
         if report.solver_failed:
             signs.append(FailureReason.SOLVER)
-        numbers = {**newest.numbers, "chi2_keyframe": estimate.chi2_newest}
+        numbers = {**newest.numbers, "chi2_keyframe": chi2}
         self._frames[-1] = replace(newest, signs=(*newest.signs, *signs), numbers=numbers)
 
     @property

@@ -216,8 +216,8 @@ class System:
             self._health.note_keyframe(report)
             if isinstance(report, Failure):
                 return report
-            self.timer.add("graph (in mapping)", report.estimate.seconds)
-            if report.estimate.rebuilt:
+            self.timer.add("graph (in mapping)", report.graph_seconds)
+            if report.rebuilt:
                 self._record.event(EventKind.GRAPH_REBUILT, view, odometry.submap.id)
         pose = FramePose(
             view.index, view.timestamp_s, odometry.submap.id, odometry.reference_id, odometry.relative_pose(track)

@@ -59,8 +59,8 @@ class Mapper:
         self._young: list[tuple[int, IntArray]] = []  # keyframe count at birth, landmark ids
         self._n_inserted = 0
 
-    def insert(self, track: Track) -> MappingReport:
-        """Make a tracked frame a keyframe and grow the map about it (poses stay as they are: solving comes after)."""
+    def observe(self, track: Track) -> None:
+        """Make a tracked frame a keyframe that sees the landmarks by which it was tracked, and nothing new."""
         submap, view = self._submap, track.view
         T_submap_kf = se3.inverse(track.T_cam_submap)
         submap.add_keyframe(Keyframe(view.index, view.timestamp_s, view.features), T_submap_kf)
@@ -69,6 +69,10 @@ class Mapper:
         kept = spread_choice(view.features.uv_rect_px[feature], n_seen, self._config.max_observations, self._size_px)
         feature = feature[kept]
         submap.add_observations(view.index, feature, track.landmark_ids[feature])
+
+    def grow(self, track: Track) -> MappingReport:
+        """Grow the map about the keyframe that a tracked frame has become, from the poses as they are now."""
+        view = track.view
         self._n_inserted += 1
         n_culled = self._cull_young()
         neighbours = self._neighbours(view.index)

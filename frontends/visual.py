@@ -12,7 +12,7 @@ import numpy as np
 
 from dualslam.core.config import Config
 from dualslam.core.geometry import se3
-from dualslam.core.interfaces import Frontend, KeyframeReport, SubmapGraph
+from dualslam.core.interfaces import Frontend, GraphEstimate, KeyframeReport, SubmapGraph
 from dualslam.core.submap import Submap
 from dualslam.core.submap_change import change_of_frame
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
@@ -119,28 +119,28 @@ class VisualFrontEnd:
         return keyframe_due(track, self.submap, self._reference_id, self._config.keyframes)
 
     def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
-        """Make the frame a keyframe: extend the map, solve its graph, drop what the solution contradicts.
+        """Make the frame a keyframe: pose it by the graph, extend the map from there, solve again.
 
-        Where that is most of what the frame was tracked by, the frame's pose is wrong: the map is left without it.
+        What a pose places, it places to its own liking: new landmarks of a wrong one confirm it, and outvote the old
+        ones in the next frames. The graph therefore poses the keyframe by its matches before any is made. Where it
+        refuses most of the matches, the frame's pose is wrong: the map is left without it.
         """
         track = self._refound(track)
-        mapping = self._mapper.insert(track)
-        matched = self._rows_matched_by(track)
+        self._mapper.observe(track)
+        matched = self._rows_of(track.view.index)
         rebuild = self._rebuild_due(track)
-        estimate = self.graph.rebuild(self.submap) if rebuild else self.graph.update(self.submap)
-        self.submap.apply_estimate(*estimate.values)
-        self.submap.remove_outliers(estimate.outlier_rows)
-        n_refused = int(np.isin(matched, estimate.outlier_rows).sum())
+        posed = self._solve()
+        n_refused = int(np.isin(matched, posed.outlier_rows).sum())
         if n_refused > self._config.health.max_refused * len(matched):
             self._withdraw(track.view.index)
             detail = f"the map contradicts {n_refused} of {len(matched)} matches of keyframe {track.view.index}"
             return Failure(FailureReason.CHI_SQUARE, detail, {"n_refused": float(n_refused)})
+        mapping = self._mapper.grow(track)
+        grown = self._solve(rebuild)
         self._meet(track.view.index)
         culled = self._cull_keyframe()
         self._tracker.refresh()
-        return KeyframeReport(
-            mapping, estimate, len(estimate.outlier_rows), culled, solver_failed=estimate.rebuilt and not rebuild
-        )
+        return KeyframeReport(mapping, posed, grown, culled, posed.rebuilt or (grown.rebuilt and not rebuild))
 
     def _note_gap(self, track: Track | Failure) -> None:
         """Keyframes beyond frames that found no pose, or one by wide matching alone, are to be tied to those before."""
@@ -158,19 +158,21 @@ class VisualFrontEnd:
         self._refinder.remember(track.view)
         return track
 
-    def _rows_matched_by(self, track: Track) -> IntArray:
-        """Return the observations by which a keyframe's frame was tracked (not those that mapping added)."""
+    def _rows_of(self, keyframe_id: int) -> IntArray:
         obs = self.submap.observations
-        in_keyframe = (obs["kf"] == track.view.index) & obs["alive"]
-        return np.flatnonzero(in_keyframe & np.isin(obs["landmark"], track.landmark_ids[track.landmark_ids >= 0]))
+        return np.flatnonzero((obs["kf"] == keyframe_id) & obs["alive"])
+
+    def _solve(self, rebuild: bool = False) -> GraphEstimate:
+        """Bring the graph up to date with the submap, and the submap with its estimate."""
+        estimate = self.graph.rebuild(self.submap) if rebuild else self.graph.update(self.submap)
+        self.submap.apply_estimate(*estimate.values)
+        self.submap.remove_outliers(estimate.outlier_rows)
+        return estimate
 
     def _withdraw(self, keyframe_id: int) -> None:
-        """Take a keyframe that the map contradicts out again, with the landmarks that only its pose placed."""
-        submap = self.submap
-        born_here = submap.landmarks["alive"] & (submap.landmarks["first_kf"] == keyframe_id)
-        submap.remove_landmarks(np.flatnonzero(born_here))
-        submap.remove_keyframe(keyframe_id, self._reference_id)
-        submap.apply_estimate(*self.graph.update(submap).values)
+        """Take a keyframe that the map contradicts out again."""
+        self.submap.remove_keyframe(keyframe_id, self._reference_id)
+        self.submap.apply_estimate(*self.graph.update(self.submap).values)
         self._tracker.refresh()
 
     def _rebuild_due(self, track: Track) -> bool:

@@ -267,8 +267,9 @@ class GraphConfig(StrictModel):
     """Keyframes (the last inserted ones, and their landmarks) whose estimate is read after each update; 0 reads all."""
     read_all_every: int = Field(10, ge=1)
     """Each so-many-th update reads the whole estimate."""
-    extra_iterations: int = Field(1, ge=0, le=10)
-    """Further Gauss-Newton steps of the incremental solver after each keyframe."""
+    extra_iterations: int = Field(0, ge=0, le=10)
+    """Further Gauss-Newton steps of the incremental solver at each update, of which a keyframe has two: one poses it by
+    its matches, one takes in what was then mapped from there."""
     rebuild_inlier_ratio: float = Field(0.65, ge=0, le=1)
     """Share of a keyframe's matches that must agree with its pose, or the graph is made anew in batch: the incremental
     estimate has then fallen behind its optimum, and good observations would be dropped as outliers."""

@@ -299,13 +299,35 @@ class MappingReport:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeReport:
-    """What a keyframe did to the map and how its graph took it. `solver_failed`: it threw and had to be made anew."""
+    """What a keyframe did to the map and how its graph took it.
+
+    Attributes
+    ----------
+    mapping : MappingReport
+    posed : GraphEstimate
+        With the keyframe's matches alone, before anything was placed from its pose.
+    grown : GraphEstimate
+        With what was then added.
+    culled_keyframe : int, optional
+    solver_failed : bool
+        It threw and had to be made anew.
+    """
 
     mapping: MappingReport
-    estimate: GraphEstimate
-    n_outliers: int
+    posed: GraphEstimate
+    grown: GraphEstimate
     culled_keyframe: int | None
     solver_failed: bool = False
+
+    @property
+    def rebuilt(self) -> bool:
+        """Whether the graph was made anew, for whatever reason."""
+        return self.posed.rebuilt or self.grown.rebuilt
+
+    @property
+    def graph_seconds(self) -> float:
+        """Time that the graph took."""
+        return self.posed.seconds + self.grown.seconds
 
 
 class MapStarter(Protocol):

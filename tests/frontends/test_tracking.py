@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.config import Config, KeyframeConfig
 from dualslam.core.geometry import se3, sim3
+from dualslam.core.interfaces import KeyframeReport
 from dualslam.core.submap import NO_LANDMARK, Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe, Track, View
 from frontends.keyframing import keyframe_due, parallax_deg
@@ -163,6 +166,23 @@ class TestMapping:
         # Each point once: descriptors tell them apart.
         seen = np.bitwise_count(submap.landmarks["descriptor"][new, None] ^ world.descriptors[None]).sum(-1).argmin(1)
         assert len(np.unique(seen)) > 0.97 * len(seen)
+
+    def test_a_keyframe_is_posed_by_the_map_before_it_places_anything(self, world: PointWorld) -> None:
+        """Tracked a degree off, it maps as much as one that was tracked right, and as truly."""
+        found = []
+        for off in (np.zeros(6), np.array([0.0, 0.0175, 0.0, -0.05, 0.0, 0.0])):
+            live = front_end(world, [0, 4, 8], start_at=8, every=2)
+            for i in range(9, 16):
+                track = tracked(live, world.view(i))
+            n_before = len(live.submap.landmarks)
+            report = live.insert_keyframe(replace(track, T_cam_submap=se3.exp(off) @ track.T_cam_submap))
+            assert isinstance(report, KeyframeReport)
+            new = np.flatnonzero(live.submap.landmarks["alive"][n_before:]) + n_before
+            nearest = np.linalg.norm(live.submap.landmarks["xyz_mu"][new, None] - world.xyz[None], axis=2).min(axis=1)
+            found.append((len(new), np.quantile(nearest / live.submap.landmarks["distance_mu"][new], 0.9)))
+        (n_right, error_right), (n_off, error_off) = found
+        assert n_off > 0.95 * n_right
+        assert error_off < 1.2 * error_right
 
     def test_keyframe_poses_and_the_frames_between_stay_right(self, world: PointWorld) -> None:
         live = front_end(world, [0, 4, 8], start_at=8)
