@@ -26,7 +26,7 @@ MB = 2**20
 
 
 class FrameBuffer:
-    """Views of the last `duration_s` seconds of video, and of all frames since the live submap was lost.
+    """Views of the last `duration_s` seconds of video, and of all frames since there was a live submap.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class FrameBuffer:
         self.peak_bytes = max(self.peak_bytes, self.nbytes)
 
     def freeze(self) -> None:
-        """Stop letting go of old views: the newest one was lost. K = k + k_r."""
+        """Stop letting go of old views: the newest one was lost, or there has been no map yet. K = k + k_r."""
         if not self._frozen:
             self._frozen = True
             self._before_loss = self._views[-2].index if len(self._views) > 1 else None

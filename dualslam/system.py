@@ -72,6 +72,7 @@ class System:
         self._parts = components
         self._config = config
         self.buffer = FrameBuffer(config.buffer.duration_s, config.buffer.max_mb)
+        self.buffer.freeze()  # no map yet, as after a loss: the first start is walked back from to the first frame
         self._live: VisualOdometry | None = None
         self._starter = components.new_starter()
         self._lost: list[View] = []

@@ -72,6 +72,19 @@ def test_the_frames_before_the_start_are_posed_by_walking_back() -> None:
     assert_right(indices, T, world)
 
 
+def test_a_start_that_comes_late_poses_frames_older_than_the_buffer_keeps() -> None:
+    still, moving = 40, path(30, np.array([0.08, 0, 0]), np.zeros(3))
+    T = np.concatenate([np.repeat(moving[:1], still, axis=0), moving])
+    world = PointWorld(cloud(), T)
+    system = system_in(world, buffer={"duration_s": 0.5})
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    start = next(e.frame for e in system.events.of_kind(EventKind.INITIALISED))
+    assert start / 30 > 0.5
+    assert sorted(system.poses) == list(range(still + len(moving)))
+
+
 def test_a_long_cover_before_the_start_hides_no_more_than_what_it_covers() -> None:
     still = np.repeat(np.eye(4)[None], 50, 0)
     moving = path(25, np.array([0.08, 0, 0.02]), np.array([0, -0.005, 0]))

@@ -229,7 +229,7 @@ class BufferConfig(StrictModel):
     """The frames that a walk back in time can still read."""
 
     duration_s: float = Field(10.0, gt=0)
-    """Seconds of video that are kept (the paper's k)."""
+    """Seconds of video that are kept (the paper's k) while there is a map to track; before it and after it, all is."""
     max_mb: float = Field(256.0, gt=0)
     """Hard bound on the memory of the kept features and images, mebibytes. Ten seconds of KITTI are 56, of 640 x 480 at
     30 Hz 120. A long loss reaches it; then images are packed, and the stretch between the frames before the loss and
