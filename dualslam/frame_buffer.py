@@ -26,7 +26,7 @@ MB = 2**20
 
 
 class FrameBuffer:
-    """Views of the last `duration_s` seconds of video, and of all frames since there was a live submap.
+    """Views of the last `duration_s` seconds of video, and of all frames since a live submap was last there.
 
     Parameters
     ----------

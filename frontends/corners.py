@@ -182,10 +182,14 @@ def _peaks(patches: NDArray[np.uint8]) -> tuple[NDArray[np.float32], IntArray]:
 
 def _least_curvature(response: NDArray[np.floating]) -> FloatArray:
     """By how much each 3 x 3 neighbourhood (N, 3, 3) curves downwards at its middle, where it does so least."""
-    r = response.astype(np.float64)
-    uu, vv = r[:, 1, 2] - 2 * r[:, 1, 1] + r[:, 1, 0], r[:, 2, 1] - 2 * r[:, 1, 1] + r[:, 0, 1]
-    uv = (r[:, 2, 2] - r[:, 2, 0] - r[:, 0, 2] + r[:, 0, 0]) / 4
+    uu, vv, uv = _second_derivatives(response.astype(np.float64))
     return np.asarray(-(uu + vv) / 2 - np.hypot((uu - vv) / 2, uv))
+
+
+def _second_derivatives(r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Along u, along v and mixed, (N,) each, at the middle of 3 x 3 neighbourhoods (N, 3, 3)."""
+    uu, vv = r[:, 1, 2] - 2 * r[:, 1, 1] + r[:, 1, 0], r[:, 2, 1] - 2 * r[:, 1, 1] + r[:, 0, 1]
+    return uu, vv, (r[:, 2, 2] - r[:, 2, 0] - r[:, 0, 2] + r[:, 0, 0]) / 4
 
 
 def quadratic_peak(response: NDArray[np.floating], min_curvature: float = 0.0) -> tuple[FloatArray, BoolArray]:
@@ -206,8 +210,7 @@ def quadratic_peak(response: NDArray[np.floating], min_curvature: float = 0.0) -
     """
     r = response.astype(np.float64)
     gradient_u, gradient_v = (r[:, 1, 2] - r[:, 1, 0]) / 2, (r[:, 2, 1] - r[:, 0, 1]) / 2
-    uu, vv = r[:, 1, 2] - 2 * r[:, 1, 1] + r[:, 1, 0], r[:, 2, 1] - 2 * r[:, 1, 1] + r[:, 0, 1]
-    uv = (r[:, 2, 2] - r[:, 2, 0] - r[:, 0, 2] + r[:, 0, 0]) / 4
+    uu, vv, uv = _second_derivatives(r)
     determinant = uu * vv - uv**2
     # Curved downwards in every direction.
     peaked = (determinant > 0) & (uu + vv < -min_curvature)
