@@ -33,7 +33,10 @@ def recover(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Failure:
     """Run a job as `run_recovery` does, in whichever direction its sequence is read."""
     if not reads_backwards(job):
         return run_recovery(job, parts)
-    last = max(view.index for view in job.views)
+    last = max(
+        *(view.index for view in job.views),
+        *(k for submap in (job.submap, *job.lost.values()) for k in (*submap.keyframes, *submap.anchors)),
+    )
 
     def renumber(index: int) -> int:
         return last - index
