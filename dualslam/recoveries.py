@@ -9,6 +9,7 @@ from itertools import takewhile
 from typing import Any
 
 from dualslam.atlas import Link, LinkKind
+from dualslam.bypass import bypass, drop_corrupted, supersede
 from dualslam.calibration import Calibration
 from dualslam.carried_poses import carry_poses
 from dualslam.core.config import RecoveryConfig
@@ -91,7 +92,7 @@ class Recoveries:
         if self._config.enabled:
             self._lost[submap_id] = Loss(onset, cause, first_lost)
 
-    def start(self, submap: Submap, newest: View, now: View | None = None) -> None:
+    def start(self, submap: Submap, newest: View, now: Moment | None = None) -> None:
         """Start the walk back from a new submap: over the frames without a pose, then on into the lost submaps.
 
         It begins at its keyframe `newest`, also where it is made again later (`now`).
@@ -111,12 +112,15 @@ class Recoveries:
         views = self._views_before(newest, submap, stop_at_posed=not onsets)
         self._submit(submap, newest, views, onsets, now)
 
-    def retry(self, submap: Submap, now: View) -> None:
+    def retry(self, submap: Submap, now: Moment, last_chance: bool = False) -> None:
         """Walk back again where something was left to find, once the new map has grown or its camera was calibrated.
 
         A link, while the buffer holds frames that a lost map saw; else poses of buffered frames that have none.
+        `last_chance`: no frame comes any more.
         """
-        if submap.id in self._under_way or not self._retries.take_if_due(submap, now.index, self._calibration.camera):
+        if submap.id in self._under_way:
+            return
+        if not self._retries.take_if_due(submap, now.index, self._calibration.camera, last_chance):
             return
         lost = {k for m in self._lost for k in self._record.atlas.submaps[m].keyframes}
         own = [view for view in self._buffer if view.index in submap.keyframes]
@@ -127,7 +131,7 @@ class Recoveries:
             self._submit(submap, way[0], way[1:], {}, now)
 
     def _submit(
-        self, submap: Submap, newest: View, views: Iterable[View], onsets: dict[int, int], now: View | None
+        self, submap: Submap, newest: View, views: Iterable[View], onsets: dict[int, int], now: Moment | None
     ) -> None:
         job = RecoveryJob(
             submap=submap.copy(),
@@ -159,8 +163,14 @@ class Recoveries:
         """Merge the walks that have ended. `live` goes on in its submap as it is after that."""
         self._take(self._executor.poll(), live, now)
 
-    def finish(self, live: VisualOdometry | None, last: Moment | None) -> None:
-        """Merge the walks that are under way after the last frame, if they end soon, and end the executor."""
+    def finish(self, live: VisualOdometry | None, last: Moment | None, hurry: bool) -> None:
+        """Walk back once more, merge what is under way after the last frame, if it ends soon, and end the executor.
+
+        `hurry`: no walk is begun any more.
+        """
+        if live is not None and last is not None and not hurry:
+            self.collect(live, last)
+            self.retry(live.submap, last, last_chance=True)
         outcomes = self._executor.finish()
         if last is not None:
             self._take(outcomes, live, last)
@@ -256,6 +266,8 @@ class Recoveries:
             S_now_then = change_of_frame(unsolved, submap, estimate.agreeing_keyframes.tolist()) @ merged.S_live_grown
             self._fuse(job, result.link, S_now_then, walked, now, seconds)
             self._settle(result.link.old_id, live)
+        for gone in supersede(self._record, walked, submap.id, self._lost.keys(), now):
+            self._lost.pop(gone, None)
 
     def _rectifier(self, job: RecoveryJob, submap: Submap) -> Callable[[Keyframe], Keyframe]:
         """Return what gives the walk's keyframes the pixels of the camera that the submap has now."""
@@ -320,8 +332,8 @@ class Recoveries:
         corrupted_since = order * onset
         if link.change_point is not None:
             corrupted_since = min(corrupted_since, order * link.change_point)
-        n_bypassed = self._bypass(walked, new_id, agreeing[-1], order)
-        n_dropped = self._drop_corrupted(found.old_id, corrupted_since, order)
+        n_bypassed = bypass(record, walked, new_id, agreeing[-1], order)
+        n_dropped = drop_corrupted(record, found.old_id, corrupted_since, order)
         for frame in walked:
             if order * frame.pose.index >= order * onset and self._was_lost(frame.pose.index, found.old_id):
                 record.rows[frame.pose.index].status = FrameStatus.RECOVERED
@@ -330,30 +342,6 @@ class Recoveries:
         record.event(
             EventKind.FUSED, now, new_id, old_submap=found.old_id, bypassed=n_bypassed, dropped=n_dropped, **numbers
         )
-
-    def _bypass(self, walked: list[WalkedFrame], new_id: int, handover: int, order: int) -> int:
-        """Let the newest part of the old map, beyond the keyframes that agree, take its poses from the new one."""
-        poses, n_bypassed = self._record.poses, 0
-        for frame in walked:
-            i = frame.pose.index
-            if order * i <= order * handover or poses[i].submap_id == new_id:
-                continue
-            self._record.pose(frame.pose)
-            self._record.rows[i].status = FrameStatus.BYPASSED
-            n_bypassed += 1
-        return n_bypassed
-
-    def _drop_corrupted(self, old_id: int, since: int, order: int) -> int:
-        """Take the pose from frames of the corrupted tail that the walk has leaped: that of the old map may be wrong.
-
-        They keep their row.
-        """
-        poses = self._record.poses
-        corrupted = [i for i, pose in poses.items() if pose.submap_id == old_id and order * i >= since]
-        for i in corrupted:
-            del poses[i]
-            self._record.rows[i].status, self._record.rows[i].submap_id = FrameStatus.BYPASSED, None
-        return len(corrupted)
 
     def _settle(self, old_id: int, live: VisualOdometry | None) -> None:
         """Let no walk look any more for what is linked: the old submap, and all that is one map with the live one."""

@@ -39,13 +39,17 @@ class RetrySchedule:
         """Note that a walk which knew so many live keyframes, and this camera, has left something to find."""
         self._tried[submap_id] = n_live, camera
 
-    def take_if_due(self, submap: Submap, now: int, camera: Camera) -> bool:
-        """Return whether the next walk is due; if so it is off the list, until it too leaves something to find."""
+    def take_if_due(self, submap: Submap, now: int, camera: Camera, last_chance: bool = False) -> bool:
+        """Return whether the next walk is due; if so it is off the list, until it too leaves something to find.
+
+        `last_chance`: the submap grows no more, so that any growth since the last walk will do.
+        """
         if submap.id not in self._tried:
             return False
         tried_with, tried_camera = self._tried[submap.id]
         n_live = self.n_live(submap, now)
-        due = camera != tried_camera or any(tried_with < n <= n_live for n in self._keyframes)
+        sizes = (*self._keyframes, n_live) if last_chance and self._keyframes else self._keyframes
+        due = camera != tried_camera or any(tried_with < n <= n_live for n in sizes)
         if due:
             del self._tried[submap.id]
         return due

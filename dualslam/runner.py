@@ -26,8 +26,8 @@ class Steppable(Protocol):
         """Take one frame."""
         ...
 
-    def finish(self) -> None:
-        """End the run."""
+    def finish(self, hurry: bool = False) -> None:
+        """End the run; in a `hurry` with what there is."""
         ...
 
 
@@ -139,7 +139,7 @@ def run_sequence(
         if not latencies_ms and not interrupted:
             raise InputError(f"{sequence.name} gave no frame; check the source and which frames were asked for.")
         try:
-            system.finish()
+            system.finish(hurry=interrupted)
         except Exception as problem:
             bug = bug or problem  # a system that broke may well break again here: the first one tells why
     return RunReport(

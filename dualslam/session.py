@@ -155,9 +155,9 @@ class _Watched:
         self._samples.take(frame, result.status)
         return result
 
-    def finish(self) -> None:
+    def finish(self, hurry: bool = False) -> None:
         self._samples.finish()
-        self._system.finish()
+        self._system.finish(hurry)
 
 
 def _write_new_events(system: System, folder: RunFolder, n_written: int) -> int:

@@ -113,9 +113,15 @@ class System:
             outcome = self._initialise(view) if self._live is None else self._track(self._live, view)
         return self._result(frame, outcome, time.perf_counter() - started)
 
-    def finish(self) -> None:
-        """End the run: wait for walks back that are under way, for so long and no longer; archive what is live."""
-        self._recoveries.finish(self._live, next(reversed(self.rows.values()), None))
+    def finish(self, hurry: bool = False) -> None:
+        """End the run: wait for walks back that are under way, for so long and no longer; archive what is live.
+
+        Parameters
+        ----------
+        hurry : bool
+            Someone waits: leave out the last walk back, for which the live map has grown since the one before.
+        """
+        self._recoveries.finish(self._live, next(reversed(self.rows.values()), None), hurry)
         if self._live is not None:
             self._archive(self._live, "end of sequence")
 

@@ -138,9 +138,10 @@ class TestRetry:
         main = trajectories_of(system).main
         assert set(main.index.tolist()) == set(range(90)) - COVERED
 
-    def test_it_ends_with_the_last_of_the_sizes(self) -> None:
+    def test_it_ends_with_the_last_of_the_sizes_and_once_more_with_the_run(self) -> None:
         system = self.run(n_failing=9)
-        assert len(system.events.of_kind(EventKind.RECOVERY_STARTED)) == 2
+        started = system.events.of_kind(EventKind.RECOVERY_STARTED)
+        assert [event.frame for event in started[2:]] == [89]
         assert not system.atlas.links
 
     def test_what_is_linked_is_not_looked_for_again(self) -> None:

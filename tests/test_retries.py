@@ -138,6 +138,25 @@ class TestFramesBeforeTheStart:
         assert all(system.rows[i].status is FrameStatus.INITIALISING for i in range(N_BEHIND))
         assert_right(system, world, range(N_BEHIND, N_BEHIND + N_SWEEP))
 
+    def test_a_map_that_stays_small_walks_back_once_more_at_the_end_of_the_run(self) -> None:
+        world = away_first()
+        system, watched = watched_system(world, retry_keyframes=[1000])
+        for frame in world.frames():
+            system.step(frame)
+        assert len(watched.jobs) == 1
+        system.finish()
+        assert [view.index for view in watched.jobs[1].views] == list(reversed(range(N_BEHIND)))
+        assert_right(system, world, range(N_BEHIND + N_SWEEP))
+
+    def test_it_does_not_where_someone_waits_for_the_end(self) -> None:
+        world = away_first()
+        system, watched = watched_system(world, retry_keyframes=[1000])
+        for frame in world.frames():
+            system.step(frame)
+        system.finish(hurry=True)
+        assert len(watched.jobs) == 1
+        assert_right(system, world, range(N_BEHIND, N_BEHIND + N_SWEEP))
+
     def test_nothing_is_tried_again_where_all_frames_have_a_pose(self) -> None:
         world = PointWorld(cloud(), hand_held(50))
         system, watched = watched_system(world, retry_keyframes=[2, 3, 4, 5, 6])
@@ -232,6 +251,17 @@ class TestSchedule:
                 assert not schedule.take_if_due(submap, now, CAMERA)
                 schedule.leave_open(0, schedule.n_live(submap, now), CAMERA)
         assert due == [12, 14]
+
+    @pytest.mark.parametrize(("keyframes", "n_new", "due"), [((100,), 1, True), ((100,), 0, False), ((), 1, False)])
+    def test_the_last_walk_wants_a_map_that_has_grown_at_all(
+        self, keyframes: tuple[int, ...], n_new: int, due: bool
+    ) -> None:
+        schedule = RetrySchedule(keyframes)
+        assert schedule.start_of(submap_with([10, 11]), 10) == 10
+        schedule.leave_open(0, 2, CAMERA)
+        grown = submap_with(range(10, 12 + n_new))
+        assert not schedule.take_if_due(grown, 20, CAMERA)
+        assert schedule.take_if_due(grown, 20, CAMERA, last_chance=True) == due
 
     def test_keyframes_are_counted_in_the_direction_of_reading(self) -> None:
         schedule = RetrySchedule((3,))

@@ -30,6 +30,7 @@ class EventKind(StrEnum):
     LINKED = "linked"
     LINK_REFUSED = "link_refused"
     FUSED = "fused"
+    SUPERSEDED = "superseded"
     LOOP_CLOSED = "loop_closed"
     INTERRUPTED = "interrupted"
 

@@ -41,6 +41,8 @@ class FailureStory:
         Links to the lost map, accepted or refused.
     linked : dict or None
     fused : dict or None
+    superseded : dict or None
+        Where a later map had posed all its frames.
     """
 
     letter: str
@@ -51,6 +53,7 @@ class FailureStory:
     tries: list[Event]
     linked: Event | None
     fused: Event | None
+    superseded: Event | None
 
     @property
     def lost_since(self) -> int:
@@ -78,6 +81,7 @@ def stories(run: RunData) -> list[FailureStory]:
                 tries=[e for e in own if e.get("event") in _TRIES],
                 linked=next((e for e in own if e["event"] == "linked"), None),
                 fused=next((e for e in own if e["event"] == "fused"), None),
+                superseded=next((e for e in later if lost in e.get("old_submaps", [])), None),
             )
         )
     return found
@@ -113,6 +117,8 @@ def _verdict(run: RunData, story: FailureStory) -> tuple[str, str]:
     rows = [row for row in run.rows if row.submap == story.failed.get("submap")]
     if story.linked is not None:
         return "✓ linked with the map after it", "pill good"
+    if story.superseded is not None:
+        return "✓ taken over by a later map", "pill good"
     if any(row.in_main_map for row in rows) and story.restart is None:
         return "✕ no map after it", "pill bad"
     return "✕ not linked", "pill bad"
@@ -158,6 +164,9 @@ def _outcome(story: FailureStory) -> str:
             if "scale" in link
             else f"The recovery linked the two{took}{after}.{bypass}"
         )
+    if story.superseded is not None:
+        frames = count(story.superseded["frames"], "frame")
+        return f"Walking back in time, submap {story.superseded['submap']} posed all its {frames}: no link is needed."
     broken = "".join(f" A recovery failed: {e.get('detail') or e.get('reason')}." for e in story.broken)
     if not refused:
         why = "the walk back in time met too few keyframes of the lost map" if story.walks else "there was no walk back"

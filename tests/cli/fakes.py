@@ -44,6 +44,7 @@ class FakeSystem:
         self.timer = StageTimer()
         self.buffer = FrameBuffer(1.0, 1.0)
         self.n_finished = 0
+        self.hurried = False
         self._truth, self._lost, self._before_step = truth, lost, before_step
         self._submap: Submap | None = None
 
@@ -65,8 +66,9 @@ class FakeSystem:
         self.poses[frame.index] = FramePose(frame.index, frame.timestamp_s, self._submap.id, frame.index, np.eye(4))
         return self._result(frame, FrameStatus.TRACKED)
 
-    def finish(self) -> None:
+    def finish(self, hurry: bool = False) -> None:
         self.n_finished += 1
+        self.hurried = hurry
 
     def _result(self, frame: Frame, status: FrameStatus) -> FrameResult:
         submap_id = None if self._submap is None else self._submap.id

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -118,7 +119,7 @@ def test_a_system_that_breaks_is_finished_and_what_it_raised_first_is_reported()
                 raise ZeroDivisionError("in a step")
             return super().step(frame)
 
-        def finish(self) -> None:
+        def finish(self, hurry: bool = False) -> None:
             super().finish()
             raise ValueError("at the end")
 
@@ -128,6 +129,17 @@ def test_a_system_that_breaks_is_finished_and_what_it_raised_first_is_reported()
     assert (report.n_frames, list(system.rows), system.n_finished) == (3, [0, 1], 1)
     assert frames.closed
     assert isinstance(run_sequence(Broken(EVERYWHERE), Frames([0])).bug, ValueError)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("stops", [False, True])
+def test_who_interrupts_a_run_does_not_wait_for_a_last_walk(stops: bool) -> None:
+    def interrupt(frame: Frame) -> None:
+        if stops and frame.index == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    system = FakeSystem(EVERYWHERE, before_step=interrupt)
+    report = run_sequence(system, Frames([0, 1, 2]))  # type: ignore[arg-type]
+    assert (report.interrupted, system.hurried, system.n_finished) == (stops, stops, 1)
 
 
 def test_a_source_without_frames_is_bad_input() -> None:

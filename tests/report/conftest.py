@@ -50,7 +50,7 @@ class Eventful(FakeSystem):
             event.data.update(reason="no_texture", detail="<b>0 features</b>", lost_since=event.frame)
         return result
 
-    def finish(self) -> None:
+    def finish(self, hurry: bool = False) -> None:
         if self.events.of_kind(EventKind.FAILED) and len(self.atlas.submaps) > 1:
             self.events.add(EventKind.REINITIALISED, LOST[-1] + 1, 2.6, 1, first_view=LOST[-1] + 1)
             self.events.add(EventKind.RECOVERY_STARTED, LOST[-1] + 1, 2.6, 1, lost=[0], frames=26)

@@ -186,6 +186,14 @@ def test_colour_frames_are_kept_in_their_colours() -> None:
     assert blue < 15
 
 
+def test_a_map_that_a_later_one_took_over_is_told_without_a_link(broken_run: RunData) -> None:
+    event = {"event": "superseded", "frame": 39, "timestamp_s": 3.9, "submap": 1, "old_submaps": [0], "frames": 20}
+    text = outline(with_events(broken_run, event)).text
+    assert "✓ taken over by a later map" in text
+    assert "submap 1 posed all its 20 frames: no link is needed." in text
+    assert "The two maps stay apart" not in text
+
+
 def test_a_run_without_truth_draws_its_maps_apart(make_run: MakeRun) -> None:
     run = read_run(make_run(truth=False))
     assert not (run.path / "groundtruth.txt").exists()
