@@ -74,7 +74,8 @@ def run_once(job: tuple[str, str, int], settings: dict[str, Any]) -> dict[str, A
     if links:
         whole = make_sequence(scene, n_frames, seed, WIDTH, HEIGHT, events=[])
         controls = audit_again(links, run(whole, values | {"corruptions": []} | settings), whole)
-        found["links"] = [link | control for link, control in zip(found["links"], controls, strict=True)]
+        claims = claimed_sigmas(system, links)
+        found["links"] = [a | b | c for a, b, c in zip(found["links"], controls, claims, strict=True)]
     return found
 
 
@@ -93,6 +94,14 @@ def run(world: Any, values: dict[str, Any]) -> Any:
 def truth_of(world: Any) -> dict[int, np.ndarray]:
     """Return the true poses of a world's frames."""
     return dict(enumerate(world.ground_truth_T_world_cam))
+
+
+def claimed_sigmas(system: Any, links: list[Any]) -> list[dict[str, float]]:
+    """Return what each link says that its scale is known to at the live end (standard deviation)."""
+    from dualslam.core.events import EventKind
+
+    linked = {(e.data["old_submap"], e.submap): e for e in system.events.of_kind(EventKind.LINKED)}
+    return [{"claimed_sigma": linked[link.old, link.new].data["sigma_scale"]} for link in links]
 
 
 def audit_again(links: list[Any], unbroken: Any, world: Any) -> list[dict[str, float | None]]:
@@ -160,9 +169,9 @@ def table(runs: list[dict[str, Any]]) -> str:
     """Return the results by kind of failure, as Markdown."""
     lines = [
         "| scene | failure | runs | lost maps | with a new map | linked | wrong | not by drift | scale % med / max "
-        "| rotation deg med / max | position % med / max | ATE % med "
+        "| rotation deg med / max | position % med / max | live scale % med / max | over its sigma, rms | ATE % med "
         "| silent jumps | frames lost within 1 s of a fusion |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     groups = [(s, k) for s in SCENES for k in KINDS] + [("all", "all")]
     for scene, kind in groups:
@@ -172,9 +181,11 @@ def table(runs: list[dict[str, Any]]) -> str:
         links = [link for r in of for link in r["links"]]
         cells = [scene, kind, len(of), sum(r["failures"] for r in of), sum(r["restarts"] for r in of), len(links)]
         cells += [sum(link["wrong"] for link in links), sum(link["wrong"] and not is_drift(link) for link in links)]
-        for name, factor in (("scale", 100), ("rotation_deg", 1), ("position", 100)):
-            values = [factor * abs(link[name]) for link in links]
+        for name, factor in (("scale", 100), ("rotation_deg", 1), ("position", 100), ("live_scale", 100)):
+            values = [factor * abs(link[name]) for link in links if link[name] is not None]
             cells.append(f"{np.median(values):.2f} / {max(values):.2f}" if values else "-")
+        ratio = [link["live_scale"] / link["claimed_sigma"] for link in links if link["live_scale"] is not None]
+        cells.append(f"{np.sqrt(np.mean(np.square(ratio))):.1f}" if ratio else "-")
         ate = [r["ate_pct"] for r in of if r["ate_pct"] is not None]
         cells.append(f"{np.median(ate):.2f}" if ate else "-")
         cells += [sum(r[name] for r in of) for name in ("silent_jumps", "lost_after_fusion")]
