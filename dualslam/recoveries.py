@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from typing import Any
@@ -109,8 +109,7 @@ class Recoveries:
                 again=now is not None,
                 **numbers,
             )
-        views = self._views_before(newest, submap, stop_at_posed=not onsets)
-        self._submit(submap, newest, views, onsets, now)
+        self._submit(submap, newest, self._views_before(newest, submap), onsets, now)
 
     def retry(self, submap: Submap, now: Moment, last_chance: bool = False) -> None:
         """Walk back again where something was left to find, once the new map has grown or its camera was calibrated.
@@ -197,12 +196,18 @@ class Recoveries:
             return False
         return any(frame.pose.index not in self._record.poses for frame in result.frames)
 
-    def _views_before(self, newest: View, submap: Submap, stop_at_posed: bool) -> Iterator[View]:
-        for view in self._buffer.backwards_from(newest.index):
-            posed = self._record.poses.get(view.index)
-            if stop_at_posed and posed is not None and posed.submap_id != submap.id:
-                return
-            yield view
+    def _views_before(self, newest: View, submap: Submap) -> list[View]:
+        """Return the buffered frames before a keyframe, the latest first: as far back as a lost map has seen any.
+
+        Where none has, as far as none is posed in another map.
+        """
+        views, poses = list(self._buffer.backwards_from(newest.index)), self._record.poses
+        seen = {i for i, pose in poses.items() if pose.submap_id in self._lost}
+        seen.update(k for m in self._lost for k in self._record.atlas.submaps[m].keyframes)
+        of_lost = [n for n, view in enumerate(views) if view.index in seen]
+        if of_lost:
+            return views[: of_lost[-1] + 1]
+        return list(takewhile(lambda v: v.index not in poses or poses[v.index].submap_id == submap.id, views))
 
     def _circumstances_of_loss(self) -> dict[str, Any]:
         """Why the newest of the lost maps was lost, and how many frames are buffered of before (k) and since (k_r)."""

@@ -278,6 +278,29 @@ class TestSchedule:
         assert schedule.take_if_due(submap, 11, replace(CAMERA, fx=451.0))
 
 
+def test_a_walk_reads_no_frame_that_is_older_than_the_lost_map() -> None:
+    """The lost map has rolled over: older frames are another's, and no link can come of them."""
+    covered = frozenset(range(100, 115))
+    world = PointWorld(cloud(), hand_held(130), covered=covered)
+    settings = {
+        "recovery": {"attempts": ["live"]},
+        "graph": {"max_keyframes": 20, "rollover_keyframes": 6},
+        "keyframes": {"max_parallax_deg": 1.0},
+        "mapping": {"redundant_ratio": 1.0},
+    }
+    system = system_in(world, **settings)
+    system._recoveries._executor = watched = Watched(system._recoveries._executor)
+    for frame in world.frames():
+        system.step(frame)
+    job = next(job for job in watched.jobs if job.lost)
+    ((lost_id, lost),) = job.lost.items()
+    assert lost_id > 0
+    assert 0 < job.views[-1].index <= min(lost.keyframes)
+    assert system.atlas.components() == [list(range(len(system.atlas.submaps)))]
+    older = [p.index for p in system.poses.values() if p.submap_id < lost_id]
+    assert max(older) >= job.views[-1].index - 1  # what comes before has its place in another map
+
+
 def test_few_keyframes_cover_the_map() -> None:
     world = away_first()
     system, _ = watched_system(world)
