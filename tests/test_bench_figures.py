@@ -27,6 +27,13 @@ def test_every_figure_is_drawn(tmp_path: Path) -> None:
         assert len(np.unique(image.reshape(-1, 3), axis=0)) > 5
 
 
+def test_a_sequence_that_no_condition_takes_has_no_figure(tmp_path: Path) -> None:
+    records = [run_fake(trial) for trial in plan_trials(SPEC, describe) if trial.sequence == "a"]
+    files = draw_figures(SPEC, bench_tables(SPEC, records), records, tmp_path)
+    assert {file.stem for file in files if file.stem.startswith("figure_7")} == {"figure_7_a"}
+    assert all(file.exists() for file in files)
+
+
 def test_without_matplotlib_the_tables_are_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dualslam.cli.bench_figures.find_spec", lambda name: None)
     assert draw_figures(SPEC, [], [], tmp_path) == []

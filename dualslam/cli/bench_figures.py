@@ -28,10 +28,12 @@ def draw_figures(spec: BenchSpec, tables: Sequence[Table], records: Sequence[Tri
     draw_rates(files[0], _rates(tables))
     by_variant = {v: [r for r in records if r.variant == v] for v in spec.variant_names}
     draw_delays(files[1], {v: [r.initialised_after_s for r in trials] for v, trials in by_variant.items()})
-    for sequence in spec.sequences:
+    tried = {r.sequence for r in records}  # conditions may leave a sequence out
+    sequences = [s for s in spec.sequences if s.name in tried]
+    for sequence in sequences:
         files.append(folder / f"figure_7_{sequence.name}.png")
         draw_statuses(files[-1], sequence.name, _statuses(spec, records, sequence.name))
-    returning = [s.name for s in spec.sequences if s.returns_to_start]
+    returning = [s.name for s in sequences if s.returns_to_start]
     if returning:
         files.append(folder / "figure_9_end_point.png")
         errors = {v: {s: _errors(spec, trials, s) for s in returning} for v, trials in by_variant.items()}
