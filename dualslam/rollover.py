@@ -20,9 +20,9 @@ def next_submap(full: Submap, submap_id: int, n_shared: int) -> Submap:
     Returns
     -------
     Submap
-        With the shared keyframes and those of their landmarks that at least two of them see. Its gauge is the first
-        shared keyframe and the baseline to the last one, as the full submap knows them, so that the link between the
-        two is the identity.
+        With the shared keyframes and those of their landmarks that at least two of them see. Its gauge is the pair of
+        shared keyframes that stand farthest apart, as the full submap knows them, so that the link between the two is
+        the identity.
     """
     shared = list(full.keyframes)[-n_shared:]
     twin = Submap(submap_id, full.K, full.landmarks["descriptor"][0])
@@ -42,5 +42,16 @@ def next_submap(full: Submap, submap_id: int, n_shared: int) -> Submap:
         feature = np.flatnonzero(ids >= 0)
         kept = new_id[ids[feature]] >= 0
         twin.add_observations(k, feature[kept], new_id[ids[feature[kept]]])
-    twin.gauge = (shared[0], shared[-1])
+    twin.gauge = _widest_pair(full, shared)
     return twin
+
+
+def _widest_pair(submap: Submap, keyframe_ids: list[int]) -> tuple[int, int]:
+    """Return the two keyframes that are farthest apart: a distance that is known the better the longer it is.
+
+    The first and the last one may stand side by side, where a hand moves to and fro.
+    """
+    centres = submap.keyframe_poses(keyframe_ids)[:, :3, 3]
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
+    first, second = np.unravel_index(int(apart.argmax()), apart.shape)
+    return keyframe_ids[int(first)], keyframe_ids[int(second)]

@@ -153,3 +153,19 @@ def test_five_thousand_keyframes_in_a_chain() -> None:
     length = np.linalg.norm(error[:, 3:], axis=1)
     assert length[first].max() < 2 * np.quantile(length, 0.99)
     assert np.linalg.norm(error[:, :3], axis=1).max() < 0.01
+
+
+def test_a_hand_that_comes_back_leaves_its_widest_baseline_as_gauge() -> None:
+    chain = Chain(Corridor(60, 0.5), GraphConfig(), 0.02)
+    for k in range(60):
+        chain.add(k)
+    full = chain.submap
+    shared = list(full.keyframes)[-N_SHARED:]
+    last, middle = shared[-1], shared[N_SHARED // 2]
+    full.T_submap_kf[last] = full.T_submap_kf[shared[0]]  # the last one stands where the first one does
+    first, second = next_submap(full, 1, N_SHARED).gauge
+    centres = full.keyframe_poses(shared)[:, :3, 3]
+    assert {first, second} != {shared[0], last}
+    baseline = np.linalg.norm(full.T_submap_kf[first][:3, 3] - full.T_submap_kf[second][:3, 3])
+    assert baseline == np.linalg.norm(centres[:, None] - centres, axis=2).max()
+    assert baseline > np.linalg.norm(full.T_submap_kf[middle][:3, 3] - centres[0])
