@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from dualslam.core.config import Config
     from dualslam.core.config_io import config_from_dict, dump_config, load_config
     from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError, SolverError
+    from dualslam.core.memory import keep_freed_memory
     from dualslam.core.threads import limit_threads
     from dualslam.core.types import Failure, Frame
     from dualslam.evaluation.failure_lab import corrupted
@@ -57,6 +58,7 @@ _WHERE = {
     "create_frontend": "build",
     "dump_config": "core.config_io",
     "evaluate_run": "evaluation.trajectory_metrics",
+    "keep_freed_memory": "core.memory",
     "limit_threads": "core.threads",
     "load_atlas": "map_store",
     "load_config": "core.config_io",
@@ -91,6 +93,7 @@ __all__ = [
     "create_frontend",
     "dump_config",
     "evaluate_run",
+    "keep_freed_memory",
     "limit_threads",
     "load_atlas",
     "load_config",

@@ -13,6 +13,7 @@ import numpy as np
 from dualslam.core.config_io import config_from_dict
 from dualslam.core.errors import DualSlamError
 from dualslam.core.interfaces import Sequence
+from dualslam.core.memory import keep_freed_memory
 from dualslam.core.threads import limit_threads
 from dualslam.core.types import Failure
 from dualslam.evaluation.bench.measure import (
@@ -70,6 +71,7 @@ def run_trial(trial: Trial, out: str) -> TrialRecord:
         Where a signal ended the run early: that is no result.
     """
     limit_threads()
+    keep_freed_memory()
     began = time.perf_counter()
     folder = trial_folder(Path(out), trial)
     try:

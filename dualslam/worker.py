@@ -20,6 +20,7 @@ from multiprocessing.connection import Connection
 from queue import Empty, SimpleQueue
 from threading import Thread
 
+from dualslam.core.memory import keep_freed_memory
 from dualslam.core.types import Failure, FailureReason
 from dualslam.direction import recover
 from dualslam.executor import Outcome
@@ -103,6 +104,7 @@ def serve(connection: Connection, make_parts: MakeParts) -> None:
     """Run jobs until the other end of the pipe is closed: what a worker process does."""
     # An interrupt at the terminal reaches all processes; what becomes of the run is the first one's affair.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    keep_freed_memory()
     parts = make_parts()
     while True:
         try:

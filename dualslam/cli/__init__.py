@@ -15,6 +15,7 @@ from pathlib import Path
 from dualslam.cli import logs
 from dualslam.cli.parser import parse
 from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError
+from dualslam.core.memory import keep_freed_memory
 from dualslam.core.threads import limit_threads
 
 EXIT_DONE, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
@@ -23,6 +24,7 @@ EXIT_DONE, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Never raises."""
     limit_threads()
+    keep_freed_memory()
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         args = parse(arguments)

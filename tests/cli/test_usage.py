@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -170,6 +171,20 @@ def test_limit_threads_leaves_what_the_user_has_set() -> None:
     environment = {"OMP_NUM_THREADS": "3", "PATH": ""}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert done.stdout.split() == ["True", "False", "3", "1"]
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have no such setting")
+def test_freed_memory_is_kept() -> None:
+    code = (
+        "import resource; from dualslam import keep_freed_memory; kept = keep_freed_memory();"
+        "fill = lambda: [b'x' * 2**23 for _ in range(12)]; fill();"
+        "faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt;"
+        "before = faults(); fill(); print(kept, faults() - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    kept, n_faults = done.stdout.split()
+    assert kept == "True"
+    assert int(n_faults) < 2000  # of 24000 pages
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,32 @@
+"""Freed memory stays with the process: what one image took, the next one takes again."""
+
+from __future__ import annotations
+
+import ctypes
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""As in glibc's `malloc.h`."""
+KEPT_BYTES = 256 * 2**20
+"""So much at most lies idle; SIFT's scale space of a KITTI image takes 110 MB."""
+LARGEST_BYTES = 32 * 2**20
+"""Larger arrays are given back all the same: glibc allows no more."""
+
+
+def keep_freed_memory() -> bool:
+    """Tell the C library to keep freed memory for what is allocated next.
+
+    glibc gives arrays of some size back to the system at once, which hands out fresh pages, zeroed, for the next ones:
+    a fifth of the CPU time of a walk back with SIFT on KITTI. Results are the same.
+
+    Call it in a program of your own as in ours; importing dualslam does not call it.
+
+    Returns
+    -------
+    bool
+        False where the C library has no such setting: elsewhere than on Linux with glibc nothing is changed.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, TypeError):
+        return False
+    return bool(mallopt(M_MMAP_THRESHOLD, LARGEST_BYTES) and mallopt(M_TRIM_THRESHOLD, KEPT_BYTES))
