@@ -66,17 +66,16 @@ def sample(levels: Pyramid, uv_px: FloatArray, axes: FloatArray, half: int) -> N
     side = 2 * half + 1
     level = np.clip(np.rint(np.log2(np.maximum(step, 1e-6))), 0, len(levels) - 1).astype(np.int64)
     grid = np.arange(-half, half + 1, dtype=np.float64)
-    x, y = np.meshgrid(grid, grid)
-    steps = np.stack([x, y], axis=-1)
     patches = np.zeros((len(uv_px), side, side), np.float32)
     for n in np.unique(level).tolist():
         of_level = np.flatnonzero(level == n)
         for begin in range(0, len(of_level), REMAP_ROWS // side):
             rows = of_level[begin : begin + REMAP_ROWS // side]
-            at = uv_px[rows, None, None] + np.einsum("nij,yxj->nyxi", axes[rows], steps)
+            right, down = axes[rows].transpose(2, 1, 0)[..., None, None]
+            at = uv_px[rows].T[..., None, None] + (right * grid + down * grid[:, None])
             # The middle of a level's first pixel is the middle of the image's.
-            at = np.asarray(at / 2.0**n, np.float32).reshape(len(rows) * side, side, 2)
-            out = cv2.remap(levels[n], at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            u, v = np.asarray(at / 2.0**n, np.float32).reshape(2, len(rows) * side, side)
+            out = cv2.remap(levels[n], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             patches[rows] = out.reshape(len(rows), side, side)
     return patches
 
