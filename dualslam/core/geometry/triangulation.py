@@ -19,6 +19,9 @@ MIN_RELATIVE_DETERMINANT = 1e-13
 """Of a point's 3x3 information, relative to its trace cubed over 27: below, a direction is not observed at all. (Two
 views with 0.001 deg of parallax have 1e-10.)"""
 
+MIN_COLUMNS = 4
+"""Points with up to so many views are taken together; with twice as many the next ones."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoViewPoints:
@@ -185,8 +188,24 @@ def triangulate_n_view(
     """
     n, n_views = uv.shape[:2]
     seen = np.ones((n, n_views), bool) if visible is None else np.asarray(visible, bool)
-    # Each point's own views come first, and no more columns than one of them needs: of many views most see little.
-    column = np.argsort(~seen, axis=1, kind="stable")[:, : max(int(seen.sum(1).max(initial=0)), 1)]
+    found = NViewPoints(np.empty((n, 3)), np.empty((n, n_views)), np.empty((n, n_views)), np.empty(n))
+    # Of many views most points have few: those that have about as many are taken together.
+    width = 2 ** np.ceil(np.log2(seen.sum(1).clip(MIN_COLUMNS))).astype(np.int64)
+    for n_columns in np.unique(width).tolist():
+        rows = np.flatnonzero(width == n_columns)
+        part = _triangulate_alike(uv[rows], K, T_cam_w, seen[rows], n_columns, n_polish)
+        found.xyz[rows], found.min_cos_parallax[rows] = part.xyz, part.min_cos_parallax
+        found.depth[rows], found.error2[rows] = part.depth, part.error2
+    return found
+
+
+def _triangulate_alike(
+    uv: FloatArray, K: FloatArray, T_cam_w: FloatArray, seen: BoolArray, n_columns: int, n_polish: int
+) -> NViewPoints:
+    """Triangulate points of which none has more than `n_columns` views."""
+    n, n_views = seen.shape
+    # Each point's own views come first.
+    column = np.argsort(~seen, axis=1, kind="stable")[:, :n_columns]
     seen, uv = np.take_along_axis(seen, column, 1), np.take_along_axis(uv, column[..., None], 1)
     w = np.repeat(seen[..., None], 2, -1).astype(np.float64)
     focal, centre = np.array([K[0, 0], K[1, 1]]), K[:2, 2]
