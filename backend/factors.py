@@ -60,6 +60,13 @@ def pose_prior(
     )
 
 
+def given_pose(keyframe_id: int, T_submap_kf: FloatArray, covariance: FloatArray) -> gtsam.PriorFactorPose3:
+    """Return a prior on a keyframe's pose with a full covariance (6, 6): rotation, translation; in its own frame."""
+    return gtsam.PriorFactorPose3(
+        pose_key(keyframe_id), to_pose3(T_submap_kf), gtsam.noiseModel.Gaussian.Covariance(covariance)
+    )
+
+
 def baseline_factor(first: int, second: int, length_mu: float) -> gtsam.RangeFactorPose3:
     """Return the factor that fixes a submap's scale: the distance between the centres of two keyframes."""
     noise = gtsam.noiseModel.Isotropic.Sigma(1, GAUGE_RANGE_RATIO * length_mu)

@@ -16,7 +16,7 @@ import numpy as np
 
 from backend import convert
 from backend.bayes_tree import BayesTree, UpdateStatistics
-from backend.factors import baseline_factor, insert_projections, pose_prior
+from backend.factors import baseline_factor, given_pose, insert_projections, pose_prior
 from backend.gauge import Gauge, choose_gauge
 from backend.ledger import OUTSIDE, Ledger, Plan
 from backend.membership import compute_residuals, find_components
@@ -74,6 +74,7 @@ class ISam2SubmapGraph:
         self._noise = PixelNoise(config.robust_k)
         self._ledger = Ledger(config)
         self._forced_holds: set[int] = set()
+        self._given: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._solver: IncrementalSolver | None = None
         self._gauge: Gauge | None = None
         self._gauge_factors: list[int] = []
@@ -101,6 +102,7 @@ class ISam2SubmapGraph:
             return self._remake(submap, start, rebuilt=False)
         if self._gauge is None or self._gauge.was_moved_in(submap):
             logger.info("submap %d changed its gauge: rebuilding its graph", submap.id)
+            self._given.clear()  # they stand in the gauge of before
             return self._remake(submap, start, rebuilt=True)
         try:
             plan = self._ledger.plan(submap, submap.T_submap_kf, submap.landmarks["xyz_mu"], suspects=self._suspects)
@@ -113,6 +115,19 @@ class ISam2SubmapGraph:
             logger.info("graph of submap %d: %s; rebuilding it", submap.id, failure)
             self._blame(failure, submap)
         return self._remake(submap, start, rebuilt=True)
+
+    def hold(self, keyframe_id: int, T_submap_kf: FloatArray, covariance: FloatArray) -> None:
+        """Take in from now on that a keyframe's pose is known from elsewhere.
+
+        Parameters
+        ----------
+        keyframe_id : int
+            It may be added to the submap later.
+        T_submap_kf : (4, 4)
+        covariance : (6, 6)
+            Of xi in ``T_submap_kf @ exp(xi)``: rotation, translation; positive definite.
+        """
+        self._given[keyframe_id] = T_submap_kf, covariance
 
     def rebuild(self, submap: Submap, near_optimum: bool = False) -> GraphEstimate:
         """Make the graph anew from the submap's arrays (batch optimum seeds a fresh iSAM2); returns everything.
@@ -210,7 +225,8 @@ class ISam2SubmapGraph:
             if gauge.second is not None:
                 graph.push_back(baseline_factor(gauge.first, gauge.second, gauge.baseline_mu))
 
-        wanted = (set(plan.weak_keyframes.tolist()) | self._forced_holds) & submap.keyframes.keys()
+        weak = set(plan.weak_keyframes.tolist())
+        wanted = (weak | self._forced_holds | self._given.keys()) & submap.keyframes.keys()
         wanted.discard(gauge.first)
         if (
             gauge.second is not None
@@ -221,7 +237,10 @@ class ISam2SubmapGraph:
         remove += [factor for k, factor in self._holds.items() if k not in wanted]
         new_holds = sorted(wanted - self._holds.keys())
         for k in new_holds:
-            graph.push_back(pose_prior(k, pose_now(k), HOLD_ROTATION_RAD, HOLD_TRANSLATION_MU))
+            if k in self._given:
+                graph.push_back(given_pose(k, *self._given[k]))
+            else:
+                graph.push_back(pose_prior(k, pose_now(k), HOLD_ROTATION_RAD, HOLD_TRANSLATION_MU))
 
         obs, rows, e = submap.observations, self._ledger.rows, plan.entering
         K = convert.to_cal3_s2(submap.K)

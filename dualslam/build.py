@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from operator import attrgetter
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from dualslam.core.camera import Camera
 from dualslam.core.config import AttemptConfig, Config, FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.grey_image import GreyImage
-from dualslam.core.interfaces import Frontend, SelfCalibrator, SubmapGraph
+from dualslam.core.interfaces import Frontend, SelfCalibrator, SubmapGraph, VisualOdometry
 from dualslam.core.rectification import rectify
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Features, Frame, View
@@ -167,7 +168,7 @@ def recovery_parts(
 
     matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
     return RecoveryParts(
-        attempts=_attempts(config, live, size_px),
+        attempts=_attempts(config, frontend, live, size_px),
         new_graph=lambda: ISam2SubmapGraph(config.graph),
         link=lambda old, new, onset: estimate_link(
             old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
@@ -184,14 +185,17 @@ def recovery_parts(
 
 
 def _attempts(
-    config: Config, live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd], size_px: tuple[int, int]
+    config: Config,
+    frontend: Frontend,
+    live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
+    size_px: tuple[int, int],
 ) -> tuple[Attempt, ...]:
     """Build the attempts; those with the same guest share what it finds in the images."""
     guests: dict[str, ImageFeatures] = {}  # by their settings
     attempts = []
     for number, attempt in enumerate(config.recovery.attempts):
         if attempt.is_live:
-            attempts.append(Attempt(attempt.name, live))
+            attempts.append(_live_attempt(frontend, attempt, config, live, size_px))
             continue
         wanted = _guest(attempt)
         key = wanted.model_dump_json()
@@ -200,6 +204,25 @@ def _attempts(
                 guests[key] = ImageFeatures(create_frontend(wanted))
         attempts.append(_attempt_with(guests[key], attempt, config, live, size_px))
     return tuple(attempts)
+
+
+def _live_attempt(
+    frontend: Frontend,
+    attempt: AttemptConfig,
+    config: Config,
+    live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
+    size_px: tuple[int, int],
+) -> Attempt:
+    """Build the attempt of the live features alone, which on the way to a lost map leap by the same rules as others."""
+
+    def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> VisualOdometry:
+        walker = live(job, submap, graph)
+        if not job.lost:
+            return walker
+        own = attrgetter("features")
+        return PnpOdometry(walker, frontend, own, job.own, bundle_adjust_arrays, config, size_px, walks_live=True)
+
+    return Attempt(attempt.name, new_odometry)
 
 
 def _attempt_with(

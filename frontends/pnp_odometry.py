@@ -31,6 +31,7 @@ from dualslam.core.support import find_lack_of_support
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray, Matches, Track, View
 from frontends.gates import CHI2_1DOF_95, CHI2_2DOF_99, MIN_CONSENSUS
 from frontends.guest_map import GuestMap, triangulate
+from frontends.leap_uncertainty import SMALL_STEP
 from frontends.resection import resect
 from frontends.tracker import GivenPose
 from frontends.visual import VisualFrontEnd
@@ -41,7 +42,6 @@ Extract = Callable[[View], Features | Failure]
 FOLLOW_FRAMES = 2  # frames that the next one is matched with
 POINT_FRAMES = 6  # frames that a point is triangulated from
 LEAP_FRAMES = 5  # frames before a gap that those beyond it are matched with
-SMALL_STEP = 0.1  # of the median depth: a scale that is off by a quarter then moves what lies beyond by 2.5 %
 MIN_CONTRAST = 4.0  # standard deviation of the greys; sensors have a noise of 1 to 3, and blank images have that alone
 SEED_KEYFRAMES = 8  # keyframes of the submap that the walk starts from
 CONFIRMING_SHARE = 0.85
@@ -98,6 +98,7 @@ class PnpOdometry:
         self._walks_live = walks_live
         self._pending: dict[int, View] = {}  # posed, but without features of the guest as yet
         self._following = False  # whether the last frame that was given has a pose
+        self._leapt: int | None = None  # the last frame that a leap has posed
         self._beyond: _Beyond | None = None  # the last frame beyond a gap, until another confirms it
 
     # --- the VisualOdometry protocol, as far as the live front end does it
@@ -126,7 +127,7 @@ class PnpOdometry:
 
     def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
         """Make the frame a keyframe and solve the graph."""
-        report = self._live.insert_keyframe(track)
+        report = self._live.insert_keyframe(track, pose_is_given=track.view.index == self._leapt)
         if isinstance(report, Failure):
             return report
         self._map.put(track.view.index, track.view.index, se3.inverse(self.submap.T_submap_kf[track.view.index]))
@@ -148,8 +149,10 @@ class PnpOdometry:
         """Pose a frame."""
         if view.index in self.submap.keyframes:
             return self._meet(view)
+        if self._live.lies_beyond_gap(view):
+            self._following = False
         if self._walks_live and self._following:
-            track = self._live.track(view)
+            track = self._live.follow(view)
             if not isinstance(track, Failure) and self._healthy(track.n_inliers, track.n_matches, track.chi2):
                 self._map.put(view.index, self.reference_id, track.T_cam_submap)
                 self._pending[view.index] = view
@@ -275,6 +278,7 @@ class PnpOdometry:
             self._map.drop(before.index)
             return Failure(FailureReason.UNCONFIRMED, f"{share:.0%} of two frames confirm the leap", wide.numbers)
         self._map.put(before.index, self.reference_id, before.pose.T_cam_submap)
+        self._leapt = index
         n_inliers = int(wide.inliers.sum())
         return GivenPose(wide.T_cam_submap, len(rows), n_inliers, wide.chi2, wide.covariance, wide=True)
 

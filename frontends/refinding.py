@@ -4,6 +4,12 @@ Beyond frames that could not be used (or after tracking has matched wide again) 
 that are seen on both sides, and the detector finds few of the same points at half or twice the distance. With the pose
 now known about, each landmark's place and size there are too: the keyframes beyond the gap are searched for what the
 last keyframes before it saw, by its patch of the image, and what is found becomes a feature of theirs like any other.
+
+The pose of a leap comes from few matches over a long way. There a landmark is looked for once its place is known to
+within what is searched, by the pose's covariance and its own: in a smaller search than that, what looks alike and
+confirms a wrong pose is all there is to find. Landmarks far away come first; what they tell of the pose makes way for
+those nearby (active search: Davison, ICCV 2003). The pose of a tracked frame is by the landmarks that it follows, and
+within the search.
 """
 
 from __future__ import annotations
@@ -16,13 +22,13 @@ import numpy as np
 from dualslam.core.camera import Camera
 from dualslam.core.columns import concatenate
 from dualslam.core.geometry import se3
-from dualslam.core.geometry.projection import refine_pose
-from dualslam.core.geometry.triangulation import point_covariance
+from dualslam.core.geometry.projection import projection_jacobians, refine_pose
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend
 from dualslam.core.rectification import rectified_sigma
 from dualslam.core.submap import Submap
-from dualslam.core.types import Failure, Features, FloatArray, IntArray, Track, View
+from dualslam.core.types import BoolArray, Failure, Features, FloatArray, IntArray, Track, View
+from frontends.leap_uncertainty import landmark_covariances, pose_uncertainty
 from frontends.patches import HALF_PX, Pyramid, build_pyramid, match_patches
 
 RIM_KEYFRAMES = 6
@@ -32,8 +38,11 @@ FAR_KEYFRAMES = 8
 KEPT_IMAGES = 12
 """Those nearest in time to the latest keyframe: twice the rim, since not each keyframe is there to stay."""
 SEARCH_RAD = 0.022
-"""About the predicted place, in the coarser image, as an angle: a pose from few matches is off by as much. Too small a
-search finds only what fits the pose that it started from."""
+"""About the predicted place, in the coarser image, as an angle: a pose from few matches is off by as much."""
+SEARCH_SIGMAS = 3.0
+"""Standard deviations of the predicted place that the search must reach."""
+ROUNDS = 4
+"""Searches in one frame beyond a leap at most, each from the pose that the one before has left."""
 MAX_DEPTH_SIGMA = 0.1
 """Relative, of a landmark that is looked for. There are more points far away than near, and of these the ones enter a
 map whose noise looks like parallax: on a rendered street, depths known to 5 % are right, to 12 % are 2 to 6 % too
@@ -45,6 +54,14 @@ SIGMA_PX = 0.45
 twice, is nearer than 0.25 to 0.5 px of where it is in truth."""
 MAJORITY = 0.5
 """Of the patches that are found must agree with one pose: below, it is chance that has found them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Leap:
+    """What a leap knows of a frame's pose, beside the landmarks that it sees: the pose and its information (6, 6)."""
+
+    T_cam_submap: FloatArray
+    information: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,53 +119,88 @@ class Refinder:
         self._rim, self._n_left = near[:RIM_KEYFRAMES], FAR_KEYFRAMES
         self._levels = {k: levels for k, levels in self._levels.items() if k in self._rim}
 
-    def extend(self, track: Track) -> Track:
+    def extend(self, track: Track, pose_is_given: bool = False) -> Track:
         """Return a frame that is to become a keyframe with the landmarks from before the gap that its image shows.
 
         Its features are those that it had, and behind them those that were found; its pose is refined with all.
+
+        Parameters
+        ----------
+        track : Track
+        pose_is_given : bool
+            Its pose and covariance are not by the landmarks that it sees, and count beside these.
         """
         view = track.view
         if self._n_left == 0 or view.image is None or view.turn_rad is not None:
             return track
         self._n_left -= 1
         levels = build_pyramid(view.image.pixels())
-        ids, features = [track.landmark_ids], [view.features]
-        for sought in self._sought(track):
-            found = self._find(sought, track, levels)
-            ids.append(sought.landmark_ids[found.row])
-            features.append(found.features)
-        return self._posed(track, concatenate(features), np.concatenate(ids))
+        leap = _Leap(track.T_cam_submap, _inverse(track.covariance)) if pose_is_given else None
+        looked_for = np.zeros(0, np.int64)
+        for _ in range(ROUNDS if leap else 1):
+            sought = self._sought(track, looked_for, leap)
+            if not sought:
+                break
+            found = [self._find(each, track, levels) for each in sought]
+            looked_for = np.concatenate([looked_for, *(each.landmark_ids for each in sought)])
+            ids = [each.landmark_ids[of.row] for each, of in zip(sought, found, strict=True)]
+            features = concatenate([track.view.features, *(of.features for of in found)])
+            track = self._posed(track, features, np.concatenate([track.landmark_ids, *ids]), leap)
+        return track
 
-    def _sought(self, track: Track) -> list[_Sought]:
-        """Return the landmarks of the rim that the frame lacks, each in the keyframe next to the gap that sees it."""
-        submap, taken = self._submap, track.landmark_ids
+    def _sought(self, track: Track, looked_for: IntArray, leap: _Leap | None) -> list[_Sought]:
+        """Return the landmarks of the rim that the frame lacks, each in the keyframe next to the gap that sees it.
+
+        Of these, the ones whose depths (and beyond a leap, whose places in the frame) are known; and none twice.
+        """
+        submap, taken = self._submap, np.concatenate([track.landmark_ids, looked_for])
+        pose_covariance = None if leap is None else self._pose_covariance(track, leap)
         found = []
         for k in self._rim:
             if k not in submap.keyframes or k not in self._images:
                 continue
             feature = np.flatnonzero(submap.landmark_of[k] >= 0)
             feature = feature[~np.isin(submap.landmark_of[k][feature], taken)]
-            known = self._depth_sigmas(submap.landmark_of[k][feature], k) < MAX_DEPTH_SIGMA
-            feature = feature[known]
             ids = submap.landmark_of[k][feature]
-            taken = np.concatenate([taken, ids])
-            found.append(_Sought(k, ids, submap.keyframes[k].features.take(feature)))
+            covariance = landmark_covariances(submap, ids)
+            known = self._depth_known(ids, k, covariance)
+            if pose_covariance is not None:
+                known[known] = self._place_known(ids[known], k, track, pose_covariance, covariance[known])
+            if known.any():
+                taken = np.concatenate([taken, ids[known]])
+                found.append(_Sought(k, ids[known], submap.keyframes[k].features.take(feature[known])))
         return found
 
-    def _depth_sigmas(self, landmark_ids: IntArray, keyframe_id: int) -> FloatArray:
-        """Return how well landmarks' depths in a keyframe are known (N,), relative, the poses taken as known."""
-        submap = self._submap
-        rows = submap.rows_of_landmarks(landmark_ids)
-        _, sigma = submap.observed_pixels(rows)
-        kf, view = np.unique(submap.observations["kf"][rows], return_inverse=True)
-        order = np.argsort(landmark_ids, kind="stable")
-        point = order[np.searchsorted(landmark_ids[order], submap.observations["landmark"][rows])]
-        xyz = submap.landmarks["xyz_mu"][landmark_ids]
-        T_kf_submap = se3.inverse(submap.keyframe_poses(kf))[view]
-        covariance = point_covariance(xyz, submap.K, point, T_kf_submap, sigma)
-        T_cam_submap = se3.inverse(submap.T_submap_kf[keyframe_id])
-        along, depth = T_cam_submap[2, :3], submap.depths(landmark_ids, T_cam_submap)
-        return np.asarray(np.sqrt(np.einsum("i,nij,j->n", along, covariance, along)) / np.maximum(depth, 1e-12))
+    def _pose_covariance(self, track: Track, leap: _Leap) -> FloatArray:
+        """Return how well the frame's pose is known (6, 6), by the leap and by the landmarks that it sees."""
+        row = np.flatnonzero(track.landmark_ids >= 0)
+        sigma = track.view.features.sigma_px[row]
+        by_landmarks = pose_uncertainty(self._submap, track.T_cam_submap, track.landmark_ids[row], sigma)
+        if by_landmarks is None:
+            return _inverse(leap.information)
+        return _inverse(_inverse(by_landmarks[0]) + leap.information)
+
+    def _depth_known(self, landmark_ids: IntArray, k: int, covariance: FloatArray) -> BoolArray:
+        """Return which landmarks' (N,) depths in keyframe k are known, the poses taken as known."""
+        T_kf_submap = se3.inverse(self._submap.T_submap_kf[k])
+        along, depth = T_kf_submap[2, :3], self._submap.depths(landmark_ids, T_kf_submap)
+        sigma = np.sqrt(np.einsum("i,nij,j->n", along, covariance, along)) / np.maximum(depth, 1e-12)
+        return np.asarray(sigma < MAX_DEPTH_SIGMA, np.bool_)
+
+    def _place_known(
+        self, landmark_ids: IntArray, k: int, track: Track, pose_covariance: FloatArray, covariance: FloatArray
+    ) -> BoolArray:
+        """Return which landmarks' (N,) places in the frame are known to within the search."""
+        submap, T = self._submap, track.T_cam_submap
+        depth, depth_kf = (submap.depths(landmark_ids, T_) for T_ in (T, se3.inverse(submap.T_submap_kf[k])))
+        known = depth > 0
+        J_pose, J_point = projection_jacobians(submap.K, T, submap.landmarks["xyz_mu"][landmark_ids[known]])
+        place = J_pose @ pose_covariance @ J_pose.swapaxes(1, 2)
+        place += J_point @ covariance[known] @ J_point.swapaxes(1, 2)
+        coarser = np.maximum(depth_kf[known] / depth[known], 1.0)
+        sigma_rad = np.sqrt(np.linalg.eigvalsh(place)[:, -1]) / coarser / submap.K[0, 0]
+        known[known] = SEARCH_SIGMAS * sigma_rad < SEARCH_RAD
+        return np.asarray(known, np.bool_)
 
     def _find(self, sought: _Sought, track: Track, levels: Pyramid) -> _Found:
         """Search the image for one keyframe's landmarks."""
@@ -188,15 +240,19 @@ class Refinder:
             self._levels[keyframe_id] = build_pyramid(self._images[keyframe_id].pixels())
         return self._levels[keyframe_id]
 
-    def _posed(self, track: Track, features: Features, landmark_ids: IntArray) -> Track:
+    def _posed(self, track: Track, features: Features, landmark_ids: IntArray, leap: _Leap | None) -> Track:
         """Pose the frame by all that was found, and leave out what does not agree."""
         row = np.flatnonzero(landmark_ids >= 0)
+        T, sigma = track.T_cam_submap, features.sigma_px[row]
+        if leap is not None:
+            T, sigma = leap.T_cam_submap, np.hypot(sigma, self._place_sigmas(landmark_ids[row], track.T_cam_submap))
         estimate = refine_pose(
             self._submap.K,
-            track.T_cam_submap,
+            T,
             self._submap.landmarks["xyz_mu"][landmark_ids[row]],
             features.uv_rect_px[row],
-            features.sigma_px[row],
+            sigma,
+            prior_information=None if leap is None else leap.information,
         )
         is_new = row >= len(track.view.features)
         if isinstance(estimate, Failure) or estimate.inliers[is_new].sum() <= MAJORITY * is_new.sum():
@@ -207,6 +263,16 @@ class Refinder:
         kept[row[is_new & ~estimate.inliers]] = False
         view = replace(track.view, features=features.take(kept))
         return replace(track, view=view, T_cam_submap=estimate.T_cam_w, landmark_ids=landmark_ids[kept])
+
+    def _place_sigmas(self, landmark_ids: IntArray, T_cam_submap: FloatArray) -> FloatArray:
+        """Return by how many pixels (N,) landmarks may be off for their own uncertainty, either coordinate."""
+        _, J = projection_jacobians(self._submap.K, T_cam_submap, self._submap.landmarks["xyz_mu"][landmark_ids])
+        place = J @ landmark_covariances(self._submap, landmark_ids) @ J.swapaxes(1, 2)
+        return np.asarray(np.sqrt(np.nan_to_num(np.trace(place, axis1=1, axis2=2) / 2, nan=0.0)), np.float64)
+
+
+def _inverse(symmetric: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.pinv(symmetric, hermitian=True), np.float64)
 
 
 def _predict(camera: Camera, uv_px: FloatArray, depth: FloatArray, T_b_a: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -16,11 +16,13 @@ from dualslam.core.interfaces import Frontend
 from dualslam.core.submap import NO_LANDMARK, Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from frontends.gates import CHI2_2DOF_99, MIN_CONSENSUS
+from frontends.leap_uncertainty import SMALL_STEP, pose_uncertainty
 from frontends.local_map import LocalMap, Prediction, covering_keyframes
 from frontends.matching import FeatureGrid, match_projected
 from frontends.resection import resect
 
 WIDER = 2.5  # second guided search: this many times the first radius
+MAX_EXTRAPOLATION = 3.0  # intervals for which the motion between the last two frames says something
 GIVEN_POSE_CHI2 = 4 * CHI2_2DOF_99  # 99 % with 2 degrees of freedom, and the pose off by as much as a pixel
 
 
@@ -105,8 +107,11 @@ class Tracker:
             self._velocity = (np.concatenate([xi[:3], float(sim3.scale(S_now_then)) * xi[3:]]), dt)
         self.refresh()
 
-    def track(self, view: View) -> Track | Failure:
-        """Pose a frame. A failure leaves the tracker as it was, so that the next frame may succeed."""
+    def track(self, view: View, may_leap: bool = True) -> Track | Failure:
+        """Pose a frame. A failure leaves the tracker as it was, so that the next frame may succeed.
+
+        `may_leap`: match it with whole keyframes where guided matching fails.
+        """
         assert self._last is not None, "start() comes first"
         features = view.features
         if len(features) < self._config.min_inliers:
@@ -118,17 +123,23 @@ class Tracker:
             found = self._pose_from_last(view, grid, T_predicted, radius_px)
             if found:
                 break
-        wide = not found
+        wide = not found or self.lies_beyond_gap(view)
         if isinstance(found, Failure):
-            found = self._pose_from_wide_matches(view)
+            found = self._pose_from_wide_matches(view) if may_leap else found
             if isinstance(found, Failure):
                 return found
             self._local = self._local_map(found[1][found[1] >= 0])
         track = self._pose_from_local_map(view, grid, *found, T_predicted, wide)
         if isinstance(track, Failure):
             return track
-        self._accept(track)
-        return track
+        verdict = self._judge_leap(track) if wide else track
+        if not isinstance(verdict, Failure):
+            self._accept(track)
+        return verdict
+
+    def lies_beyond_gap(self, view: View) -> bool:
+        """Whether so much time has passed since the last posed frame that its motion does not lead to this one."""
+        return self._velocity is not None and self._n_intervals(view.timestamp_s) > MAX_EXTRAPOLATION
 
     def track_at(self, view: View, pose: GivenPose) -> Track:
         """Take a pose as it is, and look for the landmarks of the keyframes nearest in time under it."""
@@ -182,10 +193,16 @@ class Tracker:
         assert self._last is not None
         if self._velocity is None:
             return self._last.T_cam_submap
-        xi, dt = self._velocity
-        ratio = (timestamp_s - self._last.view.timestamp_s) / dt if dt != 0 else 1.0
         # Far beyond the measured interval (frames were lost) the velocity says little.
-        return se3.exp(xi * np.clip(ratio, 0.0, 3.0)) @ self._last.T_cam_submap
+        n_intervals = np.clip(self._n_intervals(timestamp_s), 0.0, MAX_EXTRAPOLATION)
+        return se3.exp(self._velocity[0] * n_intervals) @ self._last.T_cam_submap
+
+    def _n_intervals(self, timestamp_s: float) -> float:
+        """Return the time since the last frame, over that in which its velocity was measured."""
+        assert self._last is not None
+        assert self._velocity is not None
+        dt = self._velocity[1]
+        return (timestamp_s - self._last.view.timestamp_s) / dt if dt != 0 else 1.0
 
     def _pose_from_last(
         self, view: View, grid: FeatureGrid, T_predicted: FloatArray, radius_px: float
@@ -237,6 +254,24 @@ class Tracker:
             return near
         covering = covering_keyframes(self._submap, self._n_covering, self._config.min_inliers)
         return [*near, *(k for k in covering if k not in near)]
+
+    def _judge_leap(self, track: Track) -> Track | Failure:
+        """Return a track across a gap if it holds the scale: all that is mapped beyond the gap will inherit it.
+
+        A step that is small against the depth of what is seen leaves the scale where it is.
+        """
+        assert self._last is not None
+        row = np.flatnonzero(track.landmark_ids >= 0)
+        ids = track.landmark_ids[row]
+        step = se3.inverse(track.T_cam_submap)[:3, 3] - se3.inverse(self._last.T_cam_submap)[:3, 3]
+        if np.linalg.norm(step) < SMALL_STEP * np.median(self._submap.depths(ids, track.T_cam_submap)):
+            return track
+        known = pose_uncertainty(self._submap, track.T_cam_submap, ids, track.view.features.sigma_px[row])
+        scale_sigma = np.inf if known is None else known[1]
+        if scale_sigma <= self._config.max_leap_scale_sigma:
+            return track
+        detail = f"the scale beyond the gap is known to {scale_sigma:.1%}"
+        return Failure(FailureReason.SCALE, detail, {"leap_scale_sigma": scale_sigma})
 
     def _refine(
         self, view: View, T_start: FloatArray, ids: IntArray, xyz_mu: FloatArray, feature: IntArray

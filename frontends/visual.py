@@ -49,6 +49,7 @@ class VisualFrontEnd:
         self._mapper = Mapper(frontend, config.mapping, submap, size_px)
         self._refinder = refinder
         self._after_gap = False
+        self._apart: frozenset[int] = frozenset()  # keyframes across the last gap, where few landmarks bridge it
         self._reference_id = -1
         self._since_rebuild = 0
         self._kept: frozenset[int] = frozenset()
@@ -82,7 +83,17 @@ class VisualFrontEnd:
 
     def track(self, view: View) -> Track | Failure:
         """Pose a frame against the submap."""
-        track = self._tracker.track(view)
+        return self._noted(view, self._tracker.track(view))
+
+    def follow(self, view: View) -> Track | Failure:
+        """Pose the frame next to the last one, by guided matching alone."""
+        return self._noted(view, self._tracker.track(view, may_leap=False))
+
+    def lies_beyond_gap(self, view: View) -> bool:
+        """Whether the motion of the last frames does not lead to this one: others between them are missing."""
+        return self._tracker.lies_beyond_gap(view)
+
+    def _noted(self, view: View, track: Track | Failure) -> Track | Failure:
         self._note_gap(track)
         if track and view.index in self.submap.keyframes:
             self._meet(view.index)
@@ -118,14 +129,18 @@ class VisualFrontEnd:
         """Whether the frame should become a keyframe."""
         return keyframe_due(track, self.submap, self._reference_id, self._config.keyframes)
 
-    def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
+    def insert_keyframe(self, track: Track, pose_is_given: bool = False) -> KeyframeReport | Failure:
         """Make the frame a keyframe: pose it by the graph, extend the map from there, solve again.
+
+        `pose_is_given`: its pose and covariance come from elsewhere, and count beside the landmarks that it sees.
 
         What a pose places, it places to its own liking: new landmarks of a wrong one confirm it, and outvote the old
         ones in the next frames. The graph therefore poses the keyframe by its matches before any is made. Where it
         refuses most of the matches, the frame's pose is wrong: the map is left without it.
         """
-        track = self._refound(track)
+        if pose_is_given:
+            self.graph.hold(track.view.index, se3.inverse(track.T_cam_submap), track.covariance)
+        track = self._refound(track, pose_is_given)
         self._mapper.observe(track)
         matched = self._rows_of(track.view.index)
         rebuild = self._rebuild_due(track)
@@ -135,7 +150,7 @@ class VisualFrontEnd:
             self._withdraw(track.view.index)
             detail = f"the map contradicts {n_refused} of {len(matched)} matches of keyframe {track.view.index}"
             return Failure(FailureReason.CHI_SQUARE, detail, {"n_refused": float(n_refused)})
-        mapping = self._mapper.grow(track)
+        mapping = self._mapper.grow(track, self._apart)
         grown = self._solve(rebuild)
         self._meet(track.view.index)
         culled = self._cull_keyframe()
@@ -144,17 +159,23 @@ class VisualFrontEnd:
 
     def _note_gap(self, track: Track | Failure) -> None:
         """Keyframes beyond frames that found no pose, or one by wide matching alone, are to be tied to those before."""
-        refinder, after_gap, self._after_gap = self._refinder, self._after_gap, not track
-        if not isinstance(track, Failure) and refinder is not None and (track.wide or after_gap):
-            refinder.begin(track.view.index)
+        if isinstance(track, Failure):
+            self._after_gap = True
+            return
+        if track.wide:
+            bridged = np.count_nonzero(track.landmark_ids >= 0) >= self._config.keyframes.weak_landmarks
+            self._apart = frozenset() if bridged else frozenset(self.submap.keyframes)
+        if self._refinder is not None and (track.wide or self._after_gap):
+            self._refinder.begin(track.view.index)
+        self._after_gap = False
 
-    def _refound(self, track: Track) -> Track:
+    def _refound(self, track: Track, pose_is_given: bool) -> Track:
         """Look for landmarks in the image itself where hardly any tie the new keyframe to those before it."""
         if self._refinder is None:
             return track
         if np.count_nonzero(track.landmark_ids >= 0) < self._config.keyframes.weak_landmarks:
             self._refinder.begin(track.view.index)
-        track = self._refinder.extend(track)
+        track = self._refinder.extend(track, pose_is_given)
         self._refinder.remember(track.view)
         return track
 

@@ -6,8 +6,7 @@ on through a gap sees it at half the distance), the essential matrix between the
 length of the leap, which each track that a second known frame sees tells by itself. Both are then refined with the
 points, the known poses held, and the one that more tracks agree with stays.
 
-What the leap's length is worth is not read from residuals but from the Hessian: the standard deviation of the scale at
-which the frame sees its points, their own uncertainty included. All that is mapped beyond the gap inherits it.
+What the leap's length is worth is told by `leap_uncertainty`.
 """
 
 from __future__ import annotations
@@ -24,10 +23,9 @@ from dualslam.core.interfaces import BundleAdjuster, BundleProblem
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 from frontends.gates import CHI2_2DOF_99, MIN_CONSENSUS
 from frontends.guest_map import TrackViews, triangulate
+from frontends.leap_uncertainty import leap_uncertainty
 from frontends.resection import resect
 from frontends.two_view_hypotheses import propose_relative_poses
-
-HESSIAN_INFLATION = 1.5  # poses of the known frames have errors too, and pixels of neighbours err alike
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,37 +201,10 @@ def _adjust(
     if inliers.sum() < MIN_CONSENSUS:
         return None
     mean = float(chi2[inliers].sum() / (2 * visible[inliers].sum() - 3 * inliers.sum()).clip(1))
-    covariance, scale_sigma = _uncertainty(K, T, xyz[inliers], sigma[inliers], visible[inliers])
+    information = np.zeros((int(inliers.sum()), 3, 3))
+    for v in range(len(T) - 1):
+        _, J_point = projection_jacobians(K, T[v], xyz[inliers])
+        weight = (visible[inliers, v] / sigma[inliers, v] ** 2)[:, None, None]
+        information += J_point.swapaxes(1, 2) @ (weight * J_point)
+    covariance, scale_sigma = leap_uncertainty(K, T[-1], xyz[inliers], sigma[inliers, -1], information)
     return WidePose(T[-1], xyz, inliers, mean, covariance, scale_sigma)
-
-
-def _uncertainty(
-    K: FloatArray, T_cam_submap: FloatArray, xyz: FloatArray, sigma_px: FloatArray, visible: BoolArray
-) -> tuple[FloatArray, float]:
-    """Return the covariance of the last frame's pose, and the standard deviation of its points' mean log depth.
-
-    Pose and points are unknown together: the pose's information is the Schur complement of the points.
-    """
-    n = len(xyz)
-    H_points = np.zeros((n, 3, 3))
-    for v in range(len(T_cam_submap)):
-        J_pose, J_point = projection_jacobians(K, T_cam_submap[v], xyz)
-        weight = (visible[:, v] / sigma_px[:, v] ** 2)[:, None, None]
-        H_points += J_point.swapaxes(1, 2) @ (weight * J_point)
-    weight = (1.0 / sigma_px[:, -1] ** 2)[:, None, None]
-    H_pose = (J_pose.swapaxes(1, 2) @ (weight * J_pose)).sum(axis=0)
-    H_cross = J_pose.swapaxes(1, 2) @ (weight * J_point)
-    inverse = np.linalg.pinv(H_points, hermitian=True)
-    p = xyz @ T_cam_submap[-1, :3, :3].T + T_cam_submap[-1, :3, 3]
-    g_pose = np.column_stack([p[:, 1], -p[:, 0], np.zeros((n, 3)), np.ones(n)]) / p[:, 2:]
-    g_point = T_cam_submap[-1, 2, :3] / p[:, 2:]
-    # A point counts by how well its own depth is known where the poses are.
-    share = 1.0 / np.maximum(np.einsum("ni,nij,nj->n", g_point, inverse, g_point), 1e-12)
-    share /= share.sum()
-    g_pose_mean, g_point = share @ g_pose, share[:, None] * g_point
-    reduced = H_pose - (H_cross @ inverse @ H_cross.swapaxes(1, 2)).sum(axis=0)
-    through = np.einsum("nij,njk,nk->i", H_cross, inverse, g_point)
-    rest = g_pose_mean - through
-    covariance = np.linalg.pinv(reduced, hermitian=True)
-    variance = np.einsum("ni,nij,nj->", g_point, inverse, g_point) + rest @ covariance @ rest
-    return HESSIAN_INFLATION**2 * covariance, HESSIAN_INFLATION * float(np.sqrt(max(variance, 0.0)))

@@ -76,6 +76,10 @@ class TrackingConfig(StrictModel):
     """Covisible keyframes whose landmarks make the local map."""
     wide_keyframes: int = Field(3, ge=1)
     """Recent keyframes that are tried by wide matching and PnP when guided matching fails."""
+    max_leap_scale_sigma: float = Field(0.025, gt=0)
+    """Largest standard deviation (relative) of the scale beyond a gap over which wide matching has leapt, unless the
+    step is small against the depth of the scene: all that is mapped beyond inherits the error, and 5 %, two of these,
+    is a wrong link. Where it is larger the frame counts as lost."""
     max_lost_frames: int = Field(8, ge=0)
     """Frames in a row that wide matching may fail on before the submap is given up."""
 
@@ -195,13 +199,14 @@ class RecoveryConfig(StrictModel):
     """Frames in a row that the walk may leap, because none of its keyframes can be matched in them. A walk that
     links no map, but poses the frames before a start, goes on to the end of the buffer."""
     attempts: tuple[AttemptConfig, ...] = Field(
-        (AttemptConfig(), AttemptConfig(frontend="sift", walk="live"), AttemptConfig(frontend="sift")), min_length=1
+        (AttemptConfig(frontend="sift", walk="live"), AttemptConfig(), AttemptConfig(frontend="sift")), min_length=1
     )
     """In this order, each from the same snapshot of the new map, until one leads to a link. A list of words will do,
     such as `[live, leap, sift]`; an attempt with settings is written `{frontend: sift, n_features: 3000}`."""
-    max_leap_scale_sigma: float = Field(0.025, gt=0)
-    """Largest standard deviation (relative) of the scale beyond a leap, by the Hessian of its wide matches: all that is
-    mapped beyond inherits the error, and 5 %, two of these, is a wrong link."""
+    max_leap_scale_sigma: float = Field(0.05, gt=0)
+    """Largest standard deviation (relative) of the scale beyond a leap, by the Hessian of its wide matches. Twice what
+    a link may have (`linking.max_live_scale_sigma`, by which the walk is judged in the end): the landmarks that are
+    found again beyond the gap halve it, if the leap is right."""
     retry_keyframes: tuple[int, ...] = (5, 15)
     """Keyframes of the new map, from its start on, at which a walk back that has found no link, or left buffered frames
     without a pose, is made again: the map knows depths better then, and more of the scene. It is too when the camera

@@ -9,6 +9,7 @@ from backend.local_ba import bundle_adjust
 from backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.config import GraphConfig
 from dualslam.core.errors import SolverError
+from dualslam.core.geometry import se3
 from tests.backend.scenes import Feeder, make_scene, pose_errors
 
 OPTIMUM_MU, OPTIMUM_RAD = 5e-3, 5e-3
@@ -248,3 +249,32 @@ def test_what_is_not_in_the_graph_has_no_covariance():
     with pytest.raises(SolverError, match="keyframe 3"):
         graph.pose_covariance(3)
     assert np.isnan(graph.point_covariances(np.array([1, 2]))).all()
+
+
+def test_a_pose_known_from_elsewhere_counts_by_its_covariance():
+    """Two Gaussians of the same pose: informations add, and the estimate moves by their ratio."""
+    feeder, graph, rest = start(n=8)
+    grow(feeder, graph, rest)
+    k = rest[-1]
+    alone, P = graph.full_estimate(feeder.submap), graph.pose_covariance(k)
+    T_alone = alone.T_submap_kf[list(alone.keyframe_ids).index(k)]
+    xi = 3.0 * np.sqrt(np.diag(P))  # elsewhere says that it is three standard deviations off
+    held = ISam2SubmapGraph(GraphConfig(rebuild_iterations=30))
+    held.hold(k, T_alone @ se3.exp(xi), P)  # and knows it as well as the landmarks do
+    both = held.rebuild(feeder.submap)
+    moved = se3.log(se3.inverse(T_alone) @ both.T_submap_kf[list(both.keyframe_ids).index(k)])
+    np.testing.assert_allclose(moved, xi / 2, atol=0.15 * np.abs(xi).max())
+    np.testing.assert_allclose(np.diag(held.pose_covariance(k)), np.diag(P) / 2, rtol=0.1)
+
+
+def test_a_pose_from_elsewhere_is_dropped_with_the_gauge_that_it_stands_in():
+    feeder, graph, rest = start(n=8, noise_px=0.0)
+    graph.hold(rest[-1], feeder.scene.T_true[rest[-1]], 1e-8 * np.eye(6))
+    grow(feeder, graph, rest)
+    feeder.submap.transform(2.0, np.eye(4))
+    e = graph.update(feeder.submap)
+    true = feeder.scene.T_true[e.keyframe_ids].copy()
+    true[:, :3, 3] *= 2.0
+    t, r = pose_errors(e.T_submap_kf, true)
+    assert t.max() < 2e-3
+    assert r.max() < 1e-3

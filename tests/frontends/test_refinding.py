@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 
 from dualslam.core.geometry import se3, so3
 from dualslam.core.geometry.projection import project_points
@@ -14,6 +15,7 @@ from dualslam.core.rectification import rectify
 from dualslam.core.submap import NO_LANDMARK, Submap
 from dualslam.core.types import FloatArray, Keyframe, Track, View
 from dualslam.synthetic import SyntheticSequence, make_sequence
+from frontends import refinding
 from frontends.orb import OrbFrontend
 from frontends.refinding import FAR_KEYFRAMES, Refinder
 
@@ -65,10 +67,16 @@ def true_map() -> tuple[Submap, Refinder]:
     return submap, refinder
 
 
-def track_of(view: View, T_cam_submap: FloatArray) -> Track:
-    """Pose a frame without any landmark."""
+def track_of(view: View, T_cam_submap: FloatArray, ahead_m: float = POSE_OFF_M / 2) -> Track:
+    """Pose a frame without any landmark, known so well that `nearly` is two standard deviations off."""
     ids = np.full(len(view.features), NO_LANDMARK, np.int64)
-    return Track(view, T_cam_submap, T_cam_submap, ids, 0, 0, 0, 1.0, True, np.zeros((6, 6)))
+    covariance = np.diag([(POSE_OFF_RAD / 2) ** 2] * 3 + [0.1**2, 0.1**2, ahead_m**2])
+    return Track(view, T_cam_submap, T_cam_submap, ids, 0, 0, 0, 1.0, True, covariance)
+
+
+def depths_of_found(submap: Submap, track: Track) -> FloatArray:
+    """Return how far away the landmarks are that a frame was found to see."""
+    return submap.depths(track.landmark_ids[track.landmark_ids >= 0], track.T_cam_submap)
 
 
 def nearly(T_cam_submap: FloatArray) -> FloatArray:
@@ -81,7 +89,7 @@ def test_landmarks_are_found_beyond_a_gap() -> None:
     view, T_true = view_of(FAR), se3.inverse(street().ground_truth_T_world_cam[FAR])
     refinder.begin(FAR)
     before = track_of(view, nearly(T_true))
-    track = refinder.extend(before)
+    track = refinder.extend(before, pose_is_given=True)
     found = np.flatnonzero(track.landmark_ids >= 0)
     assert len(found) > MANY
     uv, _ = project_points(submap.K, T_true, submap.landmarks["xyz_mu"][track.landmark_ids[found]])
@@ -100,7 +108,7 @@ def test_a_wrong_pose_finds_nothing_to_hold_on_to() -> None:
     T_true = se3.inverse(street().ground_truth_T_world_cam[FAR])
     refinder.begin(FAR)
     wrong = track_of(view_of(FAR), se3.exp(np.array([0, 0.2, 0, 0, 0, 0])) @ T_true)
-    track = refinder.extend(wrong)
+    track = refinder.extend(wrong, pose_is_given=True)
     assert np.count_nonzero(track.landmark_ids >= 0) < 10
 
 
@@ -111,8 +119,33 @@ def test_landmarks_whose_depth_is_hardly_known_are_not_looked_for() -> None:
     T_rim, T_next = (submap.T_submap_kf[k] for k in (RIM, AHEAD[0]))
     T_next[:3, 3] = T_rim[:3, 3] + 0.1 * (T_next[:3, 3] - T_rim[:3, 3])  # so near that nothing has parallax
     refinder.begin(FAR)
-    track = refinder.extend(track_of(view_of(FAR), se3.inverse(street().ground_truth_T_world_cam[FAR])))
+    track = track_of(view_of(FAR), se3.inverse(street().ground_truth_T_world_cam[FAR]))
+    track = refinder.extend(track, pose_is_given=True)
     assert np.count_nonzero(track.landmark_ids >= 0) < MANY / 10
+
+
+def test_what_is_near_waits_until_the_pose_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A metre off along the road moves what is 10 m away by more than is searched, and what is 50 m away by less.
+    track = track_of(view_of(FAR), se3.inverse(street().ground_truth_T_world_cam[FAR]), ahead_m=1.0)
+    nearest = []
+    for rounds in (1, refinding.ROUNDS):
+        monkeypatch.setattr(refinding, "ROUNDS", rounds)
+        submap, refinder = true_map()
+        refinder.begin(FAR)
+        depths = depths_of_found(submap, refinder.extend(track, pose_is_given=True))
+        nearest.append(np.percentile(depths, 10))
+        assert len(depths) > MANY / 4
+    assert nearest[1] < 0.8 * nearest[0]
+
+
+def test_a_tracked_frame_is_searched_for_all_that_it_may_show() -> None:
+    track = track_of(view_of(FAR), se3.inverse(street().ground_truth_T_world_cam[FAR]), ahead_m=1.0)
+    found = []
+    for is_leap in (True, False):
+        submap, refinder = true_map()
+        refinder.begin(FAR)
+        found.append(len(depths_of_found(submap, refinder.extend(track, pose_is_given=is_leap))))
+    assert found[1] >= found[0] > MANY / 4
 
 
 def test_a_few_keyframes_beyond_a_gap_are_searched_and_no_others() -> None:
@@ -121,7 +154,7 @@ def test_a_few_keyframes_beyond_a_gap_are_searched_and_no_others() -> None:
     assert refinder.extend(track) is track
     refinder.begin(FAR)
     for _ in range(FAR_KEYFRAMES):
-        assert len(refinder.extend(track).view.features) > len(track.view.features)
+        assert len(refinder.extend(track, pose_is_given=True).view.features) > len(track.view.features)
     assert refinder.extend(track) is track
 
 

@@ -104,6 +104,35 @@ class TestTracker:
         assert np.linalg.norm(error[:3]) < ROTATION_RAD
         assert not tracked(live, far.view(24)).wide
 
+    def test_frames_that_are_missing_are_a_gap_also_where_guided_matching_finds_its_way(
+        self, world: PointWorld
+    ) -> None:
+        live = front_end(world, [0, 4, 8, 12, 16], start_at=8)
+        assert not any(tracked(live, world.view(i)).wide for i in (9, 10, 11, 14))
+        assert not live.lies_beyond_gap(world.view(22))  # its motion was measured over three intervals
+        assert not tracked(live, world.view(15)).wide
+        assert live.lies_beyond_gap(world.view(19))
+        track = tracked(live, world.view(19))
+        assert track.wide
+        assert np.linalg.norm(se3.log(track.T_cam_submap @ world.T_world_cam[19])[3:]) < POSITION_M
+
+    @pytest.mark.parametrize(("keyframes", "holds"), [([0, 1], False), ([0, 4, 8, 12], True)])
+    def test_a_leap_that_loses_the_scale_is_refused(self, keyframes: list[int], holds: bool) -> None:
+        """Two keyframes side by side hardly know depths; the same leap from a wide map holds the scale."""
+        drive = PointWorld(cloud(1200, seed=1) * (1.5, 1.0, 2.5), path(60, np.array([0.05, 0, 0.2]), np.zeros(3)))
+        live = front_end(drive, keyframes, start_at=keyframes[-1], every=8)
+        last = keyframes[-1] + 1
+        before = tracked(live, drive.view(last))
+        far = live.track(drive.view(last + 12))
+        if holds:
+            assert isinstance(far, Track)
+            assert far.wide
+            return
+        assert isinstance(far, Failure)
+        assert far.reason is FailureReason.SCALE
+        again = tracked(live, drive.view(last))  # it stands where it stood
+        np.testing.assert_allclose(again.T_cam_submap, before.T_cam_submap, atol=1e-3)
+
     def test_it_follows_a_map_that_has_moved(self, world: PointWorld) -> None:
         """Another unit and another frame, between two keyframes: the motion model goes on as if nothing were."""
         live, untouched = (front_end(world, [0, 4, 8, 12, 16], start_at=8) for _ in range(2))
@@ -183,6 +212,26 @@ class TestMapping:
         (n_right, error_right), (n_off, error_off) = found
         assert n_off > 0.95 * n_right
         assert error_off < 1.2 * error_right
+
+    def test_nothing_is_triangulated_across_a_gap_that_few_landmarks_bridge(self) -> None:
+        world = PointWorld(cloud(), path(60, np.array([0.02, 0, 0]), np.array([0, 0.02, 0])))
+        before = [0, 3, 6, 9]
+        live = front_end(world, before, start_at=9, every=12)
+        tracked(live, world.view(9))
+        n_before = len(live.submap.landmarks)
+        leapt = tracked(live, world.view(24))
+        assert leapt.wide
+        assert np.count_nonzero(leapt.landmark_ids >= 0) < Config().keyframes.weak_landmarks
+        live.insert_keyframe(leapt)
+        assert len(live.submap.landmarks) == n_before  # it stands alone on its side
+        for i in (27, 30, 33):
+            live.insert_keyframe(tracked(live, world.view(i)))
+        new = np.flatnonzero(live.submap.landmarks["alive"][n_before:]) + n_before
+        assert len(new) > 30
+        # Placed by this side alone; then they may be found on the other one, too.
+        obs = live.submap.observations
+        here = obs["alive"] & np.isin(obs["kf"], [24, 27, 30, 33])
+        assert (np.bincount(obs["landmark"][here], minlength=len(live.submap.landmarks))[new] >= 2).all()
 
     def test_keyframe_poses_and_the_frames_between_stay_right(self, world: PointWorld) -> None:
         live = front_end(world, [0, 4, 8], start_at=8)
