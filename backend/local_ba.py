@@ -18,8 +18,8 @@ from backend.factors import insert_projections, pose_prior
 from backend.membership import compute_depth_sigmas, compute_residuals
 from backend.noise import PixelNoise
 from backend.solver import SolverFailure, optimise_batch
+from dualslam.core.bundle import BundleProblem, BundleResult
 from dualslam.core.errors import SolverError
-from dualslam.core.interfaces import BundleProblem, BundleResult
 from dualslam.core.submap import Submap
 from dualslam.core.types import FloatArray, IntArray
 

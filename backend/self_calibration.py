@@ -31,11 +31,12 @@ from backend.membership import MIN_DEPTH_MU, compute_depth_sigmas, compute_resid
 from backend.noise import PixelNoise
 from backend.silence import silenced
 from backend.solver import GTSAM_ERRORS, SolverFailure
+from dualslam.core.bundle import BundleProblem
 from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import Camera
 from dualslam.core.corrected_camera import LensCorrection, correction_of, given_camera
 from dualslam.core.geometry import so3
-from dualslam.core.interfaces import BundleProblem, CalibrationEstimate
+from dualslam.core.interfaces import CalibrationEstimate
 from dualslam.core.submap import Submap
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.core.bundle import BundleAdjuster, BundleProblem
 from dualslam.core.config import InitialiserConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians, refine_pose
 from dualslam.core.geometry.triangulation import triangulate_two_view
-from dualslam.core.interfaces import BundleAdjuster, BundleProblem, Frontend
+from dualslam.core.interfaces import Frontend
 from dualslam.core.types import (
     BoolArray,
     Failure,

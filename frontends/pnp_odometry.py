@@ -20,12 +20,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.config import Config
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
-from dualslam.core.interfaces import BundleAdjuster, Frontend, KeyframeReport, SubmapGraph
+from dualslam.core.interfaces import Frontend, KeyframeReport, SubmapGraph
 from dualslam.core.submap import Submap
 from dualslam.core.support import find_lack_of_support
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray, Matches, Track, View

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.core.bundle import BundleAdjuster, BundleProblem
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians
 from dualslam.core.geometry.triangulation import triangulate_n_view, triangulate_two_view
-from dualslam.core.interfaces import BundleAdjuster, BundleProblem
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 from frontends.gates import CHI2_2DOF_99, MIN_CONSENSUS
 from frontends.guest_map import TrackViews, triangulate

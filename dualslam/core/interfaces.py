@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.types import BoolArray, Failure, Features, FloatArray, Frame, IntArray, Matches, Start, Track, View
+from dualslam.core.types import Failure, Features, FloatArray, Frame, IntArray, Matches, Start, Track, View
 
 if TYPE_CHECKING:
     from dualslam.core.camera import Camera
@@ -155,70 +155,6 @@ class SubmapGraph(Protocol):
 
     def point_covariances(self, landmark_ids: IntArray) -> FloatArray:
         """(L, 3, 3) marginal covariances of landmarks, in the submap's frame."""
-        ...
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BundleProblem:
-    """Poses, points and what was seen.
-
-    Attributes
-    ----------
-    K : (3, 3)
-    T_submap_kf : (F, 4, 4)
-    fixed : (F,) bool
-        Poses that stay. One fixes the pose of the whole, two its scale too.
-    xyz_mu : (P, 3)
-    kf, point : (R,) int64
-        Rows of `T_submap_kf` and `xyz_mu` of each observation.
-    uv_px : (R, 2)
-    sigma_px : (R,)
-    """
-
-    K: FloatArray
-    T_submap_kf: FloatArray
-    fixed: BoolArray
-    xyz_mu: FloatArray
-    kf: IntArray
-    point: IntArray
-    uv_px: FloatArray
-    sigma_px: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BundleResult:
-    """What came of a `BundleProblem`.
-
-    Attributes
-    ----------
-    T_submap_kf : (F, 4, 4)
-    xyz_mu : (P, 3)
-    adjusted : (P,) bool
-        False for points left as they were: fewer than two views in front of a camera, or views along one line.
-    chi2 : (R,) float64
-        Squared whitened residual of each observation; infinite where its point is behind the camera.
-    cost_before, cost_after : float
-        Sum of the Huber losses.
-    iterations : int
-    converged : bool
-        Whether it stopped before its iterations were used up.
-    """
-
-    T_submap_kf: FloatArray
-    xyz_mu: FloatArray
-    adjusted: BoolArray
-    chi2: FloatArray
-    cost_before: float
-    cost_after: float
-    iterations: int
-    converged: bool
-
-
-class BundleAdjuster(Protocol):
-    """Batch bundle adjustment, robust. Raises `SolverError` where the solver fails."""
-
-    def __call__(self, problem: BundleProblem) -> BundleResult:
-        """Adjust all poses that are not fixed, and all points."""
         ...
 
 

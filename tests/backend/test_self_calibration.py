@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from backend.self_calibration import choose_window, estimate_calibration, estimate_correction, make_problem
+from dualslam.core.bundle import BundleProblem
 from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import PinholeCamera
 from dualslam.core.corrected_camera import LensCorrection, correct
 from dualslam.core.geometry import so3
-from dualslam.core.interfaces import BundleProblem
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe
 from tests.backend.scenes import make_features
