@@ -13,6 +13,7 @@ from dualslam.core.config import AttemptConfig, Config, RecoveryConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import sim3
+from dualslam.evaluation.link_audit import LinkAudit, audit_links
 from dualslam.executor import InlineExecutor, Outcome
 from dualslam.recovery import RecoveryJob
 from dualslam.results import trajectories_of
@@ -189,3 +190,21 @@ def test_a_black_out_on_the_road_is_leapt(attempt: str) -> None:
     length = np.linalg.norm(np.diff(truth[6:, :3, 3], axis=0), axis=1).sum()
     assert translation.max() < 0.03 * length
     assert rotation.max() < np.radians(1.0)  # a third of what makes a link wrong
+
+
+@pytest.mark.slow
+def test_missing_frames_lead_to_no_wrong_link() -> None:
+    """Ten metres of road without a frame: guided matching goes over them to a place 5.6 m off, and does not notice."""
+    world = make_sequence("street", 90, 8, 320, 240, events=[Spoil(SpoilKind.DROP, 53, 10)])
+    config = Config.model_validate({"seed": 8, "frontend": {"n_features": 600}})
+    system = build_system(config, world.camera)
+    for frame in world:
+        system.step(frame)
+    system.finish()
+    assert system.events.of_kind(EventKind.FAILED)
+    truth = dict(enumerate(world.ground_truth_T_world_cam))
+    links = audit_links(system.atlas, system.poses.values(), truth)
+    assert all(isinstance(link, LinkAudit) and not link.wrong for link in links)
+    leapt = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)[-1]
+    assert (leapt.data["verdict"] == "linked") == bool(links)
+    assert leapt.data["leaps"] == bool(links)  # over the gap no walk goes but by a leap
