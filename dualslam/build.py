@@ -17,7 +17,7 @@ from dualslam.core.camera import Camera
 from dualslam.core.config import AttemptConfig, Config, FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.grey_image import GreyImage
-from dualslam.core.interfaces import Frontend, SelfCalibrator, SubmapGraph, VisualOdometry
+from dualslam.core.interfaces import Frontend, SelfCalibrator, SubmapGraph
 from dualslam.core.rectification import rectify
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Features, Frame, View
@@ -169,6 +169,7 @@ def recovery_parts(
     matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
     return RecoveryParts(
         attempts=_attempts(config, frontend, live, size_px),
+        posing=Attempt("live", live),
         new_graph=lambda: ISam2SubmapGraph(config.graph),
         link=lambda old, new, onset: estimate_link(
             old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
@@ -213,13 +214,10 @@ def _live_attempt(
     live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
     size_px: tuple[int, int],
 ) -> Attempt:
-    """Build the attempt of the live features alone, which on the way to a lost map leap by the same rules as others."""
+    """Build the attempt of the live features alone, which leap by the same rules as others."""
 
-    def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> VisualOdometry:
-        walker = live(job, submap, graph)
-        if not job.lost:
-            return walker
-        own = attrgetter("features")
+    def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> PnpOdometry:
+        walker, own = live(job, submap, graph), attrgetter("features")
         return PnpOdometry(walker, frontend, own, job.own, bundle_adjust_arrays, config, size_px, walks_live=True)
 
     return Attempt(attempt.name, new_odometry)

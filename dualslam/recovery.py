@@ -127,10 +127,12 @@ class Attempt:
 class RecoveryParts:
     """What a recovery is made of; put together by the composition root of the process in which it runs.
 
+    `posing`: the way back where there is no lost map, but frames without a pose.
     `budget_s`: wall time after which it comes to an end with what it has, where it does not run inline.
     """
 
     attempts: tuple[Attempt, ...]
+    posing: Attempt
     new_graph: Callable[[], SubmapGraph]
     link: Linker
     carry: Callable[[LinkEstimate, Submap, int], LinkEstimate | Failure]
@@ -144,14 +146,14 @@ class RecoveryParts:
 def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Failure:
     """Walk back from the job's submap until a link to a lost one passes its gates, or nothing is left to walk on.
 
-    The job is left as it was. Where there is no map to link with, the first attempt poses the frames before the start.
+    The job is left as it was. Where there is no map to link with, the live features pose the frames before the start.
     """
     started, cpu_started = time.perf_counter(), time.thread_time()
     best: _Walk | None = None
     problem = Failure(FailureReason.SOLVER)
     events: list[Event] = []
     until = np.inf if parts.budget_s is None else started + parts.budget_s
-    for attempt in parts.attempts if job.lost else parts.attempts[:1]:
+    for attempt in parts.attempts if job.lost else (parts.posing,):
         if best is not None and time.perf_counter() > until:
             break
         walk = _walk(job, parts, attempt, until)

@@ -97,6 +97,17 @@ class TestOrder:
         assert events[0].data["unusable_at_end"] == 4
 
 
+def test_frames_before_a_start_are_posed_by_live_features_whatever_the_attempts() -> None:
+    world = PointWorld(cloud(), hand_held(30))  # without images, so that no other front end sees anything
+    system = system_in(world, recovery={"attempts": ["sift"]})
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    (start,) = system.events.of_kind(EventKind.INITIALISED)
+    assert start.data["first_view"] + 1 < start.frame  # there are some
+    assert sorted(system.poses) == list(range(30))
+
+
 class OutOfTimeAtFirst:
     """Gives the first jobs that have a lost map to look for no time at all."""
 
