@@ -208,6 +208,10 @@ class _Walk:
         self.n_leaped += self.n_unusable
         self.n_unusable = 0
 
+    def note_confirmed(self, frame: WalkedFrame) -> None:
+        self.frames.setdefault(frame.pose.index, frame)
+        self.n_leaped -= 1
+
 
 def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float) -> _Walk | Failure:
     """Make one attempt, from a copy of the job's submap; it stops at the time `until`."""
@@ -234,6 +238,8 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float
             walk.note_unusable(step.track)
             continue
         walk.note_posed(_walked(walker, step.view, step.track), step.report is not None)
+        if (earlier := walker.confirmed()) is not None:
+            walk.note_confirmed(_walked(walker, earlier.view, earlier))
         if step.view.index not in submap.keyframes:
             continue
         for tried in relinker.attempts(step.view.index):

@@ -27,7 +27,7 @@ from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend, KeyframeReport, SubmapGraph
-from dualslam.core.submap import Submap
+from dualslam.core.submap import NO_LANDMARK, Submap
 from dualslam.core.support import find_lack_of_support
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray, Matches, Track, View
 from frontends.gates import CHI2_1DOF_95, CHI2_2DOF_99, MIN_CONSENSUS
@@ -54,9 +54,20 @@ KITTI 03); under a wrong pose half of it or more may do so by chance."""
 class _Beyond:
     """A frame beyond a gap, and which of its features the tracks that agree with its pose are."""
 
-    index: int
+    view: View
     rows: IntArray
     pose: WidePose
+
+    @property
+    def index(self) -> int:
+        return self.view.index
+
+    def track(self, T_cam_submap: FloatArray) -> Track:
+        """Return the frame with a pose that it was given in the end, and no landmarks."""
+        wide, ids = self.pose, np.full(len(self.view.features), NO_LANDMARK, np.int64)
+        n, n_inliers = len(wide.inliers), int(wide.inliers.sum())
+        numbers = (n, n, n_inliers, wide.chi2)
+        return Track(self.view, T_cam_submap, T_cam_submap, ids, *numbers, wide=True, covariance=wide.covariance)
 
 
 class PnpOdometry:
@@ -100,6 +111,7 @@ class PnpOdometry:
         self._pending: dict[int, View] = {}  # posed, but without features of the guest as yet
         self._following = False  # whether the last frame that was given has a pose
         self._leapt: int | None = None  # the last frame that a leap has posed
+        self._confirmed: tuple[_Beyond, FloatArray] | None = None  # with its pose from the last leap's frame
         self._beyond: _Beyond | None = None  # the last frame beyond a gap, until another confirms it
 
     # --- the VisualOdometry protocol, as far as the live front end does it
@@ -117,6 +129,13 @@ class PnpOdometry:
     def keep(self, keyframe_ids: Set[int]) -> None:
         """Never cull these keyframes."""
         self._live.keep(keyframe_ids)
+
+    def confirmed(self) -> Track | None:
+        """Return the first frame beyond a gap, when the one just given has confirmed it: where that one stands now."""
+        if self._confirmed is None or self._leapt is None:
+            return None
+        first, T_first_leapt = self._confirmed
+        return first.track(T_first_leapt @ self._map.T_cam_submap(self._leapt))
 
     def relative_pose(self, track: Track) -> FloatArray:
         """Return ``T_kf_cam``: the track's pose relative to the reference keyframe."""
@@ -148,6 +167,7 @@ class PnpOdometry:
 
     def track(self, view: View) -> Track | Failure:
         """Pose a frame."""
+        self._confirmed = None
         if view.index in self.submap.keyframes:
             return self._meet(view)
         if self._live.lies_beyond_gap(view):
@@ -271,7 +291,7 @@ class PnpOdometry:
             if step is None:
                 self._map.drop(index)
             return wide if step is None else step
-        self._beyond = _Beyond(index, rows[wide.inliers], wide)
+        self._beyond = _Beyond(view, rows[wide.inliers], wide)
         if before is None:
             return Failure(FailureReason.UNCONFIRMED, "the first frame beyond a gap", wide.numbers)
         share = self._confirmed_share(before, self._beyond)
@@ -280,6 +300,7 @@ class PnpOdometry:
             return Failure(FailureReason.UNCONFIRMED, f"{share:.0%} of two frames confirm the leap", wide.numbers)
         self._map.put(before.index, self.reference_id, before.pose.T_cam_submap)
         self._leapt = index
+        self._confirmed = before, before.pose.T_cam_submap @ se3.inverse(wide.T_cam_submap)
         n_inliers = int(wide.inliers.sum())
         return GivenPose(wide.T_cam_submap, len(rows), n_inliers, wide.chi2, wide.covariance, wide=True)
 

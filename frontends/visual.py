@@ -116,6 +116,10 @@ class VisualFrontEnd:
         self._tracker.take(track)
         self._note_gap(track)
 
+    def confirmed(self) -> Track | None:
+        """Return None: a frame has its pose at once, or none."""
+        return None
+
     def relative_pose(self, track: Track) -> FloatArray:
         """Return ``T_kf_cam``, the track's pose relative to the reference keyframe.
 

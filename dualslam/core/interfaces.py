@@ -330,6 +330,10 @@ class VisualOdometry(Protocol):
         """Return ``T_kf_cam``: the track's pose relative to the reference keyframe; its own is the identity."""
         ...
 
+    def confirmed(self) -> Track | None:
+        """Return the earlier frame, given without a pose, that the last one has confirmed the pose of."""
+        ...
+
     def keyframe_due(self, track: Track) -> bool:
         """Whether the frame should become a keyframe."""
         ...

@@ -144,6 +144,21 @@ class TestLeap:
         error = errors(before | beyond, live)
         assert np.linalg.norm(error[:, 3:], axis=1).max() < POSITION_M * 2
 
+    def test_the_first_frame_beyond_has_its_pose_once_it_is_confirmed(self) -> None:
+        live, guest = worlds(self.covered)
+        walker = odometry(live, guest)
+        walk(walker, live, range(39, 20, -1))
+        assert walker.confirmed() is None
+        walk(walker, live, range(20, 19, -1))
+        first = walker.confirmed()
+        assert first is not None
+        assert first.view.index == 21
+        error = errors({21: first}, live)[0]
+        assert np.linalg.norm(error[3:]) < POSITION_M * 2
+        assert np.linalg.norm(error[:3]) < ROTATION_RAD
+        walk(walker, live, range(19, 18, -1))
+        assert walker.confirmed() is None
+
     @pytest.mark.parametrize("walks_live", [False, True])
     def test_frames_that_are_missing_are_leapt_as_those_that_show_nothing(self, walks_live: bool) -> None:
         live, guest = worlds()
