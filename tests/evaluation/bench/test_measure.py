@@ -192,7 +192,7 @@ def test_where_truth_is_there_in_parts_the_path_is_the_estimates() -> None:
 
 def test_a_recovery_of_the_real_system_is_read_from_its_events() -> None:
     world = PointWorld(cloud(), hand_held(70), covered=frozenset(range(35, 50)))
-    system = system_in(world, recovery={"enabled": True})
+    system = system_in(world, recovery={"enabled": True, "attempts": ["live"]})
     for frame in world.frames():
         system.step(frame)
     system.finish()
