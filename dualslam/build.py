@@ -32,7 +32,7 @@ from frontends.image_features import ImageFeatures
 from frontends.images import to_grey
 from frontends.initialiser import Initialiser
 from frontends.motion_statistics import nearest_search
-from frontends.pnp_odometry import PnpOdometry
+from frontends.pnp_odometry import Extract, PnpOdometry
 from frontends.refinding import Refinder
 from frontends.registry import check_frontend
 from frontends.registry import create_frontend as create_frontend  # part of the Python interface
@@ -196,54 +196,46 @@ def _attempts(
     attempts = []
     for number, attempt in enumerate(config.recovery.attempts):
         if attempt.is_live:
-            attempts.append(_live_attempt(frontend, attempt, config, live, size_px))
+            attempts.append(_attempt_by(frontend, lambda job: attrgetter("features"), attempt, config, live, size_px))
             continue
         wanted = _guest(attempt)
         key = wanted.model_dump_json()
         if key not in guests:
             with _naming_attempt(number):
                 guests[key] = ImageFeatures(create_frontend(wanted))
-        attempts.append(_attempt_with(guests[key], attempt, config, live, size_px))
+        features_for = partial(_features_in_images, guests[key], config.camera.model_sigma_px)
+        attempts.append(_attempt_by(guests[key].frontend, features_for, attempt, config, live, size_px))
     return tuple(attempts)
 
 
-def _live_attempt(
-    frontend: Frontend,
+def _attempt_by(
+    guest: Frontend,
+    features_for: Callable[[RecoveryJob], Extract],
     attempt: AttemptConfig,
     config: Config,
     live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
     size_px: tuple[int, int],
 ) -> Attempt:
-    """Build the attempt of the live features alone, which leap by the same rules as others."""
+    """Build an attempt in which a front end, which may be the live one itself, gives the live one its poses."""
+    walks_live = attempt.is_live or attempt.walk == "live"
 
     def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> PnpOdometry:
-        walker, own = live(job, submap, graph), attrgetter("features")
-        return PnpOdometry(walker, frontend, own, job.own, bundle_adjust_arrays, config, size_px, walks_live=True)
+        walker, features = live(job, submap, graph), features_for(job)
+        return PnpOdometry(walker, guest, features, job.own, bundle_adjust_arrays, config, size_px, walks_live)
 
     return Attempt(attempt.name, new_odometry)
 
 
-def _attempt_with(
-    guest: ImageFeatures,
-    attempt: AttemptConfig,
-    config: Config,
-    live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
-    size_px: tuple[int, int],
-) -> Attempt:
-    """Build an attempt in which another front end gives the live one its poses."""
+def _features_in_images(guest: ImageFeatures, model_sigma_px: float, job: RecoveryJob) -> Extract:
+    """Return what finds a front end's rectified features in the buffered images."""
 
-    def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> PnpOdometry:
-        def extract(view: View) -> Features | Failure:
-            if view.image is None:
-                return Failure(FailureReason.UNREADABLE, "its image is no longer buffered")
-            features = rectify(guest.of(view.image), job.camera, config.camera.model_sigma_px)
-            return features if view.turn_rad is None else straighten(features, job.camera, view.turn_rad)
+    def extract(view: View) -> Features | Failure:
+        if view.image is None:
+            return Failure(FailureReason.UNREADABLE, "its image is no longer buffered")
+        features = rectify(guest.of(view.image), job.camera, model_sigma_px)
+        return features if view.turn_rad is None else straighten(features, job.camera, view.turn_rad)
 
-        walker = live(job, submap, graph)
-        walks_live = attempt.walk == "live"
-        return PnpOdometry(walker, guest.frontend, extract, job.own, bundle_adjust_arrays, config, size_px, walks_live)
-
-    return Attempt(attempt.name, new_odometry)
+    return extract
 
 
 def _guest(attempt: AttemptConfig) -> FrontendConfig:
