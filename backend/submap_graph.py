@@ -106,6 +106,8 @@ class ISam2SubmapGraph:
             return self._remake(submap, start, rebuilt=True)
         try:
             plan = self._ledger.plan(submap, submap.T_submap_kf, submap.landmarks["xyz_mu"], suspects=self._suspects)
+            for k in plan.gone_keyframes.tolist():
+                self._given.pop(k, None)
             changes = self._changes(submap, plan, submap.T_submap_kf, submap.landmarks["xyz_mu"])
             self._solve(self._solver, submap, plan, changes)
             self._n_updates += 1
@@ -122,7 +124,7 @@ class ISam2SubmapGraph:
         Parameters
         ----------
         keyframe_id : int
-            It may be added to the submap later.
+            It may be added to the submap later. When it has left it again, nothing is known of it any more.
         T_submap_kf : (4, 4)
         covariance : (6, 6)
             Of xi in ``T_submap_kf @ exp(xi)``: rotation, translation; positive definite.

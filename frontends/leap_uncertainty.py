@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians
-from dualslam.core.geometry.triangulation import point_covariance
+from dualslam.core.landmark_views import landmark_covariances
 from dualslam.core.submap import Submap
 from dualslam.core.types import FloatArray, IntArray
 
@@ -58,26 +57,6 @@ def leap_uncertainty(
     covariance = np.linalg.pinv(reduced, hermitian=True)
     variance = np.einsum("ni,nij,nj->", g_point, inverse, g_point) + rest @ covariance @ rest
     return HESSIAN_INFLATION**2 * covariance, HESSIAN_INFLATION * float(np.sqrt(max(variance, 0.0)))
-
-
-def landmark_covariances(submap: Submap, landmark_ids: IntArray) -> FloatArray:
-    """Return the covariances (N, 3, 3) of landmarks given the poses of their keyframes; NaN where these fix them not.
-
-    Parameters
-    ----------
-    submap : Submap
-    landmark_ids : (N,) int64
-        Each once.
-    """
-    rows = submap.rows_of_landmarks(landmark_ids)
-    if len(rows) == 0:
-        return np.full((len(landmark_ids), 3, 3), np.nan)
-    _, sigma = submap.observed_pixels(rows)
-    kf, view = np.unique(submap.observations["kf"][rows], return_inverse=True)
-    order = np.argsort(landmark_ids, kind="stable")
-    point = order[np.searchsorted(landmark_ids[order], submap.observations["landmark"][rows])]
-    T_kf_submap = se3.inverse(submap.keyframe_poses(kf))[view]
-    return point_covariance(submap.landmarks["xyz_mu"][landmark_ids], submap.K, point, T_kf_submap, sigma)
 
 
 def pose_uncertainty(

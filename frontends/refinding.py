@@ -25,10 +25,11 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians, refine_pose
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend
+from dualslam.core.landmark_views import landmark_covariances
 from dualslam.core.rectification import rectified_sigma
 from dualslam.core.submap import Submap
 from dualslam.core.types import BoolArray, Failure, Features, FloatArray, IntArray, Track, View
-from frontends.leap_uncertainty import landmark_covariances, pose_uncertainty
+from frontends.leap_uncertainty import pose_uncertainty
 from frontends.patches import HALF_PX, Pyramid, build_pyramid, match_patches
 
 RIM_KEYFRAMES = 6

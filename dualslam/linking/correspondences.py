@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.columns import concatenate
-from dualslam.core.geometry import se3
-from dualslam.core.geometry.triangulation import point_covariance, triangulate_n_view
+from dualslam.core.landmark_views import landmark_covariances, triangulate_landmarks
 from dualslam.core.submap import Submap
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray
 
@@ -158,7 +157,7 @@ def match_landmarks(old: Submap, new: Submap, matcher: DescriptorMatcher | None)
     """Find which landmarks are one, as `propose_correspondences` says, wherever their points are."""
     votes = _concatenate([_votes_of_keyframe(old, new, k, matcher) for k in shared_keyframes(old, new)])
     (landmark_old, landmark_new), pair_of_vote = _one_to_one(votes, len(new.landmarks))
-    covariance_new = _covariances(new, landmark_new, new.landmarks["xyz_mu"][landmark_new], None)
+    covariance_new = landmark_covariances(new, landmark_new)
     return MatchedLandmarks(votes, landmark_old, landmark_new, pair_of_vote, covariance_new)
 
 
@@ -168,8 +167,8 @@ def place_pairs(old: Submap, new: Submap, matched: MatchedLandmarks, old_before:
     pair_of_vote, covariance_new = matched.pair_of_vote, matched.covariance_new
     xyz_old, xyz_new = old.landmarks["xyz_mu"][landmark_old], new.landmarks["xyz_mu"][landmark_new]
     if old_before is not None:
-        xyz_old = _place_anew(old, landmark_old, old_before)
-    covariance_old = _covariances(old, landmark_old, xyz_old, old_before)
+        xyz_old = triangulate_landmarks(old, landmark_old, old_before)
+    covariance_old = landmark_covariances(old, landmark_old, xyz_old, old_before)
     finite = np.isfinite(np.stack([covariance_old, covariance_new])).all((0, 2, 3))
     fixed = np.asarray(finite, np.bool_)
     row = np.where(fixed, np.cumsum(fixed) - 1, -1)
@@ -203,43 +202,6 @@ def place_pairs(old: Submap, new: Submap, matched: MatchedLandmarks, old_before:
         sigma_old=sigma_old,
         sigma_new=sigma_new,
     )
-
-
-def _views_of(submap: Submap, landmark_ids: IntArray, before: int | None) -> tuple[IntArray, IntArray]:
-    """Return the live observation rows of landmarks in the keyframes before one, and each row's place in the ids."""
-    rows = submap.rows_of_landmarks(landmark_ids)
-    if before is not None:
-        rows = rows[submap.observations["kf"][rows] < before]
-    position = np.full(len(submap.landmarks), -1)
-    position[landmark_ids] = np.arange(len(landmark_ids))
-    return rows, position[submap.observations["landmark"][rows]]
-
-
-def _covariances(submap: Submap, landmark_ids: IntArray, xyz: FloatArray, before: int | None) -> FloatArray:
-    """Return (L, 3, 3) covariances of points given the poses of the keyframes that see them; NaN where not fixed."""
-    rows, point = _views_of(submap, landmark_ids, before)
-    if len(rows) == 0:
-        return np.full((len(landmark_ids), 3, 3), np.nan)
-    _, sigma = submap.observed_pixels(rows)
-    ids, inverse = np.unique(submap.observations["kf"][rows], return_inverse=True)
-    T_kf_submap = se3.inverse(submap.keyframe_poses(ids))[inverse]
-    return point_covariance(xyz, submap.K, point, T_kf_submap, sigma)
-
-
-def _place_anew(submap: Submap, landmark_ids: IntArray, before: int) -> FloatArray:
-    """Return the landmarks' points (L, 3) as the keyframes before one alone triangulate them; else NaN."""
-    rows, point = _views_of(submap, landmark_ids, before)
-    if len(rows) == 0:
-        return np.full((len(landmark_ids), 3), np.nan)
-    pixels, _ = submap.observed_pixels(rows)
-    ids, column = np.unique(submap.observations["kf"][rows], return_inverse=True)
-    uv, visible = np.zeros((len(landmark_ids), len(ids), 2)), np.zeros((len(landmark_ids), len(ids)), bool)
-    uv[point, column], visible[point, column] = pixels, True
-    xyz = np.full((len(landmark_ids), 3), np.nan)
-    enough = visible.sum(1) >= 2
-    T_kf_submap = se3.inverse(submap.keyframe_poses(ids))
-    xyz[enough] = triangulate_n_view(uv[enough], submap.K, T_kf_submap, visible[enough]).xyz
-    return xyz
 
 
 def _pixels(submap: Submap, keyframe: IntArray, feature: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -267,6 +267,26 @@ def test_a_pose_known_from_elsewhere_counts_by_its_covariance():
     np.testing.assert_allclose(np.diag(held.pose_covariance(k)), np.diag(P) / 2, rtol=0.1)
 
 
+def test_a_pose_from_elsewhere_leaves_with_its_keyframe():
+    """A keyframe that was taken out again may come back, and is then known by its landmarks alone."""
+    feeder, graph, rest = start(n=8, noise_px=0.0)
+    k, neighbour = rest[-1], rest[-2]
+    wrong = feeder.scene.T_true[k] @ se3.exp(np.array([0.0, 0.0, 0.0, 0.01, 0.0, 0.0]))
+    graph.hold(k, wrong, 1e-8 * np.eye(6))
+    grow(feeder, graph, rest)
+    obs = feeder.submap.observations
+    here = (obs["kf"] == k) & obs["alive"]
+    feature, landmark = obs["feature"][here].copy(), obs["landmark"][here].copy()
+    keyframe = feeder.submap.keyframes[k]
+    feeder.submap.remove_keyframe(k, neighbour)
+    graph.update(feeder.submap)
+    feeder.submap.add_keyframe(keyframe, feeder.scene.T_true[k])
+    feeder.submap.add_observations(k, feature, landmark)
+    e = graph.update(feeder.submap)
+    t, _ = pose_errors(e.T_submap_kf, feeder.scene.T_true[e.keyframe_ids])
+    assert t.max() < 2e-3
+
+
 def test_a_pose_from_elsewhere_is_dropped_with_the_gauge_that_it_stands_in():
     feeder, graph, rest = start(n=8, noise_px=0.0)
     graph.hold(rest[-1], feeder.scene.T_true[rest[-1]], 1e-8 * np.eye(6))

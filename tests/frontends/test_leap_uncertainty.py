@@ -8,7 +8,7 @@ import pytest
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians, refine_pose
 from dualslam.core.types import FloatArray
-from frontends.leap_uncertainty import HESSIAN_INFLATION, landmark_covariances, leap_uncertainty, pose_uncertainty
+from frontends.leap_uncertainty import HESSIAN_INFLATION, leap_uncertainty, pose_uncertainty
 from tests.frontends.test_tracking import true_map
 from tests.point_world import PointWorld, cloud, hand_held
 
@@ -92,15 +92,3 @@ def test_landmarks_that_are_hardly_known_leave_the_scale_open() -> None:
         sigmas.append(known[1])
     assert sigmas[0] > sigmas[1] > sigmas[2]
     assert pose_uncertainty(submap, T_cam, ids[:3], np.ones(3)) is None
-
-
-def test_landmark_covariances_come_in_the_order_that_was_asked_for() -> None:
-    world = PointWorld(cloud(), hand_held(80))
-    submap = true_map(world, [0, 4, 8])
-    ids = np.flatnonzero(submap.landmarks["alive"])[:50]
-    shuffled = np.random.default_rng(0).permutation(len(ids))
-    np.testing.assert_array_equal(
-        landmark_covariances(submap, ids[shuffled]), landmark_covariances(submap, ids)[shuffled]
-    )
-    submap.remove_observations(submap.rows_of_landmarks(ids[:1]))
-    assert np.isnan(landmark_covariances(submap, ids[:1])).all()
