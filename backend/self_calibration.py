@@ -19,24 +19,20 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
-import gtsam
 import numpy as np
 
-from backend import convert
-from backend.factors import baseline_factor, pose_prior
-from backend.membership import MIN_DEPTH_MU, compute_depth_sigmas, compute_residuals
-from backend.noise import PixelNoise
-from backend.silence import silenced
+from backend.calibration_bundle import CalibratedOptimum, optimise_with_camera
+from backend.membership import compute_depth_sigmas, compute_residuals
 from backend.solver import GTSAM_ERRORS, SolverFailure
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import Camera
 from dualslam.core.corrected_camera import LensCorrection, correction_of, given_camera
 from dualslam.core.geometry import so3
-from dualslam.core.interfaces import CalibrationEstimate
+from dualslam.core.interfaces import CalibrationEstimate, CameraContradiction
 from dualslam.core.submap import Submap
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 
@@ -47,23 +43,6 @@ MAX_DEPTH_SIGMA = 0.3
 MIN_OBSERVATIONS = 1000
 MAX_PRIOR_SIGMAS = 6.0
 """A correction farther from the given calibration than this says that something else is wrong."""
-ASPECT_SIGMA, SKEW_SIGMA, TANGENTIAL_SIGMA = 1e-4, 1e-7, 1e-7
-MEDIAN_CHI2_2DOF = 1.386
-MIN_NOISE_RATIO = 0.05
-"""Residuals smaller than this share of their sigmas would be an exact simulation."""
-CALIBRATION_KEY = 1 << 60
-MAX_ITERATIONS, TOLERANCE = 25, 1e-5
-MAX_DROPS = 3
-"""Times that it is tried again without points that went behind a camera."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Optimum:
-    correction: FloatArray  # (5,)
-    covariance: FloatArray  # (5, 5)
-    noise_ratio: float  # of the residuals to their sigmas
-    cost_before: float
-    cost_after: float
 
 
 def estimate_calibration(
@@ -96,17 +75,47 @@ def estimate_calibration(
         A failure where the window holds too little, or the solver failed; an estimate is to be used only where it
         is `accepted`.
     """
-    window = choose_window(submap, config.max_keyframes)
-    rotation_deg = math.degrees(_rotation_steps(submap, window).sum())
-    if rotation_deg < config.min_rotation_deg:
-        return Failure(
-            FailureReason.DEGENERATE,
-            f"{rotation_deg:.0f} deg of turning in {len(window)} keyframes say nothing about the focal length",
-        )
-    problem = make_problem(submap, window, camera, config.max_observations, seed)
-    if len(problem.kf) < MIN_OBSERVATIONS:
-        return Failure(FailureReason.TOO_FEW_INLIERS, f"{len(problem.kf)} observations in {len(window)} keyframes")
+    problem = _ask(submap, choose_window(submap, config.max_keyframes), camera, config, seed)
+    if isinstance(problem, Failure):
+        return problem
     return estimate_correction(problem, camera.width, correction_of(camera), config, robust_k, present_covariance)
+
+
+def find_contradiction(
+    submap: Submap,
+    keyframe_ids: IntArray,
+    camera: Camera,
+    config: CalibrationConfig,
+    robust_k: float = 1.345,
+    seed: int = 0,
+    present_covariance: FloatArray | None = None,
+) -> CameraContradiction | None:
+    """Say what some keyframes of a submap have against its camera, whether or not they say for sure which one it was.
+
+    What is asked is no more than whether the difference is chance, with the errors of neighbouring pixels alike.
+
+    Parameters
+    ----------
+    submap : Submap
+        Is not changed.
+    keyframe_ids : (K,) int64
+        Ascending.
+    camera, config, robust_k, seed, present_covariance
+        As for `estimate_calibration`. Without `CalibrationConfig.refine` the camera is taken at its word.
+
+    Returns
+    -------
+    CameraContradiction or None
+        None also where they say nothing.
+    """
+    problem = _ask(submap, keyframe_ids, camera, config, seed) if config.refine else None
+    if problem is None or isinstance(problem, Failure):
+        return None
+    answer = _answer(problem, camera.width, correction_of(camera), config, robust_k, present_covariance)
+    if isinstance(answer, Failure) or answer.distance2 <= config.min_distance2:
+        return None
+    sigma = math.sqrt(answer.covariance[0, 0])
+    return CameraContradiction(float(answer.off[0]), sigma, answer.distance2, keyframe_ids, answer.best.T_submap_kf)
 
 
 def estimate_correction(
@@ -137,36 +146,79 @@ def estimate_correction(
         Of `present`, if it was estimated; the calibration that was given is taken at its word.
     """
     start = time.perf_counter()
-    prior = prior_sigmas(problem, width_px, config)
-    try:
-        best = _optimise_in_front(problem, present.vector, prior, robust_k)
-        correction, covariance = _weigh(best, prior, config.inflation * best.noise_ratio)
-    except (*GTSAM_ERRORS, np.linalg.LinAlgError) as error:
-        return Failure(FailureReason.SOLVER, str(SolverFailure.of(error)))
-    off = correction - present.vector
-    of_difference = covariance if present_covariance is None else covariance + present_covariance
-    distance2 = float(off @ np.linalg.solve(of_difference, off))
+    answer = _answer(problem, width_px, present, config, robust_k, present_covariance)
+    if isinstance(answer, Failure):
+        return answer
     estimate = CalibrationEstimate(
-        LensCorrection.of_vector(correction),
-        covariance,
-        distance2,
-        distance2 > config.min_distance2,
-        best.cost_before,
-        best.cost_after,
+        LensCorrection.of_vector(answer.correction),
+        answer.covariance,
+        answer.distance2,
+        answer.distance2 > config.min_distance2,
+        answer.best.cost_before,
+        answer.best.cost_after,
         len(problem.T_submap_kf),
         len(problem.kf),
         time.perf_counter() - start,
     )
-    sigma = math.sqrt(covariance[0, 0])
-    far = abs(float(off[0])) > config.far_sigmas * math.sqrt(of_difference[0, 0])
-    if sigma > (config.far_sigma_ratio if far else config.max_sigma_ratio) * prior[0]:
+    sigma = math.sqrt(answer.covariance[0, 0])
+    far = abs(float(answer.off[0])) > config.far_sigmas * math.sqrt(answer.of_difference[0, 0])
+    if sigma > (config.far_sigma_ratio if far else config.max_sigma_ratio) * answer.prior[0]:
         return Failure(FailureReason.DEGENERATE, "the motion does not fix the focal length", estimate.numbers)
-    if (np.abs(correction) > MAX_PRIOR_SIGMAS * prior).any():
+    if (np.abs(answer.correction) > MAX_PRIOR_SIGMAS * answer.prior).any():
         return Failure(FailureReason.SCALE, "the calibration would be too far from the given one", estimate.numbers)
     return estimate
 
 
-def _weigh(best: _Optimum, prior: FloatArray, inflation: float) -> tuple[FloatArray, FloatArray]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Answer:
+    """What a problem says about its camera, as if pixels erred by `CalibrationConfig.inflation` times as much.
+
+    Attributes
+    ----------
+    best : CalibratedOptimum
+        As they err.
+    prior : (5,)
+        Sigmas.
+    correction : (5,)
+    covariance : (5, 5)
+    off : (5,)
+        The correction less the present one.
+    of_difference : (5, 5)
+        Its covariance.
+    """
+
+    best: CalibratedOptimum
+    prior: FloatArray
+    correction: FloatArray
+    covariance: FloatArray
+    off: FloatArray
+    of_difference: FloatArray
+
+    @property
+    def distance2(self) -> float:
+        """Squared Mahalanobis distance from the present correction."""
+        return float(self.off @ np.linalg.solve(self.of_difference, self.off))
+
+
+def _answer(
+    problem: BundleProblem,
+    width_px: int,
+    present: LensCorrection,
+    config: CalibrationConfig,
+    robust_k: float,
+    present_covariance: FloatArray | None,
+) -> _Answer | Failure:
+    prior = prior_sigmas(problem, width_px, config)
+    try:
+        best = optimise_with_camera(problem, present.vector, prior, robust_k)
+        correction, covariance = _weigh(best, prior, config.inflation * best.noise_ratio)
+    except (*GTSAM_ERRORS, np.linalg.LinAlgError) as error:
+        return Failure(FailureReason.SOLVER, str(SolverFailure.of(error)))
+    of_difference = covariance if present_covariance is None else covariance + present_covariance
+    return _Answer(best, prior, correction, covariance, correction - present.vector, of_difference)
+
+
+def _weigh(best: CalibratedOptimum, prior: FloatArray, inflation: float) -> tuple[FloatArray, FloatArray]:
     """Return the correction and its covariance, had the sigmas of all pixels been `inflation` times as large.
 
     Only the calibration has a prior, so that the information in its marginal is the sum of the data's and the prior's.
@@ -178,6 +230,22 @@ def _weigh(best: _Optimum, prior: FloatArray, inflation: float) -> tuple[FloatAr
 
 
 # --- what goes in
+
+
+def _ask(
+    submap: Submap, window: IntArray, camera: Camera, config: CalibrationConfig, seed: int
+) -> BundleProblem | Failure:
+    """Collect what some keyframes say, if it can be anything about the focal length."""
+    rotation_deg = math.degrees(_rotation_steps(submap, window).sum())
+    if rotation_deg < config.min_rotation_deg:
+        return Failure(
+            FailureReason.DEGENERATE,
+            f"{rotation_deg:.0f} deg of turning in {len(window)} keyframes say nothing about the focal length",
+        )
+    problem = make_problem(submap, window, camera, config.max_observations, seed)
+    if len(problem.kf) < MIN_OBSERVATIONS:
+        return Failure(FailureReason.TOO_FEW_INLIERS, f"{len(problem.kf)} observations in {len(window)} keyframes")
+    return problem
 
 
 def choose_window(submap: Submap, max_keyframes: int) -> IntArray:
@@ -246,115 +314,3 @@ def _mask(ids: IntArray, size: int) -> BoolArray:
     mask = np.zeros(size, bool)
     mask[ids] = True
     return mask
-
-
-# --- the bundle adjustment
-
-
-class _BehindCameraError(RuntimeError):
-    """Points of the optimum lie behind a camera that saw them: the factor counts no error there, and fixes nothing."""
-
-    def __init__(self, points: IntArray) -> None:
-        super().__init__(f"{len(points)} points went behind their cameras")
-        self.points = points
-
-
-def _optimise_in_front(problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float) -> _Optimum:
-    """Minimise, without the few points that a step has put behind a camera."""
-    for _ in range(MAX_DROPS):
-        try:
-            return _optimise(problem, start, prior, robust_k)
-        except _BehindCameraError as error:
-            problem = _without(problem, error.points)
-    return _optimise(problem, start, prior, robust_k)
-
-
-def _without(problem: BundleProblem, points: IntArray) -> BundleProblem:
-    p, dropped = problem, _mask(points, len(problem.xyz_mu))
-    rows = ~dropped[p.point]
-    point = (np.cumsum(~dropped) - 1)[p.point[rows]]
-    return replace(
-        p, xyz_mu=p.xyz_mu[~dropped], kf=p.kf[rows], point=point, uv_px=p.uv_px[rows], sigma_px=p.sigma_px[rows]
-    )
-
-
-def _optimise(problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float) -> _Optimum:
-    """Minimise over poses, points and calibration; the points are eliminated first, the calibration last."""
-    p = problem
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    noise, factor = PixelNoise(robust_k), gtsam.GeneralSFMFactor2Cal3DS2
-    keyframes, points = np.arange(len(p.T_submap_kf)), np.arange(len(p.xyz_mu))
-    poses = convert.pose_keys(keyframes)
-    for uv, sigma, k, j in zip(p.uv_px, p.sigma_px.tolist(), p.kf.tolist(), p.point.tolist(), strict=True):
-        graph.push_back(factor(uv, noise(sigma), poses[k], j, CALIBRATION_KEY))
-    distance = np.linalg.norm(p.T_submap_kf[:, :3, 3] - p.T_submap_kf[0, :3, 3], axis=1)
-    far = int(np.argmax(distance))
-    graph.push_back(pose_prior(0, p.T_submap_kf[0]))
-    graph.push_back(baseline_factor(0, far, float(distance[far])))
-    graph.push_back(
-        gtsam.PriorFactorCal3DS2(
-            CALIBRATION_KEY, _to_cal3_ds2(p.K, np.zeros(5)), gtsam.noiseModel.Gaussian.Covariance(_prior(p.K, prior))
-        )
-    )
-    values.insert(CALIBRATION_KEY, _to_cal3_ds2(p.K, start))
-    convert.insert_poses(values, keyframes, p.T_submap_kf)
-    convert.insert_points(values, points, p.xyz_mu)
-    params = gtsam.LevenbergMarquardtParams()
-    params.setMaxIterations(MAX_ITERATIONS)
-    params.setRelativeErrorTol(TOLERANCE)
-    params.setLinearSolverType("SEQUENTIAL_CHOLESKY")
-    params.setOrdering(gtsam.Ordering([*points.tolist(), *poses, CALIBRATION_KEY]))
-    with silenced():  # the factor prints each point that a step puts behind a camera
-        before = float(graph.error(values))
-        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
-        result = optimizer.optimize()
-    T, xyz = convert.poses_of(result), convert.points_of(result)
-    behind = np.unique(p.point[_depths(p, T, xyz) <= MIN_DEPTH_MU])
-    if len(behind):
-        raise _BehindCameraError(behind)
-    found = np.asarray(result.atCal3DS2(CALIBRATION_KEY).vector())
-    correction, J = _from_cal3_ds2(found, p.K)
-    marginal = np.asarray(gtsam.Marginals(graph, result).marginalCovariance(CALIBRATION_KEY))
-    noise_ratio = _noise_ratio(p, T, xyz, correction)
-    return _Optimum(correction, J @ marginal @ J.T, noise_ratio, before, float(optimizer.error()))
-
-
-def _depths(problem: BundleProblem, T: FloatArray, xyz: FloatArray) -> FloatArray:
-    """Return the depth (R,) of each observed point in its camera."""
-    p = problem
-    return np.einsum("ri,ri->r", T[p.kf, :3, 2], xyz[p.point] - T[p.kf, :3, 3])
-
-
-def _noise_ratio(problem: BundleProblem, T: FloatArray, xyz: FloatArray, correction: FloatArray) -> float:
-    """Return the ratio of the typical residual to its sigma."""
-    p = problem
-    p_cam = np.einsum("rji,rj->ri", T[p.kf, :3, :3], xyz[p.point] - T[p.kf, :3, 3])
-    uv = LensCorrection.of_vector(correction).distort_px(p.K, p_cam[:, :2] / p_cam[:, 2:])
-    chi2 = ((uv - p.uv_px) ** 2).sum(1) / p.sigma_px**2
-    return max(MIN_NOISE_RATIO, math.sqrt(float(np.median(chi2)) / MEDIAN_CHI2_2DOF))
-
-
-def _to_cal3_ds2(K: FloatArray, correction: FloatArray) -> gtsam.Cal3DS2:
-    corrected = LensCorrection.of_vector(correction).intrinsics(K)
-    fx, fy, cx, cy = corrected[0, 0], corrected[1, 1], corrected[0, 2], corrected[1, 2]
-    return gtsam.Cal3DS2(fx, fy, 0.0, cx, cy, correction[3], correction[4], 0.0, 0.0)
-
-
-def _from_cal3_ds2(vector: FloatArray, K: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the correction (5,) of (fx, fy, skew, cx, cy, k1, k2, p1, p2), and its derivative (5, 9)."""
-    fx, fy, _, cx, cy, k1, k2 = vector[:7]
-    log_focal = 0.5 * (math.log(fx / K[0, 0]) + math.log(fy / K[1, 1]))
-    J = np.zeros((5, 9))
-    J[0, 0], J[0, 1] = 0.5 / fx, 0.5 / fy
-    J[1, 3] = J[2, 4] = J[3, 5] = J[4, 6] = 1.0
-    return np.array([log_focal, cx - K[0, 2], cy - K[1, 2], k1, k2]), J
-
-
-def _prior(K: FloatArray, sigmas: FloatArray) -> FloatArray:
-    """Return the (9, 9) covariance of a `Cal3DS2` in which the two focal lengths grow as one."""
-    focal = np.array([K[0, 0], K[1, 1]])
-    covariance = np.zeros((9, 9))
-    covariance[:2, :2] = sigmas[0] ** 2 * np.outer(focal, focal) + np.diag((ASPECT_SIGMA * focal) ** 2)
-    rest = np.array([SKEW_SIGMA * focal[0], *sigmas[1:], TANGENTIAL_SIGMA, TANGENTIAL_SIGMA])
-    covariance[range(2, 9), range(2, 9)] = rest**2
-    return covariance

@@ -10,21 +10,21 @@ from operator import attrgetter
 import numpy as np
 
 from backend.local_ba import bundle_adjust, bundle_adjust_arrays
-from backend.self_calibration import estimate_calibration
+from backend.self_calibration import estimate_calibration, find_contradiction
 from backend.submap_graph import ISam2SubmapGraph
-from dualslam.calibration import Calibration, check_camera
+from dualslam.calibration import Calibration
 from dualslam.core.camera import Camera
 from dualslam.core.config import AttemptConfig, Config, FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.grey_image import GreyImage
-from dualslam.core.interfaces import Frontend, SelfCalibrator, SubmapGraph
+from dualslam.core.interfaces import CameraContradiction, Frontend, SelfCalibrator, SubmapGraph
 from dualslam.core.rectification import rectify
 from dualslam.core.submap import Submap
-from dualslam.core.types import Failure, FailureReason, Features, Frame, View
+from dualslam.core.types import Failure, FailureReason, Features, Frame, IntArray, View
 from dualslam.evaluation.failure_lab import FaultScript
 from dualslam.executor import InlineExecutor, RecoveryExecutor
 from dualslam.health import judge_track
-from dualslam.linking import DescriptorMatcher, carry_to_live_end, estimate_link
+from dualslam.linking import DescriptorMatcher, carry_to_live_end, check_camera, estimate_link
 from dualslam.recovery import Attempt, RecoveryJob, RecoveryParts
 from dualslam.system import Components, System
 from dualslam.worker import WorkerExecutor
@@ -131,6 +131,14 @@ def self_calibrator(config: Config) -> SelfCalibrator:
     )
 
 
+def _contradiction(
+    job: RecoveryJob, config: Config, submap: Submap, keyframe_ids: IntArray
+) -> CameraContradiction | None:
+    """Ask keyframes of a map that a walk has grown about the camera that it was walked with."""
+    settings = (config.calibration, config.graph.robust_k, config.seed)
+    return find_contradiction(submap, keyframe_ids, job.camera, *settings, job.camera_covariance)
+
+
 def recovery_executor(
     config: Config, size_px: tuple[int, int], faults: FaultScript, frontend: Frontend
 ) -> RecoveryExecutor:
@@ -174,9 +182,9 @@ def recovery_parts(
         link=lambda old, new, onset: estimate_link(
             old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
         ),
-        carry=lambda link, new, newest_id: carry_to_live_end(link, new, newest_id, config.linking),
-        check_camera=lambda submap, camera, covariance: check_camera(
-            submap, camera, covariance, self_calibrator(config), config.calibration
+        carry=lambda link, new, newest_id, bend: carry_to_live_end(link, new, newest_id, config.linking, bend),
+        check_camera=lambda submap, link, job: check_camera(
+            submap, link, job.newest_id, partial(_contradiction, job, config), config.linking, config.calibration
         ),
         judge=lambda track: judge_track(track, config.health),
         config=config.recovery,

@@ -8,7 +8,7 @@ import numpy as np
 
 from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import Camera
-from dualslam.core.corrected_camera import correct, correction_of
+from dualslam.core.corrected_camera import correct
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph
 from dualslam.core.submap import Submap
@@ -141,36 +141,6 @@ class Calibration:
         lost = ~np.isfinite(uv_rect_px).all(axis=1)
         uv_rect_px[lost] = features.uv_rect_px[lost]
         return replace(view, features=replace(features, uv_rect_px=uv_rect_px))
-
-
-def check_camera(
-    submap: Submap, camera: Camera, covariance: FloatArray | None, estimate: SelfCalibrator, config: CalibrationConfig
-) -> Failure | None:
-    """Refuse a submap that contradicts its camera, whether or not it says for sure which one it was.
-
-    A wrong camera bends a map wherever it turns: it may agree with another map of that camera on all that both have
-    seen, and say nothing of the scale beyond. What is asked is no more than whether the difference is chance.
-
-    Parameters
-    ----------
-    submap : Submap
-    camera : Camera
-        Which rectified its features.
-    covariance : (5, 5), optional
-        Of the correction that the camera has, if it was estimated.
-    estimate : SelfCalibrator
-    config : CalibrationConfig
-        Without `refine` the camera is taken at its word.
-    """
-    if not config.refine:
-        return None
-    numbers = estimate(submap, camera, covariance).numbers
-    if numbers.get("distance2", 0.0) <= config.min_distance2:
-        return None
-    off = numbers["log_focal"] - correction_of(camera).log_focal
-    sigma = numbers["log_focal_sigma"]
-    detail = f"the new map contradicts its camera: focal length {off:+.1%}, known to {sigma:.1%}"
-    return Failure(FailureReason.CAMERA, detail, {"log_focal": off, "distance2": numbers["distance2"]})
 
 
 def _rectified_again(features: Features, camera: Camera) -> Features:

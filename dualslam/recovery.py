@@ -25,7 +25,7 @@ from dualslam.core.events import Event, EventKind
 from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
-from dualslam.linking import LinkEstimate
+from dualslam.linking import NO_BEND, Bend, LinkEstimate
 from dualslam.relinker import Linker, LinkTry, Relinker
 from dualslam.retries import way_to_gaps
 from dualslam.seam import SeamReport, refine_seam
@@ -135,8 +135,8 @@ class RecoveryParts:
     posing: Attempt
     new_graph: Callable[[], SubmapGraph]
     link: Linker
-    carry: Callable[[LinkEstimate, Submap, int], LinkEstimate | Failure]
-    check_camera: Callable[[Submap, Camera, FloatArray | None], Failure | None]
+    carry: Callable[[LinkEstimate, Submap, int, Bend], LinkEstimate | Failure]
+    check_camera: Callable[[Submap, LinkEstimate, RecoveryJob], Bend | Failure]
     judge: Judge
     config: RecoveryConfig
     fusion: FusionConfig
@@ -273,17 +273,20 @@ def _fused(tried: LinkTry, job: RecoveryJob, submap: Submap, attempt: str, parts
     found = tried.result
     if isinstance(found, Failure):
         return found
-    link = parts.carry(found, submap, job.newest_id)
+    link = parts.carry(found, submap, job.newest_id, NO_BEND)
     if isinstance(link, Failure):
         return link
-    contradicted = parts.check_camera(submap, job.camera, job.camera_covariance)
-    if contradicted is not None:
-        return contradicted
+    bend = parts.check_camera(submap, link, job)
+    if isinstance(bend, Failure):
+        return bend
     seam = refine_seam(job.lost[tried.old_id], submap, found, parts.new_graph, parts.link, parts.fusion)
     if isinstance(seam, Failure):
         unrefined = seam.reason in (FailureReason.DISABLED, FailureReason.SOLVER)
-        return FoundLink(tried.old_id, link, seam, attempt) if unrefined else seam
-    link = parts.carry(seam.link, seam.submap, job.newest_id)
+        if not unrefined:
+            return seam
+        link = parts.carry(found, submap, job.newest_id, bend)
+        return link if isinstance(link, Failure) else FoundLink(tried.old_id, link, seam, attempt)
+    link = parts.carry(seam.link, seam.submap, job.newest_id, bend)
     if isinstance(link, Failure):
         return link
     submap.take_over(seam.submap)

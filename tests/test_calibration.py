@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from backend.submap_graph import ISam2SubmapGraph
-from dualslam.build import adjust_submap, build_system, self_calibrator
-from dualslam.calibration import Calibration, check_camera
+from dualslam.build import adjust_submap, build_system
+from dualslam.calibration import Calibration
 from dualslam.carried_poses import carry_anchors, carry_poses
 from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import Camera
@@ -158,43 +158,6 @@ class TestRefine:
         assert calibration.is_due(submap)
         calibration.refine(submap, new_graph())
         assert not calibration.is_due(submap)
-
-
-class TestCheckCamera:
-    """What is asked of a map before it is linked."""
-
-    @staticmethod
-    def check(submap: Submap, camera: Camera, covariance: FloatArray | None = None, **settings: object) -> object:
-        config = Config.model_validate({"calibration": settings})
-        return check_camera(submap, camera, covariance, self_calibrator(config), config.calibration)
-
-    def test_a_map_of_the_right_camera_passes(self) -> None:
-        assert self.check(make_submap(TRUE, turning=True, n=10), TRUE) is None
-
-    def test_one_that_contradicts_it_does_not_though_it_is_not_sure_of_another(self) -> None:
-        camera = wrong_camera(1.06)
-        submap, settings = make_submap(camera, turning=True, n=6), {"inflation": 9.0}
-        answer = self_calibrator(Config.model_validate({"calibration": settings}))(submap, camera, None)
-        assert isinstance(answer, Failure)
-        assert answer.reason is FailureReason.DEGENERATE
-        refused = self.check(submap, camera, **settings)
-        assert isinstance(refused, Failure)
-        assert refused.reason is FailureReason.CAMERA
-        assert refused.numbers["log_focal"] == pytest.approx(-np.log(1.06), abs=0.02)
-
-    def test_nor_does_it_contradict_what_is_known_no_better(self) -> None:
-        camera = wrong_camera(1.03)
-        submap = make_submap(camera, turning=True, n=10)
-        assert self.check(submap, camera) is not None
-        assert self.check(submap, camera, np.diag([0.02, 5.0, 5.0, 0.02, 0.02]) ** 2) is None
-
-    def test_one_that_says_nothing_passes(self) -> None:
-        camera = wrong_camera(1.06)
-        assert self.check(make_submap(camera, turning=False, n=10), camera) is None
-
-    def test_it_is_not_asked_where_the_camera_is_taken_at_its_word(self) -> None:
-        camera = wrong_camera(1.06)
-        assert self.check(make_submap(camera, turning=True, n=10), camera, refine=False) is None
 
 
 def test_frames_between_keyframes_follow_a_map_that_bends() -> None:

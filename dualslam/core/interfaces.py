@@ -219,6 +219,29 @@ class SelfCalibrator(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraContradiction:
+    """What keyframes of a submap have against the camera that rectified their features, beyond chance.
+
+    Attributes
+    ----------
+    log_focal : float
+        The logarithm of both focal lengths that their pixels ask for, less that of the camera's.
+    log_focal_sigma : float
+    distance2 : float
+        Squared Mahalanobis distance of the whole correction from the camera's.
+    keyframe_ids : (K,) int64
+    T_submap_kf : (K, 4, 4)
+        Their poses as they would be under the camera that their pixels ask for, in a frame of their own.
+    """
+
+    log_focal: float
+    log_focal_sigma: float
+    distance2: float
+    keyframe_ids: IntArray
+    T_submap_kf: FloatArray
+
+
 class SubmapAdjuster(Protocol):
     """Refines all poses and points of a submap in place, in batch. Raises `SolverError` where the solver fails."""
 

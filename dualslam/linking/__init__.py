@@ -2,19 +2,23 @@
 
 In reading order: `correspondences` (which landmarks are the same), `estimate` (the decision, step by step), `timeline`
 (what the keyframes say one by one, in order of time), `shape` (how the maps differ beyond a similarity), `verify` (the
-gates), `live_end` (whether the new map bears the link to where it is needed); below them `pairs`, the matches as
-measurements, and `rigidity`, how firmly a map holds its scale.
+gates), `live_end` and `camera_bend` (whether the new map bears the link to where it is needed); below them `pairs`, the
+matches as measurements, and `rigidity`, how firmly a map holds its scale.
 """
 
+from dualslam.linking.camera_bend import NO_BEND, Bend, check_camera
 from dualslam.linking.correspondences import Correspondences, DescriptorMatcher, propose_correspondences
 from dualslam.linking.estimate import LinkEstimate, estimate_link
 from dualslam.linking.live_end import carry_to_live_end
 
 __all__ = [
+    "NO_BEND",
+    "Bend",
     "Correspondences",
     "DescriptorMatcher",
     "LinkEstimate",
     "carry_to_live_end",
+    "check_camera",
     "estimate_link",
     "propose_correspondences",
 ]

@@ -11,6 +11,7 @@ from dualslam.core.config import LinkingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason
+from dualslam.linking.camera_bend import NO_BEND, Bend
 from dualslam.linking.estimate import LinkEstimate
 from dualslam.linking.rigidity import scale_sigma_between
 
@@ -19,9 +20,11 @@ HOPELESS = 3.0
 
 
 def carry_to_live_end(
-    link: LinkEstimate, new: Submap, live_since: int, config: LinkingConfig
+    link: LinkEstimate, new: Submap, live_since: int, config: LinkingConfig, bend: Bend = NO_BEND
 ) -> LinkEstimate | Failure:
     """Add to a link's covariance what the walk back has lost of the scale, and refuse it where that is too much.
+
+    And what the camera may have changed, which is not read from the map's residuals.
 
     Parameters
     ----------
@@ -31,16 +34,21 @@ def carry_to_live_end(
     live_since : int
         The keyframe that the walk set out from: it and those after it are the live end.
     config : LinkingConfig
+    bend : Bend, optional
+        Of the new map, by a camera that it contradicts.
 
     Returns
     -------
     LinkEstimate or Failure
-        With `sigma_scale` in its numbers as it is at the live end, and the walk's share of it, `sigma_scale_walk`.
+        With `sigma_scale` in its numbers as it is at the live end, the walk's share of it, `sigma_scale_walk`, and the
+        camera's, `sigma_scale_camera`, where there is one.
     """
     live = np.array([k for k in new.keyframes if k >= live_since], np.int64)
     walk = scale_sigma_between(new, link.agreeing_keyframes, live, config.pixel_chi2)
-    sigma = math.hypot(link.numbers["sigma_scale"], walk)
+    sigma = math.hypot(link.numbers["sigma_scale"], walk, bend.log_scale)
     numbers = {"sigma_scale": sigma, "sigma_scale_walk": walk}
+    if bend.log_scale:
+        numbers["sigma_scale_camera"] = abs(bend.log_scale)
     if sigma > config.max_live_scale_sigma:
         detail = "nothing holds the scale between the overlap and the live end"
         if math.isfinite(walk):
@@ -50,5 +58,6 @@ def carry_to_live_end(
     # The live end grows and shrinks about the place where the maps overlap.
     held = [k for k in link.agreeing_keyframes.tolist() if k in new.keyframes]
     about = sim3.adjoint(se3.from_parts(np.eye(3), new.keyframe_poses(held)[:, :3, 3].mean(0)))
-    covariance = link.covariance + walk**2 * np.outer(about[:, 6], about[:, 6])
+    lost = np.diag([bend.rotation_rad**2] * 3 + [0.0] * 3 + [walk**2 + bend.log_scale**2])
+    covariance = link.covariance + about @ lost @ about.T
     return replace(link, covariance=covariance, numbers=link.numbers | numbers)

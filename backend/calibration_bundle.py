@@ -1,0 +1,180 @@
+"""The bundle adjustment of self-calibration: poses, points and one camera that all keyframes share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from backend import convert
+from backend.factors import baseline_factor, pose_prior
+from backend.membership import MIN_DEPTH_MU
+from backend.noise import PixelNoise
+from backend.silence import silenced
+from dualslam.core.bundle import BundleProblem
+from dualslam.core.corrected_camera import LensCorrection
+from dualslam.core.types import FloatArray, IntArray
+
+ASPECT_SIGMA, SKEW_SIGMA, TANGENTIAL_SIGMA = 1e-4, 1e-7, 1e-7
+MEDIAN_CHI2_2DOF = 1.386
+MIN_NOISE_RATIO = 0.05
+"""Residuals smaller than this share of their sigmas would be an exact simulation."""
+CALIBRATION_KEY = 1 << 60
+MAX_ITERATIONS, TOLERANCE = 25, 1e-5
+MAX_DROPS = 3
+"""Times that it is tried again without points that went behind a camera."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedOptimum:
+    """Where the cost is least.
+
+    Attributes
+    ----------
+    T_submap_kf : (K, 4, 4)
+        The problem's keyframes; the first stays where it was, and so does its distance from the one farthest from it.
+    correction : (5,)
+        Of the camera as it was given.
+    covariance : (5, 5)
+        Of the correction, by the Hessian, prior and all.
+    noise_ratio : float
+        Of the typical residual to its sigma.
+    cost_before, cost_after : float
+        Sum of the Huber losses.
+    """
+
+    T_submap_kf: FloatArray
+    correction: FloatArray
+    covariance: FloatArray
+    noise_ratio: float
+    cost_before: float
+    cost_after: float
+
+
+class _BehindCameraError(RuntimeError):
+    """Points of the optimum lie behind a camera that saw them: the factor counts no error there, and fixes nothing."""
+
+    def __init__(self, points: IntArray) -> None:
+        super().__init__(f"{len(points)} points went behind their cameras")
+        self.points = points
+
+
+def optimise_with_camera(
+    problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float
+) -> CalibratedOptimum:
+    """Minimise over poses, points and calibration, without the few points that a step has put behind a camera.
+
+    Parameters
+    ----------
+    problem : BundleProblem
+        In the rectified pixels of the camera as it was given; `fixed` is not looked at.
+    start, prior : (5,)
+        The correction to begin at, and the prior sigmas of its parts about zero.
+    robust_k : float
+        Huber threshold in sigmas.
+
+    Raises
+    ------
+    RuntimeError, LinAlgError, ...
+        What GTSAM and numpy raise (`backend.solver.GTSAM_ERRORS`).
+    """
+    for _ in range(MAX_DROPS):
+        try:
+            return _optimise(problem, start, prior, robust_k)
+        except _BehindCameraError as error:
+            problem = _without(problem, error.points)
+    return _optimise(problem, start, prior, robust_k)
+
+
+def _without(problem: BundleProblem, points: IntArray) -> BundleProblem:
+    p, dropped = problem, np.zeros(len(problem.xyz_mu), np.bool_)
+    dropped[points] = True
+    rows = ~dropped[p.point]
+    point = (np.cumsum(~dropped) - 1)[p.point[rows]]
+    return replace(
+        p, xyz_mu=p.xyz_mu[~dropped], kf=p.kf[rows], point=point, uv_px=p.uv_px[rows], sigma_px=p.sigma_px[rows]
+    )
+
+
+def _optimise(problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float) -> CalibratedOptimum:
+    """Minimise over poses, points and calibration; the points are eliminated first, the calibration last."""
+    p = problem
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    noise, factor = PixelNoise(robust_k), gtsam.GeneralSFMFactor2Cal3DS2
+    keyframes, points = np.arange(len(p.T_submap_kf)), np.arange(len(p.xyz_mu))
+    poses = convert.pose_keys(keyframes)
+    for uv, sigma, k, j in zip(p.uv_px, p.sigma_px.tolist(), p.kf.tolist(), p.point.tolist(), strict=True):
+        graph.push_back(factor(uv, noise(sigma), poses[k], j, CALIBRATION_KEY))
+    distance = np.linalg.norm(p.T_submap_kf[:, :3, 3] - p.T_submap_kf[0, :3, 3], axis=1)
+    far = int(np.argmax(distance))
+    graph.push_back(pose_prior(0, p.T_submap_kf[0]))
+    graph.push_back(baseline_factor(0, far, float(distance[far])))
+    graph.push_back(
+        gtsam.PriorFactorCal3DS2(
+            CALIBRATION_KEY, _to_cal3_ds2(p.K, np.zeros(5)), gtsam.noiseModel.Gaussian.Covariance(_prior(p.K, prior))
+        )
+    )
+    values.insert(CALIBRATION_KEY, _to_cal3_ds2(p.K, start))
+    convert.insert_poses(values, keyframes, p.T_submap_kf)
+    convert.insert_points(values, points, p.xyz_mu)
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(MAX_ITERATIONS)
+    params.setRelativeErrorTol(TOLERANCE)
+    params.setLinearSolverType("SEQUENTIAL_CHOLESKY")
+    params.setOrdering(gtsam.Ordering([*points.tolist(), *poses, CALIBRATION_KEY]))
+    with silenced():  # the factor prints each point that a step puts behind a camera
+        before = float(graph.error(values))
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+        result = optimizer.optimize()
+    T, xyz = convert.poses_of(result), convert.points_of(result)
+    behind = np.unique(p.point[_depths(p, T, xyz) <= MIN_DEPTH_MU])
+    if len(behind):
+        raise _BehindCameraError(behind)
+    found = np.asarray(result.atCal3DS2(CALIBRATION_KEY).vector())
+    correction, J = _from_cal3_ds2(found, p.K)
+    marginal = np.asarray(gtsam.Marginals(graph, result).marginalCovariance(CALIBRATION_KEY))
+    noise_ratio = _noise_ratio(p, T, xyz, correction)
+    return CalibratedOptimum(T, correction, J @ marginal @ J.T, noise_ratio, before, float(optimizer.error()))
+
+
+def _depths(problem: BundleProblem, T: FloatArray, xyz: FloatArray) -> FloatArray:
+    """Return the depth (R,) of each observed point in its camera."""
+    p = problem
+    return np.einsum("ri,ri->r", T[p.kf, :3, 2], xyz[p.point] - T[p.kf, :3, 3])
+
+
+def _noise_ratio(problem: BundleProblem, T: FloatArray, xyz: FloatArray, correction: FloatArray) -> float:
+    """Return the ratio of the typical residual to its sigma."""
+    p = problem
+    p_cam = np.einsum("rji,rj->ri", T[p.kf, :3, :3], xyz[p.point] - T[p.kf, :3, 3])
+    uv = LensCorrection.of_vector(correction).distort_px(p.K, p_cam[:, :2] / p_cam[:, 2:])
+    chi2 = ((uv - p.uv_px) ** 2).sum(1) / p.sigma_px**2
+    return max(MIN_NOISE_RATIO, math.sqrt(float(np.median(chi2)) / MEDIAN_CHI2_2DOF))
+
+
+def _to_cal3_ds2(K: FloatArray, correction: FloatArray) -> gtsam.Cal3DS2:
+    corrected = LensCorrection.of_vector(correction).intrinsics(K)
+    fx, fy, cx, cy = corrected[0, 0], corrected[1, 1], corrected[0, 2], corrected[1, 2]
+    return gtsam.Cal3DS2(fx, fy, 0.0, cx, cy, correction[3], correction[4], 0.0, 0.0)
+
+
+def _from_cal3_ds2(vector: FloatArray, K: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the correction (5,) of (fx, fy, skew, cx, cy, k1, k2, p1, p2), and its derivative (5, 9)."""
+    fx, fy, _, cx, cy, k1, k2 = vector[:7]
+    log_focal = 0.5 * (math.log(fx / K[0, 0]) + math.log(fy / K[1, 1]))
+    J = np.zeros((5, 9))
+    J[0, 0], J[0, 1] = 0.5 / fx, 0.5 / fy
+    J[1, 3] = J[2, 4] = J[3, 5] = J[4, 6] = 1.0
+    return np.array([log_focal, cx - K[0, 2], cy - K[1, 2], k1, k2]), J
+
+
+def _prior(K: FloatArray, sigmas: FloatArray) -> FloatArray:
+    """Return the (9, 9) covariance of a `Cal3DS2` in which the two focal lengths grow as one."""
+    focal = np.array([K[0, 0], K[1, 1]])
+    covariance = np.zeros((9, 9))
+    covariance[:2, :2] = sigmas[0] ** 2 * np.outer(focal, focal) + np.diag((ASPECT_SIGMA * focal) ** 2)
+    rest = np.array([SKEW_SIGMA * focal[0], *sigmas[1:], TANGENTIAL_SIGMA, TANGENTIAL_SIGMA])
+    covariance[range(2, 9), range(2, 9)] = rest**2
+    return covariance
