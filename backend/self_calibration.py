@@ -32,7 +32,7 @@ from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import Camera
 from dualslam.core.corrected_camera import LensCorrection, correction_of, given_camera
 from dualslam.core.geometry import so3
-from dualslam.core.interfaces import CalibrationEstimate, CameraContradiction
+from dualslam.core.interfaces import CalibrationEstimate, PreferredCamera
 from dualslam.core.submap import Submap
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 
@@ -81,7 +81,7 @@ def estimate_calibration(
     return estimate_correction(problem, camera.width, correction_of(camera), config, robust_k, present_covariance)
 
 
-def find_contradiction(
+def find_preferred_camera(
     submap: Submap,
     keyframe_ids: IntArray,
     camera: Camera,
@@ -89,10 +89,8 @@ def find_contradiction(
     robust_k: float = 1.345,
     seed: int = 0,
     present_covariance: FloatArray | None = None,
-) -> CameraContradiction | None:
-    """Say what some keyframes of a submap have against its camera, whether or not they say for sure which one it was.
-
-    What is asked is no more than whether the difference is chance, with the errors of neighbouring pixels alike.
+) -> PreferredCamera | None:
+    """Say which camera some keyframes of a submap would rather have, however little they know of it.
 
     Parameters
     ----------
@@ -105,17 +103,23 @@ def find_contradiction(
 
     Returns
     -------
-    CameraContradiction or None
-        None also where they say nothing.
+    PreferredCamera or None
+        None where they say nothing.
     """
     problem = _ask(submap, keyframe_ids, camera, config, seed) if config.refine else None
     if problem is None or isinstance(problem, Failure):
         return None
     answer = _answer(problem, camera.width, correction_of(camera), config, robust_k, present_covariance)
-    if isinstance(answer, Failure) or answer.distance2 <= config.min_distance2:
+    if isinstance(answer, Failure):
         return None
-    sigma = math.sqrt(answer.covariance[0, 0])
-    return CameraContradiction(float(answer.off[0]), sigma, answer.distance2, keyframe_ids, answer.best.T_submap_kf)
+    return PreferredCamera(
+        float(answer.off[0]),
+        math.sqrt(answer.covariance[0, 0]),
+        answer.distance2,
+        answer.distance2 > config.min_distance2,
+        keyframe_ids,
+        answer.best.T_submap_kf,
+    )
 
 
 def estimate_correction(

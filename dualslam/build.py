@@ -10,14 +10,14 @@ from operator import attrgetter
 import numpy as np
 
 from backend.local_ba import bundle_adjust, bundle_adjust_arrays
-from backend.self_calibration import estimate_calibration, find_contradiction
+from backend.self_calibration import estimate_calibration, find_preferred_camera
 from backend.submap_graph import ISam2SubmapGraph
 from dualslam.calibration import Calibration
 from dualslam.core.camera import Camera
 from dualslam.core.config import AttemptConfig, Config, FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.grey_image import GreyImage
-from dualslam.core.interfaces import CameraContradiction, Frontend, SelfCalibrator, SubmapGraph
+from dualslam.core.interfaces import Frontend, PreferredCamera, SelfCalibrator, SubmapGraph
 from dualslam.core.rectification import rectify
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, Features, Frame, IntArray, View
@@ -131,12 +131,12 @@ def self_calibrator(config: Config) -> SelfCalibrator:
     )
 
 
-def _contradiction(
+def _preferred_camera(
     job: RecoveryJob, config: Config, submap: Submap, keyframe_ids: IntArray
-) -> CameraContradiction | None:
+) -> PreferredCamera | None:
     """Ask keyframes of a map that a walk has grown about the camera that it was walked with."""
     settings = (config.calibration, config.graph.robust_k, config.seed)
-    return find_contradiction(submap, keyframe_ids, job.camera, *settings, job.camera_covariance)
+    return find_preferred_camera(submap, keyframe_ids, job.camera, *settings, job.camera_covariance)
 
 
 def recovery_executor(
@@ -184,7 +184,7 @@ def recovery_parts(
         ),
         carry=lambda link, new, newest_id, bend: carry_to_live_end(link, new, newest_id, config.linking, bend),
         check_camera=lambda submap, link, job: check_camera(
-            submap, link, job.newest_id, partial(_contradiction, job, config), config.linking, config.calibration
+            submap, link, job.newest_id, partial(_preferred_camera, job, config), config.linking, config.calibration
         ),
         judge=lambda track: judge_track(track, config.health),
         config=config.recovery,

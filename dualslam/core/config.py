@@ -343,8 +343,8 @@ class LinkingConfig(StrictModel):
     """The same at the new map's live end, with what the walk back has lost of the scale on the way from there to the
     overlap: as for a leap (`recovery.max_leap_scale_sigma`), 5 %, two of these, is a wrong link."""
     max_live_rotation_deg: float = Field(1.5, gt=0)
-    """Rotation by which a camera that the new map contradicts may have bent it on the way from the overlap to its live
-    end. Twice that, 3 degrees, is a wrong link."""
+    """Rotation by which the new map would bend, on the way from the overlap to its live end, under the camera that its
+    pixels ask for. Twice that, 3 degrees, is a wrong link."""
     max_rotation_sigma_deg: float = Field(1.0, gt=0)
     """Largest standard deviation of the rotation about any axis."""
     max_position_sigma: float = Field(0.0167, gt=0)

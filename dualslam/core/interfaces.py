@@ -220,8 +220,8 @@ class SelfCalibrator(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CameraContradiction:
-    """What keyframes of a submap have against the camera that rectified their features, beyond chance.
+class PreferredCamera:
+    """The camera that keyframes of a submap would rather have than the one that rectified their features.
 
     Attributes
     ----------
@@ -230,14 +230,17 @@ class CameraContradiction:
     log_focal_sigma : float
     distance2 : float
         Squared Mahalanobis distance of the whole correction from the camera's.
+    beyond_chance : bool
+        Whether the pixels contradict the camera.
     keyframe_ids : (K,) int64
     T_submap_kf : (K, 4, 4)
-        Their poses as they would be under the camera that their pixels ask for, in a frame of their own.
+        Their poses as they would be under it, in a frame of their own.
     """
 
     log_focal: float
     log_focal_sigma: float
     distance2: float
+    beyond_chance: bool
     keyframe_ids: IntArray
     T_submap_kf: FloatArray
 

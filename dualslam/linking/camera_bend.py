@@ -1,9 +1,10 @@
 """Whether a wrong camera bends the new map between the overlap, where a link is measured, and its live end.
 
 A wrong camera bends a map wherever it turns: it may agree with another map of that camera on all that both have seen,
-and say nothing of the scale beyond. Matches that err alike look like a wrong camera, too, beyond what their noise
-explains; but what they ask for changes little in the map's shape. So what counts is not how sure the pixels contradict
-the camera, but by how much the map would be another one under the camera that they ask for.
+and say nothing of the scale beyond. How sure the pixels contradict the camera does not decide. Matches that err alike
+look like a wrong camera, beyond what their noise explains, where what they ask for changes little in the map's shape;
+and a short map may hardly know its camera, and be bent. So what counts is by how much the map would be another one
+under the camera that its pixels ask for.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.config import LinkingConfig
 from dualslam.core.geometry import so3
-from dualslam.core.interfaces import CameraContradiction
+from dualslam.core.interfaces import PreferredCamera
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking.estimate import LinkEstimate
@@ -64,11 +65,11 @@ def check_camera(
     submap: Submap,
     link: LinkEstimate,
     live_since: int,
-    find: Callable[[Submap, IntArray], CameraContradiction | None],
+    find: Callable[[Submap, IntArray], PreferredCamera | None],
     config: LinkingConfig,
     calibration: CalibrationConfig,
 ) -> Bend | Failure:
-    """Return the bend that the camera may have made in a new map, none where it is not contradicted beyond chance.
+    """Return the bend that the camera may have made in a new map, none where its pixels say nothing of it.
 
     Parameters
     ----------
@@ -87,7 +88,8 @@ def check_camera(
     Returns
     -------
     Bend or Failure
-        A failure where the link would not be known well enough with it.
+        A failure where the link would not be known well enough with it: of the camera where that is contradicted beyond
+        chance, else of the scale, which more keyframes may tell.
     """
     here, there = _places(submap, link.agreeing_keyframes, live_since)
     ids = np.array(sorted(submap.keyframes), np.int64)
@@ -110,9 +112,11 @@ def check_camera(
         "bend_scale": bend.log_scale,
         "bend_deg": turn_deg,
     }
-    detail = f"the new map contradicts its camera: focal length {found.log_focal:+.1%}, known to "
-    detail += f"{found.log_focal_sigma:.1%}, would bend it by {abs(bend.log_scale):.1%} and {turn_deg:.1f} deg"
-    return Failure(FailureReason.CAMERA, detail, numbers)
+    by = f"focal length {found.log_focal:+.1%}, known to {found.log_focal_sigma:.1%}"
+    by += f", would bend it by {abs(bend.log_scale):.1%} and {turn_deg:.1f} deg"
+    if found.beyond_chance:
+        return Failure(FailureReason.CAMERA, f"the new map contradicts its camera: {by}", numbers)
+    return Failure(FailureReason.SCALE, f"the new map hardly knows its camera: {by}", numbers)
 
 
 def _places(submap: Submap, agreeing: IntArray, live_since: int) -> tuple[IntArray, IntArray]:

@@ -11,7 +11,7 @@ from backend.self_calibration import (
     choose_window,
     estimate_calibration,
     estimate_correction,
-    find_contradiction,
+    find_preferred_camera,
     make_problem,
 )
 from dualslam.build import adjust_submap
@@ -173,30 +173,32 @@ class TestEstimate:
         assert np.array_equal(a.covariance, b.covariance)
 
 
-class TestContradiction:
+class TestPreferredCamera:
     """What is asked of a map before it is linked: less than a better camera."""
 
-    def test_a_map_of_the_right_camera_has_none(self) -> None:
-        submap = make_submap(TRUE, turning=True, n=10)
-        assert find_contradiction(submap, np.arange(10), TRUE, CONFIG) is None
+    def test_the_right_camera_is_not_contradicted(self) -> None:
+        found = find_preferred_camera(make_submap(TRUE, turning=True, n=10), np.arange(10), TRUE, CONFIG)
+        assert found
+        assert not found.beyond_chance
+        assert abs(found.log_focal) < 0.01
 
-    def test_one_need_not_be_sure_of_another_camera(self) -> None:
+    def test_one_need_not_be_sure_of_another(self) -> None:
         camera, config = wrong_camera(1.06), CalibrationConfig(inflation=9.0)
         submap = make_submap(camera, turning=True, n=6)
         answer = estimate_calibration(submap, camera, config)
         assert isinstance(answer, Failure)
         assert answer.reason is FailureReason.DEGENERATE
-        found = find_contradiction(submap, np.arange(6), camera, config)
+        found = find_preferred_camera(submap, np.arange(6), camera, config)
         assert found
         assert found.log_focal == pytest.approx(-np.log(1.06), abs=0.02)
-        assert found.distance2 > config.min_distance2
+        assert found.beyond_chance
 
-    def test_its_poses_are_those_of_the_camera_that_is_asked_for(self) -> None:
+    def test_its_poses_are_those_under_the_camera_that_is_asked_for(self) -> None:
         camera = wrong_camera(1.06)
         submap, ids = make_submap(camera, turning=True, n=20), np.arange(2, 18)
         true = submap.keyframe_poses(ids)
         adjust_submap(submap, 1.345)  # the pixels of the wrong camera bend it
-        found = find_contradiction(submap, ids, camera, CONFIG)
+        found = find_preferred_camera(submap, ids, camera, CONFIG)
         assert found
         np.testing.assert_array_equal(found.keyframe_ids, ids)
         errors = []
@@ -205,20 +207,20 @@ class TestContradiction:
             errors.append(np.linalg.norm(scale * path @ R.T + t - true[:, :3, 3], axis=1).mean())
         assert errors[1] < 0.3 * errors[0]
 
-    def test_nor_is_there_one_where_the_camera_is_known_no_better(self) -> None:
+    def test_a_camera_that_is_known_no_better_is_not_contradicted(self) -> None:
         camera, ids = wrong_camera(1.03), np.arange(10)
         submap = make_submap(camera, turning=True, n=10)
-        assert find_contradiction(submap, ids, camera, CONFIG)
         unsure = np.diag([0.02, 5.0, 5.0, 0.02, 0.02]) ** 2
-        assert find_contradiction(submap, ids, camera, CONFIG, present_covariance=unsure) is None
+        found = [find_preferred_camera(submap, ids, camera, CONFIG, present_covariance=P) for P in (None, unsure)]
+        assert [each.beyond_chance for each in found if each] == [True, False]
 
-    def test_a_map_that_says_nothing_has_none(self) -> None:
+    def test_a_map_that_does_not_turn_says_nothing(self) -> None:
         camera = wrong_camera(1.06)
-        assert find_contradiction(make_submap(camera, turning=False, n=10), np.arange(10), camera, CONFIG) is None
+        assert find_preferred_camera(make_submap(camera, turning=False, n=10), np.arange(10), camera, CONFIG) is None
 
     def test_a_camera_that_is_taken_at_its_word_is_not_asked_about(self) -> None:
         camera, config = wrong_camera(1.06), CalibrationConfig(refine=False)
-        assert find_contradiction(make_submap(camera, turning=True, n=10), np.arange(10), camera, config) is None
+        assert find_preferred_camera(make_submap(camera, turning=True, n=10), np.arange(10), camera, config) is None
 
 
 class TestProblem:

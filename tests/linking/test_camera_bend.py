@@ -10,13 +10,13 @@ from functools import partial
 import numpy as np
 import pytest
 
-from backend.self_calibration import find_contradiction
+from backend.self_calibration import find_preferred_camera
 from dualslam.build import adjust_submap
 from dualslam.core.calibration_config import CalibrationConfig
 from dualslam.core.camera import PinholeCamera
 from dualslam.core.config import LinkingConfig
 from dualslam.core.geometry import se3, sim3, so3
-from dualslam.core.interfaces import CameraContradiction
+from dualslam.core.interfaces import PreferredCamera
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, IntArray
 from dualslam.linking import NO_BEND, Bend, LinkEstimate, carry_to_live_end, check_camera
@@ -34,19 +34,21 @@ def link() -> LinkEstimate:
     return replace(linked()[1], agreeing_keyframes=OVERLAP)
 
 
-def asking(camera: PinholeCamera) -> Callable[[Submap, IntArray], CameraContradiction | None]:
-    return lambda submap, ids: find_contradiction(submap, ids, camera, CALIBRATION)
+def asking(camera: PinholeCamera) -> Callable[[Submap, IntArray], PreferredCamera | None]:
+    return lambda submap, ids: find_preferred_camera(submap, ids, camera, CALIBRATION)
 
 
-def found(submap: Submap, ids: IntArray, log_scale: float, turn_deg: float) -> CameraContradiction:
-    """Return a contradiction under which the map's second half would be another by so much, seen from elsewhere."""
+def found(
+    submap: Submap, ids: IntArray, log_scale: float, turn_deg: float, beyond_chance: bool = True
+) -> PreferredCamera:
+    """Return a camera under which the map's second half would be another by so much, seen from elsewhere."""
     T = submap.keyframe_poses(ids)
     joint = T[len(T) // 2]
     bend = sim3.from_parts(math.exp(log_scale), so3.exp([0.0, math.radians(turn_deg), 0.0]), np.zeros(3))
     bend = joint @ bend @ se3.inverse(joint)
     elsewhere = sim3.from_parts(1.7, so3.exp([0.4, -1.0, 0.2]), np.array([3.0, 1.0, -2.0]))
     moved = [sim3.act_on_pose(elsewhere @ bend if i > len(T) // 2 else elsewhere, T_k) for i, T_k in enumerate(T)]
-    return CameraContradiction(0.05, 0.01, 40.0, ids, np.array(moved))
+    return PreferredCamera(0.05, 0.01, 40.0, beyond_chance, ids, np.array(moved))
 
 
 @pytest.mark.parametrize(("log_scale", "turn_deg"), [(0.0, 0.0), (0.03, 0.0), (-0.08, 2.0)])
@@ -59,9 +61,17 @@ def test_a_bend_is_by_what_one_end_turns_and_grows(log_scale: float, turn_deg: f
     assert math.degrees(bend.rotation_rad) == pytest.approx(turn_deg, abs=1e-6)
 
 
-def test_a_map_of_the_right_camera_has_none(link: LinkEstimate) -> None:
+def test_the_right_camera_bends_nothing(link: LinkEstimate) -> None:
     submap = make_submap(TRUE, turning=True, n=N)
-    assert check_camera(submap, link, LIVE_SINCE, asking(TRUE), CONFIG, CALIBRATION) == NO_BEND
+    bend = check_camera(submap, link, LIVE_SINCE, asking(TRUE), CONFIG, CALIBRATION)
+    assert isinstance(bend, Bend)
+    assert abs(bend.log_scale) < 0.005
+
+
+def test_a_map_that_says_nothing_of_its_camera_has_no_bend(link: LinkEstimate) -> None:
+    camera = wrong_camera(1.06)
+    submap = make_submap(camera, turning=False, n=N)
+    assert check_camera(submap, link, LIVE_SINCE, asking(camera), CONFIG, CALIBRATION) == NO_BEND
 
 
 def test_a_camera_that_bends_the_map_is_a_reason_for_no_link(link: LinkEstimate) -> None:
@@ -87,9 +97,11 @@ def test_what_counts_is_the_bend_and_not_the_contradiction(
     link: LinkEstimate, log_scale: float, turn_deg: float, passes: bool
 ) -> None:
     submap = make_submap(TRUE, turning=True, n=N)
-    find = partial(found, log_scale=log_scale, turn_deg=turn_deg)
-    verdict = check_camera(submap, link, LIVE_SINCE, find, CONFIG, CALIBRATION)
-    assert isinstance(verdict, Bend) is passes
+    for beyond_chance, reason in ((True, FailureReason.CAMERA), (False, FailureReason.SCALE)):
+        find = partial(found, log_scale=log_scale, turn_deg=turn_deg, beyond_chance=beyond_chance)
+        verdict = check_camera(submap, link, LIVE_SINCE, find, CONFIG, CALIBRATION)
+        assert isinstance(verdict, Bend) is passes
+        assert passes or (isinstance(verdict, Failure) and verdict.reason is reason)
 
 
 def test_it_counts_beside_what_else_is_unknown(link: LinkEstimate) -> None:
@@ -103,7 +115,7 @@ def test_it_counts_beside_what_else_is_unknown(link: LinkEstimate) -> None:
 def test_of_a_large_map_a_window_is_asked_that_reaches_both_ends(link: LinkEstimate) -> None:
     asked: list[IntArray] = []
 
-    def find(submap: Submap, ids: IntArray) -> CameraContradiction | None:
+    def find(submap: Submap, ids: IntArray) -> PreferredCamera | None:
         asked.append(ids)
         return None
 
