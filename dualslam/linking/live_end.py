@@ -24,7 +24,7 @@ def carry_to_live_end(
 ) -> LinkEstimate | Failure:
     """Add to a link's covariance what the walk back has lost of the scale, and refuse it where that is too much.
 
-    And what the camera may have changed, which is not read from the map's residuals.
+    So does what the map may be bent by its camera.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def carry_to_live_end(
         The keyframe that the walk set out from: it and those after it are the live end.
     config : LinkingConfig
     bend : Bend, optional
-        Of the new map, by a camera that it contradicts.
+        Of the new map, under the camera that its pixels ask for.
 
     Returns
     -------
