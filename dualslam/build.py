@@ -104,6 +104,10 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
         view = view_of(frame, frontend, camera, config.camera.model_sigma_px)
         return view if isinstance(view, Failure) else shutter.straightened(view, camera)
 
+    def odometry(submap: Submap, graph: SubmapGraph, n_covering: int = 0) -> VisualFrontEnd:
+        refinder = Refinder(submap, frontend, calibrated, sigma_px)
+        return VisualFrontEnd(frontend, config, submap, graph, size_px, refinder, n_covering)
+
     return System(
         Components(
             view_of=faults.around_views(straight_view_of),
@@ -111,11 +115,8 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
                 frontend, bundle_adjust_arrays, config.initialiser, calibration.camera.K, size_px, config.seed
             ),
             new_graph=lambda: ISam2SubmapGraph(config.graph),
-            new_odometry=faults.around_odometry(
-                lambda submap, graph: VisualFrontEnd(
-                    frontend, config, submap, graph, size_px, Refinder(submap, frontend, calibrated, sigma_px)
-                )
-            ),
+            new_odometry=faults.around_odometry(odometry),
+            new_seeker=faults.around_odometry(partial(odometry, n_covering=config.recovery.covering_keyframes)),
             calibration=calibration,
             shutter=shutter,
             recovery=recovery or recovery_executor(config, size_px, faults, frontend),

@@ -92,6 +92,16 @@ class Recoveries:
         if self._config.enabled:
             self._lost[submap_id] = Loss(onset, cause, first_lost)
 
+    def is_under_way(self, submap: Submap) -> bool:
+        """Whether a walk back from a submap has not come to its end yet."""
+        return submap.id in self._under_way
+
+    def found_again(self, submap: Submap) -> None:
+        """Let no walk look for a submap that is live again; from its next keyframe one poses the frames of the gap."""
+        self._lost.pop(submap.id, None)
+        self._retries.start_of(submap, min(submap.keyframes))
+        self._retries.leave_open(submap.id, 0, self._calibration.camera)
+
     def start(self, submap: Submap, newest: View, now: Moment | None = None) -> None:
         """Start the walk back from a new submap: over the frames without a pose, then on into the lost submaps.
 

@@ -97,6 +97,7 @@ def summarise(
         "posed_in_all_submaps": posed + sum(len(frames) for frames in trajectories.unlinked.values()),
         "failures": len(system.events.of_kind(EventKind.FAILED)),
         "recoveries": sum(link.kind is LinkKind.RECOVERY for link in system.atlas.links),
+        "resumed": len(system.events.of_kind(EventKind.RESUMED)),
         "recoveries_failed": len(system.events.of_kind(EventKind.RECOVERY_FAILED)),
         "submaps": len(system.atlas.submaps),
         "links": len(system.atlas.links),

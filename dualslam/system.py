@@ -22,7 +22,7 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, Frame
 from dualslam.executor import RecoveryExecutor
 from dualslam.frame_buffer import FrameBuffer
 from dualslam.frame_records import FrameRecord, FrameResult
-from dualslam.health import HealthMonitor, count_signs
+from dualslam.health import HealthMonitor, count_signs, judge_track
 from dualslam.merging import carry_links
 from dualslam.record import Record
 from dualslam.recoveries import Recoveries
@@ -34,12 +34,16 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Components:
-    """The parts that the composition root puts in: the system itself knows neither front end nor solver."""
+    """The parts that the composition root puts in: the system itself knows neither front end nor solver.
+
+    `new_seeker`: a front end that finds its submap again wherever it is seen, and goes on from there.
+    """
 
     view_of: Callable[[Frame], View | Failure]
     new_starter: Callable[[], MapStarter]
     new_graph: Callable[[], SubmapGraph]
     new_odometry: Callable[[Submap, SubmapGraph], VisualOdometry]
+    new_seeker: Callable[[Submap, SubmapGraph], VisualOdometry]
     calibration: Calibration
     shutter: Shutter
     recovery: RecoveryExecutor
@@ -74,6 +78,9 @@ class System:
         self.buffer = FrameBuffer(config.buffer.duration_s, config.buffer.max_mb)
         self.buffer.freeze()  # no map yet, as after a loss: the first start is walked back from to the first frame
         self._live: VisualOdometry | None = None
+        self._seeker: VisualOdometry | None = None  # of the map that was lost last, until another starts
+        self._n_unseen = 0  # frames since its loss that show something, without a start
+        self._sighted = False  # whether the last one has shown that map
         self._starter = components.new_starter()
         self._lost: list[View] = []
         self._health = HealthMonitor(config.health)
@@ -109,7 +116,7 @@ class System:
             outcome: Track | Failure = self._unusable(frame, view)
         else:
             self.buffer.append(view)
-            # 3. Without a live submap, try to start one; with one, track.
+            # 3. Without a live submap, look for the lost one, or try to start one; with one, track.
             outcome = self._initialise(view) if self._live is None else self._track(self._live, view)
         return self._result(frame, outcome, time.perf_counter() - started)
 
@@ -128,6 +135,8 @@ class System:
     # --- initialising
 
     def _initialise(self, view: View) -> Track | Failure:
+        if self._seeker is not None and (track := self._resume(self._seeker, view)):
+            return track
         shutter = self._parts.shutter
         with self.timer.measure("shutter"):
             readout_s = shutter.readout_s
@@ -144,12 +153,33 @@ class System:
             return start
         return self._begin_submap(start, view)
 
+    def _resume(self, seeker: VisualOdometry, view: View) -> Track | None:
+        """Go on in the map that was lost last, where two frames in a row show it."""
+        self._n_unseen += len(view.features) >= self._config.tracking.min_inliers
+        if self._n_unseen <= (self._config.recovery.resume_after or 0):
+            return None
+        with self.timer.measure("seeking"):
+            if not self._sighted:
+                self._sighted = bool(judge_track(seeker.track(view), self._config.health))
+                return None
+        self._sighted = False
+        track = self._track_with(seeker, view)
+        if isinstance(track, Failure):
+            self._seeker = None if track.reason is FailureReason.SOLVER else seeker
+            return None
+        self._live, self._seeker = seeker, None
+        self._record.event(EventKind.RESUMED, view, seeker.submap.id, n_inliers=track.n_inliers)
+        self._recoveries.found_again(seeker.submap)
+        self.buffer.thaw()
+        return track
+
     def _straighten(self, view: View) -> View:
         """Take the shutter that was found out of the frames so far; the starter begins anew. Returns the view's own."""
         shutter, camera = self._parts.shutter, self._parts.calibration.camera
         self._record.event(EventKind.SHUTTER_FOUND, view, None, readout_s=shutter.readout_s)
         self.buffer.map(lambda buffered: shutter.straightened(buffered, camera))
         self._starter = self._parts.new_starter()
+        self._seeker = None  # its map is of the pixels of before
         *waiting, newest = (v for v in self.buffer if self.rows[v.index].submap_id is None)
         for earlier in waiting:
             self._starter.collect(earlier)
@@ -172,7 +202,7 @@ class System:
             row = self.rows[k]
             row.n_matches = row.n_inliers = int((submap.landmark_of[k] >= 0).sum())
         self._record.event(kind, view, submap.id, first_view=start.views[0].index, **start.numbers)
-        self._live = self._parts.new_odometry(submap, graph)
+        self._live, self._seeker = self._parts.new_odometry(submap, graph), None
         self._live.start_at(view.index)
         self._health = HealthMonitor(self._config.health)
         self._recoveries.start(submap, view)
@@ -287,10 +317,20 @@ class System:
         self._archive(live, "track lost")
         self._recoveries.declare_lost(live.submap.id, onset, str(failure.reason), self._lost[0].index)
         self._live = None
+        self._seek(live, failure)
         self._starter = self._parts.new_starter()
         for lost in self._lost:
             self._starter.collect(lost)
         self._lost = []
+
+    def _seek(self, live: VisualOdometry, failure: Failure) -> None:
+        """Look for a lost map from now on, unless its graph has failed, or a walk back is about to change it."""
+        self._sighted, self._n_unseen, self._health = False, 0, HealthMonitor(self._config.health)
+        wanted = self._config.recovery.enabled and self._config.recovery.resume_after is not None
+        if not wanted or failure.reason is FailureReason.SOLVER or self._recoveries.is_under_way(live.submap):
+            return
+        self._seeker = self._parts.new_seeker(live.submap, live.graph)
+        self._seeker.start_at(live.reference_id)
 
     def _archive(self, live: VisualOdometry, why: str) -> None:
         submap = live.submap

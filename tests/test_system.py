@@ -8,6 +8,7 @@ import pytest
 from dualslam.core.config import RecoveryConfig
 from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.evaluation.bench.measure import breakages
 from dualslam.results import frame_rows, trajectories_of
 from dualslam.system import System
 from tests.point_world import PointWorld, cloud, hand_held, path, pose_errors, system_in
@@ -145,6 +146,51 @@ def test_frames_since_a_loss_wait_for_the_next_map_however_short_the_buffer() ->
     system = run(PointWorld(both_sides, T), buffer={"duration_s": 0.3})
     assert len(system.atlas.submaps) == 2
     assert {i: row.submap_id for i, row in system.rows.items()} == {i: int(i >= 20) for i in range(60)}
+
+
+def turning_back(n_away: int) -> PointWorld:
+    """A walk, a turn in place to where no map can start, as long as it lasts, and back to go on walking."""
+    walk = path(45, np.array([0.08, 0, 0]), np.zeros(3))
+    away = walk[24] @ path(2, np.zeros(3), np.array([0, np.pi, 0]))[1]
+    behind = cloud(seed=1) * (1, 1, -1) + walk[24][:3, 3]
+    T = np.concatenate([walk[:25], np.repeat(away[None], n_away, 0), walk[25:]])
+    return PointWorld(np.concatenate([cloud(), behind]), T)
+
+
+def test_a_lost_map_that_is_seen_again_before_another_starts_is_gone_on_with() -> None:
+    world = turning_back(25)
+    system = run(world, recovery={"enabled": True})
+    (resumed,) = system.events.of_kind(EventKind.RESUMED)
+    assert resumed.frame == 25 + 25 + 1, "two frames must show it"
+    assert len(system.atlas.submaps) == 1
+    assert [k for k in kinds(system) if k in (EventKind.FAILED, EventKind.REINITIALISED)] == [EventKind.FAILED]
+    indices, T = main_trajectory(system)
+    assert [i for i in range(70) if i not in indices] == list(range(25, 50)), "the first frame is walked back to"
+    assert_right(indices[5:], T[5:], world)
+    assert system.rows[69].status is FrameStatus.TRACKED
+
+
+def test_it_may_be_lost_again() -> None:
+    once, T = turning_back(25), turning_back(25).T_world_cam
+    world = PointWorld(once.xyz, np.concatenate([T, np.repeat(T[30:31], 12, 0)]))
+    system = run(world, recovery={"enabled": True})
+    assert kinds(system).count(EventKind.FAILED) == 2
+    assert kinds(system).count(EventKind.RESUMED) == 1
+    losses = breakages(tuple(system.events))
+    assert [(loss.submap, loss.resumed, loss.recovered) for loss in losses] == [(0, True, True), (0, False, False)]
+
+
+@pytest.mark.parametrize("settings", [{"enabled": False}, {"enabled": True, "resume_after": None}])
+def test_it_is_not_looked_for_where_that_is_not_wanted(settings: dict[str, object]) -> None:
+    system = run(turning_back(25), recovery=settings)
+    assert not system.events.of_kind(EventKind.RESUMED)
+    assert len(system.atlas.submaps) == 2
+
+
+def test_a_map_that_starts_at_once_comes_first() -> None:
+    system = run(turning_back(25), recovery={"enabled": True, "resume_after": 40})
+    assert not system.events.of_kind(EventKind.RESUMED)
+    assert system.events.of_kind(EventKind.REINITIALISED)
 
 
 @pytest.fixture(scope="module")

@@ -207,15 +207,20 @@ class RecoveryConfig(StrictModel):
     """Largest standard deviation (relative) of the scale beyond a leap, by the Hessian of its wide matches. Twice what
     a link may have (`linking.max_live_scale_sigma`, by which the walk is judged in the end): the landmarks that are
     found again beyond the gap halve it, if the leap is right."""
+    resume_after: int | None = Field(15, ge=0)
+    """Frames that show something without a start, after which a lost map is looked for, and gone on with where it is
+    seen again; null: never. A map that starts sooner is better linked, by all that a walk back finds: most start within
+    2 to 5 frames, unless the camera turns in place, and then it may come back to what the lost map shows before any
+    can start."""
     retry_keyframes: tuple[int, ...] = (5, 15)
     """Keyframes of the new map, from its start on, at which a walk back that has found no link, or left buffered frames
     without a pose, is made again: the map knows depths better then, and more of the scene. It is too when the camera
     has been calibrated since, and, if any number stands here, when the run ends and the map has grown since. One for
     poses alone that finds none is the last."""
     covering_keyframes: int = Field(20, ge=0)
-    """Keyframes that a walk which only poses frames matches widely at most, beyond those nearest in time
-    (`tracking.wide_keyframes`): the ones that together show the most of the map, since in a gap the camera may have
-    looked anywhere. Each costs about 2 ms of CPU for a frame that is not found."""
+    """Keyframes that a walk which only poses frames, or a search for a lost map, matches widely at most, beyond those
+    nearest in time (`tracking.wide_keyframes`): the ones that together show the most of the map, since in a gap the
+    camera may have looked anywhere. Each costs about 2 ms of CPU for a frame that is not found."""
     min_shared_keyframes: int = Field(4, ge=2)
     """Keyframes that both maps must hold before a link is tried."""
     max_shared_keyframes: int = Field(40, ge=4)

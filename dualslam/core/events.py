@@ -17,6 +17,7 @@ class EventKind(StrEnum):
     FAILED = "failed"
     ARCHIVED = "archived"
     REINITIALISED = "reinitialised"
+    RESUMED = "resumed"
     ROLLED_OVER = "rolled_over"
     GRAPH_REBUILT = "graph_rebuilt"
     CALIBRATED = "calibrated"

@@ -64,7 +64,7 @@ def find_map_jumps(
     events : iterable of Event
         Of the run: what was declared lost is a failure that was noticed.
     """
-    lost = {e.submap: e.frame for e in events if e.event is EventKind.FAILED and e.submap is not None}
+    lost = [(e.submap, e.frame) for e in events if e.event is EventKind.FAILED]
     by_submap: dict[int, dict[int, FloatArray]] = {}
     for pose in poses:
         if pose.index in truth:
@@ -77,7 +77,8 @@ def find_map_jumps(
         for frame, log_scale, rotation_deg in _jumps(index, est, true):
             later = int(np.searchsorted(index, frame)) + WINDOW
             until = index[later] if later < len(index) else math.inf
-            jumps.append(MapJump(m, frame, log_scale, rotation_deg, frame <= lost.get(m, -1) <= until))
+            noticed = any(submap == m and frame <= at <= until for submap, at in lost)
+            jumps.append(MapJump(m, frame, log_scale, rotation_deg, noticed))
     return jumps
 
 

@@ -43,6 +43,8 @@ class FailureStory:
     fused : dict or None
     superseded : dict or None
         Where a later map had posed all its frames.
+    resumed : dict or None
+        Where it was seen again, before another map had started.
     """
 
     letter: str
@@ -54,6 +56,7 @@ class FailureStory:
     linked: Event | None
     fused: Event | None
     superseded: Event | None
+    resumed: Event | None
 
     @property
     def lost_since(self) -> int:
@@ -68,6 +71,7 @@ def stories(run: RunData) -> list[FailureStory]:
         if event.get("event") != "failed":
             continue
         later, lost = run.events[i + 1 :], event.get("submap")
+        next_map = next((e for e in later if e.get("event") in ("reinitialised", "resumed")), {})
         own = [e for e in later if e.get("old_submap") == lost]
         looking = {e.get("submap") for e in later if e.get("event") == "recovery_started" and lost in e.get("lost", [])}
         walking = [e for e in later if e.get("submap") in looking]
@@ -75,13 +79,14 @@ def stories(run: RunData) -> list[FailureStory]:
             FailureStory(
                 letter=failure_letter(len(found) + 1),
                 failed=event,
-                restart=next((e for e in later if e.get("event") == "reinitialised"), None),
+                restart=next_map if next_map.get("event") == "reinitialised" else None,
                 walks=[e for e in walking if e.get("event") == "recovery_attempt"],
                 broken=[e for e in walking if e.get("event") == "recovery_failed"],
                 tries=[e for e in own if e.get("event") in _TRIES],
                 linked=next((e for e in own if e["event"] == "linked"), None),
                 fused=next((e for e in own if e["event"] == "fused"), None),
                 superseded=next((e for e in later if lost in e.get("old_submaps", [])), None),
+                resumed=next_map if next_map.get("event") == "resumed" else None,
             )
         )
     return found
@@ -115,6 +120,8 @@ def _card(run: RunData, scene: Scene | None, story: FailureStory) -> Markup:
 
 def _verdict(run: RunData, story: FailureStory) -> tuple[str, str]:
     rows = [row for row in run.rows if row.submap == story.failed.get("submap")]
+    if story.resumed is not None:
+        return "✓ seen again", "pill good"
     if story.linked is not None:
         return "✓ linked with the map after it", "pill good"
     if story.superseded is not None:
@@ -136,6 +143,10 @@ def _told(run: RunData, story: FailureStory) -> str:
     suspected = failed.get("suspected_since")
     if suspected is not None and suspected != story.lost_since:
         told.append(f"There were signs of trouble since frame {suspected}: the map is not trusted from there on.")
+    if story.resumed is not None:
+        gap = abs(run.row_of.get(story.resumed["frame"], 0) - run.row_of.get(story.lost_since, 0))
+        again = f"It was seen again at frame {story.resumed['frame']}, {count(gap, 'frame')} after the loss, before"
+        return " ".join([*told, again, "another map had started, and gone on with."])
     if story.restart is None:
         return " ".join([*told, "No map was started after it, until the run ended."])
     first_view = story.restart.get("first_view")

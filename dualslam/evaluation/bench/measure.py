@@ -38,44 +38,46 @@ def initialisation(rows: Sequence[FrameRow], events: Iterable[Event]) -> tuple[i
 
 
 def breakages(events: Sequence[Event]) -> tuple[Breakage, ...]:
-    """Return every lost map with what was tried to recover it.
+    """Return every loss of a map with what was tried to recover it.
 
     A recovery starts from a new submap and looks for the maps that are lost by then (``recovery_started``). Each
     ``recovery_attempt`` of that submap is its next attempt; a map that several recoveries looked for counts the most
-    attempts that one of them made.
+    attempts that one of them made. A map that was seen again before another had started (``resumed``) may be lost once
+    more.
     """
-    found: dict[int, dict[str, Any]] = {}
-    looked_for: dict[int, list[int]] = {}  # by the recovery's submap
+    found: list[dict[str, Any]] = []
+    last: dict[int, dict[str, Any]] = {}  # the last loss of each submap
+    looked_for: dict[int, list[dict[str, Any]]] = {}  # by the recovery's submap
     made: Counter[int] = Counter()
     for event in events:
         submap = -1 if event.submap is None else event.submap
         if event.event is EventKind.FAILED:
             reason = str(event.data.get("reason", ""))
-            found[submap] = {"frame": event.frame, "reason": reason, "at_s": event.timestamp_s}
+            last[submap] = {"submap": submap, "frame": event.frame, "reason": reason, "at_s": event.timestamp_s}
+            found.append(last[submap])
+        elif event.event is EventKind.RESUMED:
+            last[submap]["resumed"] = True
         elif event.event is EventKind.REINITIALISED:
-            for lost in found.values():
-                if "restart_frames" not in lost:
+            for lost in found:
+                if not lost.get("resumed") and "restart_frames" not in lost:
                     lost["restart_frames"] = abs(event.frame - lost["frame"])
                     lost["restart_s"] = abs(event.timestamp_s - lost["at_s"])
         elif event.event is EventKind.RECOVERY_STARTED:
-            looked_for[submap] = [m for m in event.data.get("lost", ()) if m in found]
-            _count(found, looked_for[submap], 1)
+            looked_for[submap] = [last[m] for m in event.data.get("lost", ()) if m in last]
+            _count(looked_for[submap], 1)
         elif event.event is EventKind.RECOVERY_ATTEMPT:
             made[submap] += 1
-            _count(found, looked_for.get(submap, []), made[submap])
-        elif event.event is EventKind.LINKED and event.data.get("old_submap") in found:
+            _count(looked_for.get(submap, []), made[submap])
+        elif event.event is EventKind.LINKED and event.data.get("old_submap") in last:
             attempt = max(made[submap], 1)
-            lost = found[event.data["old_submap"]]
+            lost = last[event.data["old_submap"]]
             lost |= {"attempts": attempt, "succeeded_at": attempt, "recovery_s": event.data.get("seconds")}
-    return tuple(
-        Breakage(submap=submap, **{name: value for name, value in lost.items() if name != "at_s"})
-        for submap, lost in found.items()
-    )
+    return tuple(Breakage(**{name: value for name, value in lost.items() if name != "at_s"}) for lost in found)
 
 
-def _count(found: dict[int, dict[str, Any]], submaps: Iterable[int], attempt: int) -> None:
-    for submap in submaps:
-        found[submap]["attempts"] = max(found[submap].get("attempts", 0), attempt)
+def _count(losses: Iterable[dict[str, Any]], attempt: int) -> None:
+    for lost in losses:
+        lost["attempts"] = max(lost.get("attempts", 0), attempt)
 
 
 def trajectory_error(main: PosedFrames, truth: Trajectory, times_s: FloatArray) -> tuple[float | None, float | None]:

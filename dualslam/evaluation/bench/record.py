@@ -60,6 +60,8 @@ class Breakage:
         The attempt that linked the map, from 1.
     recovery_s : float or None
         Seconds that the recovery took.
+    resumed : bool
+        Whether the map was seen again before another had started, and gone on with.
     """
 
     frame: int
@@ -70,6 +72,12 @@ class Breakage:
     attempts: int = 0
     succeeded_at: int | None = None
     recovery_s: float | None = None
+    resumed: bool = False
+
+    @property
+    def recovered(self) -> bool:
+        """Whether it is part of what was mapped after it."""
+        return self.resumed or self.succeeded_at is not None
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,9 +41,9 @@ def recovery_table(spec: BenchSpec, records: Sequence[TrialRecord]) -> Table:
     for variant in spec.variant_names:
         trials = [r for r in records if r.variant == variant]
         broken = [b for r in trials for b in r.breakages]
-        recovered = [b for b in broken if b.succeeded_at is not None]
+        recovered = [b for b in broken if b.recovered]
         needing = [r for r in trials if r.breakages]
-        whole = [r for r in needing if all(b.succeeded_at is not None for b in r.breakages)]
+        whole = [r for r in needing if all(b.recovered for b in r.breakages)]
         seconds = [b.recovery_s for b in recovered if b.recovery_s is not None]
         head: list[Cell] = [variant, len(trials), len(needing), len(whole), len(broken), len(recovered)]
         tail: list[Cell] = [
@@ -82,7 +82,7 @@ def redundancy_table(spec: BenchSpec, records: Sequence[TrialRecord]) -> Table:
         attempts = count_attempts([b for r in trials for b in r.breakages])
         rates = [a.failure_rate for a in attempts]
         needing = sum(bool(r.breakages) for r in trials)
-        unrecovered = sum(any(b.succeeded_at is None for b in r.breakages) for r in trials)
+        unrecovered = sum(any(not b.recovered for b in r.breakages) for r in trials)
         p0 = needing / len(trials) if trials else None
         independent = conditional = None
         if p0 is not None and rates and all(rate is not None for rate in rates):

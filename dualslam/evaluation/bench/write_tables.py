@@ -54,7 +54,7 @@ def _trials_csv(spec: BenchSpec, records: Sequence[TrialRecord]) -> str:
     writer.writerow(_COLUMNS)
     for r in records:
         verdict = judge(r, spec.thresholds)
-        recovered = sum(b.succeeded_at is not None for b in r.breakages)
+        recovered = sum(b.recovered for b in r.breakages)
         measures = (r.ate_m, r.path_m, r.end_point_error_m)
         row = [r.sequence, r.condition, r.variant, r.number, r.start, verdict, r.outcome, r.coverage, r.initialised_at]
         row += [r.initialised_after_s, *measures, len(r.breakages), recovered, len(r.links), r.wall_s, r.cpu_s, r.error]
