@@ -63,6 +63,12 @@ class FailureStory:
         """First frame of the loss."""
         return int(self.failed["lost_since"] if "lost_since" in self.failed else self.failed["frame"])
 
+    @property
+    def mapped_since(self) -> int | None:
+        """First frame after it that has a map, the next one or the lost one."""
+        event = self.resumed or self.restart
+        return None if event is None else int(event["frame"])
+
 
 def stories(run: RunData) -> list[FailureStory]:
     """Sort the events of a run by the failure that they belong to."""
@@ -208,7 +214,7 @@ def _close_up(run: RunData, scene: Scene | None, story: FailureStory) -> Markup:
     onset = row_of.get(story.lost_since, 0)
     keyframes = [int(k) for k in (story.linked or {}).get("agreeing_keyframes") or [] if int(k) in row_of]
     first = min([onset - AROUND, *(row_of[k] for k in keyframes)])
-    last = row_of.get(story.restart["frame"], onset) if story.restart else onset
+    last = onset if story.mapped_since is None else row_of.get(story.mapped_since, onset)
     drawing = close_up(run, scene, (first, last + AROUND), [row_of[k] for k in keyframes])
     if drawing is None:
         return join(None)
@@ -223,7 +229,7 @@ def _close_up(run: RunData, scene: Scene | None, story: FailureStory) -> Markup:
 def _sample_frames(run: RunData, story: FailureStory) -> Markup:
     row_of = run.row_of
     onset = row_of.get(story.lost_since, 0)
-    stop = row_of.get(story.restart["frame"], len(run.rows)) if story.restart else len(run.rows)
+    stop = len(run.rows) if story.mapped_since is None else row_of.get(story.mapped_since, len(run.rows))
     chosen = [i for i in run.samples if i in row_of and onset - 1 <= row_of[i] <= max(stop, onset)]
     words = {i: _role(run, story, i) for i in chosen}
     return _pictures(run, sorted(chosen, key=row_of.__getitem__), words)
@@ -233,8 +239,8 @@ def _role(run: RunData, story: FailureStory, index: int) -> str:
     row_of = run.row_of
     if row_of[index] < row_of.get(story.lost_since, 0):
         return "last tracked"
-    if story.restart is not None and index == story.restart["frame"]:
-        return "new map"
+    if index == story.mapped_since:
+        return "seen again" if story.resumed is not None else "new map"
     if index == story.lost_since:
         return "lost"
     return "still no map"
