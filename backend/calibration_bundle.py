@@ -62,7 +62,7 @@ class _BehindCameraError(RuntimeError):
 
 
 def optimise_with_camera(
-    problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float
+    problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float, mean: FloatArray | None = None
 ) -> CalibratedOptimum:
     """Minimise over poses, points and calibration, without the few points that a step has put behind a camera.
 
@@ -71,9 +71,11 @@ def optimise_with_camera(
     problem : BundleProblem
         In the rectified pixels of the camera as it was given; `fixed` is not looked at.
     start, prior : (5,)
-        The correction to begin at, and the prior sigmas of its parts about zero.
+        The correction to begin at, and the prior sigmas of its parts.
     robust_k : float
         Huber threshold in sigmas.
+    mean : (5,), optional
+        Of the prior; zero if it is not given.
 
     Raises
     ------
@@ -82,10 +84,10 @@ def optimise_with_camera(
     """
     for _ in range(MAX_DROPS):
         try:
-            return _optimise(problem, start, prior, robust_k)
+            return _optimise(problem, start, prior, robust_k, mean)
         except _BehindCameraError as error:
             problem = _without(problem, error.points)
-    return _optimise(problem, start, prior, robust_k)
+    return _optimise(problem, start, prior, robust_k, mean)
 
 
 def _without(problem: BundleProblem, points: IntArray) -> BundleProblem:
@@ -98,7 +100,9 @@ def _without(problem: BundleProblem, points: IntArray) -> BundleProblem:
     )
 
 
-def _optimise(problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float) -> CalibratedOptimum:
+def _optimise(
+    problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float, mean: FloatArray | None
+) -> CalibratedOptimum:
     """Minimise over poses, points and calibration; the points are eliminated first, the calibration last."""
     p = problem
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -111,11 +115,9 @@ def _optimise(problem: BundleProblem, start: FloatArray, prior: FloatArray, robu
     far = int(np.argmax(distance))
     graph.push_back(pose_prior(0, p.T_submap_kf[0]))
     graph.push_back(baseline_factor(0, far, float(distance[far])))
-    graph.push_back(
-        gtsam.PriorFactorCal3DS2(
-            CALIBRATION_KEY, _to_cal3_ds2(p.K, np.zeros(5)), gtsam.noiseModel.Gaussian.Covariance(_prior(p.K, prior))
-        )
-    )
+    expected = _to_cal3_ds2(p.K, np.zeros(5) if mean is None else mean)
+    of_prior = gtsam.noiseModel.Gaussian.Covariance(_prior(p.K, prior))
+    graph.push_back(gtsam.PriorFactorCal3DS2(CALIBRATION_KEY, expected, of_prior))
     values.insert(CALIBRATION_KEY, _to_cal3_ds2(p.K, start))
     convert.insert_poses(values, keyframes, p.T_submap_kf)
     convert.insert_points(values, points, p.xyz_mu)

@@ -41,6 +41,8 @@ MIN_VIEWS = 3
 MAX_DEPTH_SIGMA = 0.3
 """Relative; landmarks whose distance is known no better make the problem singular and say nothing."""
 MIN_OBSERVATIONS = 1000
+HELD_SIGMA = 1e-5
+"""Prior sigma of a correction that is to stay where it is."""
 MAX_PRIOR_SIGMAS = 6.0
 """A correction farther from the given calibration than this says that something else is wrong."""
 
@@ -109,8 +111,16 @@ def find_preferred_camera(
     problem = _ask(submap, keyframe_ids, camera, config, seed) if config.refine else None
     if problem is None or isinstance(problem, Failure):
         return None
-    answer = _answer(problem, camera.width, correction_of(camera), config, robust_k, present_covariance)
+    present = correction_of(camera)
+    answer = _answer(problem, camera.width, present, config, robust_k, present_covariance)
     if isinstance(answer, Failure):
+        return None
+    try:
+        now, preferred = (
+            optimise_with_camera(problem, held, np.full(5, HELD_SIGMA), robust_k, held).T_submap_kf
+            for held in (present.vector, answer.correction)
+        )
+    except (*GTSAM_ERRORS, np.linalg.LinAlgError):
         return None
     return PreferredCamera(
         float(answer.off[0]),
@@ -118,7 +128,8 @@ def find_preferred_camera(
         answer.distance2,
         answer.distance2 > config.min_distance2,
         keyframe_ids,
-        answer.best.T_submap_kf,
+        now,
+        preferred,
     )
 
 

@@ -233,8 +233,9 @@ class PreferredCamera:
     beyond_chance : bool
         Whether the pixels contradict the camera.
     keyframe_ids : (K,) int64
-    T_submap_kf : (K, 4, 4)
-        Their poses as they would be under it, in a frame of their own.
+    T_now, T_preferred : (K, 4, 4)
+        Their poses by the same pixels, and by these alone, under the camera of now and under the preferred one; each in
+        a frame and unit of its own.
     """
 
     log_focal: float
@@ -242,7 +243,8 @@ class PreferredCamera:
     distance2: float
     beyond_chance: bool
     keyframe_ids: IntArray
-    T_submap_kf: FloatArray
+    T_now: FloatArray
+    T_preferred: FloatArray
 
 
 class SubmapAdjuster(Protocol):

@@ -4,7 +4,8 @@ A wrong camera bends a map wherever it turns: it may agree with another map of t
 and say nothing of the scale beyond. How sure the pixels contradict the camera does not decide. Matches that err alike
 look like a wrong camera, beyond what their noise explains, where what they ask for changes little in the map's shape;
 and a short map may hardly know its camera, and be bent. So what counts is by how much the map would be another one
-under the camera that its pixels ask for.
+under the camera that its pixels ask for, both by the same observations: what else holds a map together would count as
+the camera's doing.
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ def check_camera(
         return NO_BEND
     rows = [np.flatnonzero(np.isin(ids, place)) for place in (here, there)]
     known = min(len(each) for each in rows) >= 2
-    bend = measure_bend(submap.keyframe_poses(ids), found.T_submap_kf, *rows) if known else Bend(math.inf, math.inf)
+    bend = measure_bend(found.T_now, found.T_preferred, *rows) if known else Bend(math.inf, math.inf)
     turn_deg = math.degrees(bend.rotation_rad)
     sigma = math.hypot(link.numbers["sigma_scale"], bend.log_scale)
     if sigma <= config.max_live_scale_sigma and turn_deg <= config.max_live_rotation_deg:

@@ -202,7 +202,7 @@ class TestPreferredCamera:
         assert found
         np.testing.assert_array_equal(found.keyframe_ids, ids)
         errors = []
-        for path in (submap.keyframe_poses(ids)[:, :3, 3], found.T_submap_kf[:, :3, 3]):
+        for path in (found.T_now[:, :3, 3], found.T_preferred[:, :3, 3]):
             scale, R, t = align_points(path, true[:, :3, 3])
             errors.append(np.linalg.norm(scale * path @ R.T + t - true[:, :3, 3], axis=1).mean())
         assert errors[1] < 0.3 * errors[0]

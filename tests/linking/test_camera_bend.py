@@ -48,7 +48,7 @@ def found(
     bend = joint @ bend @ se3.inverse(joint)
     elsewhere = sim3.from_parts(1.7, so3.exp([0.4, -1.0, 0.2]), np.array([3.0, 1.0, -2.0]))
     moved = [sim3.act_on_pose(elsewhere @ bend if i > len(T) // 2 else elsewhere, T_k) for i, T_k in enumerate(T)]
-    return PreferredCamera(0.05, 0.01, 40.0, beyond_chance, ids, np.array(moved))
+    return PreferredCamera(0.05, 0.01, 40.0, beyond_chance, ids, T, np.array(moved))
 
 
 @pytest.mark.parametrize(("log_scale", "turn_deg"), [(0.0, 0.0), (0.03, 0.0), (-0.08, 2.0)])
@@ -56,7 +56,7 @@ def test_a_bend_is_by_what_one_end_turns_and_grows(log_scale: float, turn_deg: f
     submap = make_submap(TRUE, turning=True, n=N)
     ids = np.arange(N)
     bent = found(submap, ids, log_scale, turn_deg)
-    bend = measure_bend(submap.keyframe_poses(ids), bent.T_submap_kf, OVERLAP, np.arange(LIVE_SINCE, N))
+    bend = measure_bend(submap.keyframe_poses(ids), bent.T_preferred, OVERLAP, np.arange(LIVE_SINCE, N))
     assert bend.log_scale == pytest.approx(log_scale, abs=1e-9)
     assert math.degrees(bend.rotation_rad) == pytest.approx(turn_deg, abs=1e-6)
 
