@@ -200,7 +200,7 @@ def test_the_camera_has_been_refined_meanwhile() -> None:
     assert rotation.max() < ROTATION_RAD
 
 
-def test_a_map_that_contradicts_its_camera_is_linked_after_both_have_been_calibrated() -> None:
+def test_maps_of_a_wrong_camera_are_linked_after_both_have_been_calibrated() -> None:
     settings = {
         "calibration": {"first_keyframes": 20, "max_observations": 6000},
         "keyframes": {"max_parallax_deg": 1.0},
@@ -213,7 +213,8 @@ def test_a_map_that_contradicts_its_camera_is_linked_after_both_have_been_calibr
         system.step(Frame(i, i / 30, None))
     system.finish()
     refused = system.events.of_kind(EventKind.LINK_REFUSED)
-    assert any(event.data["reason"] == "camera" for event in refused)
+    assert refused, "by the bend that the camera makes, or by what it does to the scales of the two"
+    assert {event.data["reason"] for event in refused} <= {"camera", "scale"}
     (calibrated,) = system.events.of_kind(EventKind.CALIBRATED)
     assert calibrated.data["lost"] == [0]
     (linked,) = system.events.of_kind(EventKind.LINKED)
