@@ -92,8 +92,8 @@ def check_camera(
         A failure where the link would not be known well enough with it: of the camera where that is contradicted beyond
         chance, else of the scale, which more keyframes may tell.
     """
-    here, there = _places(submap, link.agreeing_keyframes, live_since)
     ids = np.array(sorted(submap.keyframes), np.int64)
+    here, there = _places(ids, link.agreeing_keyframes, live_since)
     ids = ids[(ids >= min(here[0], there[0])) & (ids <= max(here[-1], there[-1]))]
     if len(ids) > calibration.max_keyframes:
         ids = ids[np.linspace(0, len(ids) - 1, calibration.max_keyframes).astype(np.int64)]
@@ -120,9 +120,8 @@ def check_camera(
     return Failure(FailureReason.SCALE, f"the new map hardly knows its camera: {by}", numbers)
 
 
-def _places(submap: Submap, agreeing: IntArray, live_since: int) -> tuple[IntArray, IntArray]:
-    """Return the keyframes of the overlap, and those of the live end or next to it; ascending."""
-    ids = np.array(sorted(submap.keyframes), np.int64)
+def _places(ids: IntArray, agreeing: IntArray, live_since: int) -> tuple[IntArray, IntArray]:
+    """Return, of a map's keyframes, those of the overlap, and those of the live end or next to it; ascending."""
     live = ids[ids >= live_since]
     return ids[np.isin(ids, agreeing)], live if len(live) >= MIN_PLACE else ids[-MIN_PLACE:]
 
