@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from dualslam.core.config_io import load_config
 from dualslam.core.events import EventKind
 from dualslam.core.types import Failure, FailureReason, FrameStatus
 from dualslam.evaluation.failure_lab import Corruption, FaultScript
+from dualslam.recovery import RecoveryJob
 from dualslam.session import run_to_folder
 from dualslam.sources import open_source
 from dualslam.system import System
@@ -127,6 +129,14 @@ def test_a_corrupted_run_can_be_made_again_from_its_config(tmp_path: Path) -> No
     assert (tmp_path / "clean" / "trajectory.txt").read_bytes() != texts[0]
 
 
+def _kill_and_await(executor: WorkerExecutor, script: FaultScript, job: RecoveryJob, pid: int | None) -> None:
+    """Kill the worker where the script says so, and go on once its death is known: frames here take no time."""
+    n_fired = len(script._fired)
+    script.kill_worker(job, pid)
+    if len(script._fired) > n_fired:
+        executor._busy[-1].worker._carrier.join()
+
+
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_killed_worker_costs_its_recovery_and_nothing_else(workers: int) -> None:
     world = PointWorld(cloud(), hand_held(70), covered=frozenset(range(35, 50)))
@@ -135,7 +145,7 @@ def test_a_killed_worker_costs_its_recovery_and_nothing_else(workers: int) -> No
     system._parts = replace(system._parts, view_of=script.around_views(system._parts.view_of))
     executor = system._recoveries._executor
     if isinstance(executor, WorkerExecutor):
-        executor._on_start = script.kill_worker
+        executor._on_start = partial(_kill_and_await, executor, script)
     else:
         system._recoveries._executor = script.around_inline(executor)
     for frame in world.frames():
