@@ -6,6 +6,10 @@ on through a gap sees it at half the distance), the essential matrix between the
 length of the leap, which each track that a second known frame sees tells by itself. Both are then refined with the
 points, the known poses held, and the one that more tracks agree with stays.
 
+The refinement hears only tracks that two known frames see, where there are enough of these. What one of them sees may
+lie anywhere on a line: a few false matches at the image's edge, on a road that looks alike everywhere, bend a pose by a
+degree until they agree with it, and nothing shows.
+
 What the leap's length is worth is told by `leap_uncertainty`.
 """
 
@@ -179,9 +183,8 @@ def _adjust(
     # What is behind a camera under the first pose takes no part in its refinement; it is judged again after it.
     inliers &= ((points.depth > 0) | ~visible).all(axis=1) & np.isfinite(points.xyz).all(axis=1)
     xyz, chi2 = points.xyz, np.where(visible, points.error2 / sigma**2, 0.0)
-    used = inliers
     for _ in range(2):
-        used = inliers & (chi2 < 16 * CHI2_2DOF_99).all(axis=1)
+        used = _heard(inliers & (chi2 < 16 * CHI2_2DOF_99).all(axis=1), known.visible)
         if used.sum() < MIN_CONSENSUS:
             return None
         row, view = np.nonzero(visible & used[:, None])
@@ -201,10 +204,17 @@ def _adjust(
     if inliers.sum() < MIN_CONSENSUS:
         return None
     mean = float(chi2[inliers].sum() / (2 * visible[inliers].sum() - 3 * inliers.sum()).clip(1))
-    information = np.zeros((int(inliers.sum()), 3, 3))
+    used = _heard(inliers, known.visible)
+    information = np.zeros((int(used.sum()), 3, 3))
     for v in range(len(T) - 1):
-        _, J_point = projection_jacobians(K, T[v], xyz[inliers])
-        weight = (visible[inliers, v] / sigma[inliers, v] ** 2)[:, None, None]
+        _, J_point = projection_jacobians(K, T[v], xyz[used])
+        weight = (visible[used, v] / sigma[used, v] ** 2)[:, None, None]
         information += J_point.swapaxes(1, 2) @ (weight * J_point)
-    covariance, scale_sigma = leap_uncertainty(K, T[-1], xyz[inliers], sigma[inliers, -1], information)
+    covariance, scale_sigma = leap_uncertainty(K, T[-1], xyz[used], sigma[used, -1], information)
     return WidePose(T[-1], xyz, inliers, mean, covariance, scale_sigma)
+
+
+def _heard(agree: BoolArray, visible: BoolArray) -> BoolArray:
+    """Return which of the agreeing tracks fix the pose: those that two known frames see, or all if these are few."""
+    twice = agree & (visible.sum(axis=1) >= 2)
+    return twice if twice.sum() >= MIN_CONSENSUS else agree

@@ -12,7 +12,7 @@ from dualslam.core.config import Config
 from dualslam.core.geometry import se3
 from dualslam.core.submap import NO_LANDMARK
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Track, View
-from frontends.guest_map import GuestMap, triangulate
+from frontends.guest_map import GuestMap, TrackViews, triangulate
 from frontends.orb import OrbFrontend
 from frontends.pnp_odometry import PnpOdometry
 from frontends.wide_pose import WidePose, estimate_wide_pose
@@ -22,6 +22,8 @@ from tests.point_world import CAMERA, SIZE_PX, PointWorld, cloud, path, random_f
 POSITION_M, ROTATION_RAD = 0.06, 0.005
 KEYFRAMES = [40, 43, 46, 49]
 """Of the submap that the walk back starts from, at its truth."""
+FAR_M = 60.0
+"""Thrice what the scene measures."""
 DRIVE = path(60, np.array([0.05, 0.0, 0.2]), np.array([0.0, 0.004, 0.0]))
 """Forwards: what lies ahead is seen at another scale on the other side of a gap."""
 
@@ -227,7 +229,7 @@ class TestLeap:
         assert steps[21].reason is FailureReason.SCALE
 
 
-def wide_case(seed: int, n_views: int, wrong: float) -> tuple[WidePose | Failure, FloatArray]:
+def wide_case(seed: int, n_views: int, wrong: float, look_alikes: int = 0) -> tuple[WidePose | Failure, FloatArray]:
     """Wide matches of frame 15 of the drive with frames from 40 on, some of them wrong; the pose, and the truth."""
     _, guest = worlds()
     rng = np.random.default_rng(seed)
@@ -241,15 +243,43 @@ def wide_case(seed: int, n_views: int, wrong: float) -> tuple[WidePose | Failure
     matches = {k: frontend.match_wide(tracks.features(k), features) for k in tracks.frames}
     tracks.add(15, features, matches)
     rows = tracks.rows_with_track(15)
+    if look_alikes:  # what lies far ahead, as beyond a long gap, and little of it
+        rows = rows[np.linalg.norm(features.uv_rect_px[rows] - CAMERA.K[:2, 2], axis=1) < 80][:40]
     uv = features.uv_rect_px[rows].copy()
     swap = rng.random(len(rows)) < wrong
     uv[swap] = rng.uniform([0, 0], SIZE_PX, (int(swap.sum()), 2))
     views = tracks.views(15, rows, tracks.frames)
-    found = estimate_wide_pose(views, uv, features.sigma_px[rows], CAMERA.K, SIZE_PX, bundle_adjust_arrays, seed)
+    views, uv, sigma_px = with_look_alikes(views, uv, features.sigma_px[rows], look_alikes, guest.T_world_cam[15], seed)
+    swap = np.append(swap, np.ones(look_alikes, bool))
+    found = estimate_wide_pose(views, uv, sigma_px, CAMERA.K, SIZE_PX, bundle_adjust_arrays, seed)
     if found:
         # A pixel anywhere may lie on the epipolar line of a track that only one view knows.
         assert found.inliers[swap].sum() <= 0.1 * swap.sum()
     return found, guest.T_world_cam[15]
+
+
+def with_look_alikes(
+    views: TrackViews, uv: FloatArray, sigma_px: FloatArray, n: int, T_world_cam: FloatArray, seed: int
+) -> tuple[TrackViews, FloatArray, FloatArray]:
+    """Add false matches with the last known frame: road at the image's edge that looks alike everywhere.
+
+    They lie where a camera that is turned by a degree would see points that are far away.
+    """
+    K_inverse = np.linalg.inv(CAMERA.K)
+    rng, width_height = np.random.default_rng(seed), np.array(SIZE_PX)
+    corner = rng.uniform(0.75 * width_height, width_height, (n, 2))
+    uv_known, seen = np.zeros((n, *views.uv_px.shape[1:])), np.zeros((n, views.visible.shape[1]), bool)
+    uv_known[:, -1], seen[:, -1] = corner, True
+    turned = se3.exp(np.array([0.008, 0.012, -0.015, 0.0, 0.0, 0.0])) @ se3.inverse(T_world_cam)
+    xyz = se3.act(se3.inverse(views.T_cam_submap[-1]), FAR_M * np.column_stack([corner, np.ones(n)]) @ K_inverse.T)
+    far = se3.act(turned, xyz) @ CAMERA.K.T
+    more = TrackViews(
+        views.T_cam_submap,
+        np.concatenate([views.uv_px, uv_known]),
+        np.concatenate([views.sigma_px, np.ones(seen.shape)]),
+        np.concatenate([views.visible, seen]),
+    )
+    return more, np.concatenate([uv, far[:, :2] / far[:, 2:]]), np.concatenate([sigma_px, np.ones(n)])
 
 
 class TestWidePose:
@@ -272,6 +302,13 @@ class TestWidePose:
             distance2.append(error @ np.linalg.solve(found.covariance, error))
         # Six degrees of freedom, the covariance inflated by 1.5 squared.
         assert 0.5 < np.mean(distance2) < 12
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_road_that_looks_alike_bends_no_pose(self, seed: int) -> None:
+        found, T_world_cam = wide_case(seed, 3, 0.6, look_alikes=12)
+        assert isinstance(found, WidePose)
+        error = se3.log(found.T_cam_submap @ T_world_cam)
+        assert error @ np.linalg.solve(found.covariance, error) < 22.5  # 99.9 % for six degrees of freedom
 
     def test_one_known_view_knows_no_scale(self) -> None:
         found, _ = wide_case(1, 1, 0.0)
