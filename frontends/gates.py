@@ -8,5 +8,7 @@ CHI2_2DOF_95 = 5.991
 """The same for the distance to a point."""
 CHI2_2DOF_99 = 9.210
 """And for 99 % of them."""
+CHI2_6DOF_99 = 16.812
+"""Squared Mahalanobis distance of a pose below which 99 % lie."""
 MIN_CONSENSUS = 12
 """Matches below which a RANSAC consensus of a 3-point solver is no evidence."""

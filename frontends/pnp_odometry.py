@@ -24,14 +24,12 @@ from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.config import Config
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, refine_pose
-from dualslam.core.geometry.triangulation import triangulate_two_view
-from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend, KeyframeReport, SubmapGraph
 from dualslam.core.submap import NO_LANDMARK, Submap
 from dualslam.core.support import find_lack_of_support
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray, Matches, Track, View
-from frontends.gates import CHI2_1DOF_95, CHI2_2DOF_99, MIN_CONSENSUS
 from frontends.guest_map import GuestMap, triangulate
+from frontends.leap_consensus import CONFIRMING_SHARE, BeyondGap, confirmed_share
 from frontends.leap_uncertainty import SMALL_STEP
 from frontends.resection import resect
 from frontends.tracker import GivenPose
@@ -45,22 +43,13 @@ POINT_FRAMES = 6  # frames that a point is triangulated from
 LEAP_FRAMES = 5  # frames before a gap that those beyond it are matched with
 MIN_CONTRAST = 4.0  # standard deviation of the greys; sensors have a noise of 1 to 3, and blank images have that alone
 SEED_KEYFRAMES = 8  # keyframes of the submap that the walk starts from
-CONFIRMING_SHARE = 0.85
-"""Of what two frames beyond a gap both see must agree with their poses. Of a true leap 98 % do (a rendered street,
-KITTI 03); under a wrong pose half of it or more may do so by chance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Beyond:
-    """A frame beyond a gap, and which of its features the tracks that agree with its pose are."""
+class _Beyond(BeyondGap):
+    """A frame beyond a gap, with its view."""
 
     view: View
-    rows: IntArray
-    pose: WidePose
-
-    @property
-    def index(self) -> int:
-        return self.view.index
 
     def track(self, T_cam_submap: FloatArray) -> Track:
         """Return the frame with a pose that it was given in the end, and no landmarks."""
@@ -291,14 +280,15 @@ class PnpOdometry:
             if step is None:
                 self._map.drop(index)
             return wide if step is None else step
-        self._beyond = _Beyond(view, rows[wide.inliers], wide)
+        self._beyond = _Beyond(features, rows[wide.inliers], wide, view)
         if before is None:
             return Failure(FailureReason.UNCONFIRMED, "the first frame beyond a gap", wide.numbers)
-        share = self._confirmed_share(before, self._beyond)
+        matches = self._guest.match_wide(before.features, features).index
+        share = confirmed_share(before, self._beyond, matches, self.submap.K)
         if share < CONFIRMING_SHARE:
-            self._map.drop(before.index)
+            self._map.drop(before.view.index)
             return Failure(FailureReason.UNCONFIRMED, f"{share:.0%} of two frames confirm the leap", wide.numbers)
-        self._map.put(before.index, self.reference_id, before.pose.T_cam_submap)
+        self._map.put(before.view.index, self.reference_id, before.pose.T_cam_submap)
         self._leapt = index
         self._confirmed = before, before.pose.T_cam_submap @ se3.inverse(wide.T_cam_submap)
         n_inliers = int(wide.inliers.sum())
@@ -334,38 +324,3 @@ class PnpOdometry:
         if wide.scale_sigma > limit:
             return Failure(FailureReason.SCALE, f"the scale beyond is known to {wide.scale_sigma:.1%}", wide.numbers)
         return wide
-
-    def _confirmed_share(self, first: _Beyond, second: _Beyond) -> float:
-        """Share of what two frames beyond the gap both see that agrees with their poses, each found by itself.
-
-        Twice, and the lesser counts. Of the tracks through the gap: how many lie where the points by the first pose are
-        under the second. And of all else, which was never seen before the gap and had no part in the poses: how much
-        lies on its epipolar line and in front of the cameras. Where the scene repeats itself, only that tells.
-        """
-        a, b, K = self._map.features(first.index), self._map.features(second.index), self.submap.K
-        matches = self._guest.match_wide(a, b).index
-        uv_a, uv_b = a.uv_rect_px[matches[:, 0]], b.uv_rect_px[matches[:, 1]]
-        # The poses are off by about a pixel's noise as well: sigmas count twice.
-        variance = 4.0 * (a.sigma_px[matches[:, 0]] ** 2 + b.sigma_px[matches[:, 1]] ** 2) / 2.0
-        point_of = np.full(len(a), -1)
-        point_of[first.rows] = np.arange(len(first.rows))
-        tracked = point_of[matches[:, 0]] >= 0
-        if tracked.sum() < MIN_CONSENSUS:
-            return 0.0
-        xyz = first.pose.xyz_mu[first.pose.inliers][point_of[matches[tracked, 0]]]
-        uv, _ = project_points(K, second.pose.T_cam_submap, xyz)
-        error2 = ((uv - uv_b[tracked]) ** 2).sum(axis=1)
-        share = float((error2 < CHI2_2DOF_99 * variance[tracked]).mean())
-        if (~tracked).sum() < MIN_CONSENSUS:
-            return share
-        T_b_a = second.pose.T_cam_submap @ se3.inverse(first.pose.T_cam_submap)
-        return min(share, _static_share(uv_a[~tracked], uv_b[~tracked], variance[~tracked], K, T_b_a))
-
-
-def _static_share(uv_a: FloatArray, uv_b: FloatArray, variance: FloatArray, K: FloatArray, T_b_a: FloatArray) -> float:
-    """Share of matches of two views that a scene at rest allows under their relative pose."""
-    agrees = sampson_error(fundamental_from_pose(K, T_b_a), uv_a, uv_b) < CHI2_1DOF_95 * variance
-    points = triangulate_two_view(uv_a, uv_b, K, np.eye(4), se3.inverse(T_b_a))
-    # So far away that noise decides on which side of infinity a point comes to lie, neither side says anything.
-    far = points.cos_parallax > np.cos(np.sqrt(CHI2_1DOF_95 * variance) / K[0, 0])
-    return float((agrees & (far | ((points.depth_a > 0) & (points.depth_b > 0)))).mean())

@@ -13,6 +13,7 @@ from dualslam.core.geometry.two_view import (
     essential_from_pose,
     fundamental_from_pose,
     homography_transfer_error,
+    sampson_distance,
     sampson_error,
 )
 from tests.core.scenes import K, two_views
@@ -109,3 +110,14 @@ def test_homography_transfer_and_cheirality_on_a_plane() -> None:
     assert (counts > 0.5 * len(uv_a)).sum() <= 2
     truth = np.abs(poses - se3.from_parts(T[:3, :3], T[:3, 3] / distance)).max((1, 2))
     assert counts[int(np.argmin(truth))] == len(uv_a)
+
+
+def test_sampson_distance_is_the_root_of_the_error_with_a_sign() -> None:
+    T, uv_a, uv_b = relative(3)
+    F = fundamental_from_pose(K, T)
+    line = F @ np.c_[uv_a, np.ones(len(uv_a))].T
+    aside = (line[:2] / np.linalg.norm(line[:2], axis=0)).T
+    above, below = (sampson_distance(F, uv_a, uv_b + side) for side in (aside, -aside))
+    np.testing.assert_allclose(above**2, sampson_error(F, uv_a, uv_b + aside))
+    np.testing.assert_allclose(above, -below, rtol=0.05)
+    assert (above > 0.1).all()

@@ -39,11 +39,23 @@ def sampson_error(F: FloatArray, uv_a: FloatArray, uv_b: FloatArray) -> FloatArr
 
     It is about the summed squared pixel error of both images at the best 3D point: chi-square, one degree of freedom.
     """
+    c, gradient2 = _epipolar_constraint(F, uv_a, uv_b)
+    return np.asarray(c * c / gradient2, np.float64)
+
+
+def sampson_distance(F: FloatArray, uv_a: FloatArray, uv_b: FloatArray) -> FloatArray:
+    """Return what `sampson_error` is the square of, (N,), px, with its sign: smooth in F."""
+    c, gradient2 = _epipolar_constraint(F, uv_a, uv_b)
+    return np.asarray(c / np.sqrt(gradient2), np.float64)
+
+
+def _epipolar_constraint(F: FloatArray, uv_a: FloatArray, uv_b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return ``u_b' F u_a``, (N,), and the squared length of its gradient by the four pixel coordinates."""
     a, b = _homogeneous(uv_a), _homogeneous(uv_b)
     line_b, line_a = F @ a, F.T @ b
     c = np.einsum("ij,ij->j", b, line_b)
     gradient2 = line_a[0] ** 2 + line_a[1] ** 2 + line_b[0] ** 2 + line_b[1] ** 2
-    return np.asarray(c * c / np.maximum(gradient2, 1e-300), np.float64)
+    return c, np.maximum(gradient2, 1e-300)
 
 
 def homography_transfer_error(H_b_a: FloatArray, uv_a: FloatArray, uv_b: FloatArray) -> FloatArray:
