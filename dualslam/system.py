@@ -22,7 +22,8 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, Frame
 from dualslam.executor import RecoveryExecutor
 from dualslam.frame_buffer import FrameBuffer
 from dualslam.frame_records import FrameRecord, FrameResult
-from dualslam.health import HealthMonitor, count_signs, judge_track
+from dualslam.health import HealthMonitor, count_signs
+from dualslam.lost_map import LostMapWatch
 from dualslam.merging import carry_links
 from dualslam.record import Record
 from dualslam.recoveries import Recoveries
@@ -78,9 +79,7 @@ class System:
         self.buffer = FrameBuffer(config.buffer.duration_s, config.buffer.max_mb)
         self.buffer.freeze()  # no map yet, as after a loss: the first start is walked back from to the first frame
         self._live: VisualOdometry | None = None
-        self._seeker: VisualOdometry | None = None  # of the map that was lost last, until another starts
-        self._n_unseen = 0  # frames since its loss that show something, without a start
-        self._sighted = False  # whether the last one has shown that map
+        self._lost_map = LostMapWatch(components.new_seeker, config)
         self._starter = components.new_starter()
         self._lost: list[View] = []
         self._health = HealthMonitor(config.health)
@@ -135,7 +134,7 @@ class System:
     # --- initialising
 
     def _initialise(self, view: View) -> Track | Failure:
-        if self._seeker is not None and (track := self._resume(self._seeker, view)):
+        if self._lost_map.is_due(view) and (track := self._resume(view)):
             return track
         shutter = self._parts.shutter
         with self.timer.measure("shutter"):
@@ -153,21 +152,19 @@ class System:
             return start
         return self._begin_submap(start, view)
 
-    def _resume(self, seeker: VisualOdometry, view: View) -> Track | None:
+    def _resume(self, view: View) -> Track | None:
         """Go on in the map that was lost last, where two frames in a row show it."""
-        self._n_unseen += len(view.features) >= self._config.tracking.min_inliers
-        if self._n_unseen <= (self._config.recovery.resume_after or 0):
-            return None
         with self.timer.measure("seeking"):
-            if not self._sighted:
-                self._sighted = bool(judge_track(seeker.track(view), self._config.health))
-                return None
-        self._sighted = False
+            seeker = self._lost_map.sighted(view)
+        if seeker is None:
+            return None
         track = self._track_with(seeker, view)
         if isinstance(track, Failure):
-            self._seeker = None if track.reason is FailureReason.SOLVER else seeker
+            if track.reason is FailureReason.SOLVER:
+                self._lost_map.end()
             return None
-        self._live, self._seeker = seeker, None
+        self._live = seeker
+        self._lost_map.end()
         self._record.event(EventKind.RESUMED, view, seeker.submap.id, n_inliers=track.n_inliers)
         self._recoveries.found_again(seeker.submap)
         self.buffer.thaw()
@@ -179,7 +176,7 @@ class System:
         self._record.event(EventKind.SHUTTER_FOUND, view, None, readout_s=shutter.readout_s)
         self.buffer.map(lambda buffered: shutter.straightened(buffered, camera))
         self._starter = self._parts.new_starter()
-        self._seeker = None  # its map is of the pixels of before
+        self._lost_map.end()  # it is of the pixels of before
         *waiting, newest = (v for v in self.buffer if self.rows[v.index].submap_id is None)
         for earlier in waiting:
             self._starter.collect(earlier)
@@ -202,7 +199,8 @@ class System:
             row = self.rows[k]
             row.n_matches = row.n_inliers = int((submap.landmark_of[k] >= 0).sum())
         self._record.event(kind, view, submap.id, first_view=start.views[0].index, **start.numbers)
-        self._live, self._seeker = self._parts.new_odometry(submap, graph), None
+        self._live = self._parts.new_odometry(submap, graph)
+        self._lost_map.end()
         self._live.start_at(view.index)
         self._health = HealthMonitor(self._config.health)
         self._recoveries.start(submap, view)
@@ -317,20 +315,14 @@ class System:
         self._archive(live, "track lost")
         self._recoveries.declare_lost(live.submap.id, onset, str(failure.reason), self._lost[0].index)
         self._live = None
-        self._seek(live, failure)
+        self._health = HealthMonitor(self._config.health)
+        # Not where its graph has failed, or a walk back is about to change it.
+        if failure.reason is not FailureReason.SOLVER and not self._recoveries.is_under_way(live.submap):
+            self._lost_map.begin(live)
         self._starter = self._parts.new_starter()
         for lost in self._lost:
             self._starter.collect(lost)
         self._lost = []
-
-    def _seek(self, live: VisualOdometry, failure: Failure) -> None:
-        """Look for a lost map from now on, unless its graph has failed, or a walk back is about to change it."""
-        self._sighted, self._n_unseen, self._health = False, 0, HealthMonitor(self._config.health)
-        wanted = self._config.recovery.enabled and self._config.recovery.resume_after is not None
-        if not wanted or failure.reason is FailureReason.SOLVER or self._recoveries.is_under_way(live.submap):
-            return
-        self._seeker = self._parts.new_seeker(live.submap, live.graph)
-        self._seeker.start_at(live.reference_id)
 
     def _archive(self, live: VisualOdometry, why: str) -> None:
         submap = live.submap
