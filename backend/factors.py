@@ -7,6 +7,7 @@ import numpy as np
 
 from backend.convert import pose_key, to_pose3
 from backend.noise import GAUGE_RANGE_RATIO, GAUGE_SIGMA, PixelNoise, pose_sigmas
+from dualslam.core.submap import RelativePose
 from dualslam.core.types import FloatArray, IntArray
 
 
@@ -60,11 +61,10 @@ def pose_prior(
     )
 
 
-def given_pose(keyframe_id: int, T_submap_kf: FloatArray, covariance: FloatArray) -> gtsam.PriorFactorPose3:
-    """Return a prior on a keyframe's pose with a full covariance (6, 6): rotation, translation; in its own frame."""
-    return gtsam.PriorFactorPose3(
-        pose_key(keyframe_id), to_pose3(T_submap_kf), gtsam.noiseModel.Gaussian.Covariance(covariance)
-    )
+def relative_pose(keyframe_id: int, known: RelativePose) -> gtsam.BetweenFactorPose3:
+    """Return the factor of what is known of a keyframe's pose relative to another one."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(known.covariance)
+    return gtsam.BetweenFactorPose3(pose_key(known.keyframe_id), pose_key(keyframe_id), to_pose3(known.T_ref_kf), noise)
 
 
 def baseline_factor(first: int, second: int, length_mu: float) -> gtsam.RangeFactorPose3:

@@ -10,13 +10,14 @@ import logging
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 
 import gtsam
 import numpy as np
 
 from backend import convert
 from backend.bayes_tree import BayesTree, UpdateStatistics
-from backend.factors import baseline_factor, given_pose, insert_projections, pose_prior
+from backend.factors import baseline_factor, insert_projections, pose_prior, relative_pose
 from backend.gauge import Gauge, choose_gauge
 from backend.ledger import OUTSIDE, Ledger, Plan
 from backend.membership import compute_residuals, find_components
@@ -25,7 +26,7 @@ from backend.solver import N_LAST, IncrementalSolver, SolverFailure, optimise_ba
 from dualslam.core.config import GraphConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.interfaces import GraphEstimate
-from dualslam.core.submap import Submap
+from dualslam.core.submap import RelativePose, Submap
 from dualslam.core.types import FloatArray, IntArray
 
 logger = logging.getLogger(__name__)
@@ -43,7 +44,7 @@ MEDIAN_CHI2_2DOF = 1.386
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Changes:
-    """A plan as the solver takes it. In `graph` the gauge stands first, then the holds, then the projections."""
+    """A plan as the solver takes it. In `graph`: the gauge, the holds, the relative poses, the projections."""
 
     graph: gtsam.NonlinearFactorGraph
     values: gtsam.Values
@@ -51,6 +52,8 @@ class _Changes:
     gauge: Gauge
     new_holds: list[int]  # keyframes
     kept_holds: dict[int, int]
+    new_relative: list[tuple[int, RelativePose]]
+    kept_relative: dict[int, tuple[RelativePose, int]]
     order: IntArray  # of the projections
 
 
@@ -74,11 +77,11 @@ class ISam2SubmapGraph:
         self._noise = PixelNoise(config.robust_k)
         self._ledger = Ledger(config)
         self._forced_holds: set[int] = set()
-        self._given: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._solver: IncrementalSolver | None = None
         self._gauge: Gauge | None = None
         self._gauge_factors: list[int] = []
         self._holds: dict[int, int] = {}
+        self._relative: dict[int, tuple[RelativePose, int]] = {}
         self._suspects: IntArray = np.zeros(0, np.int64)
         self._n_updates = 0
         self._misfit = False
@@ -102,12 +105,9 @@ class ISam2SubmapGraph:
             return self._remake(submap, start, rebuilt=False)
         if self._gauge is None or self._gauge.was_moved_in(submap):
             logger.info("submap %d changed its gauge: rebuilding its graph", submap.id)
-            self._given.clear()  # they stand in the gauge of before
             return self._remake(submap, start, rebuilt=True)
         try:
             plan = self._ledger.plan(submap, submap.T_submap_kf, submap.landmarks["xyz_mu"], suspects=self._suspects)
-            for k in plan.gone_keyframes.tolist():
-                self._given.pop(k, None)
             changes = self._changes(submap, plan, submap.T_submap_kf, submap.landmarks["xyz_mu"])
             self._solve(self._solver, submap, plan, changes)
             self._n_updates += 1
@@ -117,19 +117,6 @@ class ISam2SubmapGraph:
             logger.info("graph of submap %d: %s; rebuilding it", submap.id, failure)
             self._blame(failure, submap)
         return self._remake(submap, start, rebuilt=True)
-
-    def hold(self, keyframe_id: int, T_submap_kf: FloatArray, covariance: FloatArray) -> None:
-        """Take in from now on that a keyframe's pose is known from elsewhere.
-
-        Parameters
-        ----------
-        keyframe_id : int
-            It may be added to the submap later. When it has left it again, nothing is known of it any more.
-        T_submap_kf : (4, 4)
-        covariance : (6, 6)
-            Of xi in ``T_submap_kf @ exp(xi)``: rotation, translation; positive definite.
-        """
-        self._given[keyframe_id] = T_submap_kf, covariance
 
     def rebuild(self, submap: Submap, near_optimum: bool = False) -> GraphEstimate:
         """Make the graph anew from the submap's arrays (batch optimum seeds a fresh iSAM2); returns everything.
@@ -228,7 +215,8 @@ class ISam2SubmapGraph:
                 graph.push_back(baseline_factor(gauge.first, gauge.second, gauge.baseline_mu))
 
         weak = set(plan.weak_keyframes.tolist())
-        wanted = (weak | self._forced_holds | self._given.keys()) & submap.keyframes.keys()
+        known = {k: r for k, r in submap.relative_poses.items() if {k, r.keyframe_id} <= submap.keyframes.keys()}
+        wanted = ((weak | self._forced_holds) & submap.keyframes.keys()) - known.keys()
         wanted.discard(gauge.first)
         if (
             gauge.second is not None
@@ -239,10 +227,12 @@ class ISam2SubmapGraph:
         remove += [factor for k, factor in self._holds.items() if k not in wanted]
         new_holds = sorted(wanted - self._holds.keys())
         for k in new_holds:
-            if k in self._given:
-                graph.push_back(given_pose(k, *self._given[k]))
-            else:
-                graph.push_back(pose_prior(k, pose_now(k), HOLD_ROTATION_RAD, HOLD_TRANSLATION_MU))
+            graph.push_back(pose_prior(k, pose_now(k), HOLD_ROTATION_RAD, HOLD_TRANSLATION_MU))
+        kept_relative = {k: (r, f) for k, (r, f) in self._relative.items() if known.get(k) is r}
+        remove += [factor for k, (_, factor) in self._relative.items() if k not in kept_relative]
+        new_relative = sorted(((k, r) for k, r in known.items() if k not in kept_relative), key=itemgetter(0))
+        for k, r in new_relative:
+            graph.push_back(relative_pose(k, r))
 
         obs, rows, e = submap.observations, self._ledger.rows, plan.entering
         K = convert.to_cal3_s2(submap.K)
@@ -253,7 +243,7 @@ class ISam2SubmapGraph:
         convert.insert_poses(values, new, np.array([poses[k] for k in new.tolist()]).reshape(-1, 4, 4))
         convert.insert_points(values, plan.new_landmarks, xyz_mu[plan.new_landmarks])
         kept = {k: factor for k, factor in self._holds.items() if k in wanted}
-        return _Changes(graph, values, remove, gauge, new_holds, kept, order)
+        return _Changes(graph, values, remove, gauge, new_holds, kept, new_relative, kept_relative, order)
 
     def _solve(self, solver: IncrementalSolver, submap: Submap, plan: Plan, changes: _Changes) -> None:
         """Let the solver take the changes in, and note the factor indices that it gives."""
@@ -261,12 +251,13 @@ class ISam2SubmapGraph:
         due = self._n_updates % RELINEARISE_EVERY == 0 or self._misfit
         indices = solver.update(changes.graph, changes.values, changes.remove, newest, due)
         projections = len(indices) - len(changes.order)
-        holds = projections - len(changes.new_holds)
+        relative = projections - len(changes.new_relative)
+        holds = relative - len(changes.new_holds)
         if changes.gauge is not self._gauge:
             self._gauge, self._gauge_factors = changes.gauge, indices[:holds].tolist()
-        self._holds = changes.kept_holds | dict(
-            zip(changes.new_holds, indices[holds:projections].tolist(), strict=True)
-        )
+        self._holds = changes.kept_holds | dict(zip(changes.new_holds, indices[holds:relative].tolist(), strict=True))
+        taken = zip(changes.new_relative, indices[relative:projections].tolist(), strict=True)
+        self._relative = changes.kept_relative | {k: (known, factor) for (k, known), factor in taken}
         factors = np.empty(len(changes.order), np.int64)
         factors[changes.order] = indices[projections:]
         self._ledger.commit(plan, factors)
@@ -337,7 +328,7 @@ class ISam2SubmapGraph:
     # --- starting again
 
     def _reset(self) -> None:
-        self._solver, self._gauge, self._gauge_factors, self._holds = None, None, [], {}
+        self._solver, self._gauge, self._gauge_factors, self._holds, self._relative = None, None, [], {}, {}
         self._suspects = np.zeros(0, np.int64)
         self._ledger.clear()
 

@@ -156,5 +156,6 @@ def _rectified_again(features: Features, camera: Camera) -> Features:
 
 def _change_camera(submap: Submap, camera: Camera) -> None:
     submap.K = camera.K
+    submap.relative_poses = {}  # they were measured with the camera of before
     for k, keyframe in submap.keyframes.items():
         submap.keyframes[k] = replace(keyframe, features=_rectified_again(keyframe.features, camera))

@@ -95,6 +95,9 @@ def _add_keyframes(merged: Submap, base: Submap, moved: Submap, rectify: Rectify
     for k, anchor in moved.anchors.items():
         if k not in merged.keyframes and k not in merged.anchors:
             merged.anchors[k] = Anchor(anchor.keyframe_id, anchor.T_kf_cam)
+    for k, known in moved.relative_poses.items():
+        if k in added and known.keyframe_id in merged.keyframes:
+            merged.relative_poses[k] = known
 
 
 def _remove_rejected(merged: Submap, base: Submap, moved: Submap) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from dualslam.core.config import Config
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend, GraphEstimate, KeyframeReport, SubmapGraph
-from dualslam.core.submap import Submap
+from dualslam.core.submap import RelativePose, Submap
 from dualslam.core.submap_change import change_of_frame
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from frontends.keyframing import keyframe_due
@@ -143,7 +143,9 @@ class VisualFrontEnd:
         refuses most of the matches, the frame's pose is wrong: the map is left without it.
         """
         if pose_is_given:
-            self.graph.hold(track.view.index, se3.inverse(track.T_cam_submap), track.covariance)
+            T_ref_kf = se3.inverse(self.submap.T_submap_kf[self._reference_id]) @ se3.inverse(track.T_cam_submap)
+            known = RelativePose(self._reference_id, T_ref_kf, track.covariance)
+            self.submap.relative_poses[track.view.index] = known
         track = self._refound(track, pose_is_given)
         self._mapper.observe(track)
         matched = self._rows_of(track.view.index)

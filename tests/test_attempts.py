@@ -12,7 +12,7 @@ from dualslam.core.camera import PinholeCamera
 from dualslam.core.config import AttemptConfig, Config, RecoveryConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.events import Event, EventKind
-from dualslam.core.geometry import sim3
+from dualslam.core.geometry import se3, sim3
 from dualslam.evaluation.link_audit import LinkAudit, audit_links
 from dualslam.executor import InlineExecutor, Outcome
 from dualslam.recovery import RecoveryJob
@@ -194,6 +194,12 @@ def test_a_black_out_on_the_road_is_leapt(attempt: str) -> None:
         ids = [k for k in submap.keyframes if (k > 35) == (m == link.b)]
         est, true = submap.keyframe_poses(ids)[:, :3, 3], truth[ids][:, :3, 3]
         scales.append(np.linalg.norm(true - true.mean(0)) / np.linalg.norm(est - est.mean(0)))
+    # What the leap knew is still known once the walk's result is in the map, whatever frame the map has by then.
+    new = system.atlas.submaps[link.b]
+    (k, known), *_ = new.relative_poses.items()
+    assert k < 35 < known.keyframe_id
+    off = se3.log(se3.inverse(known.T_ref_kf) @ se3.inverse(new.T_submap_kf[known.keyframe_id]) @ new.T_submap_kf[k])
+    assert off @ np.linalg.solve(known.covariance, off) < 22.5  # 99.9 % for six degrees of freedom
     # The whole new map, not only its end on this side of the gap, has its place and size.
     assert abs(float(sim3.scale(link.S_a_b)) / (scales[1] / scales[0]) - 1) < 0.05
     main = trajectories_of(system).main

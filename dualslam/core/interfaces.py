@@ -141,10 +141,6 @@ class SubmapGraph(Protocol):
         """Make the solver's state anew from the submap's arrays; `near_optimum`: parts of them are solved already."""
         ...
 
-    def hold(self, keyframe_id: int, T_submap_kf: FloatArray, covariance: FloatArray) -> None:
-        """Take in that a keyframe's pose is known from elsewhere: (6, 6), rotation, translation; in its own frame."""
-        ...
-
     def full_estimate(self, submap: Submap) -> GraphEstimate:
         """Return the estimate of everything in the graph as of the last update, without solving."""
         ...

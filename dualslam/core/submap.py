@@ -24,6 +24,34 @@ class Anchor:
     T_kf_cam: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativePose:
+    """Where a keyframe stands by what is no observation of the submap's landmarks: another front end's leap.
+
+    Attributes
+    ----------
+    keyframe_id : int
+        Relative to which other keyframe.
+    T_ref_kf : (4, 4)
+    covariance : (6, 6)
+        Of xi in ``T_ref_kf @ exp(xi)``: rotation, translation; positive definite.
+    """
+
+    keyframe_id: int
+    T_ref_kf: FloatArray
+    covariance: FloatArray
+
+    def scaled(self, scale: float) -> RelativePose:
+        """Return the same in another unit of length."""
+        T, units = self.T_ref_kf.copy(), np.repeat([1.0, scale], 3)
+        T[:3, 3] *= scale
+        return RelativePose(self.keyframe_id, T, units[:, None] * self.covariance * units)
+
+    def seen_from(self, keyframe_id: int, T_kf_ref: FloatArray) -> RelativePose:
+        """Return the same relative to another keyframe, of which the old one's place is known."""
+        return RelativePose(keyframe_id, T_kf_ref @ self.T_ref_kf, self.covariance)
+
+
 class Submap:
     """Keyframes, landmarks and observations in one local frame, in that frame's own unit of length.
 
@@ -49,6 +77,8 @@ class Submap:
         ``kf``, ``feature``, ``landmark``, ``alive``.
     anchors : dict of int to Anchor
         Keyframes that were culled as redundant.
+    relative_poses : dict of int to RelativePose
+        Keyframes of which more is known than their observations say.
     gauge : tuple of int
         The two keyframes of the first baseline: the first pose is fixed, their distance fixes the scale.
     """
@@ -61,6 +91,7 @@ class Submap:
         self.T_submap_kf: dict[int, FloatArray] = {}
         self.landmark_of: dict[int, IntArray] = {}
         self.anchors: dict[int, Anchor] = {}
+        self.relative_poses: dict[int, RelativePose] = {}
         self.gauge: tuple[int, int] = (-1, -1)
         self.landmarks = Table(
             xyz_mu=(np.float64, (3,)),
@@ -110,6 +141,12 @@ class Submap:
         self.remove_observations(rows)
         T_kf_cam = se3.inverse(self.T_submap_kf[anchor_id]) @ self.T_submap_kf[keyframe_id]
         self.anchors[keyframe_id] = Anchor(anchor_id, T_kf_cam)
+        self.relative_poses.pop(keyframe_id, None)
+        for k, known in self.relative_poses.items():
+            if known.keyframe_id == keyframe_id:
+                self.relative_poses[k] = known.seen_from(anchor_id, T_kf_cam)
+        if anchor_id in self.relative_poses and self.relative_poses[anchor_id].keyframe_id == anchor_id:
+            del self.relative_poses[anchor_id]
         del self.keyframes[keyframe_id], self.T_submap_kf[keyframe_id], self.landmark_of[keyframe_id]
 
     def resolve_anchor(self, keyframe_id: int, T_kf_cam: FloatArray) -> FloatArray:
@@ -313,6 +350,7 @@ class Submap:
             T_kf_cam = anchor.T_kf_cam.copy()
             T_kf_cam[:3, 3] *= scale
             self.anchors[k] = Anchor(anchor.keyframe_id, T_kf_cam)
+        self.relative_poses = {k: known.scaled(scale) for k, known in self.relative_poses.items()}
         lm = self.landmarks
         lm["xyz_mu"][:] = scale * lm["xyz_mu"] @ R.T + t
         lm["normal"][:] = lm["normal"] @ R.T
@@ -334,6 +372,7 @@ class Submap:
         twin.T_submap_kf = {k: T.copy() for k, T in self.T_submap_kf.items()}
         twin.landmark_of = {k: a.copy() for k, a in self.landmark_of.items()}
         twin.anchors = dict(self.anchors)
+        twin.relative_poses = dict(self.relative_poses)
         twin.gauge = self.gauge
         twin.landmarks = Table.from_columns(self.landmarks.columns())
         twin.observations = Table.from_columns(self.observations.columns())
@@ -346,6 +385,10 @@ class Submap:
         twin.T_submap_kf = {number_of(k): T for k, T in twin.T_submap_kf.items()}
         twin.landmark_of = {number_of(k): ids for k, ids in twin.landmark_of.items()}
         twin.anchors = {number_of(k): Anchor(number_of(a.keyframe_id), a.T_kf_cam) for k, a in twin.anchors.items()}
+        twin.relative_poses = {
+            number_of(k): replace(known, keyframe_id=number_of(known.keyframe_id))
+            for k, known in twin.relative_poses.items()
+        }
         twin.gauge = (number_of(self.gauge[0]), number_of(self.gauge[1]))
         for column in (twin.observations["kf"], twin.landmarks["first_kf"]):
             column[:] = [number_of(k) for k in column.tolist()]
@@ -356,4 +399,5 @@ class Submap:
         self.K, self.gauge = changed.K, changed.gauge
         self.keyframes, self.T_submap_kf = changed.keyframes, changed.T_submap_kf
         self.landmark_of, self.anchors = changed.landmark_of, changed.anchors
+        self.relative_poses = changed.relative_poses
         self.landmarks, self.observations = changed.landmarks, changed.observations

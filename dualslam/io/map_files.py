@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.errors import InputError, OutputError
-from dualslam.core.submap import Anchor, Submap
+from dualslam.core.submap import Anchor, RelativePose, Submap
 from dualslam.core.tables import Table
 from dualslam.core.types import Features, Keyframe
 from dualslam.io.atomic import atomic_file, write_text
@@ -24,7 +24,7 @@ from dualslam.io.trajectory_files import read_text
 Arrays = Mapping[str, NDArray[Any]]
 
 METADATA = "map.json"
-SUBMAP_FORMAT = 1
+SUBMAP_FORMAT = 2
 _FEATURE_FIELDS = tuple(f.name for f in fields(Features))
 
 
@@ -129,6 +129,10 @@ def submap_to_arrays(submap: Submap) -> dict[str, NDArray[Any]]:
         "anchor_id": np.array(list(submap.anchors), np.int64),
         "anchor_kf": np.array([a.keyframe_id for a in submap.anchors.values()], np.int64),
         "anchor_T_kf_cam": np.array([a.T_kf_cam for a in submap.anchors.values()], np.float64).reshape(-1, 4, 4),
+        "relative_id": np.array(list(submap.relative_poses), np.int64),
+        "relative_kf": np.array([r.keyframe_id for r in submap.relative_poses.values()], np.int64),
+        "relative_T_ref_kf": np.array([r.T_ref_kf for r in submap.relative_poses.values()]).reshape(-1, 4, 4),
+        "relative_covariance": np.array([r.covariance for r in submap.relative_poses.values()]).reshape(-1, 6, 6),
     }
     for name in _FEATURE_FIELDS if keyframes else ():
         arrays[f"features_{name}"] = np.concatenate([getattr(kf.features, name) for kf in keyframes])
@@ -163,6 +167,9 @@ def submap_from_arrays(arrays: Arrays) -> Submap:
         arrays["anchor_id"].tolist(), arrays["anchor_kf"].tolist(), arrays["anchor_T_kf_cam"], strict=True
     ):
         submap.anchors[anchor_id] = Anchor(keyframe_id, T_kf_cam.copy())
+    known = (arrays[f"relative_{name}"] for name in ("kf", "T_ref_kf", "covariance"))
+    for k, ref, T_ref_kf, covariance in zip(arrays["relative_id"].tolist(), *known, strict=True):
+        submap.relative_poses[k] = RelativePose(int(ref), T_ref_kf.copy(), covariance.copy())
     submap.landmarks = Table.from_columns(landmarks)
     submap.observations = Table.from_columns(observations)
     return submap

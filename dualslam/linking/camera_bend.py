@@ -6,6 +6,10 @@ look like a wrong camera, beyond what their noise explains, where what they ask 
 and a short map may hardly know its camera, and be bent. So what counts is by how much the map would be another one
 under the camera that its pixels ask for, both by the same observations: what else holds a map together would count as
 the camera's doing.
+
+Of that, chance has its share: pixels of an exact camera ask for another one, too. A correction at a squared distance of
+d2 makes, in whatever direction, a change of at most sqrt(d2) of that change's standard deviations (Cauchy-Schwarz), so
+that of the change's square at least the part 1 / d2 is what chance makes on average. The rest counts.
 """
 
 from __future__ import annotations
@@ -41,6 +45,11 @@ class Bend:
 
     log_scale: float = 0.0
     rotation_rad: float = 0.0
+
+    def beyond_chance(self, distance2: float) -> Bend:
+        """Return what counts of it, if the pixels ask for the other camera by this squared distance."""
+        share = math.sqrt(max(0.0, 1.0 - 1.0 / distance2)) if distance2 > 0 else 0.0
+        return Bend(share * self.log_scale, share * self.rotation_rad)
 
 
 NO_BEND = Bend()
@@ -101,8 +110,9 @@ def check_camera(
     if found is None:
         return NO_BEND
     rows = [np.flatnonzero(np.isin(ids, place)) for place in (here, there)]
-    known = min(len(each) for each in rows) >= 2
-    bend = measure_bend(found.T_now, found.T_preferred, *rows) if known else Bend(math.inf, math.inf)
+    bend = Bend(math.inf, math.inf)
+    if min(len(each) for each in rows) >= 2:
+        bend = measure_bend(found.T_now, found.T_preferred, *rows).beyond_chance(found.distance2)
     turn_deg = math.degrees(bend.rotation_rad)
     sigma = math.hypot(link.numbers["sigma_scale"], bend.log_scale)
     if sigma <= config.max_live_scale_sigma and turn_deg <= config.max_live_rotation_deg:

@@ -10,6 +10,7 @@ from backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.config import GraphConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
+from dualslam.core.submap import RelativePose
 from tests.backend.scenes import Feeder, make_scene, pose_errors
 
 OPTIMUM_MU, OPTIMUM_RAD = 5e-3, 5e-3
@@ -251,50 +252,71 @@ def test_what_is_not_in_the_graph_has_no_covariance():
     assert np.isnan(graph.point_covariances(np.array([1, 2]))).all()
 
 
-def test_a_pose_known_from_elsewhere_counts_by_its_covariance():
+def relative_to(ref, T_submap_ref, T_submap_kf, covariance):
+    return RelativePose(ref, se3.inverse(T_submap_ref) @ T_submap_kf, covariance)
+
+
+def test_a_relative_pose_counts_by_its_covariance():
     """Two Gaussians of the same pose: informations add, and the estimate moves by their ratio."""
     feeder, graph, rest = start(n=8)
     grow(feeder, graph, rest)
-    k = rest[-1]
-    alone, P = graph.full_estimate(feeder.submap), graph.pose_covariance(k)
+    submap, k = feeder.submap, rest[-1]
+    first = submap.gauge[0]  # which does not move
+    alone, P = graph.full_estimate(submap), graph.pose_covariance(k)
     T_alone = alone.T_submap_kf[list(alone.keyframe_ids).index(k)]
     xi = 3.0 * np.sqrt(np.diag(P))  # elsewhere says that it is three standard deviations off
-    held = ISam2SubmapGraph(GraphConfig(rebuild_iterations=30))
-    held.hold(k, T_alone @ se3.exp(xi), P)  # and knows it as well as the landmarks do
-    both = held.rebuild(feeder.submap)
+    T_known = T_alone @ se3.exp(xi)
+    submap.relative_poses[k] = relative_to(first, submap.T_submap_kf[first], T_known, P)  # as sure as the landmarks
+    tied = ISam2SubmapGraph(GraphConfig(rebuild_iterations=30))
+    both = tied.rebuild(submap)
     moved = se3.log(se3.inverse(T_alone) @ both.T_submap_kf[list(both.keyframe_ids).index(k)])
     np.testing.assert_allclose(moved, xi / 2, atol=0.15 * np.abs(xi).max())
-    np.testing.assert_allclose(np.diag(held.pose_covariance(k)), np.diag(P) / 2, rtol=0.1)
+    np.testing.assert_allclose(np.diag(tied.pose_covariance(k)), np.diag(P) / 2, rtol=0.1)
 
 
-def test_a_pose_from_elsewhere_leaves_with_its_keyframe():
-    """A keyframe that was taken out again may come back, and is then known by its landmarks alone."""
-    feeder, graph, rest = start(n=8, noise_px=0.0)
-    k, neighbour = rest[-1], rest[-2]
-    wrong = feeder.scene.T_true[k] @ se3.exp(np.array([0.0, 0.0, 0.0, 0.01, 0.0, 0.0]))
-    graph.hold(k, wrong, 1e-8 * np.eye(6))
+def wrongly_tied(n=8):
+    """A map of exact pixels whose newest keyframe is said, most surely, to stand elsewhere."""
+    feeder, graph, rest = start(n=n, noise_px=0.0)
+    k, T = rest[-1], feeder.scene.T_true
+    wrong = T[k] @ se3.exp(np.array([0.0, 0.0, 0.0, 0.01, 0.0, 0.0]))
+    feeder.submap.relative_poses[k] = relative_to(rest[0], T[rest[0]], wrong, 1e-8 * np.eye(6))
     grow(feeder, graph, rest)
-    obs = feeder.submap.observations
+    return feeder, graph, k
+
+
+def worst(feeder, estimate):
+    return pose_errors(estimate.T_submap_kf, feeder.scene.T_true[estimate.keyframe_ids])[0].max()
+
+
+def test_a_relative_pose_leaves_with_its_keyframe():
+    """A keyframe that was taken out again may come back, and is then known by its landmarks alone."""
+    feeder, graph, k = wrongly_tied()
+    submap = feeder.submap
+    assert worst(feeder, graph.full_estimate(submap)) > 5e-3
+    obs = submap.observations
     here = (obs["kf"] == k) & obs["alive"]
     feature, landmark = obs["feature"][here].copy(), obs["landmark"][here].copy()
-    keyframe = feeder.submap.keyframes[k]
-    feeder.submap.remove_keyframe(k, neighbour)
-    graph.update(feeder.submap)
-    feeder.submap.add_keyframe(keyframe, feeder.scene.T_true[k])
-    feeder.submap.add_observations(k, feature, landmark)
-    e = graph.update(feeder.submap)
-    t, _ = pose_errors(e.T_submap_kf, feeder.scene.T_true[e.keyframe_ids])
-    assert t.max() < 2e-3
+    keyframe = submap.keyframes[k]
+    submap.remove_keyframe(k, k - 1)
+    graph.update(submap)
+    submap.add_keyframe(keyframe, feeder.scene.T_true[k])
+    submap.add_observations(k, feature, landmark)
+    assert worst(feeder, graph.update(submap)) < 2e-3
 
 
-def test_a_pose_from_elsewhere_is_dropped_with_the_gauge_that_it_stands_in():
-    feeder, graph, rest = start(n=8, noise_px=0.0)
-    graph.hold(rest[-1], feeder.scene.T_true[rest[-1]], 1e-8 * np.eye(6))
-    grow(feeder, graph, rest)
+def test_the_graph_follows_what_the_submap_knows_of_a_pose():
+    feeder, graph, k = wrongly_tied()
+    T = feeder.scene.T_true
+    feeder.submap.relative_poses[k] = relative_to(k - 2, T[k - 2], T[k], 1e-8 * np.eye(6))
+    assert worst(feeder, graph.update(feeder.submap)) < 2e-3
+    assert worst(feeder, graph.rebuild(feeder.submap)) < 2e-3
+
+
+def test_a_relative_pose_outlasts_a_change_of_gauge():
+    feeder, graph, _ = wrongly_tied()
+    off = worst(feeder, graph.full_estimate(feeder.submap))
     feeder.submap.transform(2.0, np.eye(4))
     e = graph.update(feeder.submap)
     true = feeder.scene.T_true[e.keyframe_ids].copy()
     true[:, :3, 3] *= 2.0
-    t, r = pose_errors(e.T_submap_kf, true)
-    assert t.max() < 2e-3
-    assert r.max() < 1e-3
+    assert abs(pose_errors(e.T_submap_kf, true)[0].max() / off - 2.0) < 0.2

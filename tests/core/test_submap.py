@@ -10,7 +10,7 @@ import pytest
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.geometry import se3
 from dualslam.core.stage_timer import StageTimer
-from dualslam.core.submap import NO_LANDMARK, Submap
+from dualslam.core.submap import NO_LANDMARK, RelativePose, Submap
 from dualslam.core.tables import Table
 from dualslam.core.types import Keyframe, Start, View
 from tests.point_world import make_features, path
@@ -127,6 +127,31 @@ class TestSubmap:
         np.testing.assert_allclose(submap.landmarks["distance_mu"], 2 * before.landmarks["distance_mu"])
         old, new = before.resolve_anchor(20, np.eye(4)), submap.resolve_anchor(20, np.eye(4))
         np.testing.assert_allclose(new[:3, 3], 2 * T[:3, :3] @ old[:3, 3] + T[:3, 3], atol=1e-12)
+
+    def test_what_is_known_of_a_pose_follows_the_keyframe_that_it_is_relative_to(self, submap: Submap) -> None:
+        """As long as both are there: culled, the other one stands where its anchor says."""
+
+        def error() -> float:
+            known = submap.relative_poses[30]
+            T_submap_kf = submap.T_submap_kf[known.keyframe_id] @ known.T_ref_kf
+            return float(np.abs(T_submap_kf - submap.T_submap_kf[30]).max())
+
+        T_ref_kf = se3.inverse(submap.T_submap_kf[20]) @ submap.T_submap_kf[30]
+        submap.relative_poses[30] = RelativePose(20, T_ref_kf, np.diag([1.0, 1, 1, 4, 4, 4]))
+        submap.transform(2.0, se3.exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])))
+        assert error() < 1e-12
+        np.testing.assert_allclose(np.diag(submap.relative_poses[30].covariance), [1, 1, 1, 16, 16, 16])
+        turned = submap.renumbered(lambda k: -k)
+        assert turned.relative_poses.keys() == {-30}
+        assert turned.relative_poses[-30].keyframe_id == -20
+        twin = submap.copy()
+        submap.remove_keyframe(20, 10)
+        assert submap.relative_poses[30].keyframe_id == 10
+        assert error() < 1e-12
+        submap.remove_keyframe(30, 10)
+        assert not submap.relative_poses
+        twin.remove_keyframe(20, 30)  # of its own place relative to itself there is nothing to know
+        assert not twin.relative_poses
 
     def test_a_copy_is_independent(self, submap: Submap) -> None:
         twin = submap.copy()

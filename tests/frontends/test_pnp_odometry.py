@@ -165,17 +165,20 @@ class TestLeap:
     def test_frames_that_are_missing_are_leapt_as_those_that_show_nothing(self, walks_live: bool) -> None:
         live, guest = worlds()
         walker = odometry(live, guest, walks_live=walks_live)
-        held: dict[int, FloatArray] = {}
-        walker.graph.hold = lambda k, T, covariance: held.update({k: covariance})  # type: ignore[method-assign]
         steps = walk(walker, live, range(39, 33, -1)) | walk(walker, live, range(22, 14, -1))
         assert all(steps[i] for i in range(39, 33, -1))
         assert isinstance(steps[22], Failure)
         assert steps[22].reason is FailureReason.UNCONFIRMED
         assert isinstance(steps[21], Track)
         assert steps[21].wide
-        # The graph is told what the leap knows of the pose, of the leap alone.
-        assert held.keys() == {21}
-        np.testing.assert_array_equal(held[21], steps[21].covariance)
+        # The submap is told what the leap knows of the pose, of the leap alone.
+        assert walker.submap.relative_poses.keys() == {21}
+        known = walker.submap.relative_poses[21]
+        assert known.keyframe_id >= 34
+        np.testing.assert_array_equal(known.covariance, steps[21].covariance)
+        T_live = live.T_world_cam
+        off = se3.log(se3.inverse(known.T_ref_kf) @ se3.inverse(T_live[known.keyframe_id]) @ T_live[21])
+        assert np.linalg.norm(off[3:]) < POSITION_M * 2
         error = errors(steps, live)
         assert np.linalg.norm(error[:, 3:], axis=1).max() < POSITION_M * 2
 

@@ -10,7 +10,7 @@ import pytest
 
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.geometry import se3
-from dualslam.core.submap import Submap
+from dualslam.core.submap import RelativePose, Submap
 from dualslam.core.types import Features, Keyframe
 from dualslam.io import load_map, load_submap, save_map, save_submap
 
@@ -43,6 +43,7 @@ def submap() -> Submap:
     submap.merge_landmarks(ids[5:6], ids[6:7])
     submap.remove_keyframe(20, 12)
     submap.gauge = (10, 12)
+    submap.relative_poses[12] = RelativePose(10, se3.exp(rng.normal(0, 1, 6)), np.diag(rng.uniform(1, 2, 6)))
     return submap
 
 
@@ -62,6 +63,11 @@ def assert_same(a: Submap, b: Submap) -> None:
     for k in a.anchors:
         assert a.anchors[k].keyframe_id == b.anchors[k].keyframe_id
         np.testing.assert_array_equal(a.anchors[k].T_kf_cam, b.anchors[k].T_kf_cam)
+    assert list(a.relative_poses) == list(b.relative_poses)
+    for k, known in a.relative_poses.items():
+        assert known.keyframe_id == b.relative_poses[k].keyframe_id
+        np.testing.assert_array_equal(known.T_ref_kf, b.relative_poses[k].T_ref_kf)
+        np.testing.assert_array_equal(known.covariance, b.relative_poses[k].covariance)
     for one, other in ((a.landmarks, b.landmarks), (a.observations, b.observations)):
         x, y = one.columns(), other.columns()
         assert list(x) == list(y)

@@ -139,3 +139,31 @@ def test_a_link_carries_it_in_its_covariance() -> None:
     np.testing.assert_allclose(np.diag(more)[[0, 1, 2, 6]], [math.radians(0.5) ** 2] * 3 + [0.015**2], rtol=1e-6)
     refused = carry_to_live_end(link, case.new, int(THERE[0]), CONFIG, Bend(0.03))
     assert isinstance(refused, Failure)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_what_counts_is_never_less_than_the_bend_without_its_variance(seed: int) -> None:
+    """In whatever direction of the camera's parameters the map bends: the bound must hold without knowing it."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(5, 5))
+    covariance = A @ A.T
+    for size in (0.3, 1.0, 2.0, 5.0):
+        correction = size * A @ rng.normal(size=5) / math.sqrt(5.0)
+        distance2 = float(correction @ np.linalg.solve(covariance, correction))
+        # The worst direction first, in which all of the distance is this bend's.
+        for g in (np.linalg.solve(covariance, correction), *rng.normal(size=(20, 5))):
+            bend, variance = float(g @ correction), float(g @ covariance @ g)
+            counted = Bend(bend, abs(bend)).beyond_chance(distance2)
+            assert bend**2 - variance <= counted.log_scale**2 + 1e-9
+            assert abs(counted.log_scale) <= abs(bend)
+            assert counted.rotation_rad == pytest.approx(abs(counted.log_scale))
+
+
+def test_a_camera_within_one_sigma_bends_nothing(link: LinkEstimate) -> None:
+    submap = make_submap(TRUE, turning=True, n=N)
+    for distance2, passes in ((0.9, True), (1.3, True), (4.0, False)):
+
+        def find(submap: Submap, ids: IntArray, distance2: float = distance2) -> PreferredCamera:
+            return replace(found(submap, ids, 0.04, 0.0, beyond_chance=False), distance2=distance2)
+
+        assert isinstance(check_camera(submap, link, LIVE_SINCE, find, CONFIG, CALIBRATION), Bend) is passes
