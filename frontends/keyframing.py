@@ -47,8 +47,10 @@ def tracked_share(track: Track, submap: Submap, reference_id: int) -> float:
 
 
 def parallax_deg(track: Track, submap: Submap, reference_id: int) -> float:
-    """Angle under which the baseline to a keyframe is seen from the scene's median depth, degrees."""
+    """Angle under which the baseline to a keyframe is seen from the scene's median depth, degrees; 0 of no scene."""
     ids = track.landmark_ids[track.landmark_ids >= 0]
+    if not len(ids):
+        return 0.0
     T_cam_submap = track.T_cam_submap
     depth = submap.depths(ids, T_cam_submap)
     centre = se3.inverse(T_cam_submap)[:3, 3]

@@ -302,6 +302,14 @@ class TestKeyframing:
         assert keyframe_due(track, live.submap, 8, KeyframeConfig(weak_landmarks=5000))
         assert not keyframe_due(tracked(live, world.view(8)), live.submap, 8, KeyframeConfig(weak_landmarks=5000))
 
+    @pytest.mark.filterwarnings("error")
+    def test_a_pose_from_elsewhere_without_a_landmark_is_due(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8], start_at=8)
+        track = tracked(live, world.view(9))
+        unseen = replace(track, landmark_ids=np.full_like(track.landmark_ids, NO_LANDMARK))
+        assert parallax_deg(unseen, live.submap, 8) == 0.0
+        assert keyframe_due(unseen, live.submap, 8, KeyframeConfig())
+
 
 def test_local_map_predicts_what_the_camera_sees(world: PointWorld) -> None:
     submap = true_map(world, [0, 4, 8])
