@@ -208,7 +208,7 @@ def test_maps_of_a_wrong_camera_are_linked_after_both_have_been_calibrated() -> 
         "camera": {"model_sigma_px": 0.0},
         "recovery": {"attempts": ["live"]},
     }
-    system, world = miscalibrated(1.02, range(26, 38), settings)
+    system, world = miscalibrated(1.03, range(26, 38), settings)
     for i in range(75):
         system.step(Frame(i, i / 30, None))
     system.finish()
