@@ -13,6 +13,9 @@ from dualslam.core.interfaces import Sequence
 from dualslam.frame_records import FrameResult
 from dualslam.session import Outcome
 
+FINISHING = "all frames are in: ending the walks back, writing the results"
+"""Shown once no frame is left to count: a last walk back may take seconds."""
+
 
 @contextmanager
 def progress(sequence: Sequence, quiet: bool) -> Iterator[Callable[[FrameResult], None] | None]:
@@ -37,6 +40,8 @@ def progress(sequence: Sequence, quiet: bool) -> Iterator[Callable[[FrameResult]
         def on_frame(result: FrameResult) -> None:
             where = "" if result.submap_id is None else f", submap {result.submap_id}, {result.n_inliers} landmarks"
             bar.update(task, advance=1, state=f"{result.status}{where}")
+            if bar.finished:
+                bar.update(task, state=FINISHING)
 
         yield on_frame
 
