@@ -143,8 +143,7 @@ class VisualFrontEnd:
         refuses most of the matches, the frame's pose is wrong: the map is left without it.
         """
         if pose_is_given:
-            T_ref_kf = se3.inverse(self.submap.T_submap_kf[self._reference_id]) @ se3.inverse(track.T_cam_submap)
-            known = RelativePose(self._reference_id, T_ref_kf, track.covariance)
+            known = RelativePose(self._reference_id, self.relative_pose(track), track.covariance)
             self.submap.relative_poses[track.view.index] = known
         track = self._refound(track, pose_is_given)
         self._mapper.observe(track)
