@@ -40,8 +40,11 @@ class LostMapWatch:
         """Look for no map any more."""
         self._seeker, self._n_unseen, self._sighted = None, 0, False
 
-    def is_due(self, view: View) -> bool:
-        """Whether a frame is to be shown: not as long as another map may soon start (`recovery.resume_after`)."""
+    def note(self, view: View) -> bool:
+        """Count a frame without a map; return whether it is to be shown.
+
+        It is not as long as another map may soon start (`recovery.resume_after`).
+        """
         if self._seeker is None or self._after is None:
             return False
         self._n_unseen += len(view.features) >= self._config.tracking.min_inliers

@@ -134,7 +134,7 @@ class System:
     # --- initialising
 
     def _initialise(self, view: View) -> Track | Failure:
-        if self._lost_map.is_due(view) and (track := self._resume(view)):
+        if self._lost_map.note(view) and (track := self._resume(view)):
             return track
         shutter = self._parts.shutter
         with self.timer.measure("shutter"):
