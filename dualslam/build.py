@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from operator import attrgetter
 
 import numpy as np
 
@@ -20,7 +19,8 @@ from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend, PreferredCamera, SelfCalibrator, SubmapGraph
 from dualslam.core.rectification import rectify
 from dualslam.core.submap import Submap
-from dualslam.core.types import Failure, FailureReason, Features, Frame, IntArray, View
+from dualslam.core.threads import spare_cores
+from dualslam.core.types import Failure, FailureReason, Frame, IntArray, View
 from dualslam.evaluation.failure_lab import FaultScript
 from dualslam.executor import InlineExecutor, RecoveryExecutor
 from dualslam.health import judge_track
@@ -28,18 +28,21 @@ from dualslam.linking import DescriptorMatcher, carry_to_live_end, check_camera,
 from dualslam.recovery import Attempt, RecoveryJob, RecoveryParts
 from dualslam.system import Components, System
 from dualslam.worker import WorkerExecutor
+from frontends.guest_features import BufferedFeatures, GuestFeatures, OwnFeatures
 from frontends.image_features import ImageFeatures
 from frontends.images import to_grey
 from frontends.initialiser import Initialiser
 from frontends.motion_statistics import nearest_search
-from frontends.pnp_odometry import Extract, PnpOdometry
+from frontends.pnp_odometry import PnpOdometry, Route
 from frontends.refinding import Refinder
 from frontends.registry import check_frontend
 from frontends.registry import create_frontend as create_frontend  # part of the Python interface
-from frontends.rolling_shutter import RollingShutter, straighten
+from frontends.rolling_shutter import RollingShutter
 from frontends.visual import VisualFrontEnd
 
 ADJUST_ITERATIONS = 20
+FEATURE_THREADS = 2
+"""That find other front ends' features beside a walk back, where the tracking waits for it."""
 WORKER_BUDGET = 0.75
 """Share of the time after which a worker counts as hung that its walks may take: what they have by then is not lost."""
 
@@ -149,17 +152,24 @@ def recovery_executor(
     parts = recovery_parts(config, size_px, frontend=frontend)
     if recovery.workers == 0:
         return faults.around_inline(InlineExecutor(parts))
-    make_parts = partial(recovery_parts, config, size_px, WORKER_BUDGET * recovery.time_limit_s)
+    # Live frames come first: threads beside the walk only where a core is left beside the tracking and the workers.
+    n_threads = min(FEATURE_THREADS, spare_cores(1 + recovery.workers))
+    make_parts = partial(recovery_parts, config, size_px, WORKER_BUDGET * recovery.time_limit_s, n_threads=n_threads)
     limits = recovery.time_limit_s, recovery.finish_wait_s
     return WorkerExecutor(make_parts, recovery.workers, *limits, on_start=faults.kill_worker)
 
 
 def recovery_parts(
-    config: Config, size_px: tuple[int, int], budget_s: float | None = None, frontend: Frontend | None = None
+    config: Config,
+    size_px: tuple[int, int],
+    budget_s: float | None = None,
+    frontend: Frontend | None = None,
+    n_threads: int = FEATURE_THREADS,
 ) -> RecoveryParts:
     """Build what a walk back in time is made of, for images of this width and height; see `RecoveryParts.budget_s`.
 
-    `frontend`: the live one, where this process has it already: it may hold networks.
+    `frontend`: the live one, where this process has it already: it may hold networks. `n_threads`: that find other
+    front ends' features beside the walk; the results do not depend on it.
 
     Raises
     ------
@@ -177,7 +187,7 @@ def recovery_parts(
 
     matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
     return RecoveryParts(
-        attempts=_attempts(config, frontend, live, size_px),
+        attempts=_attempts(config, frontend, live, size_px, n_threads),
         posing=Attempt("live", live),
         new_graph=lambda: ISam2SubmapGraph(config.graph),
         link=lambda old, new, onset: estimate_link(
@@ -199,27 +209,28 @@ def _attempts(
     frontend: Frontend,
     live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
     size_px: tuple[int, int],
+    n_threads: int,
 ) -> tuple[Attempt, ...]:
     """Build the attempts; those with the same guest share what it finds in the images."""
     guests: dict[str, ImageFeatures] = {}  # by their settings
     attempts = []
     for number, attempt in enumerate(config.recovery.attempts):
         if attempt.is_live:
-            attempts.append(_attempt_by(frontend, lambda job: attrgetter("features"), attempt, config, live, size_px))
+            attempts.append(_attempt_by(frontend, lambda job: OwnFeatures(), attempt, config, live, size_px))
             continue
         wanted = _guest(attempt)
         key = wanted.model_dump_json()
         if key not in guests:
             with _naming_attempt(number):
-                guests[key] = ImageFeatures(create_frontend(wanted))
-        features_for = partial(_features_in_images, guests[key], config.camera.model_sigma_px)
+                guests[key] = ImageFeatures(create_frontend(wanted), n_threads)
+        features_for = partial(_buffered_features, guests[key], config.camera.model_sigma_px)
         attempts.append(_attempt_by(guests[key].frontend, features_for, attempt, config, live, size_px))
     return tuple(attempts)
 
 
 def _attempt_by(
     guest: Frontend,
-    features_for: Callable[[RecoveryJob], Extract],
+    features_for: Callable[[RecoveryJob], GuestFeatures],
     attempt: AttemptConfig,
     config: Config,
     live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
@@ -230,21 +241,15 @@ def _attempt_by(
 
     def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> PnpOdometry:
         walker, features = live(job, submap, graph), features_for(job)
-        return PnpOdometry(walker, guest, features, job.own, bundle_adjust_arrays, config, size_px, walks_live)
+        overlap_id = max((k for lost in job.lost.values() for k in lost.keyframes), default=job.newest_id)
+        route = Route(job.own, job.views, overlap_id)
+        return PnpOdometry(walker, guest, features, route, bundle_adjust_arrays, config, size_px, walks_live)
 
     return Attempt(attempt.name, new_odometry)
 
 
-def _features_in_images(guest: ImageFeatures, model_sigma_px: float, job: RecoveryJob) -> Extract:
-    """Return what finds a front end's rectified features in the buffered images."""
-
-    def extract(view: View) -> Features | Failure:
-        if view.image is None:
-            return Failure(FailureReason.UNREADABLE, "its image is no longer buffered")
-        features = rectify(guest.of(view.image), job.camera, model_sigma_px)
-        return features if view.turn_rad is None else straighten(features, job.camera, view.turn_rad)
-
-    return extract
+def _buffered_features(images: ImageFeatures, model_sigma_px: float, job: RecoveryJob) -> BufferedFeatures:
+    return BufferedFeatures(images, job.camera, model_sigma_px)
 
 
 def _guest(attempt: AttemptConfig) -> FrontendConfig:

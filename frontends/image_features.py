@@ -1,11 +1,15 @@
-"""Another front end's features of buffered images, each found once.
+"""Another front end's features of buffered images, each found once, by threads of their own.
 
 Attempts at a recovery walk the same frames one after the other, and so does a recovery that is tried again: finding
-SIFT features anew each time was more than half of what walks cost that come to nothing.
+SIFT features anew each time was more than half of what walks cost that come to nothing. And of what a walk over a gap
+costs that comes to a link, half was waiting for features, while the images that it would come to next were known:
+their features are found beside what it does with those before.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from weakref import WeakKeyDictionary
 
 from dualslam.core.grey_image import GreyImage
@@ -23,20 +27,44 @@ class ImageFeatures:
     Parameters
     ----------
     frontend : Frontend
+    n_threads : int
+        That look at foreseen images; at a gap six to eight are wanted at once, and the walk goes no further without
+        them. With none they are looked at when they are wanted.
     """
 
-    def __init__(self, frontend: Frontend) -> None:
+    def __init__(self, frontend: Frontend, n_threads: int) -> None:
         self.frontend = frontend
         self._known: WeakKeyDictionary[GreyImage, Features] = WeakKeyDictionary()  # the last used one stands last
+        self._begun: WeakKeyDictionary[GreyImage, Future[Features]] = WeakKeyDictionary()
+        self._threads = ThreadPoolExecutor(n_threads, "dualslam-features") if n_threads else None
 
     def of(self, image: GreyImage) -> Features:
         """Return the features of an image, in its own pixels."""
         features = self._known.pop(image, None)
         if features is None:
-            features = self.frontend.extract(image.pixels())
+            if image not in self._begun:  # what was foreseen did not come: it shall keep nobody waiting
+                self.foresee([])
+            features = self._begun.pop(image).result() if image in self._begun else self._look_at(image)
         self._known[image] = features
         self._make_room()
         return features
+
+    def foresee(self, images: Iterable[GreyImage]) -> None:
+        """Say which images will be asked for next, in this order: the threads look at them, and at no others."""
+        if self._threads is None:
+            return
+        wanted = list(images)
+        for image, features in list(self._begun.items()):
+            if image not in wanted and (features.cancel() or features.done()):
+                del self._begun[image]
+                if not features.cancelled() and features.exception() is None:
+                    self._known[image] = features.result()
+        for image in wanted:
+            if image not in self._known and image not in self._begun:
+                self._begun[image] = self._threads.submit(self._look_at, image)
+
+    def _look_at(self, image: GreyImage) -> Features:
+        return self.frontend.extract(image.pixels())
 
     def _make_room(self) -> None:
         nbytes = sum(features.nbytes for features in self._known.values())

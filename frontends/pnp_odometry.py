@@ -15,8 +15,9 @@ itself, sees the same points where they should be.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Set
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from dualslam.core.interfaces import Frontend, KeyframeReport, SubmapGraph
 from dualslam.core.submap import NO_LANDMARK, Submap
 from dualslam.core.support import find_lack_of_support
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray, Matches, Track, View
+from frontends.guest_features import GuestFeatures
 from frontends.guest_map import GuestMap, triangulate
 from frontends.leap_consensus import CONFIRMING_SHARE, BeyondGap, confirmed_share
 from frontends.leap_uncertainty import SMALL_STEP
@@ -36,13 +38,31 @@ from frontends.tracker import GivenPose
 from frontends.visual import VisualFrontEnd
 from frontends.wide_pose import WidePose, estimate_wide_pose
 
-Extract = Callable[[View], Features | Failure]
-
 FOLLOW_FRAMES = 2  # frames that the next one is matched with
 POINT_FRAMES = 6  # frames that a point is triangulated from
 LEAP_FRAMES = 5  # frames before a gap that those beyond it are matched with
 MIN_CONTRAST = 4.0  # standard deviation of the greys; sensors have a noise of 1 to 3, and blank images have that alone
 SEED_KEYFRAMES = 8  # keyframes of the submap that the walk starts from
+N_FORESEEN = 2  # usable frames beyond the one at hand: a leap takes two
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Route:
+    """What a walk sets out from, and what it will come to.
+
+    Attributes
+    ----------
+    own : sequence of View
+        Of the submap's own keyframes.
+    ahead : sequence of View
+        In the order in which they will be given.
+    overlap_id : int
+        The first frame on the way that an older submap holds: a gap lies before it.
+    """
+
+    own: Sequence[View]
+    ahead: Sequence[View]
+    overlap_id: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,10 +87,9 @@ class PnpOdometry:
     live : VisualFrontEnd
         Of the submap.
     guest : Frontend
-    extract : callable
-        The guest's rectified features of a view, from its image.
-    views : iterable of View
-        Views of the submap's own keyframes are taken from these, to start with.
+    features : GuestFeatures
+        The guest's.
+    route : Route
     walks_live : bool
         The live front end poses the frames as long as it can by itself, and the guest where it cannot.
     """
@@ -79,8 +98,8 @@ class PnpOdometry:
         self,
         live: VisualFrontEnd,
         guest: Frontend,
-        extract: Extract,
-        views: Iterable[View],
+        features: GuestFeatures,
+        route: Route,
         adjuster: BundleAdjuster,
         config: Config,
         size_px: tuple[int, int],
@@ -90,8 +109,9 @@ class PnpOdometry:
         self.graph = live.graph
         self._live = live
         self._guest = guest
-        self._extract = extract
-        self._views = {view.index: view for view in views}
+        self._guest_features = features
+        self._route = route
+        self._place_on_route = {view.index: place for place, view in enumerate(route.ahead)}
         self._adjuster = adjuster
         self._config = config
         self._size_px = size_px
@@ -140,6 +160,7 @@ class PnpOdometry:
         if isinstance(report, Failure):
             return report
         self._map.put(track.view.index, track.view.index, se3.inverse(self.submap.T_submap_kf[track.view.index]))
+        self._foresee_gap(track.view.index)
         return report
 
     # --- its own
@@ -148,11 +169,13 @@ class PnpOdometry:
         """Begin at a keyframe of the submap: it and its neighbours in time give the first points."""
         self._live.start_at(keyframe_id)
         nearest = self.submap.keyframes_near(keyframe_id)[:SEED_KEYFRAMES]
+        own = {view.index: view for view in self._route.own}
         for k in reversed(nearest):
-            if k in self._views:
+            if k in own:
                 self._map.put(k, k, se3.inverse(self.submap.T_submap_kf[k]))
-                self._pending[k] = self._views[k]
+                self._pending[k] = own[k]
         self._following = True
+        self._foresee_gap(keyframe_id)
 
     def track(self, view: View) -> Track | Failure:
         """Pose a frame."""
@@ -167,11 +190,14 @@ class PnpOdometry:
                 self._map.put(view.index, self.reference_id, track.T_cam_submap)
                 self._pending[view.index] = view
                 return track
-        features = self._features(view)
+        features: Features | Failure | None = self._lack(view)
+        if features is None:
+            self._guest_features.foresee([*self._needed().values(), view, *self._usable_after(view)])
+            self._catch_up()
+            features = self._features(view)
         if isinstance(features, Failure):
             self._following = False
             return features
-        self._catch_up()
         pose: GivenPose | Track | Failure = Failure(FailureReason.TOO_FEW_MATCHES)
         if self._following:
             pose = self._follow(view.index, features)
@@ -198,24 +224,47 @@ class PnpOdometry:
 
     def _catch_up(self) -> None:
         """Find the guest's features in the frames that have been posed without them, those that the next one needs."""
-        keyframes = [k for k in self._pending if k in self.submap.keyframes]
-        needed = {*keyframes[-SEED_KEYFRAMES:], *list(self._pending)[-FOLLOW_FRAMES:]}
-        for index, view in self._pending.items():
-            features = self._features(view) if index in needed else None
-            if features is not None and not isinstance(features, Failure):
+        for index, view in self._needed().items():
+            features = self._features(view)
+            if not isinstance(features, Failure):
                 self._map.add(index, features, self._matches(features, self._map.frames[-LEAP_FRAMES:]))
         self._pending = {}
 
+    def _needed(self) -> dict[int, View]:
+        """Return the frames, of those posed without the guest's features, that it needs to pose the next one."""
+        needed = {*self._pending_keyframes(), *list(self._pending)[-FOLLOW_FRAMES:]}
+        return {index: view for index, view in self._pending.items() if index in needed}
+
+    def _pending_keyframes(self) -> list[int]:
+        return [k for k in self._pending if k in self.submap.keyframes][-SEED_KEYFRAMES:]
+
+    def _foresee_gap(self, index: int) -> None:
+        """Have the guest look at keyframes, as long as the gap lies ahead that it is needed for."""
+        if index > self._route.overlap_id:
+            self._guest_features.foresee([self._pending[k] for k in self._pending_keyframes()])
+
+    def _usable_after(self, view: View) -> Iterator[View]:
+        """Yield the next frames on the route in which features can be found."""
+        place = self._place_on_route.get(view.index, len(self._route.ahead))
+        usable = (after for after in self._route.ahead[place + 1 :] if self._lack(after) is None)
+        return islice(usable, N_FORESEEN)
+
     def _features(self, view: View) -> Features | Failure:
-        minimum = self._config.tracking.min_inliers
-        if len(view.features) < minimum:
+        lack = self._lack(view)
+        if lack is not None:
+            return lack
+        features = self._guest_features.of(view)
+        if not isinstance(features, Failure) and len(features) < self._config.tracking.min_inliers:
+            return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features of {self._guest.name} in the image")
+        return features
+
+    def _lack(self, view: View) -> Failure | None:
+        """Return why a frame is not worth a look."""
+        if len(view.features) < self._config.tracking.min_inliers:
             return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image")
         if view.image is not None and view.image.pixels()[::8, ::8].std() < MIN_CONTRAST:
             return Failure(FailureReason.NO_TEXTURE, "a blank image")
-        features = self._extract(view)
-        if not isinstance(features, Failure) and len(features) < minimum:
-            return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features of {self._guest.name} in the image")
-        return features
+        return None
 
     def _matches(self, features: Features, frames: list[int]) -> dict[int, Matches]:
         return {k: self._guest.match_wide(self._map.features(k), features) for k in reversed(frames)}

@@ -22,7 +22,8 @@ class Frontend(Protocol):
 
     Nothing outside a front end knows what its descriptors are made of. They are rows of one array, of one type and
     length, that can be stored, sent to another process and handed back for comparison. The same image gives the same
-    features, whatever came before: a front end has no state. `frontends.conformance` checks all that is said here.
+    features, whatever came before: a front end has no state, and several threads may ask it at once.
+    `frontends.conformance` checks all that is said here.
 
     Attributes
     ----------

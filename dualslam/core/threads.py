@@ -28,3 +28,9 @@ def limit_threads() -> bool:
     for name, value in LIMITS.items():
         os.environ.setdefault(name, value)
     return "numpy" not in sys.modules
+
+
+def spare_cores(n_busy: int) -> int:
+    """Return how many of the cores that this process may use are left beside so many busy ones."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(0, usable - n_busy)

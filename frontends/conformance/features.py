@@ -6,6 +6,7 @@ import os
 import pickle
 import random
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -118,11 +119,15 @@ def check_colour_and_memory_layout(subject: Subject) -> None:
 
 
 def check_same_image_same_features(subject: Subject) -> None:
-    """Bit for bit: again, after another image, in another instance, after a trip to another process."""
+    """Bit for bit: again, after another image, beside it, in another instance, after a trip to another process."""
     frontend, image = subject.make(), subject.image()
     features = frontend.extract(image)
     frontend.extract(subject.scene(2).photograph()[:200, :300])
     expect(same_features(frontend.extract(image), features), "the second time, other features")
+    with ThreadPoolExecutor(2) as threads:
+        beside = list(threads.map(frontend.extract, [image, subject.scene(2).photograph(), image, image]))
+    same = all(same_features(beside[i], features) for i in (0, 2, 3))
+    expect(same, "other features while another thread asks for an image's")
     expect(same_features(subject.make().extract(image), features), "another instance finds other features")
     sent: object = pickle.loads(pickle.dumps(frontend))
     expect(same_features(sent.extract(image), features), "after pickling, other features")  # type: ignore[attr-defined]

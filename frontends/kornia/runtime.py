@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from threading import RLock
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from dualslam.core.errors import ConfigError
+
+_ON_CPU = RLock()
 
 
 def choose_device(name: str) -> torch.device:
@@ -36,18 +39,20 @@ def inference(device: torch.device, half: bool) -> Iterator[None]:
     """Run torch without gradients; on the CPU in one thread, on CUDA the networks in half precision if wanted.
 
     The number of threads belongs to the process: it is put back. One, because the order of a sum, and so its last bit,
-    would depend on it, and because our parallelism is processes (`dualslam.core.threads`).
+    would depend on it, and because our parallelism is processes (`dualslam.core.threads`). Callers in other threads
+    wait: they would put back each other's.
     """
     on_cpu = device.type == "cpu"
-    threads = torch.get_num_threads()
-    if on_cpu:
-        torch.set_num_threads(1)
-    try:
-        with torch.inference_mode(), torch.autocast(device.type, torch.float16, enabled=half and not on_cpu):
-            yield
-    finally:
+    with _ON_CPU if on_cpu else nullcontext():
+        threads = torch.get_num_threads()
         if on_cpu:
-            torch.set_num_threads(threads)
+            torch.set_num_threads(1)
+        try:
+            with torch.inference_mode(), torch.autocast(device.type, torch.float16, enabled=half and not on_cpu):
+                yield
+        finally:
+            if on_cpu:
+                torch.set_num_threads(threads)
 
 
 class DeviceCopies:

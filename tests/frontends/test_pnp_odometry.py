@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from dualslam.core.submap import NO_LANDMARK
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Track, View
 from frontends.guest_map import GuestMap, TrackViews, triangulate
 from frontends.orb import OrbFrontend
-from frontends.pnp_odometry import PnpOdometry
+from frontends.pnp_odometry import PnpOdometry, Route
 from frontends.wide_pose import WidePose, estimate_wide_pose
 from tests.frontends.test_tracking import front_end
 from tests.point_world import CAMERA, SIZE_PX, PointWorld, cloud, path, random_features
@@ -28,6 +29,22 @@ DRIVE = path(60, np.array([0.05, 0.0, 0.2]), np.array([0.0, 0.004, 0.0]))
 """Forwards: what lies ahead is seen at another scale on the other side of a gap."""
 
 
+class WorldFeatures:
+    """Features of a world of points, or those that a test has put into their place; it notes what was asked for."""
+
+    def __init__(self, world: PointWorld) -> None:
+        self.find: Callable[[View], Features | Failure] = lambda view: world.features(view.index)
+        self.asked: list[int] = []
+        self.foreseen: list[int] = []
+
+    def of(self, view: View) -> Features | Failure:
+        self.asked.append(view.index)
+        return self.find(view)
+
+    def foresee(self, views: Iterable[View]) -> None:
+        self.foreseen += [view.index for view in views]
+
+
 def worlds(covered: range = range(0)) -> tuple[PointWorld, PointWorld]:
     """The live front end's points and the guest's, which are others, along the same path."""
     hidden = frozenset(covered)
@@ -38,16 +55,17 @@ def worlds(covered: range = range(0)) -> tuple[PointWorld, PointWorld]:
 
 
 def odometry(
-    live: PointWorld, guest: PointWorld, config: Config | None = None, walks_live: bool = False
+    live: PointWorld,
+    guest: PointWorld | WorldFeatures,
+    config: Config | None = None,
+    walks_live: bool = False,
+    overlap_id: int = 0,
 ) -> PnpOdometry:
-    def extract(view: View) -> Features | Failure:
-        return guest.features(view.index)
-
     walker = PnpOdometry(
         front_end(live, KEYFRAMES, 40),
         OrbFrontend(),
-        extract,
-        [live.view(k) for k in KEYFRAMES],
+        WorldFeatures(guest) if isinstance(guest, PointWorld) else guest,
+        Route([live.view(k) for k in KEYFRAMES], [live.view(i) for i in range(39, -1, -1)], overlap_id),
         bundle_adjust_arrays,
         config or Config(),
         SIZE_PX,
@@ -104,8 +122,9 @@ class TestFollowing:
 
     def test_an_image_that_is_gone_is_a_failure_with_its_reason(self) -> None:
         live, guest = worlds()
-        walker = odometry(live, guest)
-        walker._extract = lambda view: Failure(FailureReason.UNREADABLE, "gone")
+        features = WorldFeatures(guest)
+        features.find = lambda view: Failure(FailureReason.UNREADABLE, "gone")
+        walker = odometry(live, features)
         failure = walker.track(live.view(39))
         assert isinstance(failure, Failure)
         assert failure.detail == "gone"
@@ -132,17 +151,16 @@ class TestLeap:
 
     def test_the_live_front_end_walks_where_it_can(self) -> None:
         live, guest = worlds(range(25, 32))
-        walker = odometry(live, guest, walks_live=True)
-        extracted, extract = [], walker._extract
-        walker._extract = lambda view: (extracted.append(view.index), extract(view))[1]
+        features = WorldFeatures(guest)
+        walker = odometry(live, features, walks_live=True)
         before = walk(walker, live, range(39, 31, -1))
         assert all(before.values())
-        assert not extracted
+        assert not features.asked
         beyond = walk(walker, live, range(31, 9, -1))
         assert all(beyond[i] for i in range(23, 9, -1))
         # Those before the gap that it matches with, those in it and the two that confirm it; then live features again.
-        assert {24, 23} <= set(extracted)
-        assert not {i for i in extracted if i < 21}
+        assert {24, 23} <= set(features.asked)
+        assert not {i for i in features.asked if i < 21}
         error = errors(before | beyond, live)
         assert np.linalg.norm(error[:, 3:], axis=1).max() < POSITION_M * 2
 
@@ -192,6 +210,29 @@ class TestLeap:
         ratio = np.linalg.norm(est[0] - est[-1]) / np.linalg.norm(true[0] - true[-1])
         assert abs(ratio - 1) < 0.02
 
+    def test_what_a_leap_needs_is_foreseen(self) -> None:
+        live, guest = worlds(range(25, 32))
+        features = WorldFeatures(guest)
+        walker = odometry(live, features, walks_live=True, overlap_id=24)
+        assert features.foreseen == KEYFRAMES[::-1]
+        walk(walker, live, range(39, 31, -1))
+        assert set(features.foreseen) == {*KEYFRAMES, *walker.submap.keyframes}  # and none of the other frames
+        for i in range(31, 9, -1):
+            before, features.asked = set(features.foreseen), []
+            walker.track(live.view(i))
+            assert set(features.asked) <= set(features.foreseen)
+            if i < 30:  # with the first frame in the gap came those that it is matched with, and the next ones
+                assert set(features.asked) <= before
+
+    def test_no_gap_no_features_of_the_guest(self) -> None:
+        """The older submap ends where this one begins, and nothing lies between that the guest would be needed for."""
+        live, guest = worlds()
+        features = WorldFeatures(guest)
+        walker = odometry(live, features, walks_live=True, overlap_id=40)
+        assert all(walk(walker, live, range(39, 20, -1)).values())
+        assert not features.foreseen
+        assert not features.asked
+
     def test_poses_that_contradict_each_other_are_not_believed(self) -> None:
         """Rows of like houses: beyond the gap, frame after frame shows what was before it from another place, and each
         pose is as well supported as the true one. Only what was not seen before the gap tells how the camera moved.
@@ -200,13 +241,14 @@ class TestLeap:
         before = PointWorld(guest.xyz[:600], DRIVE, seed=3, covered=guest.covered)
         np.testing.assert_array_equal(before.descriptors, guest.descriptors[:600])
 
-        def features(view: View) -> Features:
+        def seen_alike(view: View) -> Features:
             xyz = guest.xyz.copy()
             xyz[:600, 1] += 0.6 if view.index % 2 else -0.6
             return (PointWorld(xyz, DRIVE, seed=3) if view.index < 22 else before).features(view.index)
 
-        walker = odometry(live, before)
-        walker._extract = features
+        features = WorldFeatures(before)
+        features.find = seen_alike
+        walker = odometry(live, features)
         steps = {i: walker.track(live.view(i)) for i in range(39, 14, -1)}
         assert not any(steps.values())
         assert {steps[i].reason for i in range(21, 14, -1)} == {FailureReason.UNCONFIRMED}

@@ -1,0 +1,63 @@
+"""Where the features come from by which a walk is posed that the live front end does not pose by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Protocol
+
+from dualslam.core.camera import Camera
+from dualslam.core.rectification import rectify
+from dualslam.core.types import Failure, FailureReason, Features, View
+from frontends.image_features import ImageFeatures
+from frontends.rolling_shutter import straighten
+
+
+class GuestFeatures(Protocol):
+    """A front end's rectified features of views."""
+
+    def of(self, view: View) -> Features | Failure:
+        """Return the features of a view; a failure where they cannot be found any more."""
+        ...
+
+    def foresee(self, views: Iterable[View]) -> None:
+        """Say which views will be asked for next, in this order: their features may be found beforehand."""
+        ...
+
+
+class OwnFeatures:
+    """Those that the live front end has found: it is its own guest. Implements `GuestFeatures`."""
+
+    def of(self, view: View) -> Features | Failure:
+        """Return the view's own features."""
+        return view.features
+
+    def foresee(self, views: Iterable[View]) -> None:
+        """Do nothing: they are there."""
+
+
+class BufferedFeatures:
+    """Those that another front end finds in the buffered images. Implements `GuestFeatures`.
+
+    Parameters
+    ----------
+    images : ImageFeatures
+    camera : Camera
+    model_sigma_px : float
+        See `CameraConfig.model_sigma_px`.
+    """
+
+    def __init__(self, images: ImageFeatures, camera: Camera, model_sigma_px: float) -> None:
+        self._images = images
+        self._camera = camera
+        self._model_sigma_px = model_sigma_px
+
+    def of(self, view: View) -> Features | Failure:
+        """Return the features of a view; a failure where its image is gone."""
+        if view.image is None:
+            return Failure(FailureReason.UNREADABLE, "its image is no longer buffered")
+        features = rectify(self._images.of(view.image), self._camera, self._model_sigma_px)
+        return features if view.turn_rad is None else straighten(features, self._camera, view.turn_rad)
+
+    def foresee(self, views: Iterable[View]) -> None:
+        """Say which views will be asked for next."""
+        self._images.foresee(view.image for view in views if view.image is not None)
