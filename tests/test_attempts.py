@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dualslam.build import build_system
+from dualslam.build import build_system, recovery_parts
 from dualslam.core.camera import PinholeCamera
 from dualslam.core.config import AttemptConfig, Config, RecoveryConfig
 from dualslam.core.errors import ConfigError
@@ -15,13 +15,14 @@ from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import se3, sim3
 from dualslam.evaluation.link_audit import LinkAudit, audit_links
 from dualslam.executor import InlineExecutor, Outcome
-from dualslam.recovery import RecoveryJob
+from dualslam.recovery import RecoveryJob, RecoveryResult, run_recovery
 from dualslam.results import trajectories_of
 from dualslam.synthetic import Event as Spoil
 from dualslam.synthetic import make_sequence
 from dualslam.synthetic.events import EventKind as SpoilKind
 from dualslam.system import System
 from tests.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
+from tests.test_worker import assert_same
 
 COVERED = frozenset(range(35, 50))
 CAMERA = PinholeCamera(640, 480, 450.0, 450.0, 319.5, 239.5)
@@ -207,6 +208,23 @@ def test_a_black_out_on_the_road_is_leapt(attempt: str) -> None:
     length = np.linalg.norm(np.diff(truth[6:, :3, 3], axis=0), axis=1).sum()
     assert translation.max() < 0.03 * length
     assert rotation.max() < np.radians(1.0)  # a third of what makes a link wrong
+
+
+@pytest.mark.slow
+def test_the_result_is_the_same_whatever_the_threads() -> None:
+    world = make_sequence("street", 52, seed=2, events=[Spoil(SpoilKind.BLACKOUT, 26, 10)])
+    config = Config.model_validate({"recovery": {"attempts": ["leap"]}, "calibration": {"refine": False}})
+    system = build_system(config, world.camera)
+    jobs: list[RecoveryJob] = []
+    system._recoveries._executor.submit = jobs.append  # type: ignore[method-assign]
+    for i in range(6, 52):
+        system.step(world.frame(i))
+    job = next(job for job in jobs if job.lost)
+    size_px = (world.camera.width, world.camera.height)
+    alone, beside = (run_recovery(job, recovery_parts(config, size_px, n_threads=n)) for n in (0, 2))
+    assert isinstance(beside, RecoveryResult)
+    assert beside.events[-1].data["leaps"] == 1
+    assert_same(alone, beside)
 
 
 @pytest.mark.slow
