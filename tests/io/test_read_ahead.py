@@ -12,17 +12,11 @@ import pytest
 
 from dualslam.io import open_sequence
 from dualslam.io.read_ahead import read_ahead
+from tests.waiting import wait_until
 
 
 def reading_threads() -> list[threading.Thread]:
     return [t for t in threading.enumerate() if t.name == "dualslam-read-ahead"]
-
-
-def until(condition) -> None:
-    deadline = time.monotonic() + 5
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.001)
-    assert condition()
 
 
 class Counting:
@@ -54,7 +48,7 @@ def test_runs_ahead_by_its_depth_and_no_more() -> None:
     assert source.made == 0, "nothing happens before the first item is asked for"
     assert next(stream) == 0
     # One was taken, three wait, and one is in the producer's hand.
-    until(lambda: source.made == 5)
+    wait_until(lambda: source.made == 5, seconds=5)
     time.sleep(0.02)
     assert source.made == 5
     stream.close()
@@ -66,7 +60,7 @@ def test_stopping_early_ends_the_thread_and_closes_the_source() -> None:
         if item == 3:
             break
     gc.collect()
-    until(lambda: not reading_threads())
+    wait_until(lambda: not reading_threads(), seconds=5)
     assert source.closed_on == "dualslam-read-ahead"
     assert source.made < 10
 
@@ -92,7 +86,7 @@ def test_an_exception_in_the_consumer_ends_the_thread() -> None:
     with pytest.raises(RuntimeError, match="consumer"):
         consume()
     gc.collect()
-    until(lambda: not reading_threads())
+    wait_until(lambda: not reading_threads(), seconds=5)
 
 
 def test_a_live_source_drops_its_oldest() -> None:
@@ -118,7 +112,7 @@ def test_a_sequence_left_early_leaves_no_thread(dataset: Path) -> None:
         if frame.index == 1:
             break
     gc.collect()
-    until(lambda: not reading_threads())
+    wait_until(lambda: not reading_threads(), seconds=5)
 
 
 def test_two_readings_at_once_do_not_disturb_each_other(dataset: Path) -> None:

@@ -6,8 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from dualslam.evaluation.bench.tables import bench_tables
 from tests.evaluation.bench import fakes
 from tests.evaluation.bench.dask_cluster import Cluster, dask_cluster
 from tests.evaluation.bench.fakes import SPEC, describe, processes_in, run_fake, runs_in
+from tests.waiting import wait_until
 
 
 @pytest.fixture(scope="module")
@@ -115,19 +115,12 @@ def test_no_process_outlives_a_bench_that_is_killed(notes: Path) -> None:
     root = Path(__file__).parents[3]
     bench = subprocess.Popen([sys.executable, "-c", code], cwd=root)
     try:
-        wait_for(lambda: len(list(notes.iterdir())) == 2)
+        wait_until(lambda: len(list(notes.iterdir())) == 2)
     finally:
         bench.kill()
         bench.wait()
     for file in notes.iterdir():
-        wait_for(lambda pid=int(file.name): not running(pid))  # type: ignore[misc]
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
+        wait_until(lambda pid=int(file.name): not running(pid))  # type: ignore[misc]
 
 
 def running(pid: int) -> bool:

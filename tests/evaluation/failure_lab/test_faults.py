@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from dualslam.system import System
 from dualslam.worker import WorkerExecutor
 from tests.cli.conftest import _own_environment  # noqa: F401 (used by every test)
 from tests.point_world import PointWorld, cloud, hand_held, system_in
+from tests.waiting import wait_until
 
 N = 45
 
@@ -128,14 +128,6 @@ def test_a_corrupted_run_can_be_made_again_from_its_config(tmp_path: Path) -> No
     assert (tmp_path / "clean" / "trajectory.txt").read_bytes() != texts[0]
 
 
-def _await_results(executor: WorkerExecutor) -> None:
-    """Wait until what the processes were given has ended: frames here take no time, and a camera's do."""
-    end_s = time.monotonic() + 60
-    while any(task.worker._results.empty() for task in executor._busy):
-        assert time.monotonic() < end_s, "the recovery process gave no result"
-        time.sleep(0.005)
-
-
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_killed_worker_costs_its_recovery_and_nothing_else(workers: int) -> None:
     world = PointWorld(cloud(), hand_held(70), covered=frozenset(range(35, 50)))
@@ -149,8 +141,8 @@ def test_a_killed_worker_costs_its_recovery_and_nothing_else(workers: int) -> No
         system._recoveries._executor = script.around_inline(executor)
     for frame in world.frames():
         system.step(frame)
-        if isinstance(executor, WorkerExecutor):
-            _await_results(executor)
+        if isinstance(executor, WorkerExecutor):  # frames here take no time, and a camera's do
+            wait_until(lambda: not any(task.worker._results.empty() for task in executor._busy))
     system.finish()
     (failed,) = system.events.of_kind(EventKind.RECOVERY_FAILED)
     assert failed.data["reason"] == "worker"
