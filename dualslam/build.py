@@ -216,21 +216,21 @@ def _attempts(
     attempts = []
     for number, attempt in enumerate(config.recovery.attempts):
         if attempt.is_live:
-            attempts.append(_attempt_by(frontend, lambda job: OwnFeatures(), attempt, config, live, size_px))
+            attempts.append(_attempt_by(frontend, lambda camera: OwnFeatures(), attempt, config, live, size_px))
             continue
         wanted = _guest(attempt)
         key = wanted.model_dump_json()
         if key not in guests:
             with _naming_attempt(number):
                 guests[key] = ImageFeatures(create_frontend(wanted), n_threads)
-        features_for = partial(_buffered_features, guests[key], config.camera.model_sigma_px)
+        features_for = partial(BufferedFeatures, guests[key], config.camera.model_sigma_px)
         attempts.append(_attempt_by(guests[key].frontend, features_for, attempt, config, live, size_px))
     return tuple(attempts)
 
 
 def _attempt_by(
     guest: Frontend,
-    features_for: Callable[[RecoveryJob], GuestFeatures],
+    features_for: Callable[[Camera], GuestFeatures],
     attempt: AttemptConfig,
     config: Config,
     live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
@@ -240,16 +240,12 @@ def _attempt_by(
     walks_live = attempt.is_live or attempt.walk == "live"
 
     def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> PnpOdometry:
-        walker, features = live(job, submap, graph), features_for(job)
+        walker, features = live(job, submap, graph), features_for(job.camera)
         overlap_id = max((k for lost in job.lost.values() for k in lost.keyframes), default=job.newest_id)
         route = Route(job.own, job.views, overlap_id)
         return PnpOdometry(walker, guest, features, route, bundle_adjust_arrays, config, size_px, walks_live)
 
     return Attempt(attempt.name, new_odometry)
-
-
-def _buffered_features(images: ImageFeatures, model_sigma_px: float, job: RecoveryJob) -> BufferedFeatures:
-    return BufferedFeatures(images, job.camera, model_sigma_px)
 
 
 def _guest(attempt: AttemptConfig) -> FrontendConfig:

@@ -41,15 +41,15 @@ class BufferedFeatures:
     Parameters
     ----------
     images : ImageFeatures
-    camera : Camera
     model_sigma_px : float
         See `CameraConfig.model_sigma_px`.
+    camera : Camera
     """
 
-    def __init__(self, images: ImageFeatures, camera: Camera, model_sigma_px: float) -> None:
+    def __init__(self, images: ImageFeatures, model_sigma_px: float, camera: Camera) -> None:
         self._images = images
-        self._camera = camera
         self._model_sigma_px = model_sigma_px
+        self._camera = camera
 
     def of(self, view: View) -> Features | Failure:
         """Return the features of a view; a failure where its image is gone."""

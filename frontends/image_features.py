@@ -1,4 +1,4 @@
-"""Another front end's features of buffered images, each found once, by threads of their own.
+"""Another front end's features of buffered images, each found once, and beforehand where they can be foreseen.
 
 Attempts at a recovery walk the same frames one after the other, and so does a recovery that is tried again: finding
 SIFT features anew each time was more than half of what walks cost that come to nothing. And of what a walk over a gap
@@ -42,9 +42,10 @@ class ImageFeatures:
         """Return the features of an image, in its own pixels."""
         features = self._known.pop(image, None)
         if features is None:
-            if image not in self._begun:  # what was foreseen did not come: it shall keep nobody waiting
+            begun = self._begun.pop(image, None)
+            if begun is None:  # what was foreseen did not come: it shall keep nobody waiting
                 self.foresee([])
-            features = self._begun.pop(image).result() if image in self._begun else self._look_at(image)
+            features = self._look_at(image) if begun is None else begun.result()
         self._known[image] = features
         self._make_room()
         return features

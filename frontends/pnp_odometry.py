@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 
@@ -192,9 +192,9 @@ class PnpOdometry:
                 return track
         features: Features | Failure | None = self._lack(view)
         if features is None:
-            self._guest_features.foresee([*self._needed().values(), view, *self._usable_after(view)])
+            self._guest_features.foresee(chain(self._needed().values(), [view], self._usable_after(view)))
             self._catch_up()
-            features = self._features(view)
+            features = self._look_at(view)
         if isinstance(features, Failure):
             self._following = False
             return features
@@ -251,8 +251,9 @@ class PnpOdometry:
 
     def _features(self, view: View) -> Features | Failure:
         lack = self._lack(view)
-        if lack is not None:
-            return lack
+        return self._look_at(view) if lack is None else lack
+
+    def _look_at(self, view: View) -> Features | Failure:
         features = self._guest_features.of(view)
         if not isinstance(features, Failure) and len(features) < self._config.tracking.min_inliers:
             return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features of {self._guest.name} in the image")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from frontends import image_features
 from frontends.image_features import ImageFeatures
 from frontends.orb import OrbFrontend
 from tests.frontends.conftest import textured
+from tests.waiting import wait_until
 
 
 class CountingFrontend(OrbFrontend):
@@ -114,8 +114,7 @@ def test_what_was_found_in_vain_is_kept_for_later() -> None:
     features.foresee(images[:1])
     features.of(images[0])
     features.foresee(images[1:])
-    while not features._begun[images[1]].done():
-        time.sleep(0.001)
+    wait_until(features._begun[images[1]].done)
     features.foresee([])
     assert len(features) == 2
     features.of(images[1])
