@@ -21,7 +21,7 @@ from backend.factors import baseline_factor, insert_projections, pose_prior, rel
 from backend.gauge import Gauge, choose_gauge
 from backend.ledger import OUTSIDE, Ledger, Plan
 from backend.membership import compute_residuals, find_components
-from backend.noise import PixelNoise
+from backend.noise import PixelNoise, residual_variance
 from backend.solver import N_LAST, IncrementalSolver, SolverFailure, optimise_batch
 from dualslam.core.config import GraphConfig
 from dualslam.core.errors import SolverError
@@ -39,7 +39,6 @@ MISFIT_CHI2 = 1.2
 """Each third update relinearises, and each that follows one whose newest observations fit worse than this."""
 FAR_MU = 200.0
 """A point this far from its camera (the median initial depth is 1) is looked at again before the next solution."""
-MEDIAN_CHI2_2DOF = 1.386
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -311,9 +310,9 @@ class ISam2SubmapGraph:
             float(np.minimum(newest, self._config.insert_sigmas**2).mean() / 2) if len(newest) else float("nan")
         )
         self._misfit = chi2_newest > MISFIT_CHI2
-        # Where the pixels are noisier than their sigmas say, the gate opens as much: it is there for outliers.
-        noise = max(1.0, float(np.median(chi2)) / MEDIAN_CHI2_2DOF) if len(chi2) else 1.0
-        outliers = row[chi2 > self._config.outlier_chi2 * noise]
+        n_views = np.bincount(lm[inside], minlength=1)[lm[row]]
+        noise2 = residual_variance(chi2, n_views, self._config.least_noise**2)
+        outliers = row[chi2 > self._config.outlier_chi2 * noise2]
         return GraphEstimate(
             keyframe_ids=keyframes,
             T_submap_kf=T,
@@ -321,6 +320,7 @@ class ISam2SubmapGraph:
             xyz_mu=xyz,
             outlier_rows=np.union1d(outliers, plan.refused) if plan is not None else outliers,
             chi2_newest=chi2_newest,
+            noise2=noise2,
             rebuilt=rebuilt,
             seconds=time.thread_time() - start,
         )

@@ -60,6 +60,7 @@ class Mapper:
         self._size_px = size_px
         self._young: list[tuple[int, IntArray]] = []  # keyframe count at birth, landmark ids
         self._n_inserted = 0
+        self._gate_chi2 = config.reprojection_chi2  # as it is for the keyframe that grows
 
     def observe(self, track: Track) -> None:
         """Make a tracked frame a keyframe that sees the landmarks by which it was tracked, and nothing new."""
@@ -72,14 +73,16 @@ class Mapper:
         feature = feature[kept]
         submap.add_observations(view.index, feature, track.landmark_ids[feature])
 
-    def grow(self, track: Track, apart: Set[int] = frozenset()) -> MappingReport:
+    def grow(self, track: Track, apart: Set[int] = frozenset(), noise2: float = 1.0) -> MappingReport:
         """Grow the map about the keyframe that a tracked frame has become, from the poses as they are now.
 
         `apart`: keyframes across a gap, with which nothing new is triangulated. What few landmarks tie to each other
         has epipolar lines that are off, on which half of what is found is wrong (rendered streets: 65 of 130), each of
-        it by a depth that confirms the poses.
+        it by a depth that confirms the poses. `noise2`: variance of the map's whitened residuals. What fits worse than
+        these is let in neither as a new landmark nor as another view of one; noisier pixels open no gate to landmarks.
         """
         view = track.view
+        self._gate_chi2 = self._config.reprojection_chi2 * min(noise2, 1.0)
         self._n_inserted += 1
         n_culled = self._cull_young()
         neighbours = self._neighbours(view.index)
@@ -157,7 +160,7 @@ class Mapper:
         )
         row, feature = matches.index[:, 0], matches.index[:, 1]
         error = (features.uv_rect_px[feature] - prediction.uv_px[row]) / features.sigma_px[feature][:, None]
-        close = np.einsum("ij,ij->i", error, error) < self._config.reprojection_chi2
+        close = np.einsum("ij,ij->i", error, error) < self._gate_chi2
         ids, feature = local.landmark_ids[prediction.rows[row[close]]], feature[close]
         there = submap.landmark_of[k][feature]
         free = there == NO_LANDMARK
@@ -199,8 +202,8 @@ class Mapper:
             (points.depth_a > 0)
             & (points.depth_b > 0)
             & (points.cos_parallax < np.cos(np.radians(config.min_parallax_deg)))
-            & (points.error2_a < config.reprojection_chi2 * a.sigma_px[fa] ** 2)
-            & (points.error2_b < config.reprojection_chi2 * b.sigma_px[fb] ** 2)
+            & (points.error2_a < self._gate_chi2 * a.sigma_px[fa] ** 2)
+            & (points.error2_b < self._gate_chi2 * b.sigma_px[fb] ** 2)
             & self._scales_agree(a, b, fa, fb, points.depth_a, points.depth_b)
         )
         fa, fb = fa[ok], fb[ok]

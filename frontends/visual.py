@@ -155,7 +155,7 @@ class VisualFrontEnd:
             self._withdraw(track.view.index)
             detail = f"the map contradicts {n_refused} of {len(matched)} matches of keyframe {track.view.index}"
             return Failure(FailureReason.CHI_SQUARE, detail, {"n_refused": float(n_refused)})
-        mapping = self._mapper.grow(track, self._apart)
+        mapping = self._mapper.grow(track, self._apart, posed.noise2)
         grown = self._solve(rebuild)
         self._meet(track.view.index)
         culled = self._cull_keyframe()

@@ -47,7 +47,7 @@ def watch(n: int, sick: dict[int, dict[str, Any]], lost_from: int | None = None,
 
 def keyframe(chi2: float = 0.5, solver_failed: bool = False) -> KeyframeReport:
     none = np.zeros(0, np.int64)
-    estimate = GraphEstimate(none, np.zeros((0, 4, 4)), none, np.zeros((0, 3)), none, chi2, solver_failed, 0.0)
+    estimate = GraphEstimate(none, np.zeros((0, 4, 4)), none, np.zeros((0, 3)), none, chi2, 1.0, solver_failed, 0.0)
     return KeyframeReport(MappingReport(0, 0, 0, 0), estimate, estimate, None, solver_failed)
 
 

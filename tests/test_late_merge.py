@@ -52,8 +52,15 @@ class FailingExecutor(LateExecutor):
     """One whose jobs all fail."""
 
     def poll(self) -> list[Outcome]:
+        return self._lost(super().poll())
+
+    def finish(self) -> list[Outcome]:
+        return self._lost(super().finish())
+
+    @staticmethod
+    def _lost(outcomes: list[Outcome]) -> list[Outcome]:
         lost = Failure(FailureReason.WORKER, "the recovery process ended with exit code -9")
-        return [(job, lost) for job, _ in super().poll()]
+        return [(job, lost) for job, _ in outcomes]
 
 
 def late_system(world: PointWorld, polls: int, **settings: object) -> System:

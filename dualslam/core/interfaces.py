@@ -110,6 +110,8 @@ class GraphEstimate:
         Rows of the submap's observation table whose residual is beyond the graph's chi-square gate.
     chi2_newest : float
         Mean squared whitened residual per degree of freedom of the factors added last (1 is expected).
+    noise2 : float
+        Variance that the whitened residuals have (1 where the pixels' sigmas are right): what gates go by.
     rebuilt : bool
         True where the solver threw and the graph was made anew from the submap's arrays.
     seconds : float
@@ -122,6 +124,7 @@ class GraphEstimate:
     xyz_mu: FloatArray
     outlier_rows: IntArray
     chi2_newest: float
+    noise2: float
     rebuilt: bool
     seconds: float
 

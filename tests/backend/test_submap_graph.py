@@ -109,6 +109,27 @@ def test_outliers_are_reported_and_borne():
     assert len(found - present) < 0.08 * len(obs)
 
 
+@pytest.mark.parametrize(("noise", "gauged"), [(0.5, 0.6), (0.8, 0.8), (2.0, 2.0)])
+def test_the_outliers_gate_follows_the_noise_that_residuals_have(noise, gauged):
+    """In pixels better and worse than their sigmas, what is five standard deviations off is out, and nothing else."""
+    feeder, graph, rest = start(noise_px=noise)
+    rng = np.random.default_rng(3)
+    wrong = set()
+    for k in rest:
+        f = feeder.scene.features[k]
+        bad = rng.permutation(len(f.uv_px))[: len(f.uv_px) // 20]
+        f.uv_rect_px[bad, 0] += rng.choice([-5.0, 5.0], len(bad)) * gauged * f.sigma_px[bad]
+        wrong |= {(k, i) for i in bad.tolist()}
+    assert grow(feeder, graph, rest)[-1].noise2 == pytest.approx(gauged**2, rel=0.15)
+    e, obs = graph.full_estimate(feeder.submap), feeder.submap.observations
+    n_views = np.bincount(obs["landmark"], minlength=len(feeder.submap.landmarks))
+    judged = np.isin(obs["landmark"], e.landmark_ids) & (n_views[obs["landmark"]] >= 6)
+    is_wrong = np.array([pair in wrong for pair in zip(obs["kf"].tolist(), obs["feature"].tolist(), strict=True)])
+    is_out = np.isin(np.arange(len(obs)), e.outlier_rows)
+    assert is_out[judged & is_wrong].mean() > 0.9
+    assert is_out[judged & ~is_wrong].mean() < 0.03
+
+
 def test_observations_beyond_all_use_are_refused_and_reported():
     feeder, graph, rest = start()
     uv = feeder.scene.features[rest[0]].uv_rect_px
@@ -258,7 +279,8 @@ def relative_to(ref, T_submap_ref, T_submap_kf, covariance):
 
 def test_a_relative_pose_counts_by_its_covariance():
     """Two Gaussians of the same pose: informations add, and the estimate moves by their ratio."""
-    feeder, graph, rest = start(n=8)
+    gaussian = GraphConfig(robust_k=100.0, rebuild_iterations=30)
+    feeder, graph, rest = start(n=8, config=gaussian)
     grow(feeder, graph, rest)
     submap, k = feeder.submap, rest[-1]
     first = submap.gauge[0]  # which does not move
@@ -267,7 +289,7 @@ def test_a_relative_pose_counts_by_its_covariance():
     xi = 3.0 * np.sqrt(np.diag(P))  # elsewhere says that it is three standard deviations off
     T_known = T_alone @ se3.exp(xi)
     submap.relative_poses[k] = relative_to(first, submap.T_submap_kf[first], T_known, P)  # as sure as the landmarks
-    tied = ISam2SubmapGraph(GraphConfig(rebuild_iterations=30))
+    tied = ISam2SubmapGraph(gaussian)
     both = tied.rebuild(submap)
     moved = se3.log(se3.inverse(T_alone) @ both.T_submap_kf[list(both.keyframe_ids).index(k)])
     np.testing.assert_allclose(moved, xi / 2, atol=0.15 * np.abs(xi).max())

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from backend.submap_graph import ISam2SubmapGraph
-from dualslam.core.config import Config, KeyframeConfig
+from dualslam.core.config import Config, KeyframeConfig, MappingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.interfaces import KeyframeReport
 from dualslam.core.submap import NO_LANDMARK, Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe, Track, View
 from frontends.keyframing import keyframe_due, parallax_deg
 from frontends.local_map import LocalMap
-from frontends.mapper import spread_choice
+from frontends.mapper import Mapper, spread_choice
 from frontends.orb import OrbFrontend
 from frontends.resection import resect
 from frontends.visual import VisualFrontEnd
@@ -212,6 +212,29 @@ class TestMapping:
         (n_right, error_right), (n_off, error_off) = found
         assert n_off > 0.95 * n_right
         assert error_off < 1.2 * error_right
+
+    def test_no_landmark_is_let_in_that_fits_worse_than_the_map_does(self, world: PointWorld) -> None:
+        """Its gate follows residuals that are smaller than their sigmas, and opens for none that are larger."""
+        worst, n_new = {}, {}
+        for noise2 in (0.25, 1.0, 4.0):
+            live = front_end(world, [0, 4, 8], start_at=8, every=2)
+            track, submap = tracked(live, world.view(12)), live.submap
+            mapper = Mapper(OrbFrontend(), Config().mapping, submap, SIZE_PX)
+            mapper.observe(track)
+            n_before = len(submap.observations)
+            n_new[noise2] = mapper.grow(track, noise2=noise2).n_new
+            rows = np.arange(n_before, len(submap.observations))
+            uv_px, sigma_px = submap.observed_pixels(rows)
+            chi2 = []
+            for i, row in enumerate(rows):
+                T_cam_submap = se3.inverse(submap.T_submap_kf[int(submap.observations["kf"][row])])
+                xyz_mu = submap.landmarks["xyz_mu"][submap.observations["landmark"][row]]
+                error = (CAMERA.project(se3.act(T_cam_submap, xyz_mu[None]))[0] - uv_px[i]) / sigma_px[i]
+                chi2.append(error @ error)
+            worst[noise2] = max(chi2)
+        gate = MappingConfig().reprojection_chi2
+        assert worst[0.25] < 0.25 * gate < worst[1.0] < gate
+        assert 0 < n_new[0.25] < n_new[1.0] == n_new[4.0]
 
     def test_nothing_is_triangulated_across_a_gap_that_few_landmarks_bridge(self) -> None:
         world = PointWorld(cloud(), path(60, np.array([0.02, 0, 0]), np.array([0, 0.02, 0])))
