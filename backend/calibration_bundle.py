@@ -11,14 +11,13 @@ import numpy as np
 from backend import convert
 from backend.factors import baseline_factor, pose_prior
 from backend.membership import MIN_DEPTH_MU
-from backend.noise import PixelNoise
+from backend.noise import MEDIAN_CHI2_2DOF, PixelNoise
 from backend.silence import silenced
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.corrected_camera import LensCorrection
 from dualslam.core.types import FloatArray, IntArray
 
 ASPECT_SIGMA, SKEW_SIGMA, TANGENTIAL_SIGMA = 1e-4, 1e-7, 1e-7
-MEDIAN_CHI2_2DOF = 1.386
 MIN_NOISE_RATIO = 0.05
 """Residuals smaller than this share of their sigmas would be an exact simulation."""
 CALIBRATION_KEY = 1 << 60

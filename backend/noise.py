@@ -11,8 +11,6 @@ GAUGE_SIGMA = 1e-5
 """Sigma of the priors that fix a gauge (rad, and submap units): tight, yet far from the limits of a double."""
 GAUGE_RANGE_RATIO = 1e-4
 """Sigma of the first baseline, relative to its length."""
-
-
 MEDIAN_CHI2_2DOF = 1.386
 MIN_VIEWS, MIN_OBSERVATIONS = 4, 400
 """What the residuals' variance is read from: landmarks of so many views, and so many of their observations, which put
@@ -33,16 +31,16 @@ def residual_variance(chi2: FloatArray, n_views: IntArray, least: float) -> floa
     n_views : (R,) int64
         Views that each one's landmark has. The landmark takes 3 of their ``2 n`` numbers, which is given back.
     least : float
-        The smallest answer.
+        The smallest answer, at most 1.
 
     Returns
     -------
     float
-        1, or `least` if that is more, where too few landmarks have views enough to tell.
+        1 where too few landmarks have views enough to tell.
     """
     tells = n_views >= MIN_VIEWS
     if np.count_nonzero(tells) < MIN_OBSERVATIONS:
-        return max(1.0, least)
+        return 1.0
     per_number = chi2[tells] / (1 - 1.5 / n_views[tells])
     return max(least, float(np.median(per_number)) / MEDIAN_CHI2_2DOF)
 

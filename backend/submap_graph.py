@@ -310,7 +310,7 @@ class ISam2SubmapGraph:
             float(np.minimum(newest, self._config.insert_sigmas**2).mean() / 2) if len(newest) else float("nan")
         )
         self._misfit = chi2_newest > MISFIT_CHI2
-        n_views = np.bincount(lm[inside], minlength=1)[lm[row]]
+        n_views = np.bincount(lm[inside])[lm[row]]
         noise2 = residual_variance(chi2, n_views, self._config.least_noise**2)
         outliers = row[chi2 > self._config.outlier_chi2 * noise2]
         return GraphEstimate(

@@ -258,7 +258,7 @@ class GraphConfig(StrictModel):
     of freedom, 99 %, since what is dropped here is dropped for good."""
     least_noise: float = Field(0.6, gt=0, le=1)
     """Standard deviation, in the pixels' sigmas, that gates take residuals to have at least. Landmarks of four views
-    and more have 0.4 to 0.5 (the error of a lens model is much the same in neighbouring views), those of fewer, seen
+    and more have 0.25 to 0.5 (the error of a lens model is much the same in neighbouring views), those of fewer, seen
     from further apart, some more. 1: gates are never tighter than the pixels' sigmas."""
     max_keyframes: int = Field(150, ge=20, le=1000)
     """Keyframes at which a submap rolls over into the next: an update's cost grows with the map (on a road 65 ms on
