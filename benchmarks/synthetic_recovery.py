@@ -1,11 +1,14 @@
 """Failures scripted into rendered worlds with exact truth: what is recovered, and how true each link is.
 
-    python benchmarks/synthetic_recovery.py --runs 40 --jobs 2 --out runs/synthetic_recovery.jsonl
+    python benchmarks/synthetic_recovery.py --runs 40 --jobs 2 [--half development]
 
 A run is a street (320 x 240 pixels) or a room (640 x 480) of its own seed, with one failure of one kind in the middle.
 Each prints a line; a file that holds some runs already is continued. Run k of a kind has the same world, place and seed
 always. Where a link was made, the world is run once more without the failure, and that map, which never broke, is
-audited at the same frames: what the scale is off by there is drift, and not the link's doing.
+audited at the same frames: what the scale is off by there is drift, and not the link's doing. A link is wrong by the
+rule as it is written, drift or not; how many are no worse than the map that never broke stands beside it.
+
+Settings are chosen on the development half (world seeds from 0) and reported on the other (from 10,000).
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ SCENES = ("street", "room")
 SIZE = {"street": (320, 240, 600), "room": (640, 480, 1000)}
 """Width, height, features. In small images of a room a hand moves too little for a map to start within its 8 s."""
 SECONDS = {"street": 9.0, "room": 8.0}
+FIRST_SEED = {"development": 0, "reporting": 10_000}
 
 
 def script(kind: str, scene: str, rng: np.random.Generator, n_frames: int, rate_hz: float) -> dict[str, list[Any]]:
@@ -169,9 +173,9 @@ def is_drift(link: dict[str, Any]) -> bool:
 def table(runs: list[dict[str, Any]]) -> str:
     """Return the results by kind of failure, as Markdown."""
     lines = [
-        "| scene | failure | runs | lost maps | with a new map | linked | wrong | not by drift | scale % med / max "
-        "| rotation deg med / max | position % med / max | live scale % med / max | over its sigma, rms | ATE % med "
-        "| silent jumps | frames lost within 1 s of a fusion |",
+        "| scene | failure | runs | lost maps | with a new map | linked | wrong | of these beyond drift "
+        "| scale % med / max | rotation deg med / max | position % med / max | live scale % med / max "
+        "| over its sigma, rms | ATE % med | silent jumps | frames lost within 1 s of a fusion |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     groups = [(s, k) for s in SCENES for k in KINDS] + [("all", "all")]
@@ -201,13 +205,18 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--only", action="append", choices=(*KINDS, *SCENES), help="kinds or scenes to run")
     parser.add_argument("--set", type=json.loads, default={}, help="config values as JSON, over the script's own")
-    parser.add_argument("--out", type=Path, default=Path("runs/synthetic_recovery.jsonl"))
+    parser.add_argument(
+        "--half", choices=tuple(FIRST_SEED), default="reporting", help="which worlds (default: reporting)"
+    )
+    parser.add_argument("--out", type=Path, help="default: runs/synthetic_recovery_HALF.jsonl")
     args = parser.parse_args()
+    args.out = args.out or Path(f"runs/synthetic_recovery_{args.half}.jsonl")
     args.out.parent.mkdir(parents=True, exist_ok=True)
     text = args.out.read_text() if args.out.exists() else ""
     runs = [json.loads(line) for line in text.splitlines()]
     done = {(r["scene"], r["kind"], r["seed"]) for r in runs}
-    wanted = [(s, k, n) for n in range(args.runs) for s in SCENES for k in KINDS]
+    seeds = range(FIRST_SEED[args.half], FIRST_SEED[args.half] + args.runs)
+    wanted = [(s, k, n) for n in seeds for s in SCENES for k in KINDS]
     if args.only:
         wanted = [job for job in wanted if {job[0], job[1]} & set(args.only)]
     missing = [job for job in wanted if job not in done]

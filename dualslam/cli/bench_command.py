@@ -22,18 +22,18 @@ from dualslam.evaluation.bench.plan import plan_trials
 from dualslam.evaluation.bench.pool import run_in_processes
 from dualslam.evaluation.bench.record import TrialRecord, judge
 from dualslam.evaluation.bench.run import Executor, run_bench
-from dualslam.evaluation.bench.spec import BenchSpec, load_spec
+from dualslam.evaluation.bench.spec import BenchSpec, Half, load_spec
 from dualslam.evaluation.bench.tables import bench_tables
 from dualslam.evaluation.bench.write_tables import TABLES, write_tables
 
 
 def execute(args: argparse.Namespace) -> int:
     """Run what is not done yet, write the tables, and print them."""
-    spec = load_spec(args.spec).only(args.only)
+    spec = load_spec(args.spec).only(args.only).with_trials(args.trials, args.half)
     if args.data is not None and not args.data.is_dir():
         raise InputError(f"--data {args.data} is no folder; give the one that holds the sequences.")
     trials = plan_trials(spec, partial(describe_source, data=args.data))
-    out: Path = args.out if args.out is not None else Path("runs") / spec.name
+    out: Path = args.out if args.out is not None else Path("runs") / _folder_name(spec)
     logs.release()
     with _progress(spec, args.quiet) as on_trial:
         records = run_bench(spec, trials, out, _executor(args, out), on_trial)
@@ -54,11 +54,18 @@ def _executor(args: argparse.Namespace, out: Path) -> Executor:
     return lambda trials: run_in_processes(run, trials, n_processes)
 
 
+def _folder_name(spec: BenchSpec) -> str:
+    """Return a folder of its own for each half, so that no table mixes them."""
+    return spec.name if spec.half is Half.REPORTING else f"{spec.name}_{spec.half}"
+
+
 def _command(args: argparse.Namespace) -> str:
     """Return the command as another person would give it; how trials were spread does not matter to them."""
     words = ["dualslam bench", str(args.spec)]
     words += ["--data DIR"] if args.data is not None else []
     words += [f"--only {name}" for name in args.only]
+    words += [f"--trials {args.trials}"] if args.trials is not None else []
+    words += [f"--half {args.half}"] if args.half is not None else []
     return " ".join(words)
 
 

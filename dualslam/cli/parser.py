@@ -155,6 +155,12 @@ def _add_bench(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument("--out", metavar="DIR", type=Path, help="folder; a bench goes on there (default: runs/NAME)")
     parser.add_argument("--data", metavar="DIR", type=Path, help="folder in which the sequences of the bench are")
     parser.add_argument("--only", metavar="SEQUENCE", action="append", default=[], help="this sequence; repeatable")
+    parser.add_argument("--trials", metavar="N", type=_positive, help="of each sequence and condition, over the spec's")
+    parser.add_argument(
+        "--half",
+        choices=("development", "reporting"),
+        help="trials to choose settings on, or trials to publish; they share no seed (default: the spec's, reporting)",
+    )
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--jobs", metavar="N", type=_positive, help="trials at the same time (default: one a CPU)")
     where.add_argument("--scheduler", metavar="ADDRESS", help="run the trials on the workers of this Dask scheduler")

@@ -1,7 +1,7 @@
 """From a bench to its trials: where each starts, where its corruption lies, which configuration it runs with.
 
-All variants get the same trials. What is random about one depends on the bench's seed, the names of its sequence and
-condition, and its number alone, so that another sequence or more trials leave the others as they are.
+All variants get the same trials. What is random about one depends on the bench's seed and half, the names of its
+sequence and condition, and its number alone, so that another sequence or more trials leave the others as they are.
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ import numpy as np
 from dualslam.core.config import Config
 from dualslam.core.config_io import Override, load_config
 from dualslam.core.errors import ConfigError
-from dualslam.evaluation.bench.spec import BenchSpec, ConditionSpec, SequenceSpec, VariantSpec
+from dualslam.evaluation.bench.spec import BenchSpec, ConditionSpec, Half, SequenceSpec, VariantSpec
 
 # Steps of start and place that spread any number of trials evenly over both: the golden ratio's fraction leaves the
 # smallest gaps, and the square root of 2 is in no simple ratio to it.
 _SPREAD = (0.6180339887498949, 0.41421356237309515)
+_SALT = {Half.DEVELOPMENT: (), Half.REPORTING: (0x5245504F,)}
+"""What a half adds to every seed. Trials from before there were halves are development trials."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,8 +127,9 @@ def _trial(
     number: int,
 ) -> Trial:
     words = int.from_bytes(hashlib.sha256(f"{sequence.name}\0{condition.name}".encode()).digest()[:8], "little")
-    rng = np.random.default_rng([spec.seed, words, number])
-    shares = np.random.default_rng([spec.seed, words]).random(2) + np.multiply(number, _SPREAD)
+    salt = _SALT[spec.half]
+    rng = np.random.default_rng([spec.seed, words, number, *salt])
+    shares = np.random.default_rng([spec.seed, words, *salt]).random(2) + np.multiply(number, _SPREAD)
     first, last = _start_range(sequence, info)
     start = first + int((last - first + 1) * (shares[0] % 1))
     span = min(sequence.frames or info.n_frames, info.n_frames - start)

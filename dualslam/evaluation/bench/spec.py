@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,6 +17,16 @@ from dualslam.core.errors import ConfigError
 from dualslam.core.strict_model import StrictModel
 
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9._+-]*$"
+
+
+class Half(StrEnum):
+    """Which half of all trials a bench runs: what is chosen on one is reported on the other.
+
+    The halves share no seed, no start frame and no place of a corruption, save where a spec fixes these.
+    """
+
+    DEVELOPMENT = "development"  # to look at, and to choose thresholds and settings on
+    REPORTING = "reporting"  # to publish; nothing may be chosen on it
 
 
 class SequenceSpec(StrictModel):
@@ -134,6 +145,8 @@ class BenchSpec(StrictModel):
     """Of each sequence and condition. They differ in start frame, in the place of corruptions, and in seeds."""
     seed: int = Field(0, ge=0)
     """Of where trials start, where corruptions lie, and of each trial's own seeds."""
+    half: Half = Half.REPORTING
+    """Development trials are for choosing settings on, reporting trials for the tables that are published."""
     set: dict[str, Any] = Field(default_factory=dict)
     """Config fields of all variants."""
     thresholds: Thresholds = Thresholds()
@@ -183,6 +196,11 @@ class BenchSpec(StrictModel):
         kept = tuple(s for s in self.sequences if s.name in chosen)
         conditions = tuple(c for c in self.conditions if c.sequences is None or chosen & set(c.sequences))
         return self.model_copy(update={"sequences": kept, "conditions": conditions})
+
+    def with_trials(self, trials: int | None, half: str | None) -> BenchSpec:
+        """Return the bench with so many trials and of this half, where they are given."""
+        wanted: dict[str, Any] = {} if trials is None else {"trials": trials}
+        return self.model_copy(update=wanted if half is None else wanted | {"half": Half(half)})
 
 
 def load_spec(path: str | Path) -> BenchSpec:

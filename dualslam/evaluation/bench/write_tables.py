@@ -37,7 +37,7 @@ def write_tables(
         What makes the same tables again.
     """
     page, folder = out / TABLES, out / FOLDER
-    heading = f"## {spec.name}\n\n`{command}`: {len(records)} trials, seed {spec.seed}.\n\n"
+    heading = f"## {spec.name}\n\n`{command}`: {len(records)} trials of the {spec.half} half, seed {spec.seed}.\n\n"
     write_text(page, heading + "\n".join(table.markdown() for table in tables))
     files = [page]
     for table in tables:

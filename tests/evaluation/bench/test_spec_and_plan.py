@@ -10,7 +10,7 @@ import pytest
 from dualslam.core.corruption import Cause
 from dualslam.core.errors import ConfigError
 from dualslam.evaluation.bench.plan import Trial, plan_trials
-from dualslam.evaluation.bench.spec import BenchSpec, load_spec
+from dualslam.evaluation.bench.spec import BenchSpec, Half, load_spec
 from tests.evaluation.bench.fakes import SPEC, describe
 
 MINIMAL = """
@@ -107,6 +107,25 @@ def test_another_sequence_changes_no_other_trial() -> None:
 def test_more_trials_leave_those_that_there_are() -> None:
     prints = {t.fingerprint for t in plan_trials(SPEC.model_copy(update={"trials": 8}), describe)}
     assert all(t.fingerprint in prints for t in plan_trials(SPEC, describe))
+
+
+def test_the_halves_share_no_seed_start_or_place() -> None:
+    many = SPEC.model_copy(update={"trials": 20})
+    chosen_on, reported_on = (of(plan_trials(many.with_trials(None, half), describe), "a", "blackout") for half in Half)
+    for value in (
+        lambda t: t.config["seed"],
+        lambda t: t.config["corruptions"][0]["seed"],
+        lambda t: (t.start, t.config["corruptions"][0]["start"]),
+    ):
+        assert not {value(t) for t in chosen_on} & {value(t) for t in reported_on}
+    assert not {t.fingerprint for t in chosen_on} & {t.fingerprint for t in reported_on}
+
+
+def test_the_command_line_decides_on_trials_and_half() -> None:
+    asked = SPEC.with_trials(7, "development")
+    assert (asked.trials, asked.half) == (7, Half.DEVELOPMENT)
+    assert SPEC.with_trials(None, None) == SPEC
+    assert SPEC.half is Half.REPORTING
 
 
 def test_a_whole_sequence_is_run_to_its_end() -> None:

@@ -135,7 +135,7 @@ def test_what_is_written(tmp_path: Path) -> None:
     tables = bench_tables(SPEC, RECORDS)
     written = write_tables(SPEC, tables, RECORDS, tmp_path, "dualslam bench fake.yaml")
     page = (tmp_path / "tables.md").read_text()
-    assert "`dualslam bench fake.yaml`: 30 trials, seed 0" in page
+    assert "`dualslam bench fake.yaml`: 30 trials of the reporting half, seed 0" in page
     assert "| a | blackout | - | ⊗ 3/3 | 0.55 | ↷ 1/3 |" in page
     assert len(written) == len(tables) + 2
     trials = list(csv.DictReader(io.StringIO((tmp_path / "tables" / "trials.csv").read_text())))
