@@ -125,8 +125,8 @@ def audit_again(links: list[Any], unbroken: Any, world: Any) -> list[dict[str, f
 def measure(system: Any, world: Any, audits: list[Any], cpu_s: float) -> dict[str, Any]:
     """Return the numbers of a finished run."""
     from dualslam.core.events import EventKind
+    from dualslam.evaluation.alignment import align_points
     from dualslam.evaluation.map_jumps import find_map_jumps
-    from dualslam.evaluation.trajectory_metrics import align_points
     from dualslam.results import trajectories_of
 
     truth = truth_of(world)

@@ -45,4 +45,9 @@ def _one(title: str, score: dict[str, Any]) -> list[str]:
         translation = score.get("rpe_1s_trans_pct_median")
         rest = "" if translation is None else f", {translation:.2f} % of the distance"
         lines.append(f"  RPE over 1 s (median): {score['rpe_1s_rot_deg_median']:.3f} deg{rest}")
+    if score.get("broken") is not None:
+        where = f", the first at {score['first_broken_s']:.1f} s" if score["broken"] else ""
+        lines.append(
+            f"  silent breaks: {score['broken']} of {score['judged']} stretches of 2 s do not fit the truth{where}"
+        )
     return lines

@@ -13,6 +13,8 @@ import numpy as np
 
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray
+from dualslam.evaluation.alignment import align_points
+from dualslam.evaluation.silent_breaks import find_silent_breaks
 from dualslam.io.run_folder import TRAJECTORY, unlinked_submaps
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate, nearest_in_time, read_tum
 
@@ -70,6 +72,8 @@ class TrajectoryScore:
         Scale of the last third over that of the first.
     rpe_1s_rot_deg_median, rpe_1s_trans_pct_median : float or None
         Relative pose error over 1 s; translation of the distance moved.
+    judged, broken, broken_pct, first_broken_s
+        As in `dualslam.evaluation.silent_breaks.SilentBreaks`.
     """
 
     frames: int
@@ -86,6 +90,10 @@ class TrajectoryScore:
     scale_drift: float | None = None
     rpe_1s_rot_deg_median: float | None = None
     rpe_1s_trans_pct_median: float | None = None
+    judged: int | None = None
+    broken: int | None = None
+    broken_pct: float | None = None
+    first_broken_s: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields that are known."""
@@ -140,7 +148,9 @@ def score_trajectory(
     ref = Trajectory(truth.timestamps_s[row[used]], truth.T_world_cam[row[used]])
     scale, absolute = absolute_error(est, ref, alignment)
     relative = relative_error(est, ref, scale, frame_dt_s)
-    return TrajectoryScore(**counts, **absolute, scale_drift=scale_drift(est, ref), **relative)
+    breaks = find_silent_breaks(est.timestamps_s - times[0], _positions(est), _positions(ref), frame_dt_s)
+    found = {} if breaks is None else asdict(breaks)
+    return TrajectoryScore(**counts, **absolute, scale_drift=scale_drift(est, ref), **relative, **found)
 
 
 def absolute_error(est: Trajectory, ref: Trajectory, alignment: Alignment) -> tuple[float, dict[str, Any]]:
@@ -191,24 +201,6 @@ def relative_error(
         off = np.linalg.norm(scale * T_est[:, :3, 3] - T_ref[:, :3, 3], axis=1)
         fields["rpe_1s_trans_pct_median"] = float(np.median(100 * off[enough] / moved[enough]))
     return fields
-
-
-def align_points(p: FloatArray, q: FloatArray, *, with_scale: bool = True) -> tuple[float, FloatArray, FloatArray]:
-    """Return s, R, t that minimise the sum of ``|q - (s R p + t)|^2`` (Umeyama 1991), p and q (N, 3).
-
-    Unlike the alignment that links maps, this one has an answer for any input: a trajectory that never moved, or moved
-    on a line only, must be scored too.
-    """
-    mean_p, mean_q = p.mean(axis=0), q.mean(axis=0)
-    a, b = p - mean_p, q - mean_q
-    U, D, Vt = np.linalg.svd(b.T @ a / len(p))  # Eq. (38)
-    S = np.ones(3)
-    if np.linalg.det(U) * np.linalg.det(Vt) < 0:
-        S[-1] = -1.0  # Eq. (39)
-    R = np.asarray(U @ np.diag(S) @ Vt, np.float64)  # Eq. (40)
-    variance = (a * a).sum() / len(p)
-    s = float((D * S).sum() / max(variance, 1e-300)) if with_scale else 1.0  # Eq. (42)
-    return s, R, np.asarray(mean_q - s * R @ mean_p, np.float64)  # Eq. (41)
 
 
 def evaluate_run(

@@ -22,7 +22,7 @@ from dualslam.core.corrected_camera import LensCorrection, correct
 from dualslam.core.geometry import so3
 from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe
-from dualslam.evaluation.trajectory_metrics import align_points
+from dualslam.evaluation.alignment import align_points
 from tests.backend.scenes import make_features
 
 WIDTH, HEIGHT = 640, 480

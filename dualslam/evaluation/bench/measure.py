@@ -10,8 +10,9 @@ import numpy as np
 
 from dualslam.core.events import Event, EventKind
 from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.evaluation.alignment import align_points
 from dualslam.evaluation.bench.record import STATUS_LETTERS, Breakage
-from dualslam.evaluation.trajectory_metrics import MIN_POSES, align_points, score_trajectory
+from dualslam.evaluation.trajectory_metrics import MIN_POSES, score_trajectory
 from dualslam.io.run_folder import FrameRow, PosedFrames
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
 
