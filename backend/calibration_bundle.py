@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from backend import convert
-from backend.factors import baseline_factor, pose_prior
-from backend.membership import MIN_DEPTH_MU
-from backend.noise import MEDIAN_CHI2_2DOF, PixelNoise
-from backend.silence import silenced
+from dualslam.backend import convert
+from dualslam.backend.factors import baseline_factor, pose_prior
+from dualslam.backend.gtsam_output import without_gtsam_output
+from dualslam.backend.noise import MEDIAN_CHI2_2DOF, PixelNoise
+from dualslam.backend.observability import MIN_DEPTH_MU
 from dualslam.core.bundle import BundleProblem
-from dualslam.core.corrected_camera import LensCorrection
+from dualslam.core.camera.corrected import LensCorrection
 from dualslam.core.types import FloatArray, IntArray
 
 ASPECT_SIGMA, SKEW_SIGMA, TANGENTIAL_SIGMA = 1e-4, 1e-7, 1e-7
@@ -79,7 +79,7 @@ def optimise_with_camera(
     Raises
     ------
     RuntimeError, LinAlgError, ...
-        What GTSAM and numpy raise (`backend.solver.GTSAM_ERRORS`).
+        What GTSAM and numpy raise (`dualslam.backend.solver.GTSAM_ERRORS`).
     """
     for _ in range(MAX_DROPS):
         try:
@@ -125,7 +125,7 @@ def _optimise(
     params.setRelativeErrorTol(TOLERANCE)
     params.setLinearSolverType("SEQUENTIAL_CHOLESKY")
     params.setOrdering(gtsam.Ordering([*points.tolist(), *poses, CALIBRATION_KEY]))
-    with silenced():  # the factor prints each point that a step puts behind a camera
+    with without_gtsam_output():  # the factor prints each point that a step puts behind a camera
         before = float(graph.error(values))
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
         result = optimizer.optimize()

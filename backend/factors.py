@@ -5,10 +5,10 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from backend.convert import pose_key, to_pose3
-from backend.noise import GAUGE_RANGE_RATIO, GAUGE_SIGMA, PixelNoise, pose_sigmas
-from dualslam.core.submap import RelativePose
+from dualslam.backend.convert import pose_key, to_pose3
+from dualslam.backend.noise import GAUGE_RANGE_RATIO, GAUGE_SIGMA, PixelNoise, pose_sigmas
 from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.submap import RelativePose
 
 
 def insert_projections(

@@ -9,8 +9,8 @@ from typing import TypeGuard
 import numpy as np
 
 from dualslam.core.geometry import se3
-from dualslam.core.submap import Submap
 from dualslam.core.types import FloatArray
+from dualslam.map.submap import Submap
 
 MIN_BASELINE_MU = 1e-3
 """Shorter than this a baseline cannot carry the scale (the median initial depth is 1)."""

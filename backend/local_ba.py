@@ -1,4 +1,4 @@
-"""Batch bundle adjustment of a few keyframes and their points: initialisation, seams, windows.
+"""Batch bundle adjustment of a few keyframes and their points: initialisation, overlaps, windows.
 
 GTSAM's Levenberg-Marquardt with the points eliminated first. A vectorised numpy solver with a Schur complement was
 written beside it and thrown away: at 20 free and 5 fixed keyframes with 6,200 observations it took 14.4 ms an iteration
@@ -13,15 +13,15 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from backend import convert
-from backend.factors import insert_projections, pose_prior
-from backend.membership import compute_depth_sigmas, compute_residuals
-from backend.noise import PixelNoise
-from backend.solver import SolverFailure, optimise_batch
+from dualslam.backend import convert
+from dualslam.backend.factors import insert_projections, pose_prior
+from dualslam.backend.noise import PixelNoise
+from dualslam.backend.observability import compute_depth_sigmas, compute_residuals
+from dualslam.backend.solver import SolverFailure, optimise_batch
 from dualslam.core.bundle import BundleProblem, BundleResult
 from dualslam.core.errors import SolverError
-from dualslam.core.submap import Submap
 from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.submap import Submap
 
 MAX_DEPTH_SIGMA = 1.0
 """A point whose distance is known no better than this (relative, one sigma) is not adjusted."""

@@ -24,17 +24,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from backend.calibration_bundle import CalibratedOptimum, optimise_with_camera
-from backend.membership import compute_depth_sigmas, compute_residuals
-from backend.solver import GTSAM_ERRORS, SolverFailure
+from dualslam.backend.calibration_bundle import CalibratedOptimum, optimise_with_camera
+from dualslam.backend.observability import compute_depth_sigmas, compute_residuals
+from dualslam.backend.solver import GTSAM_ERRORS, SolverFailure
+from dualslam.config.calibration_config import CalibrationConfig
 from dualslam.core.bundle import BundleProblem
-from dualslam.core.calibration_config import CalibrationConfig
-from dualslam.core.camera import Camera
-from dualslam.core.corrected_camera import LensCorrection, correction_of, given_camera
+from dualslam.core.camera.corrected import LensCorrection, correction_of, given_camera
+from dualslam.core.camera.models import Camera
 from dualslam.core.geometry import so3
 from dualslam.core.interfaces import CalibrationEstimate, PreferredCamera
-from dualslam.core.submap import Submap
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
+from dualslam.map.submap import Submap
 
 MIN_VIEWS = 3
 """Keyframes of the window that must see a landmark: two views have little to say beyond their own relative pose."""

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from backend import convert
-from backend.membership import find_components
-from backend.noise import GAUGE_SIGMA, gaussian
-from backend.solver import GTSAM_ERRORS, SolverFailure
+from dualslam.backend import convert
+from dualslam.backend.noise import GAUGE_SIGMA, gaussian
+from dualslam.backend.observability import find_components
+from dualslam.backend.solver import GTSAM_ERRORS, SolverFailure
 from dualslam.core.errors import SolverError
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 

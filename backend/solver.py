@@ -28,8 +28,8 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from backend import convert
-from backend.bayes_tree import BayesTree, UpdateStatistics, parse_bayes_tree
+from dualslam.backend import convert
+from dualslam.backend.bayes_tree import BayesTree, UpdateStatistics, parse_bayes_tree
 from dualslam.core.types import FloatArray, IntArray
 
 POSE_THRESHOLDS = (0.0005, 0.0025)

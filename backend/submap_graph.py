@@ -15,19 +15,19 @@ from operator import itemgetter
 import gtsam
 import numpy as np
 
-from backend import convert
-from backend.bayes_tree import BayesTree, UpdateStatistics
-from backend.factors import baseline_factor, insert_projections, pose_prior, relative_pose
-from backend.gauge import Gauge, choose_gauge
-from backend.ledger import OUTSIDE, Ledger, Plan
-from backend.membership import compute_residuals, find_components
-from backend.noise import PixelNoise, residual_variance
-from backend.solver import N_LAST, IncrementalSolver, SolverFailure, optimise_batch
-from dualslam.core.config import GraphConfig
+from dualslam.backend import convert
+from dualslam.backend.bayes_tree import BayesTree, UpdateStatistics
+from dualslam.backend.factor_index import OUTSIDE, FactorIndex, Plan
+from dualslam.backend.factors import baseline_factor, insert_projections, pose_prior, relative_pose
+from dualslam.backend.gauge import Gauge, choose_gauge
+from dualslam.backend.noise import PixelNoise, residual_variance
+from dualslam.backend.observability import compute_residuals, find_components
+from dualslam.backend.solver import N_LAST, IncrementalSolver, SolverFailure, optimise_batch
+from dualslam.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.interfaces import GraphEstimate
-from dualslam.core.submap import RelativePose, Submap
 from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.submap import RelativePose, Submap
 
 logger = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ class ISam2SubmapGraph:
     def __init__(self, config: GraphConfig) -> None:
         self._config = config
         self._noise = PixelNoise(config.robust_k)
-        self._ledger = Ledger(config)
+        self._factor_index = FactorIndex(config)
         self._forced_holds: set[int] = set()
         self._solver: IncrementalSolver | None = None
         self._gauge: Gauge | None = None
@@ -106,7 +106,9 @@ class ISam2SubmapGraph:
             logger.info("submap %d changed its gauge: rebuilding its graph", submap.id)
             return self._remake(submap, start, rebuilt=True)
         try:
-            plan = self._ledger.plan(submap, submap.T_submap_kf, submap.landmarks["xyz_mu"], suspects=self._suspects)
+            plan = self._factor_index.plan(
+                submap, submap.T_submap_kf, submap.landmarks["xyz_mu"], suspects=self._suspects
+            )
             changes = self._changes(submap, plan, submap.T_submap_kf, submap.landmarks["xyz_mu"])
             self._solve(self._solver, submap, plan, changes)
             self._n_updates += 1
@@ -151,7 +153,7 @@ class ISam2SubmapGraph:
         SolverError
             If the keyframe is not in the graph, or the solver cannot tell.
         """
-        if self._solver is None or keyframe_id not in self._ledger.keyframes:
+        if self._solver is None or keyframe_id not in self._factor_index.keyframes:
             raise SolverError(f"keyframe {keyframe_id} is not in the graph: update it with the keyframe's submap first")
         try:
             return self._solver.covariance(convert.pose_key(keyframe_id))
@@ -200,10 +202,10 @@ class ISam2SubmapGraph:
     def _changes(self, submap: Submap, plan: Plan, poses: Mapping[int, FloatArray], xyz_mu: FloatArray) -> _Changes:
         """Translate a plan into factors and values; new variables start from `poses` and `xyz_mu`."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        remove = self._ledger.rows["factor"][plan.leaving].tolist()
+        remove = self._factor_index.rows["factor"][plan.leaving].tolist()
 
         def pose_now(k: int) -> FloatArray:
-            known = self._solver is not None and k in self._ledger.keyframes
+            known = self._solver is not None and k in self._factor_index.keyframes
             return self._solver.pose(k) if self._solver is not None and known else poses[k]
 
         gauge = choose_gauge(submap, self._gauge, pose_now)
@@ -233,7 +235,7 @@ class ISam2SubmapGraph:
         for k, r in new_relative:
             graph.push_back(relative_pose(k, r))
 
-        obs, rows, e = submap.observations, self._ledger.rows, plan.entering
+        obs, rows, e = submap.observations, self._factor_index.rows, plan.entering
         K = convert.to_cal3_s2(submap.K)
         order = insert_projections(
             graph, obs["kf"][e], obs["landmark"][e], rows["uv_px"][e], rows["sigma_px"][e], K, self._noise
@@ -259,7 +261,7 @@ class ISam2SubmapGraph:
         self._relative = changes.kept_relative | {k: (known, factor) for (k, known), factor in taken}
         factors = np.empty(len(changes.order), np.int64)
         factors[changes.order] = indices[projections:]
-        self._ledger.commit(plan, factors)
+        self._factor_index.commit(plan, factors)
         steps = [solver.statistics]
         for _ in range(self._config.extra_iterations):
             solver.iterate(newest)
@@ -268,7 +270,7 @@ class ISam2SubmapGraph:
 
     def _n_rows(self, submap: Submap, plan: Plan, keyframe_id: int) -> int:
         kf = submap.observations["kf"]
-        inside = np.count_nonzero((self._ledger.rows["factor"] >= 0) & (kf == keyframe_id))
+        inside = np.count_nonzero((self._factor_index.rows["factor"] >= 0) & (kf == keyframe_id))
         change = np.count_nonzero(kf[plan.entering] == keyframe_id) - np.count_nonzero(kf[plan.leaving] == keyframe_id)
         return int(inside + change)
 
@@ -281,11 +283,11 @@ class ISam2SubmapGraph:
         rebuild, it is the whole submap.
         """
         assert self._solver is not None
-        obs, rows = submap.observations, self._ledger.rows
+        obs, rows = submap.observations, self._factor_index.rows
         kf, lm = obs["kf"][: len(rows)], obs["landmark"][: len(rows)]
         entering = plan.entering if plan is not None else np.zeros(0, np.int64)
         inside = np.flatnonzero(rows["factor"] >= 0)
-        keyframes, row = np.array(sorted(self._ledger.keyframes), np.int64), inside
+        keyframes, row = np.array(sorted(self._factor_index.keyframes), np.int64), inside
         window = 0 if rebuilt or plan is None else self._config.read_window
         if window and len(keyframes) > window:
             recent = np.union1d(np.array(list(submap.keyframes)[-window:], np.int64), kf[entering])
@@ -330,14 +332,14 @@ class ISam2SubmapGraph:
     def _reset(self) -> None:
         self._solver, self._gauge, self._gauge_factors, self._holds, self._relative = None, None, [], {}, {}
         self._suspects = np.zeros(0, np.int64)
-        self._ledger.clear()
+        self._factor_index.clear()
 
     def _blame(self, failure: SolverFailure, submap: Submap) -> None:
         """Keep the landmark that the solver named out of the next graph, or hold the keyframe that it named."""
         if failure.key is None:
             return
         if not convert.is_pose_key(failure.key):
-            self._ledger.banned.add(failure.key)
+            self._factor_index.banned.add(failure.key)
         elif convert.keyframe_of(failure.key) in submap.keyframes:
             self._forced_holds.add(convert.keyframe_of(failure.key))
 
@@ -364,7 +366,7 @@ class ISam2SubmapGraph:
         """Batch-optimise what the submap holds, and seed a fresh iSAM2 with the result."""
         poses: Mapping[int, FloatArray] = submap.T_submap_kf
         xyz = submap.landmarks["xyz_mu"]
-        plan = self._ledger.plan(submap, poses, xyz, caution, strict=False)
+        plan = self._factor_index.plan(submap, poses, xyz, caution, strict=False)
         self._hold_loose_pieces(submap, plan)
         batch = self._changes(submap, plan, poses, xyz)
         optimum = optimise_batch(batch.graph, batch.values, plan.new_keyframes, plan.new_landmarks, iterations)
@@ -372,7 +374,7 @@ class ISam2SubmapGraph:
         xyz = xyz.copy()
         xyz[plan.new_landmarks] = optimum.xyz_mu
         # Seen from the optimum, some points are no longer certain, or no longer in front: plan again.
-        plan = self._ledger.plan(submap, poses, xyz, caution)
+        plan = self._factor_index.plan(submap, poses, xyz, caution)
         self._hold_loose_pieces(submap, plan)
         solver = IncrementalSolver()
         self._solve(solver, submap, plan, self._changes(submap, plan, poses, xyz))

@@ -23,16 +23,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from backend.local_ba import bundle_adjust_arrays
+from dualslam.backend.local_ba import bundle_adjust_arrays
 from dualslam.build import view_of
-from dualslam.core.config import Config
-from dualslam.core.config_io import load_config
+from dualslam.config.files import load_config
+from dualslam.config.settings import Config
 from dualslam.core.types import FloatArray, Start, View
-from dualslam.evaluation.link_audit import truth_by_frame
-from dualslam.evaluation.statistics import wilson_interval
-from dualslam.sources import open_source
-from frontends.initialiser import Initialiser
-from frontends.registry import create_frontend
+from dualslam.frontends.registry import create_frontend
+from dualslam.frontends.tracking.initialiser import Initialiser
+from dualslam.lab.audits.link_audit import truth_by_frame
+from dualslam.lab.metrics.statistics import wilson_interval
+from dualslam.run.sources import open_source
 
 WRONG_DEG = 5.0
 TRUTH_SIGMA_M = 0.003
@@ -53,7 +53,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Trial:
+class StartTrial:
     """What came of one start frame: frames until a map started, its error, the truth's own, and what the start says of
     its error; all None where none did.
     """
@@ -106,7 +106,7 @@ def read(source: str, config: Config, stride: int) -> tuple[list[View], dict[int
     return views, truth_by_frame(index, times, sequence.ground_truth), sequence.camera
 
 
-def trial(views: list[View], truth: dict[int, FloatArray], camera: Any, config: Config) -> Trial:
+def trial(views: list[View], truth: dict[int, FloatArray], camera: Any, config: Config) -> StartTrial:
     """Feed views until a map starts."""
     frontend = create_frontend(config.frontend)
     size_px = (camera.width, camera.height)
@@ -118,8 +118,8 @@ def trial(views: list[View], truth: dict[int, FloatArray], camera: Any, config: 
             assert isinstance(start, Start)
             error_deg, truth_sigma_deg = direction_error_deg(start, truth) or (None, None)
             claimed = start.numbers["direction_sigma_deg"]
-            return Trial(n, error_deg, truth_sigma_deg, claimed, time.process_time() - begin, n + 1)
-    return Trial(None, None, None, None, time.process_time() - begin, len(views))
+            return StartTrial(n, error_deg, truth_sigma_deg, claimed, time.process_time() - begin, n + 1)
+    return StartTrial(None, None, None, None, time.process_time() - begin, len(views))
 
 
 def direction_error_deg(start: Start, truth: dict[int, FloatArray]) -> tuple[float, float] | None:
@@ -136,7 +136,7 @@ def direction_error_deg(start: Start, truth: dict[int, FloatArray]) -> tuple[flo
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))), float(np.degrees(sigma))
 
 
-def row(name: str, matching: str, trials: list[Trial]) -> str:
+def row(name: str, matching: str, trials: list[StartTrial]) -> str:
     """One line of the table."""
     delays = [each.delay for each in trials if each.delay is not None]
     errors = np.array([each.error_deg for each in trials if each.error_deg is not None])

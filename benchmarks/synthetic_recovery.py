@@ -57,8 +57,8 @@ def script(kind: str, scene: str, rng: np.random.Generator, n_frames: int, rate_
 def run_once(job: tuple[str, str, int], settings: dict[str, Any]) -> dict[str, Any]:
     """Run one world, and measure."""
     limit_threads()
-    from dualslam.evaluation.link_audit import LinkAudit, audit_links
-    from dualslam.synthetic import make_sequence
+    from dualslam.lab.audits.link_audit import LinkAudit, audit_links
+    from dualslam.lab.synthetic import make_sequence
 
     scene, kind, seed = job
     rate_hz = 10.0 if scene == "street" else 30.0
@@ -87,7 +87,7 @@ def run_once(job: tuple[str, str, int], settings: dict[str, Any]) -> dict[str, A
 def run(world: Any, values: dict[str, Any]) -> Any:
     """Return the system that has seen the whole of a world."""
     from dualslam.build import build_system
-    from dualslam.core.config_io import config_from_dict
+    from dualslam.config.files import config_from_dict
 
     system = build_system(config_from_dict(values, "synthetic_recovery"), world.camera)
     for frame in world:
@@ -111,7 +111,7 @@ def claimed_sigmas(system: Any, links: list[Any]) -> list[dict[str, float]]:
 
 def audit_again(links: list[Any], unbroken: Any, world: Any) -> list[dict[str, float | None]]:
     """Return for each link what the same audit finds in a map that never broke, if that was one map."""
-    from dualslam.evaluation.link_audit import audit_unbroken
+    from dualslam.lab.audits.link_audit import audit_unbroken
 
     submaps = unbroken.atlas.submaps
     T = {p.index: submaps[0].resolve_anchor(p.keyframe_id, p.T_kf_cam) for p in unbroken.poses.values()}
@@ -125,9 +125,9 @@ def audit_again(links: list[Any], unbroken: Any, world: Any) -> list[dict[str, f
 def measure(system: Any, world: Any, audits: list[Any], cpu_s: float) -> dict[str, Any]:
     """Return the numbers of a finished run."""
     from dualslam.core.events import EventKind
-    from dualslam.evaluation.alignment import align_points
-    from dualslam.evaluation.map_jumps import find_map_jumps
-    from dualslam.results import trajectories_of
+    from dualslam.lab.audits.map_jumps import find_map_jumps
+    from dualslam.lab.metrics.alignment import align_points
+    from dualslam.run.results import trajectories_of
 
     truth = truth_of(world)
     main = trajectories_of(system).main
@@ -161,7 +161,7 @@ def measure(system: Any, world: Any, audits: list[Any], cpu_s: float) -> dict[st
 
 def is_drift(link: dict[str, Any]) -> bool:
     """Whether a link's scale is no more than 5 % off from what the map that never broke says of the same places."""
-    from dualslam.evaluation.link_audit import WRONG_POSITION, WRONG_ROTATION_DEG, WRONG_SCALE
+    from dualslam.lab.audits.link_audit import WRONG_POSITION, WRONG_ROTATION_DEG, WRONG_SCALE
 
     if link["rotation_deg"] > WRONG_ROTATION_DEG or link["position"] > WRONG_POSITION:
         return False

@@ -21,57 +21,57 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from dualslam.build import build_system, create_frontend, recovery_parts
-    from dualslam.core.config import Config
-    from dualslam.core.config_io import config_from_dict, dump_config, load_config
+    from dualslam.config.files import config_from_dict, dump_config, load_config
+    from dualslam.config.settings import Config
     from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError, SolverError
     from dualslam.core.memory import keep_freed_memory
     from dualslam.core.threads import limit_threads
     from dualslam.core.types import Failure, Frame
-    from dualslam.evaluation.failure_lab import corrupted
-    from dualslam.evaluation.trajectory_metrics import evaluate_run
-    from dualslam.frame_records import FrameResult
-    from dualslam.linking import propose_correspondences
-    from dualslam.map_store import load_atlas, save_atlas
-    from dualslam.recovery import walk_back
+    from dualslam.io.map_store import load_atlas, save_atlas
+    from dualslam.lab.disturbances import corrupted
+    from dualslam.lab.metrics.trajectory_metrics import evaluate_run
+    from dualslam.map.frame_records import FrameResult
+    from dualslam.recovery.linking import propose_correspondences
+    from dualslam.recovery.reverse_tracking import track_in_reverse
     from dualslam.report import comparison_page, read_run, report_page
-    from dualslam.results import trajectories_of
-    from dualslam.runner import run_sequence
-    from dualslam.session import run_to_folder
-    from dualslam.sources import open_source
+    from dualslam.run.results import trajectories_of
+    from dualslam.run.runner import run_sequence
+    from dualslam.run.session import run_to_folder
+    from dualslam.run.sources import open_source
     from dualslam.system import System
 
 _WHERE = {
-    "Config": "core.config",
+    "Config": "config.settings",
     "ConfigError": "core.errors",
     "DualSlamError": "core.errors",
     "Failure": "core.types",
     "Frame": "core.types",
-    "FrameResult": "frame_records",
+    "FrameResult": "map.frame_records",
     "InputError": "core.errors",
     "OutputError": "core.errors",
     "SolverError": "core.errors",
     "System": "system",
     "build_system": "build",
     "comparison_page": "report",
-    "config_from_dict": "core.config_io",
-    "corrupted": "evaluation.failure_lab",
+    "config_from_dict": "config.files",
+    "corrupted": "lab.disturbances",
     "create_frontend": "build",
-    "dump_config": "core.config_io",
-    "evaluate_run": "evaluation.trajectory_metrics",
+    "dump_config": "config.files",
+    "evaluate_run": "lab.metrics.trajectory_metrics",
     "keep_freed_memory": "core.memory",
     "limit_threads": "core.threads",
-    "load_atlas": "map_store",
-    "load_config": "core.config_io",
-    "open_source": "sources",
-    "propose_correspondences": "linking",
+    "load_atlas": "io.map_store",
+    "load_config": "config.files",
+    "open_source": "run.sources",
+    "propose_correspondences": "recovery.linking",
     "read_run": "report",
     "recovery_parts": "build",
     "report_page": "report",
-    "run_sequence": "runner",
-    "run_to_folder": "session",
-    "save_atlas": "map_store",
-    "trajectories_of": "results",
-    "walk_back": "recovery",
+    "run_sequence": "run.runner",
+    "run_to_folder": "run.session",
+    "save_atlas": "io.map_store",
+    "trajectories_of": "run.results",
+    "track_in_reverse": "recovery.reverse_tracking",
 }
 
 __all__ = [
@@ -105,8 +105,8 @@ __all__ = [
     "run_sequence",
     "run_to_folder",
     "save_atlas",
+    "track_in_reverse",
     "trajectories_of",
-    "walk_back",
 ]
 
 

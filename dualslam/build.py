@@ -8,37 +8,37 @@ from functools import partial
 
 import numpy as np
 
-from backend.local_ba import bundle_adjust, bundle_adjust_arrays
-from backend.self_calibration import estimate_calibration, find_preferred_camera
-from backend.submap_graph import ISam2SubmapGraph
-from dualslam.calibration import Calibration
-from dualslam.core.camera import Camera
-from dualslam.core.config import AttemptConfig, Config, FrontendConfig
+from dualslam.backend.local_ba import bundle_adjust, bundle_adjust_arrays
+from dualslam.backend.self_calibration import estimate_calibration, find_preferred_camera
+from dualslam.backend.submap_graph import ISam2SubmapGraph
+from dualslam.calibration.lens import Calibration
+from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
+from dualslam.core.camera.models import Camera
+from dualslam.core.camera.rectification import rectify
 from dualslam.core.errors import ConfigError
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend, PreferredCamera, SelfCalibrator, SubmapGraph
-from dualslam.core.rectification import rectify
-from dualslam.core.submap import Submap
 from dualslam.core.threads import spare_cores
 from dualslam.core.types import Failure, FailureReason, Frame, IntArray, View
-from dualslam.evaluation.failure_lab import FaultScript
-from dualslam.executor import InlineExecutor, RecoveryExecutor
+from dualslam.frontends.features.image_features import ImageFeatures
+from dualslam.frontends.features.images import to_grey
+from dualslam.frontends.features.motion_statistics import nearest_search
+from dualslam.frontends.gap.auxiliary_features import AuxiliaryFeatures, BufferedFeatures, OwnFeatures
+from dualslam.frontends.gap.pnp_odometry import PnpOdometry, Route
+from dualslam.frontends.gap.refinding import Refinder
+from dualslam.frontends.registry import check_frontend
+from dualslam.frontends.registry import create_frontend as create_frontend  # part of the Python interface
+from dualslam.frontends.tracking.initialiser import Initialiser
+from dualslam.frontends.tracking.rolling_shutter import RollingShutter
+from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.health import judge_track
-from dualslam.linking import DescriptorMatcher, carry_to_live_end, check_camera, estimate_link
-from dualslam.recovery import Attempt, RecoveryJob, RecoveryParts
+from dualslam.lab.disturbances import FaultScript
+from dualslam.map.submap import Submap
+from dualslam.recovery.executor import InlineExecutor, RecoveryExecutor
+from dualslam.recovery.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
+from dualslam.recovery.reverse_tracking import Attempt, RecoveryJob, RecoveryParts
+from dualslam.recovery.worker import WorkerExecutor
 from dualslam.system import Components, System
-from dualslam.worker import WorkerExecutor
-from frontends.guest_features import BufferedFeatures, GuestFeatures, OwnFeatures
-from frontends.image_features import ImageFeatures
-from frontends.images import to_grey
-from frontends.initialiser import Initialiser
-from frontends.motion_statistics import nearest_search
-from frontends.pnp_odometry import PnpOdometry, Route
-from frontends.refinding import Refinder
-from frontends.registry import check_frontend
-from frontends.registry import create_frontend as create_frontend  # part of the Python interface
-from frontends.rolling_shutter import RollingShutter
-from frontends.visual import VisualFrontEnd
 
 ADJUST_ITERATIONS = 20
 FEATURE_THREADS = 2
@@ -62,7 +62,7 @@ def check_config(config: Config) -> None:
     for number, attempt in enumerate(config.recovery.attempts):
         if not attempt.is_live:
             with _naming_attempt(number):
-                check_frontend(_guest(attempt))
+                check_frontend(_auxiliary(attempt))
 
 
 def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | None = None) -> System:
@@ -102,10 +102,10 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
     def calibrated() -> Camera:
         return calibration.camera
 
-    def straight_view_of(frame: Frame) -> View | Failure:
+    def corrected_view_of(frame: Frame) -> View | Failure:
         camera = calibration.camera
         view = view_of(frame, frontend, camera, config.camera.model_sigma_px)
-        return view if isinstance(view, Failure) else shutter.straightened(view, camera)
+        return view if isinstance(view, Failure) else shutter.shutter_corrected(view, camera)
 
     def odometry(submap: Submap, graph: SubmapGraph, n_covering: int = 0) -> VisualFrontEnd:
         refinder = Refinder(submap, frontend, calibrated, sigma_px)
@@ -113,13 +113,13 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
 
     return System(
         Components(
-            view_of=faults.around_views(straight_view_of),
+            view_of=faults.around_views(corrected_view_of),
             new_starter=lambda: Initialiser(
                 frontend, bundle_adjust_arrays, config.initialiser, calibration.camera.K, size_px, config.seed
             ),
             new_graph=lambda: ISam2SubmapGraph(config.graph),
             new_odometry=faults.around_odometry(odometry),
-            new_seeker=faults.around_odometry(partial(odometry, n_covering=config.recovery.covering_keyframes)),
+            new_relocaliser=faults.around_odometry(partial(odometry, n_covering=config.recovery.covering_keyframes)),
             calibration=calibration,
             shutter=shutter,
             recovery=recovery or recovery_executor(config, size_px, faults, frontend),
@@ -193,7 +193,7 @@ def recovery_parts(
         link=lambda old, new, onset: estimate_link(
             old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
         ),
-        carry=lambda link, new, newest_id, bend: carry_to_live_end(link, new, newest_id, config.linking, bend),
+        propagate=lambda link, new, newest_id, bend: propagate_to_live_end(link, new, newest_id, config.linking, bend),
         check_camera=lambda submap, link, job: check_camera(
             submap, link, job.newest_id, partial(_preferred_camera, job, config), config.linking, config.calibration
         ),
@@ -211,44 +211,46 @@ def _attempts(
     size_px: tuple[int, int],
     n_threads: int,
 ) -> tuple[Attempt, ...]:
-    """Build the attempts; those with the same guest share what it finds in the images."""
-    guests: dict[str, ImageFeatures] = {}  # by their settings
+    """Build the attempts; those with the same auxiliary front end share what it finds in the images."""
+    auxiliaries: dict[str, ImageFeatures] = {}  # by their settings
     attempts = []
     for number, attempt in enumerate(config.recovery.attempts):
         if attempt.is_live:
             attempts.append(_attempt_by(frontend, lambda camera: OwnFeatures(), attempt, config, live, size_px))
             continue
-        wanted = _guest(attempt)
+        wanted = _auxiliary(attempt)
         key = wanted.model_dump_json()
-        if key not in guests:
+        if key not in auxiliaries:
             with _naming_attempt(number):
-                guests[key] = ImageFeatures(create_frontend(wanted), n_threads)
-        features_for = partial(BufferedFeatures, guests[key], config.camera.model_sigma_px)
-        attempts.append(_attempt_by(guests[key].frontend, features_for, attempt, config, live, size_px))
+                auxiliaries[key] = ImageFeatures(create_frontend(wanted), n_threads)
+        features_for = partial(BufferedFeatures, auxiliaries[key], config.camera.model_sigma_px)
+        attempts.append(_attempt_by(auxiliaries[key].frontend, features_for, attempt, config, live, size_px))
     return tuple(attempts)
 
 
 def _attempt_by(
-    guest: Frontend,
-    features_for: Callable[[Camera], GuestFeatures],
+    auxiliary: Frontend,
+    features_for: Callable[[Camera], AuxiliaryFeatures],
     attempt: AttemptConfig,
     config: Config,
     live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
     size_px: tuple[int, int],
 ) -> Attempt:
     """Build an attempt in which a front end, which may be the live one itself, gives the live one its poses."""
-    walks_live = attempt.is_live or attempt.walk == "live"
+    tracks_live = attempt.is_live or attempt.tracking == "live"
 
     def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> PnpOdometry:
-        walker, features = live(job, submap, graph), features_for(job.camera)
+        reverse_tracker, features = live(job, submap, graph), features_for(job.camera)
         overlap_id = max((k for lost in job.lost.values() for k in lost.keyframes), default=job.newest_id)
         route = Route(job.own, job.views, overlap_id)
-        return PnpOdometry(walker, guest, features, route, bundle_adjust_arrays, config, size_px, walks_live)
+        return PnpOdometry(
+            reverse_tracker, auxiliary, features, route, bundle_adjust_arrays, config, size_px, tracks_live
+        )
 
     return Attempt(attempt.name, new_odometry)
 
 
-def _guest(attempt: AttemptConfig) -> FrontendConfig:
+def _auxiliary(attempt: AttemptConfig) -> FrontendConfig:
     return FrontendConfig(name=attempt.frontend, n_features=attempt.n_features, options=attempt.options)
 
 

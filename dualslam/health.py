@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dualslam.core.config import HealthConfig
+from dualslam.config.settings import HealthConfig
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import KeyframeReport
 from dualslam.core.support import find_lack_of_support

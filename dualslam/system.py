@@ -9,26 +9,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.atlas import Link, LinkKind
-from dualslam.calibration import Calibration
-from dualslam.carried_poses import carry_anchors, carry_poses
-from dualslam.core.config import Config
+from dualslam.calibration.lens import Calibration
+from dualslam.config.settings import Config
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import MapStarter, Shutter, SubmapGraph, VisualOdometry
-from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, Start, Track, View
-from dualslam.executor import RecoveryExecutor
-from dualslam.frame_buffer import FrameBuffer
-from dualslam.frame_records import FrameRecord, FrameResult
 from dualslam.health import HealthMonitor, count_signs
-from dualslam.lost_map import LostMapWatch
-from dualslam.merging import carry_links
-from dualslam.record import Record
-from dualslam.recoveries import Recoveries
-from dualslam.rollover import next_submap
-from dualslam.trajectory import FramePose
+from dualslam.map.atlas import Link, LinkKind
+from dualslam.map.frame_records import FrameRecord, FrameResult
+from dualslam.map.propagation import propagate_anchors, propagate_poses
+from dualslam.map.record import Record
+from dualslam.map.split import next_submap
+from dualslam.map.submap import Submap
+from dualslam.map.trajectory import FramePose
+from dualslam.recovery.executor import RecoveryExecutor
+from dualslam.recovery.frame_buffer import FrameBuffer
+from dualslam.recovery.manager import Recoveries
+from dualslam.recovery.merge import propagate_links
+from dualslam.recovery.relocaliser import Relocaliser
 
 log = logging.getLogger(__name__)
 
@@ -37,14 +37,14 @@ log = logging.getLogger(__name__)
 class Components:
     """The parts that the composition root puts in: the system itself knows neither front end nor solver.
 
-    `new_seeker`: a front end that finds its submap again wherever it is seen, and goes on from there.
+    `new_relocaliser`: a front end that finds its submap again wherever it is seen, and goes on from there.
     """
 
     view_of: Callable[[Frame], View | Failure]
     new_starter: Callable[[], MapStarter]
     new_graph: Callable[[], SubmapGraph]
     new_odometry: Callable[[Submap, SubmapGraph], VisualOdometry]
-    new_seeker: Callable[[Submap, SubmapGraph], VisualOdometry]
+    new_relocaliser: Callable[[Submap, SubmapGraph], VisualOdometry]
     calibration: Calibration
     shutter: Shutter
     recovery: RecoveryExecutor
@@ -79,7 +79,7 @@ class System:
         self.buffer = FrameBuffer(config.buffer.duration_s, config.buffer.max_mb)
         self.buffer.freeze()  # no map yet, as after a loss: the first start is walked back from to the first frame
         self._live: VisualOdometry | None = None
-        self._lost_map = LostMapWatch(components.new_seeker, config)
+        self._relocaliser = Relocaliser(components.new_relocaliser, config)
         self._starter = components.new_starter()
         self._lost: list[View] = []
         self._health = HealthMonitor(config.health)
@@ -119,29 +119,29 @@ class System:
             outcome = self._initialise(view) if self._live is None else self._track(self._live, view)
         return self._result(frame, outcome, time.perf_counter() - started)
 
-    def finish(self, hurry: bool = False) -> None:
+    def finish(self, interrupted: bool = False) -> None:
         """End the run: wait for walks back that are under way, for so long and no longer; archive what is live.
 
         Parameters
         ----------
-        hurry : bool
+        interrupted : bool
             Someone waits: leave out the last walk back, for which the live map has grown since the one before.
         """
-        self._recoveries.finish(self._live, next(reversed(self.rows.values()), None), hurry)
+        self._recoveries.finish(self._live, next(reversed(self.rows.values()), None), interrupted)
         if self._live is not None:
             self._archive(self._live, "end of sequence")
 
     # --- initialising
 
     def _initialise(self, view: View) -> Track | Failure:
-        if self._lost_map.note(view) and (track := self._resume(view)):
+        if self._relocaliser.note(view) and (track := self._relocalise(view)):
             return track
         shutter = self._parts.shutter
         with self.timer.measure("shutter"):
             readout_s = shutter.readout_s
             may_start = shutter.may_start(view, self._parts.calibration.camera)
             if shutter.readout_s != readout_s:
-                view = self._straighten(view)
+                view = self._correct_shutter(view)
         if not may_start:
             return Failure(FailureReason.DOUBTFUL_INITIALISATION, "a fast turn before the shutter is known")
         with self.timer.measure("initialisation"):
@@ -152,31 +152,31 @@ class System:
             return start
         return self._begin_submap(start, view)
 
-    def _resume(self, view: View) -> Track | None:
+    def _relocalise(self, view: View) -> Track | None:
         """Go on in the map that was lost last, where two frames in a row show it."""
-        with self.timer.measure("seeking"):
-            seeker = self._lost_map.sighted(view)
-        if seeker is None:
+        with self.timer.measure("relocalisation"):
+            relocaliser = self._relocaliser.sighted(view)
+        if relocaliser is None:
             return None
-        track = self._track_with(seeker, view)
+        track = self._track_with(relocaliser, view)
         if isinstance(track, Failure):
             if track.reason is FailureReason.SOLVER:
-                self._lost_map.end()
+                self._relocaliser.end()
             return None
-        self._live = seeker
-        self._lost_map.end()
-        self._record.event(EventKind.RESUMED, view, seeker.submap.id, n_inliers=track.n_inliers)
-        self._recoveries.found_again(seeker.submap)
+        self._live = relocaliser
+        self._relocaliser.end()
+        self._record.event(EventKind.RELOCALISED, view, relocaliser.submap.id, n_inliers=track.n_inliers)
+        self._recoveries.found_again(relocaliser.submap)
         self.buffer.thaw()
         return track
 
-    def _straighten(self, view: View) -> View:
+    def _correct_shutter(self, view: View) -> View:
         """Take the shutter that was found out of the frames so far; the starter begins anew. Returns the view's own."""
         shutter, camera = self._parts.shutter, self._parts.calibration.camera
         self._record.event(EventKind.SHUTTER_FOUND, view, None, readout_s=shutter.readout_s)
-        self.buffer.map(lambda buffered: shutter.straightened(buffered, camera))
+        self.buffer.map(lambda buffered: shutter.shutter_corrected(buffered, camera))
         self._starter = self._parts.new_starter()
-        self._lost_map.end()  # it is of the pixels of before
+        self._relocaliser.end()  # it is of the pixels of before
         *waiting, newest = (v for v in self.buffer if self.rows[v.index].submap_id is None)
         for earlier in waiting:
             self._starter.collect(earlier)
@@ -200,7 +200,7 @@ class System:
             row.n_matches = row.n_inliers = int((submap.landmark_of[k] >= 0).sum())
         self._record.event(kind, view, submap.id, first_view=start.views[0].index, **start.numbers)
         self._live = self._parts.new_odometry(submap, graph)
-        self._lost_map.end()
+        self._relocaliser.end()
         self._live.start_at(view.index)
         self._health = HealthMonitor(self._config.health)
         self._recoveries.start(submap, view)
@@ -241,7 +241,7 @@ class System:
         if isinstance(track, Failure):
             return track
         if track.wide:
-            self._record.event(EventKind.RELOCALISED, view, odometry.submap.id, n_inliers=track.n_inliers)
+            self._record.event(EventKind.GAP_RELOCALISED, view, odometry.submap.id, n_inliers=track.n_inliers)
         if odometry.keyframe_due(track):
             try:
                 with self.timer.measure("mapping"):
@@ -275,7 +275,7 @@ class System:
                 return
             live.adopt(refined.graph, refined.before)
             self.buffer.map(calibration.rectified)
-            self._carry(refined.before, live.submap)
+            self._propagate(refined.before, live.submap)
             changed = [m for m in self._recoveries.waiting if self._update_camera(self.atlas.submaps[m])]
         self._record.event(EventKind.CALIBRATED, view, live.submap.id, lost=changed, **refined.numbers)
 
@@ -285,15 +285,15 @@ class System:
         if isinstance(before, Failure):
             log.warning("submap %d keeps its camera: %s", lost.id, before.detail)
             return False
-        self._carry(before, lost)
+        self._propagate(before, lost)
         return True
 
-    def _carry(self, before: Submap, submap: Submap) -> None:
+    def _propagate(self, before: Submap, submap: Submap) -> None:
         """Let all that is known against a submap follow it where a calibration has bent it."""
-        for pose in carry_poses(self.poses.values(), before, submap):
+        for pose in propagate_poses(self.poses.values(), before, submap):
             self.poses[pose.index] = pose
-        carry_anchors(before, submap)
-        carry_links(self.atlas, before, submap)
+        propagate_anchors(before, submap)
+        propagate_links(self.atlas, before, submap)
 
     # --- failure
 
@@ -318,7 +318,7 @@ class System:
         self._health = HealthMonitor(self._config.health)
         # Not where its graph has failed, or a walk back is about to change it.
         if failure.reason is not FailureReason.SOLVER and not self._recoveries.is_under_way(live.submap):
-            self._lost_map.begin(live)
+            self._relocaliser.begin(live)
         self._starter = self._parts.new_starter()
         for lost in self._lost:
             self._starter.collect(lost)

@@ -10,7 +10,7 @@ from typing import Any, Protocol, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from dualslam.core.config import FrontendConfig
+from dualslam.config.settings import FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.interfaces import Frontend
 
@@ -18,17 +18,17 @@ ENTRY_POINT_GROUP = "dualslam.frontends"
 """A package offers a front end by ``[project.entry-points."dualslam.frontends"] name = "module:Class"``."""
 
 BUILT_IN: Mapping[str, str] = {
-    "orb": "frontends.orb:OrbFrontend",
-    "sift": "frontends.sift:SiftFrontend",
-    "gms": "frontends.gms:GmsFrontend",
-    "kornia": "frontends.kornia.frontend:KorniaFrontend",
+    "orb": "dualslam.frontends.features.orb:OrbFrontend",
+    "sift": "dualslam.frontends.features.sift:SiftFrontend",
+    "gms": "dualslam.frontends.features.gms:GmsFrontend",
+    "kornia": "dualslam.frontends.features.kornia.frontend:KorniaFrontend",
 }
 """Name to ``module:attribute``; the module is imported only when its name is asked for."""
 
 EXTRAS: Mapping[str, str] = {"kornia": "dualslam[kornia]"}
 """What to install for a built-in front end that needs more than the core's dependencies."""
 
-EXTRA_OPTIONS: Mapping[str, str] = {"kornia": "frontends.kornia.options:KorniaOptions"}
+EXTRA_OPTIONS: Mapping[str, str] = {"kornia": "dualslam.frontends.features.kornia.options:KorniaOptions"}
 """Options of the built-in front ends that need an extra, in modules that can be imported without it."""
 
 OptionsT = TypeVar("OptionsT", bound=BaseModel)

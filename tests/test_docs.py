@@ -12,8 +12,8 @@ from types import ModuleType
 
 import pytest
 
-from dualslam.core.config import Config
-from dualslam.core.config_io import _all_paths
+from dualslam.config.files import _all_paths
+from dualslam.config.settings import Config
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"]

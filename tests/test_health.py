@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dualslam.core.config import HealthConfig
+from dualslam.config.settings import HealthConfig
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import GraphEstimate, KeyframeReport, MappingReport
 from dualslam.core.types import Failure, FailureReason, Features, Track, View
 from dualslam.health import HealthMonitor, count_signs
-from tests.point_world import random_features
+from dualslam.testing.point_world import random_features
 
 CONFIG = HealthConfig()
 LOST = Failure(FailureReason.TOO_FEW_MATCHES, "no keyframe matched")

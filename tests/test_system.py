@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dualslam.core.config import RecoveryConfig
+from dualslam.config.settings import RecoveryConfig
 from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, FrameStatus
-from dualslam.evaluation.bench.measure import breakages
-from dualslam.results import frame_rows, trajectories_of
+from dualslam.lab.bench.measure import breakages
+from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.system import System
-from tests.point_world import PointWorld, cloud, hand_held, path, pose_errors, system_in
+from dualslam.testing.point_world import PointWorld, cloud, hand_held, path, pose_errors, system_in
 
 POSITION_M, ROTATION_RAD = 0.06, 0.01
 
@@ -90,7 +90,7 @@ def test_a_long_cover_before_the_start_hides_no_more_than_what_it_covers() -> No
     still = np.repeat(np.eye(4)[None], 50, 0)
     moving = path(25, np.array([0.08, 0, 0.02]), np.array([0, -0.005, 0]))
     covered = frozenset(range(5, 45))
-    assert len(covered) > RecoveryConfig().max_leap_frames
+    assert len(covered) > RecoveryConfig().max_gap_frames
     world = PointWorld(cloud(), np.concatenate([still, moving]), covered=covered)
     system = run(world)
     indices, T = main_trajectory(system)
@@ -160,8 +160,8 @@ def turning_back(n_away: int) -> PointWorld:
 def test_a_lost_map_that_is_seen_again_before_another_starts_is_gone_on_with() -> None:
     world = turning_back(25)
     system = run(world, recovery={"enabled": True})
-    (resumed,) = system.events.of_kind(EventKind.RESUMED)
-    assert resumed.frame == 25 + 25 + 1, "two frames must show it"
+    (relocalised,) = system.events.of_kind(EventKind.RELOCALISED)
+    assert relocalised.frame == 25 + 25 + 1, "two frames must show it"
     assert len(system.atlas.submaps) == 1
     assert [k for k in kinds(system) if k in (EventKind.FAILED, EventKind.REINITIALISED)] == [EventKind.FAILED]
     indices, T = main_trajectory(system)
@@ -175,21 +175,21 @@ def test_it_may_be_lost_again() -> None:
     world = PointWorld(once.xyz, np.concatenate([T, np.repeat(T[30:31], 12, 0)]))
     system = run(world, recovery={"enabled": True})
     assert kinds(system).count(EventKind.FAILED) == 2
-    assert kinds(system).count(EventKind.RESUMED) == 1
+    assert kinds(system).count(EventKind.RELOCALISED) == 1
     losses = breakages(tuple(system.events))
-    assert [(loss.submap, loss.resumed, loss.recovered) for loss in losses] == [(0, True, True), (0, False, False)]
+    assert [(loss.submap, loss.relocalised, loss.recovered) for loss in losses] == [(0, True, True), (0, False, False)]
 
 
-@pytest.mark.parametrize("settings", [{"enabled": False}, {"enabled": True, "resume_after": None}])
+@pytest.mark.parametrize("settings", [{"enabled": False}, {"enabled": True, "relocalise_after": None}])
 def test_it_is_not_looked_for_where_that_is_not_wanted(settings: dict[str, object]) -> None:
     system = run(turning_back(25), recovery=settings)
-    assert not system.events.of_kind(EventKind.RESUMED)
+    assert not system.events.of_kind(EventKind.RELOCALISED)
     assert len(system.atlas.submaps) == 2
 
 
 def test_a_map_that_starts_at_once_comes_first() -> None:
-    system = run(turning_back(25), recovery={"enabled": True, "resume_after": 40})
-    assert not system.events.of_kind(EventKind.RESUMED)
+    system = run(turning_back(25), recovery={"enabled": True, "relocalise_after": 40})
+    assert not system.events.of_kind(EventKind.RELOCALISED)
     assert system.events.of_kind(EventKind.REINITIALISED)
 
 
@@ -200,7 +200,7 @@ def parted(world: PointWorld) -> System:
 
 def test_a_long_loss_ends_the_submap_and_the_next_one_starts(parted: System, world: PointWorld) -> None:
     assert len(parted.atlas.submaps) == 2
-    order = [k for k in kinds(parted) if k not in (EventKind.INITIALISATION_REFUSED, EventKind.RELOCALISED)]
+    order = [k for k in kinds(parted) if k not in (EventKind.INITIALISATION_REFUSED, EventKind.GAP_RELOCALISED)]
     assert order == [
         EventKind.INITIALISED,
         EventKind.FAILED,

@@ -14,7 +14,7 @@ from typing import Any, get_args
 from latex2mathml.converter import convert
 from pydantic import BaseModel
 
-from dualslam.core.config import Config
+from dualslam.config.settings import Config
 
 FIELDS = "<!-- every field of the configuration -->"
 # Code comes first: what looks like an equation in it is none.

@@ -18,8 +18,8 @@ import numpy as np  # noqa: E402 - after the number of threads is set
 
 from dualslam.core.geometry import sim3  # noqa: E402
 from dualslam.core.geometry.umeyama import umeyama  # noqa: E402
-from dualslam.core.submap import Submap  # noqa: E402
 from dualslam.core.types import Failure, FloatArray, FrameStatus  # noqa: E402
+from dualslam.map.submap import Submap  # noqa: E402
 from dualslam.report.markup import Markup, coordinate, tag  # noqa: E402
 
 OUT = Path(__file__).resolve().parent.parent / "docs" / "failure.svg"
@@ -101,7 +101,7 @@ class Picture:
 
     def svg(self) -> Markup:
         """Return the picture."""
-        panels = [self._failure(), self._walk(), self._fused()]
+        panels = [self._failure(), self._make_attempt(), self._fused()]
         words = [self._words(i, *text) for i, text in enumerate(self._texts())]
         label = "Three steps of a recovery: a map is lost, a new map walks back in time, a similarity joins the two"
         return tag(
@@ -135,7 +135,7 @@ class Picture:
             _cross(gap[0], LOST),
         ]
 
-    def _walk(self) -> list[Markup]:
+    def _make_attempt(self) -> list[Markup]:
         # Before the link the new map has a frame and a unit of its own: drawn as if its unit were the old one.
         unit = float(sim3.scale(self.S_world_old))
         R = sim3.rotation(self.S_world_new)
@@ -146,8 +146,8 @@ class Picture:
         shared = [int(k) for k in self.linked["agreeing_keyframes"] if k >= FIRST]
         old = self.uv(sim3.act(self.S_world_old, self.old.keyframe_poses(shared)[:, :3, 3]), 1)
         new = self.uv(sim3.act(own, self.new.keyframe_poses(shared)[:, :3, 3]), 1, drop)
-        walked = sorted(k for k in self.new.keyframes if FIRST <= k <= first + 2)
-        way = self.uv(sim3.act(own, self.new.keyframe_poses(walked)[:, :3, 3]), 1, drop)
+        recovered_frames = sorted(k for k in self.new.keyframes if FIRST <= k <= first + 2)
+        way = self.uv(sim3.act(own, self.new.keyframe_poses(recovered_frames)[:, :3, 3]), 1, drop)
         return [
             self.landmarks(self.old, self.S_world_old, 1, OLD),
             self.landmarks(self.new, own, 1, NEW, drop),

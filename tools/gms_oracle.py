@@ -1,7 +1,7 @@
-"""Ask OpenCV contrib's `matchGMS` about many pairs, for `tests/frontends/test_gms.py`, and compare it with ours.
+"""Ask OpenCV contrib's `matchGMS` about many pairs, for `tests/frontends/features/test_gms.py`, and compare it with ours.
 
     pip install --no-deps --target DIR opencv-contrib-python-headless
-    python tools/gms_oracle.py DIR                      write tests/frontends/gms_oracle.npz anew
+    python tools/gms_oracle.py DIR                      write tests/frontends/features/gms_oracle.npz anew
     python tools/gms_oracle.py DIR --images FOLDER ...  compare on real pairs, of which nothing is kept
 
 The contrib wheel and the one that this project depends on are both called cv2, so that contrib is never installed: it
@@ -77,7 +77,7 @@ def made_up_pairs(n: int) -> list[Pair]:
 
 def rendered_pairs(n: int) -> list[Pair]:
     """Nearest ORB descriptors of rendered frames, in the street and in the room, the second image also turned."""
-    from dualslam.synthetic import make_sequence
+    from dualslam.lab.synthetic import make_sequence
 
     pairs = []
     for scene in ("street", "room"):
@@ -101,7 +101,7 @@ def real_pairs(folder: Path, n: int) -> list[Pair]:
 
 def nearest_pair(a: NDArray[np.uint8], b: NDArray[np.uint8], n_features: int) -> Pair:
     """Return the pair of two images: for each feature of a the nearest of b."""
-    from frontends.orb import OrbFrontend
+    from dualslam.frontends.features.orb import OrbFrontend
 
     frontend = OrbFrontend(n_features)
     features_a, features_b = frontend.extract(a), frontend.extract(b)
@@ -163,7 +163,7 @@ def compare(
     pairs: list[Pair], masks: list[list[NDArray[np.bool_]]], contrib_ms: NDArray[np.float64], version: str
 ) -> None:
     """Print how many pairs give the same matches, and both times."""
-    from frontends.motion_statistics import supported_matches
+    from dualslam.frontends.features.motion_statistics import supported_matches
 
     n = np.array([len(pair.uv_a) for pair in pairs])
     print(f"{len(pairs)} pairs, {n.min()} to {n.max()} matches (median {np.median(n):.0f}); contrib {version}")

@@ -13,18 +13,18 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from dualslam.bench_trial import describe_source, run_trial
 from dualslam.cli import logs
 from dualslam.cli.bench_figures import draw_figures
 from dualslam.core.errors import InputError
-from dualslam.evaluation.bench.cluster import run_on_cluster
-from dualslam.evaluation.bench.plan import plan_trials
-from dualslam.evaluation.bench.pool import run_in_processes
-from dualslam.evaluation.bench.record import TrialRecord, judge
-from dualslam.evaluation.bench.run import Executor, run_bench
-from dualslam.evaluation.bench.spec import BenchSpec, Half, load_spec
-from dualslam.evaluation.bench.tables import bench_tables
-from dualslam.evaluation.bench.write_tables import TABLES, write_tables
+from dualslam.lab.bench.cluster import run_on_cluster
+from dualslam.lab.bench.plan import plan_trials
+from dualslam.lab.bench.pool import run_in_processes
+from dualslam.lab.bench.record import TrialRecord, judge
+from dualslam.lab.bench.run import Executor, run_bench
+from dualslam.lab.bench.spec import BenchSpec, Half, load_spec
+from dualslam.lab.bench.tables import bench_tables
+from dualslam.lab.bench.write_tables import TABLES, write_tables
+from dualslam.run.bench_trial import describe_source, run_trial
 
 
 def execute(args: argparse.Namespace) -> int:

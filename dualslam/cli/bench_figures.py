@@ -7,16 +7,18 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from dualslam.evaluation.bench.record import TrialRecord, judge
-from dualslam.evaluation.bench.spec import BenchSpec
-from dualslam.evaluation.bench.table import Table
+from dualslam.lab.bench.record import TrialRecord, judge
+from dualslam.lab.bench.spec import BenchSpec
+from dualslam.lab.bench.table import ResultTable
 
 log = logging.getLogger(__name__)
 
 FOLDER = "figures"
 
 
-def draw_figures(spec: BenchSpec, tables: Sequence[Table], records: Sequence[TrialRecord], out: Path) -> list[Path]:
+def draw_figures(
+    spec: BenchSpec, tables: Sequence[ResultTable], records: Sequence[TrialRecord], out: Path
+) -> list[Path]:
     """Draw the figures into ``figures/``; return what was written: nothing without matplotlib, and the log says so."""
     if find_spec("matplotlib") is None:
         log.warning("no figures: they need matplotlib (pip install 'dualslam[report]')")
@@ -41,7 +43,7 @@ def draw_figures(spec: BenchSpec, tables: Sequence[Table], records: Sequence[Tri
     return files
 
 
-def _rates(tables: Sequence[Table]) -> dict[str, dict[str, tuple[float, float, float]]]:
+def _rates(tables: Sequence[ResultTable]) -> dict[str, dict[str, tuple[float, float, float]]]:
     """Return percent and the ends of the interval."""
     table = next(t for t in tables if t.name == "table_2_failures")
     rates: dict[str, dict[str, tuple[float, float, float]]] = {}

@@ -6,7 +6,7 @@ import argparse
 
 from dualslam.build import check_config
 from dualslam.cli.configuration import config_of
-from dualslam.core.config_io import dump_config
+from dualslam.config.files import dump_config
 
 
 def execute(args: argparse.Namespace) -> int:

@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from dualslam.core import strict_yaml
-from dualslam.core.config import Config
-from dualslam.core.config_io import Override, load_config
+from dualslam.config import strict_yaml
+from dualslam.config.files import Override, load_config
+from dualslam.config.settings import Config
 from dualslam.core.errors import ConfigError
 
 

@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dualslam.core.interfaces import Sequence
-from dualslam.frame_records import FrameResult
-from dualslam.session import Outcome
+from dualslam.map.frame_records import FrameResult
+from dualslam.run.session import Outcome
 
 FINISHING = "all frames are in: ending the walks back, writing the results"
 """Shown once no frame is left to count: a last walk back may take seconds."""

@@ -12,11 +12,11 @@ from dualslam.cli.configuration import config_of
 from dualslam.cli.console import progress
 from dualslam.cli.outputs import check_free
 from dualslam.cli.run_command import conclude
-from dualslam.core.config import Config
+from dualslam.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.report import read_run
-from dualslam.session import run_to_folder
-from dualslam.sources import WorldSequence, make_world
+from dualslam.run.session import run_to_folder
+from dualslam.run.sources import WorldSequence, make_world
 
 MIN_FRAMES = 60
 BLACKOUT_FRAMES = 12

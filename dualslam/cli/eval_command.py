@@ -7,9 +7,9 @@ import json
 from typing import Any
 
 from dualslam.core.errors import InputError
-from dualslam.evaluation.trajectory_metrics import evaluate_run
 from dualslam.io.map_files import to_plain
-from dualslam.sources import open_source
+from dualslam.lab.metrics.trajectory_metrics import evaluate_run
+from dualslam.run.sources import open_source
 
 
 def execute(args: argparse.Namespace) -> int:

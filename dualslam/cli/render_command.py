@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 
 from dualslam.core.errors import OutputError
-from dualslam.sources import make_world, read_script
-from dualslam.synthetic import render_to_folder
+from dualslam.lab.synthetic import render_to_folder
+from dualslam.run.sources import make_world, read_script
 
 _TEXTS = ("times.txt", "calib.txt", "groundtruth_tum.txt", "SOURCE.md")
 _IMAGE = re.compile(r"\d{6}\.(png|jpg)")
@@ -31,7 +31,7 @@ def _remove_rendering(folder: Path) -> None:
     if not folder.is_dir() or not any(folder.iterdir()):
         return
     try:
-        ours = "Rendered by `dualslam.synthetic`" in (folder / "SOURCE.md").read_text(encoding="utf-8")
+        ours = "Rendered by `dualslam.lab.synthetic`" in (folder / "SOURCE.md").read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         ours = False
     if not ours:

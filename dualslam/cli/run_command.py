@@ -7,8 +7,8 @@ import argparse
 from dualslam.cli import logs
 from dualslam.cli.configuration import config_of
 from dualslam.cli.console import final_line, progress, stage_table
-from dualslam.session import Outcome, run_to_folder
-from dualslam.sources import open_source
+from dualslam.run.session import Outcome, run_to_folder
+from dualslam.run.sources import open_source
 
 EXIT_DONE, EXIT_NO_MAP, EXIT_INTERRUPTED = 0, 1, 130
 

@@ -13,11 +13,11 @@ class EventKind(StrEnum):
 
     INITIALISED = "initialised"
     INITIALISATION_REFUSED = "initialisation_refused"
-    RELOCALISED = "relocalised"
+    GAP_RELOCALISED = "gap_relocalised"
     FAILED = "failed"
     ARCHIVED = "archived"
     REINITIALISED = "reinitialised"
-    RESUMED = "resumed"
+    RELOCALISED = "relocalised"
     ROLLED_OVER = "rolled_over"
     GRAPH_REBUILT = "graph_rebuilt"
     CALIBRATED = "calibrated"
@@ -31,7 +31,7 @@ class EventKind(StrEnum):
     LINKED = "linked"
     LINK_REFUSED = "link_refused"
     FUSED = "fused"
-    SUPERSEDED = "superseded"
+    ABSORBED = "absorbed"
     LOOP_CLOSED = "loop_closed"
     INTERRUPTED = "interrupted"
 

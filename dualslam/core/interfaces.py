@@ -1,4 +1,4 @@
-"""The seams of the system, as Protocols: what a front end, a graph and a sequence must offer to be used by the rest."""
+"""The interfaces of the system, as Protocols: what a front end, a graph and a sequence must offer to be used by the rest."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from dualslam.core.types import Failure, Features, FloatArray, Frame, IntArray, Matches, Start, Track, View
 
 if TYPE_CHECKING:
-    from dualslam.core.camera import Camera
-    from dualslam.core.corrected_camera import LensCorrection
-    from dualslam.core.submap import Submap
+    from dualslam.core.camera.corrected import LensCorrection
+    from dualslam.core.camera.models import Camera
+    from dualslam.map.submap import Submap
 
 
 class Frontend(Protocol):
@@ -23,7 +23,7 @@ class Frontend(Protocol):
     Nothing outside a front end knows what its descriptors are made of. They are rows of one array, of one type and
     length, that can be stored, sent to another process and handed back for comparison. The same image gives the same
     features, whatever came before: a front end has no state, and several threads may ask it at once.
-    `frontends.conformance` checks all that is said here.
+    `dualslam.frontends.conformance` checks all that is said here.
 
     Attributes
     ----------
@@ -318,7 +318,7 @@ class Shutter(Protocol):
         """Time between reading the first and the last row; 0: all at once, or not known yet."""
         ...
 
-    def straightened(self, view: View, camera: Camera) -> View:
+    def shutter_corrected(self, view: View, camera: Camera) -> View:
         """Return a frame's view as if all rows had been read at once. Frames come in the order of the sequence."""
         ...
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dualslam.core.config import HealthConfig
+from dualslam.config.settings import HealthConfig
 from dualslam.core.types import Failure, FailureReason
 
 

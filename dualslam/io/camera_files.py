@@ -2,7 +2,7 @@
 
 Our own format is the dictionary of the camera's class as YAML or JSON::
 
-    model: pinhole            # or radtan, kannala_brandt, fov: see dualslam.core.camera
+    model: pinhole            # or radtan, kannala_brandt, fov: see dualslam.core.camera.models
     fx: 718.856
     fy: 718.856
     cx: 607.193
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from dualslam.core.camera import (
+from dualslam.core.camera.models import (
     Camera,
     FovCamera,
     KannalaBrandtCamera,

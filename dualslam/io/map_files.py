@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.errors import InputError, OutputError
-from dualslam.core.submap import Anchor, RelativePose, Submap
-from dualslam.core.tables import Table
 from dualslam.core.types import Features, Keyframe
 from dualslam.io.atomic import atomic_file, write_text
 from dualslam.io.trajectory_files import read_text
+from dualslam.map.submap import Anchor, RelativePose, Submap
+from dualslam.map.tables import Table
 
 Arrays = Mapping[str, NDArray[Any]]
 

@@ -11,14 +11,14 @@ from dualslam.report.statuses import count
 SHOWN_TRIES = 8
 """Links of one failure that are shown at once; the rest unfolds."""
 Event = dict[str, Any]
-_WALK = ("attempt", "reached", "posed", "keyframes", "leaped", "verdict", "time")
+_WALK = ("attempt", "reached", "posed", "keyframes", "skipped", "verdict", "time")
 _LINK = ("back at", "verdict", "attempt", "keyframes", "matches", "inliers", "scale", "rotation", "position", "time")
 
 
-def walk_table(walks: Sequence[Event]) -> Markup:
+def attempt_table(walks: Sequence[Event]) -> Markup:
     """Return a table of the attempts to walk back."""
     return (
-        _titled("Walks back in time", _table(_WALK, [_walk_cells(event) for event in walks]), None)
+        _titled("Walks back in time", _table(_WALK, [_attempt_cells(event) for event in walks]), None)
         if walks
         else join(None)
     )
@@ -52,15 +52,15 @@ def _table(columns: Sequence[str], cells: Sequence[dict[str, str]]) -> Markup:
     return tag("div", tag("table", tag("thead", head), tag("tbody", body), cls="cards"), cls="scroll")
 
 
-def _walk_cells(event: Event) -> dict[str, str]:
-    leaped = event.get("leaped_frames")
+def _attempt_cells(event: Event) -> dict[str, str]:
+    skipped = event.get("skipped_frames")
     verdict = str(event.get("verdict", ""))
     return {
         "attempt": str(event.get("attempt", "")),
         "reached": f"frame {event.get('frame', '-')}",
         "posed": count(event["frames"], "frame") if "frames" in event else "",
         "keyframes": str(event.get("new_keyframes", "")),
-        "leaped": "" if leaped is None else count(leaped, "frame"),
+        "skipped": "" if skipped is None else count(skipped, "frame"),
         "verdict": f"✓ {verdict}" if verdict == "linked" else verdict,
         "time": _seconds(event),
     }

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from dualslam.report.attempts import link_table, walk_table
+from dualslam.report.attempts import attempt_table, link_table
 from dualslam.report.markup import Markup, join, number, tag
-from dualslam.report.placement import Scene, place
+from dualslam.report.placement import PlacedRun, place
 from dualslam.report.run_data import RunData
 from dualslam.report.statuses import count
 from dualslam.report.top_view import close_up, failure_letter
@@ -41,9 +41,9 @@ class FailureStory:
         Links to the lost map, accepted or refused.
     linked : dict or None
     fused : dict or None
-    superseded : dict or None
+    absorbed : dict or None
         Where a later map had posed all its frames.
-    resumed : dict or None
+    relocalised : dict or None
         Where it was seen again, before another map had started.
     """
 
@@ -55,8 +55,8 @@ class FailureStory:
     tries: list[Event]
     linked: Event | None
     fused: Event | None
-    superseded: Event | None
-    resumed: Event | None
+    absorbed: Event | None
+    relocalised: Event | None
 
     @property
     def lost_since(self) -> int:
@@ -66,7 +66,7 @@ class FailureStory:
     @property
     def mapped_since(self) -> int | None:
         """First frame after it that has a map, the next one or the lost one."""
-        event = self.resumed or self.restart
+        event = self.relocalised or self.restart
         return None if event is None else int(event["frame"])
 
 
@@ -77,7 +77,7 @@ def stories(run: RunData) -> list[FailureStory]:
         if event.get("event") != "failed":
             continue
         later, lost = run.events[i + 1 :], event.get("submap")
-        next_map = next((e for e in later if e.get("event") in ("reinitialised", "resumed")), {})
+        next_map = next((e for e in later if e.get("event") in ("reinitialised", "relocalised")), {})
         own = [e for e in later if e.get("old_submap") == lost]
         looking = {e.get("submap") for e in later if e.get("event") == "recovery_started" and lost in e.get("lost", [])}
         walking = [e for e in later if e.get("submap") in looking]
@@ -91,8 +91,8 @@ def stories(run: RunData) -> list[FailureStory]:
                 tries=[e for e in own if e.get("event") in _TRIES],
                 linked=next((e for e in own if e["event"] == "linked"), None),
                 fused=next((e for e in own if e["event"] == "fused"), None),
-                superseded=next((e for e in later if lost in e.get("old_submaps", [])), None),
-                resumed=next_map if next_map.get("event") == "resumed" else None,
+                absorbed=next((e for e in later if lost in e.get("old_submaps", [])), None),
+                relocalised=next_map if next_map.get("event") == "relocalised" else None,
             )
         )
     return found
@@ -114,23 +114,23 @@ def failures_section(run: RunData) -> Markup:
 # --- one failure
 
 
-def _card(run: RunData, scene: Scene | None, story: FailureStory) -> Markup:
+def _card(run: RunData, scene: PlacedRun | None, story: FailureStory) -> Markup:
     verdict, cls = _verdict(run, story)
     head = tag(
         "h3", tag("span", story.letter, cls="break"), f" Frame {story.lost_since} ", tag("span", verdict, cls=cls)
     )
     parts = [head, tag("p", _told(run, story)), _sample_frames(run, story), _close_up(run, scene, story)]
-    parts += [walk_table(story.walks), link_table(story.tries)]
+    parts += [attempt_table(story.walks), link_table(story.tries)]
     return tag("article", parts, cls="failure")
 
 
 def _verdict(run: RunData, story: FailureStory) -> tuple[str, str]:
     rows = [row for row in run.rows if row.submap == story.failed.get("submap")]
-    if story.resumed is not None:
+    if story.relocalised is not None:
         return "✓ seen again", "pill good"
     if story.linked is not None:
         return "✓ linked with the map after it", "pill good"
-    if story.superseded is not None:
+    if story.absorbed is not None:
         return "✓ taken over by a later map", "pill good"
     if any(row.in_main_map for row in rows) and story.restart is None:
         return "✕ no map after it", "pill bad"
@@ -149,9 +149,9 @@ def _told(run: RunData, story: FailureStory) -> str:
     suspected = failed.get("suspected_since")
     if suspected is not None and suspected != story.lost_since:
         told.append(f"There were signs of trouble since frame {suspected}: the map is not trusted from there on.")
-    if story.resumed is not None:
-        gap = abs(run.row_of.get(story.resumed["frame"], 0) - run.row_of.get(story.lost_since, 0))
-        again = f"It was seen again at frame {story.resumed['frame']}, {count(gap, 'frame')} after the loss, before"
+    if story.relocalised is not None:
+        gap = abs(run.row_of.get(story.relocalised["frame"], 0) - run.row_of.get(story.lost_since, 0))
+        again = f"It was seen again at frame {story.relocalised['frame']}, {count(gap, 'frame')} after the loss, before"
         return " ".join([*told, again, "another map had started, and gone on with."])
     if story.restart is None:
         return " ".join([*told, "No map was started after it, until the run ended."])
@@ -181,9 +181,9 @@ def _outcome(story: FailureStory) -> str:
             if "scale" in link
             else f"The recovery linked the two{took}{after}.{bypass}"
         )
-    if story.superseded is not None:
-        frames = count(story.superseded["frames"], "frame")
-        return f"Walking back in time, submap {story.superseded['submap']} posed all its {frames}: no link is needed."
+    if story.absorbed is not None:
+        frames = count(story.absorbed["frames"], "frame")
+        return f"Walking back in time, submap {story.absorbed['submap']} posed all its {frames}: no link is needed."
     broken = "".join(f" A recovery failed: {e.get('detail') or e.get('reason')}." for e in story.broken)
     if not refused:
         why = "the walk back in time met too few keyframes of the lost map" if story.walks else "there was no walk back"
@@ -206,7 +206,7 @@ def _link_words(link: Mapping[str, Any]) -> str:
     return "; ".join(words)
 
 
-def _close_up(run: RunData, scene: Scene | None, story: FailureStory) -> Markup:
+def _close_up(run: RunData, scene: PlacedRun | None, story: FailureStory) -> Markup:
     """Draw the path around the loss: far enough back to show the keyframes that a link rests on."""
     if scene is None:
         return join(None)
@@ -240,7 +240,7 @@ def _role(run: RunData, story: FailureStory, index: int) -> str:
     if row_of[index] < row_of.get(story.lost_since, 0):
         return "last tracked"
     if index == story.mapped_since:
-        return "seen again" if story.resumed is not None else "new map"
+        return "seen again" if story.relocalised is not None else "new map"
     if index == story.lost_since:
         return "lost"
     return "still no map"

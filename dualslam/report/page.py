@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from dualslam.core.config import Config
+from dualslam.config.settings import Config
 from dualslam.core.types import FrameStatus
 from dualslam.io.run_folder import EVENTS
 from dualslam.report.charts import latency_histogram, stage_table

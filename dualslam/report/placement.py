@@ -38,7 +38,7 @@ class Placed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class PlacedRun:
     """All that one drawing shows, in one frame.
 
     Attributes
@@ -67,7 +67,7 @@ class Scene:
     note: str
 
 
-def place(run: RunData) -> Scene:
+def place(run: RunData) -> PlacedRun:
     """Bring the trajectories of a run into one frame: the truth's, or the main map's own."""
     maps: list[tuple[int | None, PosedRows]] = [(None, run.main)] if len(run.main) else []
     maps += list(run.unlinked.items())
@@ -75,7 +75,7 @@ def place(run: RunData) -> Scene:
         apart = [_unplaced(m, posed) for m, posed in maps[1:]]
         placed = [_unplaced(m, posed) for m, posed in maps[:1]]
         down = run.main.T_map_cam[:, :3, 1].mean(axis=0) if len(run.main) else np.zeros(3)
-        return Scene(placed, apart, *_no_truth(), run.points, "", down, "No ground truth: in the map's own unit.")
+        return PlacedRun(placed, apart, *_no_truth(), run.points, "", down, "No ground truth: in the map's own unit.")
     placed, apart, points = [], [], np.zeros((0, 3))
     for m, posed in maps:
         S_truth_map = align(posed, run.truth)
@@ -89,7 +89,7 @@ def place(run: RunData) -> Scene:
     if apart:
         note += " A map with too little motion to be aligned is drawn apart."
     down = run.truth.T_map_cam[:, :3, 1].mean(axis=0)
-    return Scene(placed, apart, run.truth.row, run.truth.xyz, points, "m", down, note)
+    return PlacedRun(placed, apart, run.truth.row, run.truth.xyz, points, "m", down, note)
 
 
 def align(posed: PosedRows, truth: PosedRows) -> FloatArray | Failure:

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.core.camera import Camera, camera_from_dict
+from dualslam.core.camera.models import Camera, camera_from_dict
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure, FloatArray, FrameStatus, IntArray
 from dualslam.io.map_files import METADATA, load_arrays
+from dualslam.io.map_store import submap_path
 from dualslam.io.run_folder import EVENTS, MAP, SUMMARY, FrameRow
-from dualslam.map_store import submap_path
 from dualslam.report.placement import align
 from dualslam.report.run_data import PosedRows, RunData, are_shown, linked_submaps
 from dualslam.report.statuses import WITHOUT_POSE

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.atlas import Atlas
-from dualslam.core import strict_yaml
+from dualslam.config import strict_yaml
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import sim3
 from dualslam.core.types import BoolArray, FloatArray, FrameStatus, IntArray
 from dualslam.io import run_folder
 from dualslam.io.map_files import METADATA, load_arrays
+from dualslam.io.map_store import load_links, submap_path
 from dualslam.io.run_folder import FrameRow, read_events, read_frames, unlinked_submaps
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate, nearest_in_time, read_text, read_tum
-from dualslam.map_store import load_links, submap_path
+from dualslam.map.atlas import Atlas
 
 MAX_POINTS = 2500
 MAX_VIEW_DISTANCE_MU = 8.0

@@ -14,7 +14,7 @@ import numpy as np
 from dualslam.core.types import FloatArray, FrameStatus
 from dualslam.report.canvas import ticks
 from dualslam.report.markup import Markup, coordinate, duration, number, tag
-from dualslam.report.placement import Scene, place
+from dualslam.report.placement import PlacedRun, place
 from dualslam.report.run_data import RunData
 from dualslam.report.statuses import MEANING, count, span, stretches
 from dualslam.report.top_view import failure_letter
@@ -25,7 +25,7 @@ MIN_LABEL_PERCENT = 3.0
 _MARKS = {
     "initialised": ("○", "mark", "a map begins"),
     "reinitialised": ("○", "mark", "a new map begins"),
-    "relocalised": ("↺", "mark quiet", "found again by wide matching"),
+    "gap_relocalised": ("↺", "mark quiet", "found again by wide matching"),
     "rolled_over": ("→", "mark quiet", "a full submap hands over to the next"),
     "linked": ("◆", "mark good", "two submaps are linked"),
     "loop_closed": ("◆", "mark good", "a loop is closed"),
@@ -114,7 +114,7 @@ def _inlier_lane(run: RunData) -> Markup:
     return _lane("landmarks", note, _stretched(len(run.rows), shapes, "Landmarks matched and agreeing", 100), words)
 
 
-def _error_lane(run: RunData, scene: Scene) -> Markup | None:
+def _error_lane(run: RunData, scene: PlacedRun) -> Markup | None:
     """Draw the distance from the true position, where there is a truth."""
     error = np.full(len(run.rows), np.nan)
     for placed in scene.placed:

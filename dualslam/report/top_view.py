@@ -10,7 +10,7 @@ import numpy as np
 from dualslam.core.types import FloatArray, FrameStatus, IntArray
 from dualslam.report.canvas import Canvas
 from dualslam.report.markup import Markup, join, tag
-from dualslam.report.placement import Placed, Scene, extent, place, plane_from_above
+from dualslam.report.placement import Placed, PlacedRun, extent, place, plane_from_above
 from dualslam.report.run_data import RunData
 from dualslam.report.statuses import MEANING, count, span, stretches
 
@@ -31,7 +31,7 @@ def top_view(run: RunData) -> Markup:
         else []
     )
     for placed in scene.apart:
-        alone = Scene([placed], [], *_nothing(), np.zeros((0, 3)), "", scene.down * 0, "")
+        alone = PlacedRun([placed], [], *_nothing(), np.zeros((0, 3)), "", scene.down * 0, "")
         words = f"Submap {placed.submap}, not linked, in its own frame and unit: {count(len(placed.row), 'frame')}."
         parts.append(tag("figure", _drawing(run, alone, _axes(alone)), tag("figcaption", tag("p", words)), cls="apart"))
     return join(parts)
@@ -41,7 +41,7 @@ def _nothing() -> tuple[np.ndarray, FloatArray]:
     return np.zeros(0, np.int64), np.zeros((0, 3))
 
 
-def close_up(run: RunData, scene: Scene, rows: tuple[int, int], marked: Sequence[int]) -> Markup | None:
+def close_up(run: RunData, scene: PlacedRun, rows: tuple[int, int], marked: Sequence[int]) -> Markup | None:
     """Return the part of the drawing that some frames are in, or None where none of them has a place.
 
     Parameters
@@ -66,11 +66,11 @@ def close_up(run: RunData, scene: Scene, rows: tuple[int, int], marked: Sequence
     return _drawing(run, near, _axes(scene), window, marked) if near.placed else None
 
 
-def _axes(scene: Scene) -> FloatArray:
+def _axes(scene: PlacedRun) -> FloatArray:
     return plane_from_above(np.concatenate([xyz for _, xyz in _lines(scene)]), scene.down)[0]
 
 
-def _lines(scene: Scene) -> list[tuple[IntArray, FloatArray]]:
+def _lines(scene: PlacedRun) -> list[tuple[IntArray, FloatArray]]:
     return [*((p.row, p.xyz) for p in scene.placed), (scene.truth_row, scene.truth_xyz)]
 
 
@@ -81,7 +81,7 @@ def _cut(placed: Placed, low: int, high: int) -> Placed:
 
 def _drawing(
     run: RunData,
-    scene: Scene,
+    scene: PlacedRun,
     axes: FloatArray,
     window: Sequence[FloatArray] | None = None,
     marked: Sequence[int] = (),
@@ -103,7 +103,7 @@ def _drawing(
     return canvas.draw(shapes, words, _description(run, scene))
 
 
-def _description(run: RunData, scene: Scene) -> str:
+def _description(run: RunData, scene: PlacedRun) -> str:
     n_failures = len(run.events_of("failed"))
     n_posed = sum(len(p.row) for p in scene.placed)
     truth = ", with the true path" if len(scene.truth_row) else ""
@@ -129,7 +129,7 @@ def _path(run: RunData, placed: Placed, canvas: Canvas, axes: FloatArray) -> lis
     return shapes
 
 
-def _truth(run: RunData, scene: Scene, canvas: Canvas, axes: FloatArray) -> list[Markup]:
+def _truth(run: RunData, scene: PlacedRun, canvas: Canvas, axes: FloatArray) -> list[Markup]:
     """Draw the true path, and on it where the run has no pose at all."""
     if not len(scene.truth_row):
         return []
@@ -148,7 +148,7 @@ def _truth(run: RunData, scene: Scene, canvas: Canvas, axes: FloatArray) -> list
     return shapes
 
 
-def _ends(scene: Scene, canvas: Canvas, axes: FloatArray) -> list[Markup]:
+def _ends(scene: PlacedRun, canvas: Canvas, axes: FloatArray) -> list[Markup]:
     # The truth has both ends; without it the main map's first and last pose stand for them.
     xyz = scene.truth_xyz if len(scene.truth_row) else scene.placed[0].xyz
     uv = xyz[[0, -1]] @ axes.T
@@ -158,7 +158,7 @@ def _ends(scene: Scene, canvas: Canvas, axes: FloatArray) -> list[Markup]:
     return words
 
 
-def _breakages(run: RunData, scene: Scene, canvas: Canvas, axes: FloatArray) -> list[Markup]:
+def _breakages(run: RunData, scene: PlacedRun, canvas: Canvas, axes: FloatArray) -> list[Markup]:
     """Mark where each failure began: at the last frame that had a pose before it."""
     rows = np.concatenate([p.row for p in scene.placed])
     xyz = np.concatenate([p.xyz for p in scene.placed])
@@ -181,7 +181,7 @@ def failure_letter(i: int) -> str:
     return LETTERS[i - 1] if i <= len(LETTERS) else str(i)
 
 
-def _legend(run: RunData, scene: Scene) -> list[Markup]:
+def _legend(run: RunData, scene: PlacedRun) -> list[Markup]:
     drawn = {run.rows[i].status for placed in scene.placed for i in placed.row.tolist()}
     items = [_key(f"way st-{s}", f"{s}: {MEANING[s]}") for s in FrameStatus if s in drawn]
     if len(scene.truth_row):

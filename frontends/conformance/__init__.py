@@ -2,7 +2,7 @@
 
 In a test of another package::
 
-    from frontends.conformance import CHECKS, Subject
+    from dualslam.frontends.conformance import CHECKS, Subject
 
     @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
     def test_front_end_conforms(check):
@@ -18,9 +18,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from frontends.conformance import features, matching
-from frontends.conformance.subject import NotConforming, Subject
-from frontends.registry import FrontendFactory
+from dualslam.frontends.conformance import features, matching
+from dualslam.frontends.conformance.subject import NotConforming, Subject
+from dualslam.frontends.registry import FrontendFactory
 
 __all__ = ["CHECKS", "NotConforming", "Subject", "check_frontend"]
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.types import Features, FloatArray
-from frontends.conformance.scene import Scene
-from frontends.conformance.subject import FEATURES_ARRAYS, Subject, expect, same_features
+from dualslam.frontends.conformance.scene import PrintedPlane
+from dualslam.frontends.conformance.subject import FEATURES_ARRAYS, Subject, expect, same_features
 
 TINY = ((1, 1), (1, 300), (300, 1), (7, 7), (16, 16), (33, 33), (20, 300))
 """Heights and widths."""
@@ -182,7 +182,7 @@ def check_pixel_centres_by_discs(subject: Subject) -> None:
     radius_px, spacing = 5.0, 47
     grid = np.stack(np.meshgrid(np.arange(40, 440, spacing), np.arange(40, 320, spacing)), axis=-1).reshape(-1, 2)
     centres = grid + np.random.default_rng(5).uniform(-0.5, 0.5, grid.shape)
-    features = subject.make().extract(Scene.of_discs(centres, radius_px, (480, 360)).photograph(noise=1.0))
+    features = subject.make().extract(PrintedPlane.of_discs(centres, radius_px, (480, 360)).photograph(noise=1.0))
     step = features.uv_px[:, None] - centres[None]
     nearest = np.hypot(*np.moveaxis(step, 2, 0)).argmin(axis=1)
     offset = step[np.arange(len(nearest)), nearest]

@@ -9,9 +9,9 @@ import numpy as np
 
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Matches
-from frontends.conformance.scene import local_zoom, tilted, transfer, turned
-from frontends.conformance.subject import Subject, expect
-from frontends.matching import FeatureGrid, match_projected
+from dualslam.frontends.conformance.scene import local_zoom, tilted, transfer, turned
+from dualslam.frontends.conformance.subject import Subject, expect
+from dualslam.frontends.features.matching import FeatureGrid, match_projected
 
 MIN_MATCHES = 30
 MIN_RIGHT = 0.9

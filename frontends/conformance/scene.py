@@ -17,7 +17,7 @@ MARGIN_PX = 160
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class PrintedPlane:
     """A printed plane, `size_px` wide and high in the straight view.
 
     Attributes
@@ -31,7 +31,7 @@ class Scene:
     size_px: tuple[int, int]
 
     @classmethod
-    def printed(cls, seed: int, size_px: tuple[int, int] = (480, 360)) -> Scene:
+    def printed(cls, seed: int, size_px: tuple[int, int] = (480, 360)) -> PrintedPlane:
         """Blobs, bars and triangles of 2 to 40 pixels."""
         rng = np.random.default_rng([seed, 0x5CE])
         width, height = (TEXELS * (side + 2 * MARGIN_PX) for side in size_px)
@@ -50,7 +50,7 @@ class Scene:
         return cls(np.asarray(cv2.GaussianBlur(texture, (0, 0), TEXELS / 3), np.uint8), size_px)
 
     @classmethod
-    def of_discs(cls, centres_px: FloatArray, radius_px: float, size_px: tuple[int, int]) -> Scene:
+    def of_discs(cls, centres_px: FloatArray, radius_px: float, size_px: tuple[int, int]) -> PrintedPlane:
         """Bright discs (N, 2) on grey, exact to a hundredth of a pixel."""
         width, height = (TEXELS * (side + 2 * MARGIN_PX) for side in size_px)
         texture = np.full((height, width), 60.0, np.float32)

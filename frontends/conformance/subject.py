@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Features, FloatArray
-from frontends.conformance.scene import Scene
-from frontends.registry import FrontendFactory
+from dualslam.frontends.conformance.scene import PrintedPlane
+from dualslam.frontends.registry import FrontendFactory
 
 N_FEATURES = 800
 FEATURES_ARRAYS = ("uv_px", "uv_rect_px", "sigma_px", "scale", "octave", "angle_rad", "descriptors")
@@ -48,19 +48,19 @@ class Subject:
         """Build it anew."""
         return self.factory.from_options(n_features, self.options)
 
-    def scene(self, seed: int = 1) -> Scene:
+    def scene(self, seed: int = 1) -> PrintedPlane:
         """Return a flat scene full of blobs, bars and corners."""
         return _printed(seed)
 
     def image(self, H_view_scene: FloatArray | None = None, seed: int = 0) -> NDArray[np.uint8]:
-        """Photograph that scene (`Scene.photograph`)."""
+        """Photograph that scene (`PrintedPlane.photograph`)."""
         return self.scene().photograph(H_view_scene, seed=seed)
 
 
 @lru_cache(maxsize=2)
-def _printed(seed: int) -> Scene:
+def _printed(seed: int) -> PrintedPlane:
     """The scene of a seed: drawing one takes longer than most checks."""
-    return Scene.printed(seed)
+    return PrintedPlane.printed(seed)
 
 
 def same_features(a: Features, b: Features) -> bool:

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backend.bayes_tree import parse_bayes_tree
-from backend.submap_graph import ISam2SubmapGraph
-from dualslam.core.config import GraphConfig
+from dualslam.backend.bayes_tree import parse_bayes_tree
+from dualslam.backend.submap_graph import ISam2SubmapGraph
+from dualslam.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
 from tests.backend.test_submap_graph import grow, start
 

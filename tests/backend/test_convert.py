@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from backend import convert
+from dualslam.backend import convert
 
 
 def so3_hat(w):

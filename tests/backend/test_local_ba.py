@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from backend.local_ba import BundleProblem, bundle_adjust, bundle_adjust_arrays
-from tests.backend.scenes import Feeder, K, make_scene, pose_errors
+from dualslam.backend.local_ba import BundleProblem, bundle_adjust, bundle_adjust_arrays
+from dualslam.testing.graph_scene import Feeder, K, make_scene, pose_errors
 
 
 def make_problem(n=8, noise_px=0.0, seed=0, n_fixed=2):

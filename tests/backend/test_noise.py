@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backend.noise import MIN_OBSERVATIONS, MIN_VIEWS, residual_variance
+from dualslam.backend.noise import MIN_OBSERVATIONS, MIN_VIEWS, residual_variance
 from dualslam.core.types import FloatArray, IntArray
 
 LEAST = 0.01

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from backend.self_calibration import (
+from dualslam.backend.self_calibration import (
     choose_window,
     estimate_calibration,
     estimate_correction,
@@ -15,15 +15,15 @@ from backend.self_calibration import (
     make_problem,
 )
 from dualslam.build import adjust_submap
+from dualslam.config.calibration_config import CalibrationConfig
 from dualslam.core.bundle import BundleProblem
-from dualslam.core.calibration_config import CalibrationConfig
-from dualslam.core.camera import PinholeCamera
-from dualslam.core.corrected_camera import LensCorrection, correct
+from dualslam.core.camera.corrected import LensCorrection, correct
+from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.geometry import so3
-from dualslam.core.submap import Submap
 from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe
-from dualslam.evaluation.alignment import align_points
-from tests.backend.scenes import make_features
+from dualslam.lab.metrics.alignment import align_points
+from dualslam.map.submap import Submap
+from dualslam.testing.graph_scene import make_features
 
 WIDTH, HEIGHT = 640, 480
 TRUE = PinholeCamera(WIDTH, HEIGHT, 500.0, 500.0, 319.5, 239.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backend.sim3_graph import Sim3Edge, Sim3Prior, optimise_sim3
+from dualslam.backend.sim3_graph import Sim3Edge, Sim3Prior, optimise_sim3
 from dualslam.core.errors import SolverError
 from tests.backend.test_convert import random_sim3, sim3_exp
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backend.local_ba import bundle_adjust
-from backend.submap_graph import ISam2SubmapGraph
-from dualslam.core.config import GraphConfig
+from dualslam.backend.local_ba import bundle_adjust
+from dualslam.backend.submap_graph import ISam2SubmapGraph
+from dualslam.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
-from dualslam.core.submap import RelativePose
-from tests.backend.scenes import Feeder, make_scene, pose_errors
+from dualslam.map.submap import RelativePose
+from dualslam.testing.graph_scene import Feeder, make_scene, pose_errors
 
 OPTIMUM_MU, OPTIMUM_RAD = 5e-3, 5e-3
 """How far iSAM2, which does not relinearise what moves little, may be from the batch optimum: less than the standard
@@ -138,7 +138,7 @@ def test_observations_beyond_all_use_are_refused_and_reported():
     obs = feeder.submap.observations
     mine = np.flatnonzero((obs["kf"] == rest[0]) & (obs["feature"] < 5))
     assert np.isin(mine, e.outlier_rows).all()
-    assert (graph._ledger.rows["factor"][mine] < 0).all()
+    assert (graph._factor_index.rows["factor"][mine] < 0).all()
 
 
 def test_dead_rows_leave_and_so_do_landmarks_left_with_one():
@@ -157,7 +157,7 @@ def test_dead_rows_leave_and_so_do_landmarks_left_with_one():
     full = graph.full_estimate(submap)
     assert landmark not in full.landmark_ids
     assert not np.isin(gone, full.landmark_ids).any()
-    assert (graph._ledger.rows["factor"][rows] < 0).all()
+    assert (graph._factor_index.rows["factor"][rows] < 0).all()
     later = grow(feeder, graph, rest[11:16])
     assert not any(x.rebuilt for x in later)
 

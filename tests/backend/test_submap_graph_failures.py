@@ -7,13 +7,13 @@ import logging
 import numpy as np
 import pytest
 
-from backend import submap_graph as module
-from backend.solver import IncrementalSolver, SolverFailure
-from backend.submap_graph import ISam2SubmapGraph
-from dualslam.core.config import GraphConfig
+from dualslam.backend import submap_graph as module
+from dualslam.backend.solver import IncrementalSolver, SolverFailure
+from dualslam.backend.submap_graph import ISam2SubmapGraph
+from dualslam.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
-from dualslam.core.submap import Submap
-from tests.backend.scenes import K, pose_errors
+from dualslam.map.submap import Submap
+from dualslam.testing.graph_scene import K, pose_errors
 from tests.backend.test_submap_graph import apply, grow, start
 
 
@@ -163,7 +163,7 @@ def test_a_real_gtsam_exception_is_survived(monkeypatch):
     submap = feeder.submap
     T = submap.T_submap_kf[5]
     bad = add_landmark(submap, T[:3, 3] + T[:3, :3] @ [0.1, 0.0, -1.0], [4, 5])
-    real = module.Ledger._judge
+    real = module.FactorIndex._judge
     calls = []
 
     def gullible(self, submap, poses, xyz_mu, row, *args):
@@ -174,7 +174,7 @@ def test_a_real_gtsam_exception_is_survived(monkeypatch):
             fits = fits | (submap.observations["landmark"][row] == bad)
         return fits, certain
 
-    monkeypatch.setattr(module.Ledger, "_judge", gullible)
+    monkeypatch.setattr(module.FactorIndex, "_judge", gullible)
     e = graph.update(submap)
     assert e.rebuilt
     assert bad not in e.landmark_ids

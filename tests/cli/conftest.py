@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from dualslam.core.threads import LIMITS
-from dualslam.sources import make_world
-from dualslam.synthetic import SyntheticSequence, render_to_folder
+from dualslam.lab.synthetic import SyntheticSequence, render_to_folder
+from dualslam.run.sources import make_world
 from tests.cli.fakes import builder
 
 N_FRAMES = 24
@@ -42,7 +42,7 @@ def fake(world: SyntheticSequence, monkeypatch: pytest.MonkeyPatch) -> Callable[
 
     def install(**options: object) -> None:
         truth = dict(enumerate(world.ground_truth_T_world_cam))
-        monkeypatch.setattr("dualslam.session.build_system", builder(truth, **options))
+        monkeypatch.setattr("dualslam.run.session.build_system", builder(truth, **options))
 
     install()
     return install

@@ -6,16 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dualslam.atlas import Atlas
-from dualslam.core.camera import Camera
-from dualslam.core.config import Config
+from dualslam.config.settings import Config
+from dualslam.core.camera.models import Camera
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.stage_timer import StageTimer
-from dualslam.core.submap import Submap
 from dualslam.core.types import Features, FloatArray, Frame, FrameStatus, Keyframe
-from dualslam.frame_buffer import FrameBuffer
-from dualslam.frame_records import FrameRecord, FrameResult
-from dualslam.trajectory import FramePose
+from dualslam.map.atlas import Atlas
+from dualslam.map.frame_records import FrameRecord, FrameResult
+from dualslam.map.submap import Submap
+from dualslam.map.trajectory import FramePose
+from dualslam.recovery.frame_buffer import FrameBuffer
 
 NO_FEATURES = Features(
     np.zeros((0, 2)),
@@ -44,7 +44,7 @@ class FakeSystem:
         self.timer = StageTimer()
         self.buffer = FrameBuffer(1.0, 1.0)
         self.n_finished = 0
-        self.hurried = False
+        self.was_interrupted = False
         self._truth, self._lost, self._before_step = truth, lost, before_step
         self._submap: Submap | None = None
 
@@ -66,9 +66,9 @@ class FakeSystem:
         self.poses[frame.index] = FramePose(frame.index, frame.timestamp_s, self._submap.id, frame.index, np.eye(4))
         return self._result(frame, FrameStatus.TRACKED)
 
-    def finish(self, hurry: bool = False) -> None:
+    def finish(self, interrupted: bool = False) -> None:
         self.n_finished += 1
-        self.hurried = hurry
+        self.was_interrupted = interrupted
 
     def _result(self, frame: Frame, status: FrameStatus) -> FrameResult:
         submap_id = None if self._submap is None else self._submap.id

@@ -9,8 +9,8 @@ import pytest
 
 from dualslam.cli.console import FINISHING, progress
 from dualslam.core.types import FrameStatus
-from dualslam.frame_records import FrameResult
-from dualslam.sources import open_source
+from dualslam.map.frame_records import FrameResult
+from dualslam.run.sources import open_source
 
 SOURCE = "synthetic:street,frames=3,seed=1,width=160,height=120"
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from dualslam.cli import main
-from dualslam.core.camera import Camera
-from dualslam.core.config import Config
-from dualslam.core.config_io import load_config
+from dualslam.config.files import load_config
+from dualslam.config.settings import Config
+from dualslam.core.camera.models import Camera
 from dualslam.core.types import FloatArray, Frame
-from dualslam.sources import make_world
+from dualslam.run.sources import make_world
 from tests.cli.fakes import FakeSystem
 
 N = 32
@@ -35,8 +35,8 @@ def out(truth: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         return FakeSystem(truth, lost=tuple(range(18 if config.recovery.enabled else 16, 22)))
 
     monkeypatch.setattr("dualslam.cli.demo_command.MIN_FRAMES", N)
-    monkeypatch.setattr("dualslam.synthetic.render.Renderer.image", lambda *_: np.zeros((480, 640), np.uint8))
-    monkeypatch.setattr("dualslam.session.build_system", build)
+    monkeypatch.setattr("dualslam.lab.synthetic.render.Renderer.image", lambda *_: np.zeros((480, 640), np.uint8))
+    monkeypatch.setattr("dualslam.run.session.build_system", build)
     return tmp_path / "demo"
 
 
@@ -74,7 +74,7 @@ def test_status_is_that_of_the_run_with_recovery(
     def build(config: Config, camera: Camera) -> FakeSystem:
         return FakeSystem(truth, lost=tuple(range(N)) if config.recovery.enabled is blind else ())
 
-    monkeypatch.setattr("dualslam.session.build_system", build)
+    monkeypatch.setattr("dualslam.run.session.build_system", build)
     assert main(["demo", "--frames", str(N), "--out", str(out), "--quiet"]) == status
     assert (out / "compare.html").exists()
 
@@ -84,6 +84,6 @@ def test_an_interrupted_demo_ends_there(truth: Truth, out: Path, monkeypatch: py
         if frame.index == 5:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("dualslam.session.build_system", lambda *_: FakeSystem(truth, before_step=interrupt))
+    monkeypatch.setattr("dualslam.run.session.build_system", lambda *_: FakeSystem(truth, before_step=interrupt))
     assert main(["demo", "--frames", str(N), "--out", str(out), "--quiet"]) == 130
     assert [path.name for path in out.iterdir()] == ["off"]

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from dualslam.cli import main
-from dualslam.core.config_io import load_config
+from dualslam.config.files import load_config
 from dualslam.core.types import Frame
-from dualslam.map_store import load_atlas
-from dualslam.results import versions
-from dualslam.sources import open_source
-from dualslam.synthetic import SyntheticSequence
+from dualslam.io.map_store import load_atlas
+from dualslam.lab.synthetic import SyntheticSequence
+from dualslam.run.results import versions
+from dualslam.run.sources import open_source
 from tests.cli.conftest import N_FRAMES
 
 Install = Callable[..., None]

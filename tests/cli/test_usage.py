@@ -11,7 +11,7 @@ import dualslam
 from dualslam.cli import main
 from dualslam.cli.configuration import config_of
 from dualslam.cli.parser import parse
-from dualslam.core.config_io import load_config
+from dualslam.config.files import load_config
 
 
 def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:

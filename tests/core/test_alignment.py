@@ -18,7 +18,7 @@ from dualslam.core.geometry.alignment import (
     umeyama_batch,
 )
 from dualslam.core.types import Failure, FailureReason
-from tests.core.scenes import TwoMaps, two_maps
+from dualslam.testing.two_maps import TwoMaps, two_maps
 
 EXACT = 1e-10
 MAX_LOG_SCALE = 0.015  # three sigmas of this scene

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dualslam.core.camera import (
+from dualslam.core.camera.models import (
     Camera,
     FovCamera,
     KannalaBrandtCamera,

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import PoseEstimate, project_points, projection_jacobians, refine_pose
 from dualslam.core.types import Failure, FailureReason
-from tests.core.scenes import K, two_views
+from dualslam.testing.two_maps import K, two_views
 
 NUMERICAL_PX = 1e-4
 CHI2_6DOF_MEAN = 6.0

@@ -14,7 +14,7 @@ from dualslam.core.geometry.triangulation import (
     triangulate_n_view,
     triangulate_two_view,
 )
-from tests.core.scenes import K, two_views
+from dualslam.testing.two_maps import K, two_views
 
 EXACT = 1e-9
 EXCESS_PX2 = 1e-6

@@ -16,7 +16,7 @@ from dualslam.core.geometry.two_view import (
     sampson_distance,
     sampson_error,
 )
-from tests.core.scenes import K, two_views
+from dualslam.testing.two_maps import K, two_views
 
 EXACT = 1e-9
 NORMAL = np.array([0.1, -0.3, -0.95]) / np.linalg.norm([0.1, -0.3, -0.95])

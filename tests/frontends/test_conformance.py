@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dualslam.core.config import FrontendConfig
+from dualslam.config.settings import FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.types import Features, Matches
-from frontends import registry
-from frontends.conformance import CHECKS, NotConforming, Subject, check_frontend
-from frontends.conformance.scene import Scene, tilted, transfer
-from frontends.gms import GmsFrontend
-from frontends.orb import OrbFrontend
-from frontends.sift import SiftFrontend
+from dualslam.frontends import registry
+from dualslam.frontends.conformance import CHECKS, NotConforming, Subject, check_frontend
+from dualslam.frontends.conformance.scene import PrintedPlane, tilted, transfer
+from dualslam.frontends.features.gms import GmsFrontend
+from dualslam.frontends.features.orb import OrbFrontend
+from dualslam.frontends.features.sift import SiftFrontend
 
 EXAMPLE = Path(__file__).with_name("example_package")
 
@@ -83,7 +83,7 @@ def test_it_is_gone_without_its_package() -> None:
 
 def test_scene_is_where_it_says() -> None:
     centres = np.array([[100.25, 80.5], [211.75, 90.0], [330.4, 250.3]])
-    scene = Scene.of_discs(centres, 6.0, (480, 360))
+    scene = PrintedPlane.of_discs(centres, 6.0, (480, 360))
     H = tilted(scene.size_px)
     for view, expected in ((None, centres), (H, transfer(H, centres))):
         image = scene.photograph(view, noise=0.0).astype(np.float64) - 60.0

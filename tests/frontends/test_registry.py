@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from dualslam.core.config import FrontendConfig
+from dualslam.config.settings import FrontendConfig
 from dualslam.core.errors import ConfigError
-from frontends import registry
-from frontends.orb import OrbFrontend
+from dualslam.frontends import registry
+from dualslam.frontends.features.orb import OrbFrontend
 
 
 def test_orb_is_built_in_and_takes_its_options() -> None:
@@ -52,16 +52,18 @@ def offer(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
 
 
 def test_entry_points_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    offer(monkeypatch, theirs="frontends.orb:OrbFrontend", orb="nowhere:Nothing")
+    offer(monkeypatch, theirs="dualslam.frontends.features.orb:OrbFrontend", orb="nowhere:Nothing")
     assert registry.known_frontends() == sorted([*registry.BUILT_IN, "theirs"])
     assert isinstance(registry.create_frontend(FrontendConfig(name="theirs")), OrbFrontend)
     assert isinstance(registry.create_frontend(FrontendConfig(name="orb")), OrbFrontend)
 
 
 def test_what_can_be_imported_needs_no_entry_point() -> None:
-    assert isinstance(registry.create_frontend(FrontendConfig(name="frontends.orb:OrbFrontend")), OrbFrontend)
-    with pytest.raises(ConfigError, match=r"'frontends\.orb:Nothing'.*cannot be imported"):
-        registry.create_frontend(FrontendConfig(name="frontends.orb:Nothing"))
+    assert isinstance(
+        registry.create_frontend(FrontendConfig(name="dualslam.frontends.features.orb:OrbFrontend")), OrbFrontend
+    )
+    with pytest.raises(ConfigError, match=r"'dualslam\.frontends\.features\.orb:Nothing'.*cannot be imported"):
+        registry.create_frontend(FrontendConfig(name="dualslam.frontends.features.orb:Nothing"))
 
 
 @pytest.mark.parametrize(
@@ -97,7 +99,7 @@ sys.exit(main(["config", "--frontend", "kornia"]))
         registry.check_frontend(FrontendConfig(name="kornia", options={"no_such": 1}))
 
 
-@pytest.mark.parametrize("value", ["no_such_module:Thing", "frontends.orb:NoSuchThing"])
+@pytest.mark.parametrize("value", ["no_such_module:Thing", "dualslam.frontends.features.orb:NoSuchThing"])
 def test_broken_entry_point_is_a_config_error(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
     offer(monkeypatch, broken=value)
     with pytest.raises(ConfigError, match=r"'broken'.*cannot be imported"):
@@ -105,5 +107,5 @@ def test_broken_entry_point_is_a_config_error(monkeypatch: pytest.MonkeyPatch, v
 
 
 def test_registry_imports_no_front_end_by_itself() -> None:
-    code = "import sys, frontends.registry; sys.exit('cv2' in sys.modules or 'frontends.orb' in sys.modules)"
+    code = "import sys, dualslam.frontends.registry; sys.exit('cv2' in sys.modules or 'dualslam.frontends.features.orb' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

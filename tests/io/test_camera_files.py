@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from dualslam.core.camera import FovCamera, KannalaBrandtCamera, PinholeCamera, RadTanCamera
+from dualslam.core.camera.models import FovCamera, KannalaBrandtCamera, PinholeCamera, RadTanCamera
 from dualslam.core.errors import InputError
 from dualslam.io import read_camera_file
 

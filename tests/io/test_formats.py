@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dualslam.core.camera import FovCamera, PinholeCamera, RadTanCamera
+from dualslam.core.camera.models import FovCamera, PinholeCamera, RadTanCamera
 from dualslam.core.errors import InputError
 from dualslam.io import open_sequence
 

@@ -10,9 +10,9 @@ import pytest
 
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.geometry import se3
-from dualslam.core.submap import RelativePose, Submap
 from dualslam.core.types import Features, Keyframe
 from dualslam.io import load_map, load_submap, save_map, save_submap
+from dualslam.map.submap import RelativePose, Submap
 
 
 def features(rng: np.random.Generator, n: int) -> Features:

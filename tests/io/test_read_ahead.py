@@ -12,7 +12,7 @@ import pytest
 
 from dualslam.io import open_sequence
 from dualslam.io.read_ahead import read_ahead
-from tests.waiting import wait_until
+from dualslam.testing.waiting import wait_until
 
 
 def reading_threads() -> list[threading.Thread]:

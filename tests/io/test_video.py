@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dualslam.core.camera import camera_from_fov
+from dualslam.core.camera.models import camera_from_fov
 from dualslam.core.errors import InputError
 from dualslam.io import open_sequence
 from dualslam.io.sequence import Given, Selection

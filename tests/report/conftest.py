@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from dualslam.core.config import Config
+from dualslam.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.types import Frame
-from dualslam.frame_records import FrameResult
+from dualslam.lab.synthetic import SyntheticSequence, make_sequence
+from dualslam.map.frame_records import FrameResult
 from dualslam.report import RunData, read_run
-from dualslam.session import run_to_folder
-from dualslam.sources import WorldSequence
-from dualslam.synthetic import SyntheticSequence, make_sequence
+from dualslam.run.session import run_to_folder
+from dualslam.run.sources import WorldSequence
 from tests.cli.fakes import FakeSystem
 
 N_FRAMES = 40
@@ -50,7 +50,7 @@ class Eventful(FakeSystem):
             event.data.update(reason="no_texture", detail="<b>0 features</b>", lost_since=event.frame)
         return result
 
-    def finish(self, hurry: bool = False) -> None:
+    def finish(self, interrupted: bool = False) -> None:
         if self.events.of_kind(EventKind.FAILED) and len(self.atlas.submaps) > 1:
             self.events.add(EventKind.REINITIALISED, LOST[-1] + 1, 2.6, 1, first_view=LOST[-1] + 1)
             self.events.add(EventKind.RECOVERY_STARTED, LOST[-1] + 1, 2.6, 1, lost=[0], frames=26)
@@ -58,7 +58,7 @@ class Eventful(FakeSystem):
                 "attempt": "sift",
                 "frames": 9,
                 "new_keyframes": 5,
-                "leaped_frames": 6,
+                "skipped_frames": 6,
                 "seconds": 1.25,
                 "k": 20,
                 "k_r": 7,

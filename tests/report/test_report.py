@@ -11,20 +11,20 @@ import cv2
 import numpy as np
 import pytest
 
-from dualslam.atlas import Atlas, Link, LinkKind
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3, sim3, so3
-from dualslam.core.submap import Submap
 from dualslam.core.types import Frame, FrameStatus, Keyframe
+from dualslam.io.map_store import save_atlas
 from dualslam.io.run_folder import RunFolder
-from dualslam.map_store import save_atlas
+from dualslam.lab.synthetic import SyntheticSequence
+from dualslam.map.atlas import Atlas, Link, LinkKind
+from dualslam.map.submap import Submap
 from dualslam.report import RunData, SampleKeeper, read_run, report_page
 from dualslam.report.canvas import Canvas, nice_step, ticks
 from dualslam.report.failures import stories
 from dualslam.report.markup import Markup, tag
 from dualslam.report.placement import place, plane_from_above
 from dualslam.report.run_data import PosedRows, _map_points
-from dualslam.synthetic import SyntheticSequence
 from tests.cli.fakes import NO_FEATURES
 from tests.report.conftest import LOST, N_FRAMES, MakeRun, with_events
 
@@ -187,7 +187,7 @@ def test_colour_frames_are_kept_in_their_colours() -> None:
 
 
 def test_a_map_that_a_later_one_took_over_is_told_without_a_link(broken_run: RunData) -> None:
-    event = {"event": "superseded", "frame": 39, "timestamp_s": 3.9, "submap": 1, "old_submaps": [0], "frames": 20}
+    event = {"event": "absorbed", "frame": 39, "timestamp_s": 3.9, "submap": 1, "old_submaps": [0], "frames": 20}
     text = outline(with_events(broken_run, event)).text
     assert "✓ taken over by a later map" in text
     assert "submap 1 posed all its 20 frames: no link is needed." in text
@@ -198,7 +198,7 @@ def test_a_map_that_was_seen_again_is_told_without_a_restart(broken_run: RunData
     failed = next(i for i, e in enumerate(broken_run.events) if e["event"] == "failed")
     lost = broken_run.events[failed]
     again = next(i for i in sorted(broken_run.samples) if i > lost["frame"])
-    event = {"event": "resumed", "frame": again, "timestamp_s": 1.0, "submap": lost["submap"]}
+    event = {"event": "relocalised", "frame": again, "timestamp_s": 1.0, "submap": lost["submap"]}
     events = [*broken_run.events[: failed + 1], event, *broken_run.events[failed + 1 :]]
     text = outline(replace(broken_run, events=events)).text
     assert "✓ seen again" in text

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from dualslam.core.config import StrictModel
+from dualslam.config.settings import StrictModel
 from dualslam.core.errors import InputError
 from dualslam.core.types import Features, Matches
-from frontends.registry import parse_options
+from dualslam.frontends.registry import parse_options
 
 REACH_PX = 14
 SAMPLES = np.linspace(-REACH_PX, REACH_PX, 8)

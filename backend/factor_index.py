@@ -1,0 +1,192 @@
+"""What of a submap is in its factor graph, and what should change: pure numpy, no solver."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.backend.observability import MIN_DEPTH_MU, compute_depth_sigmas, compute_residuals, take_mask
+from dualslam.config.settings import GraphConfig
+from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.map.submap import Submap
+from dualslam.map.tables import Table
+
+OUTSIDE = -1
+LEAVE_RATIO = 2.0
+"""A landmark leaves the graph at this many times the uncertainty at which it may enter, so that it does not flutter."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """The changes that bring a graph up to date with its submap.
+
+    Attributes
+    ----------
+    entering, leaving : (R,) int64
+        Observation rows whose factors are added, and removed.
+    refused : (R,) int64
+        Live rows that fit so badly that they are not let in.
+    new_landmarks : (L,) int64
+    new_keyframes, gone_keyframes : (K,) int64
+    weak_keyframes : (K,) int64
+        All keyframes that the graph, as it will be, ties to fewer than `GraphConfig.min_ties` well-seen landmarks.
+    """
+
+    entering: IntArray
+    leaving: IntArray
+    refused: IntArray
+    new_landmarks: IntArray
+    new_keyframes: IntArray
+    gone_keyframes: IntArray
+    weak_keyframes: IntArray
+
+
+class FactorIndex:
+    """Row by row, the factor index of each observation; it grows with the submap's table.
+
+    Attributes
+    ----------
+    rows : Table
+        ``factor`` (index in the solver, or `OUTSIDE`), ``uv_px`` (2), ``sigma_px``: one row per observation row. Pixels
+        never change, so they are looked up once.
+    keyframes : set of int
+        Those whose pose is in the graph.
+    banned : set of int
+        Landmarks that made the solver fail. They stay out until they are observed again.
+    """
+
+    def __init__(self, config: GraphConfig) -> None:
+        self._config = config
+        self.rows = Table(factor=(np.int64, ()), uv_px=(np.float64, (2,)), sigma_px=(np.float64, ()))
+        self.keyframes: set[int] = set()
+        self.banned: set[int] = set()
+        self._n_planned = 0
+
+    def clear(self) -> None:
+        """Forget what is in the graph (not the pixels, not the bans)."""
+        self.rows["factor"][:] = OUTSIDE
+        self.keyframes = set()
+        self._n_planned = 0
+
+    def plan(
+        self,
+        submap: Submap,
+        poses: Mapping[int, FloatArray],
+        xyz_mu: FloatArray,
+        caution: float = 1.0,
+        strict: bool = True,
+        suspects: IntArray | None = None,
+    ) -> Plan:
+        """Compare the submap with the graph; nothing changes until `commit`.
+
+        Parameters
+        ----------
+        submap : Submap
+        poses : mapping of int to (4, 4)
+            ``T_submap_kf`` to judge by (normally the submap's).
+        xyz_mu : (L, 3)
+            Points to judge by (normally the submap's).
+        caution : float
+            Above 1 landmarks are asked for that much more certainty.
+        strict : bool
+            Hold the observations of new landmarks to `GraphConfig.enter_sigmas`; False before a batch optimisation.
+        suspects : (S,) int64, optional
+            Landmarks to look at again although nothing of theirs changed.
+        """
+        self._take_new_rows(submap)
+        obs = submap.observations
+        kf, lm, alive = obs["kf"], obs["landmark"], obs["alive"]
+        n_landmarks = len(submap.landmarks)
+        inside = self.rows["factor"] >= 0
+        died = inside & ~alive
+        # A landmark is looked at again where it got an observation (touched) or lost one.
+        fresh = self._n_planned + np.flatnonzero(alive[self._n_planned :])
+        touched = take_mask(lm[fresh], n_landmarks)
+        lost = take_mask(lm[died], n_landmarks)
+        if suspects is not None:
+            lost[suspects] = True
+        if self._n_planned:
+            self.banned.difference_update(lm[fresh].tolist())
+        known = take_mask(lm[inside], n_landmarks)
+        allowed = touched.copy()
+        allowed[list(self.banned)] = False
+        row = np.flatnonzero(alive & np.where(inside, lost[lm], allowed[lm]))
+        gate = np.where(known | (not strict), self._config.insert_sigmas, self._config.enter_sigmas)
+        fits, certain = self._judge(submap, poses, xyz_mu, row, inside, known, known & ~lost, gate, caution)
+
+        leaving = died | (inside & known[lm] & ~certain[lm] & lost[lm])
+        candidate = ~inside[row]
+        entering = np.zeros(len(lm), bool)
+        entering[row[candidate & fits & certain[lm[row]]]] = True
+        refused = row[candidate & ~fits]
+        leaving[row[~candidate & ~fits]] = True  # behind the camera after all: such a factor has no derivative
+        new_landmarks = np.flatnonzero(take_mask(lm[entering], n_landmarks) & ~known)
+
+        live = np.array(sorted(submap.keyframes), np.int64)
+        here = np.array(sorted(self.keyframes), np.int64)
+        weak = self._weak_keyframes((inside & ~leaving) | entering, kf, lm, live)
+        return Plan(
+            np.flatnonzero(entering),
+            np.flatnonzero(leaving),
+            refused,
+            new_landmarks,
+            np.setdiff1d(live, here, assume_unique=True),
+            np.setdiff1d(here, live, assume_unique=True),
+            weak,
+        )
+
+    def commit(self, plan: Plan, factor_of_entering: IntArray) -> None:
+        """Take over that the solver has accepted a plan, and the factor indices that it gave."""
+        self.rows["factor"][plan.leaving] = OUTSIDE
+        self.rows["factor"][plan.entering] = factor_of_entering
+        self.keyframes.update(plan.new_keyframes.tolist())
+        self.keyframes.difference_update(plan.gone_keyframes.tolist())
+        self._n_planned = len(self.rows)
+
+    def _take_new_rows(self, submap: Submap) -> None:
+        obs, n = submap.observations, len(self.rows)
+        if len(obs) == n:
+            return
+        self.rows.append(len(obs) - n, factor=OUTSIDE)
+        alive = n + np.flatnonzero(obs["alive"][n:])
+        self.rows["uv_px"][alive], self.rows["sigma_px"][alive] = submap.observed_pixels(alive)
+
+    def _judge(
+        self,
+        submap: Submap,
+        poses: Mapping[int, FloatArray],
+        xyz_mu: FloatArray,
+        row: IntArray,
+        inside: BoolArray,
+        known: BoolArray,
+        trusted: BoolArray,
+        gate_sigmas: FloatArray,
+        caution: float,
+    ) -> tuple[BoolArray, BoolArray]:
+        """Return which of the rows fit, and which landmarks are certain enough (`trusted` ones are not asked)."""
+        ids, pose = np.unique(submap.observations["kf"][row], return_inverse=True)
+        T = np.array([poses[k] for k in ids.tolist()]).reshape(-1, 4, 4)
+        point = submap.observations["landmark"][row]
+        sigma = self.rows["sigma_px"][row]
+        res = compute_residuals(submap.K, T, pose, xyz_mu[point], self.rows["uv_px"][row], sigma)
+        fits = np.where(inside[row], res.depth_mu > MIN_DEPTH_MU, res.chi2 < gate_sigmas[point] ** 2)
+        asked = fits & ~trusted[point]
+        certain = trusted.copy()
+        names, index = np.unique(point[asked], return_inverse=True)
+        sigmas = compute_depth_sigmas(submap.K, T, pose[asked], res.xyz_cam[asked], sigma[asked], index, len(names))
+        limit = self._config.max_depth_sigma / caution * np.where(known[names], LEAVE_RATIO, 1.0)
+        # Two views of a point fit whatever the poses are along their epipolar lines: it is the third that has a say.
+        n_views = np.bincount(index, minlength=len(names))
+        young = len(submap.keyframes) <= self._config.young_keyframes
+        enough = n_views >= np.where(known[names] | young, 2, self._config.min_views)
+        certain[names] = (sigmas < limit) & enough
+        return fits, certain
+
+    def _weak_keyframes(self, inside: BoolArray, kf: IntArray, lm: IntArray, live: IntArray) -> IntArray:
+        # A landmark of two views ties its two keyframes up to scale only: it takes a third to hold one of them.
+        k, j = kf[inside], lm[inside]
+        held = np.bincount(j)[j] >= 3 if len(j) else np.zeros(0, bool)
+        ties = np.bincount(k[held], minlength=int(live.max(initial=0)) + 1)
+        return live[ties[live] < self._config.min_ties]

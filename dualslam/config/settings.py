@@ -1,0 +1,397 @@
+"""Every setting of a run, with its meaning: strict pydantic models, read from and written to YAML."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from dualslam.config.calibration_config import CalibrationConfig
+from dualslam.config.corruption import Corruption
+from dualslam.config.strict_model import StrictModel as StrictModel  # part of this module, too
+
+
+class FrontendConfig(StrictModel):
+    """Features and their comparison."""
+
+    name: str = "orb"
+    """Which front end: `orb`, `sift`, `gms`, `kornia` (an extra), or one that another package offers as an entry point
+    of `dualslam.frontends`; or `module:Class`, of what can be imported."""
+    n_features: int = Field(1000, ge=50, le=20000)
+    """Keypoints per image."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """Settings of the chosen front end alone; it checks their names itself."""
+
+
+class CameraConfig(StrictModel):
+    """What is known of the camera beyond its calibration file."""
+
+    model_sigma_px: float = Field(0.8, ge=0)
+    """Error of the camera model itself at a pixel (one sigma), beside the noise of the features: chequerboard
+    calibrations and rectified data sets are off by half a pixel to a pixel towards the rim of the image."""
+    readout_s: float | None = Field(None, ge=0, le=0.1)
+    """Time between reading the first and the last row of an image: 0 for a global shutter, about 0.03 for webcams and
+    the first Kinect. None: the frames in which there is no map are asked for it, and where one that
+    rolls is likely, no map starts from a fast turn until it is known."""
+    readout_evidence: float = Field(144.0, gt=0)
+    """Chi-square by which a rolling shutter must explain frames better than a global one, or a global one better than
+    0.02 s, to be known: three sigmas, with errors four times what they seem, as neighbouring pixels err alike."""
+
+
+class InitialiserConfig(StrictModel):
+    """How a submap starts: two views, a first bundle adjustment, and a check after it."""
+
+    matching: Literal["ratio", "gms"] = "ratio"
+    """How the two views are matched: by the front end's own wide matching, or by grid-based motion statistics, which
+    any front end with binary descriptors supports (`orb` with `gms` is the paper's Dual-SLAM+)."""
+    min_matches: int = Field(60, ge=20)
+    """Matches between the two views below which no model is tried."""
+    min_points: int = Field(50, ge=15)
+    """Triangulated points that must survive the first bundle adjustment."""
+    min_parallax_deg: float = Field(1.0, gt=0)
+    """Angle under which the two cameras must see half as many points as `min_points`, after the rotation is taken out.
+    However many more are far away: on a road most are, and the near ones fix the motion."""
+    max_direction_sigma_deg: float = Field(1.5, gt=0)
+    """Largest standard deviation (from the bundle adjustment's Hessian) of the direction of translation."""
+    max_chi2: float = Field(2.5, gt=0)
+    """Mean squared whitened residual per degree of freedom after the bundle adjustment (1 is expected)."""
+    min_support: float = Field(0.6, gt=0, le=1)
+    """Share of the points that the frames between the two views must confirm by their own pixels."""
+    homography_ratio: float = Field(0.45, gt=0, lt=1)
+    """Share of the homography's score in both models' above which the scene is planar, or the motion as a turn."""
+    max_views: int = Field(120, ge=5)
+    """How many recent frames are kept as possible first views."""
+
+
+class TrackingConfig(StrictModel):
+    """Pose of each frame against the submap."""
+
+    search_radius_px: float = Field(15.0, gt=0)
+    """Search radius about a landmark's predicted pixel, at the finest octave, when the motion model is trusted."""
+    local_radius_px: float = Field(4.0, gt=0)
+    """The same for the landmarks of the local map, after a first pose is found."""
+    min_inliers: int = Field(20, ge=6)
+    """Landmarks that must agree with a pose for it to be taken at all."""
+    local_keyframes: int = Field(20, ge=2)
+    """Covisible keyframes whose landmarks make the local map."""
+    wide_keyframes: int = Field(3, ge=1)
+    """Recent keyframes that are tried by wide matching and PnP when guided matching fails."""
+    max_gap_scale_sigma: float = Field(0.025, gt=0)
+    """Largest standard deviation (relative) of the scale beyond a gap over which wide matching has skipped, unless the
+    step is small against the depth of the scene: all that is mapped beyond inherits the error, and 5 %, two of these,
+    is a wrong link. Where it is larger the frame counts as lost."""
+    max_lost_frames: int = Field(8, ge=0)
+    """Frames in a row that wide matching may fail on before the submap is given up."""
+
+
+class KeyframeConfig(StrictModel):
+    """When a frame becomes a keyframe."""
+
+    max_tracked_ratio: float = Field(0.6, gt=0, le=1)
+    """A keyframe is due when fewer than this share of the last keyframe's landmarks is still tracked."""
+    min_parallax_deg: float = Field(0.5, ge=0)
+    """...and the camera has moved enough to see the scene's median depth under this angle (or tracking is weak)."""
+    max_parallax_deg: float = Field(4.0, gt=0)
+    """Parallax at which a keyframe is due whatever is tracked."""
+    max_frames: int = Field(30, ge=1)
+    """Frames after which a keyframe is due if the camera moved at all."""
+    weak_landmarks: int = Field(60, ge=10)
+    """Tracked landmarks below which tracking is weak and a keyframe is due at once."""
+
+
+class MappingConfig(StrictModel):
+    """New landmarks at a keyframe, and what is culled."""
+
+    triangulate_against: int = Field(6, ge=1)
+    """Older keyframes that a new keyframe is paired with."""
+    min_parallax_deg: float = Field(1.0, gt=0)
+    """Smallest angle between the two rays of a new landmark."""
+    reprojection_chi2: float = Field(5.991, gt=0)
+    """Gate of a new landmark's squared whitened residual in each view: chi-square, 2 degrees of freedom, 95 %."""
+    max_observations: int = Field(250, ge=50)
+    """Known landmarks that a keyframe holds on to, spread over its image: more make the solver slower, not better."""
+    min_found_ratio: float = Field(0.25, ge=0, le=1)
+    """A young landmark that tracking finds in fewer of the frames that should see it is culled."""
+    min_observations: int = Field(3, ge=2)
+    """Keyframes that must see a landmark by the time that two more keyframes have come."""
+    redundant_ratio: float = Field(0.9, gt=0, le=1)
+    """A keyframe of whose landmarks this share is seen by three others at the same or a finer scale is culled."""
+
+
+class HealthConfig(StrictModel):
+    """When a tracked frame counts as explained by the map."""
+
+    min_inliers: int = Field(25, ge=6)
+    """Landmarks that must agree with the frame's pose."""
+    min_inlier_ratio: float = Field(0.35, ge=0, le=1)
+    """Share of the matched landmarks that must agree."""
+    max_chi2: float = Field(2.5, gt=0)
+    """Mean squared whitened residual per degree of freedom of the agreeing landmarks (1 is expected)."""
+    majority: float = Field(0.5, ge=0, le=1)
+    """Early sign: share of the matches below which those that disagree could hold another pose."""
+    jump_chi2: float = Field(27.856, gt=0)
+    """Early sign: squared Mahalanobis distance of a pose from the motion model's, under the pose's covariance and the
+    motion model's own error as the last frames show it, above its level there: chi-square, 6 degrees of freedom,
+    99.99 % (what drivers and hands do has heavier tails than a Gaussian)."""
+    sign_sigmas: float = Field(3.09, gt=0)
+    """Early sign: standard deviations of a chi-square over its degrees of freedom, above its level as a rule
+    (one-sided 99.9 %)."""
+    max_keyframe_chi2: float = Field(2.0, gt=0)
+    """Early sign: chi-square of the graph's newest factors over its degrees of freedom, relative to that level. They
+    hold outliers that no one has sorted out yet, and no quantile is known for them."""
+    max_refused: float = Field(0.5, ge=0, le=1)
+    """Share of a new keyframe's matches that its graph may refuse: where the map contradicts the majority, the pose
+    is wrong, and the keyframe is taken out again before the map grows about it. 1 lets every pose in."""
+    level_frames: int = Field(60, ge=10)
+    """Healthy frames on which the level of the chi-square and the error of the motion model are measured."""
+    sign_weight: int = Field(4, ge=1)
+    """Healthy frames that outweigh one with a sign: the stretch in which the signs outweigh, up to the loss, is
+    suspected to be corrupted. Signs on up to one healthy frame in five then add up to nothing."""
+
+
+class AttemptConfig(StrictModel):
+    """One attempt at a recovery: where its walk back takes the poses from. It may be written as one word, which is
+    `live`, `gap` (`{frontend: sift, tracking: live}`) or a front end's name.
+    """
+
+    frontend: str = "live"
+    """`live`: the live features, guided by the motion model in reverse. Or a front end by its name: features of its
+    own, found in the buffered images, pose the frames by PnP from one to the next, and leap those that cannot be used.
+    Landmarks, and what is compared when linking, are made of the live features in either case."""
+    tracking: Literal["own", "live"] = "own"
+    """Whether that front end poses every frame, so that the attempt does not depend on the live features, or only the
+    leaps and what comes after them until the live features can take over, which is several times as fast."""
+    n_features: int = Field(2000, ge=50, le=20000)
+    """Keypoints per image of that front end."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """Settings of that front end alone."""
+
+    @property
+    def is_live(self) -> bool:
+        """Whether it walks on the live features alone."""
+        return self.frontend == "live"
+
+    @property
+    def name(self) -> str:
+        """What events call it."""
+        return self.frontend if self.tracking == "own" else f"gap ({self.frontend})"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_word(cls, value: Any) -> Any:
+        if value == "gap":
+            return {"frontend": "sift", "tracking": "live"}
+        return {"frontend": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _settings_have_an_owner(self) -> AttemptConfig:
+        if self.is_live and self != AttemptConfig.model_construct():
+            raise ValueError("`live` has no settings of its own: it is the front end that the section `frontend` sets")
+        return self
+
+
+class RecoveryConfig(StrictModel):
+    """The walk back in time that joins a new submap to the one that was lost."""
+
+    enabled: bool = True
+    """Off: a lost track ends the submap, and the next one stays apart from it."""
+    max_gap_frames: int = Field(30, ge=0)
+    """Frames in a row that the walk may leap, because none of its keyframes can be matched in them. A walk that
+    links no map, but poses the frames before a start, goes on to the end of the buffer."""
+    attempts: tuple[AttemptConfig, ...] = Field(
+        (AttemptConfig(frontend="sift", tracking="live"), AttemptConfig(), AttemptConfig(frontend="sift")), min_length=1
+    )
+    """In this order, each from the same snapshot of the new map, until one leads to a link. A list of words will do,
+    such as `[live, gap, sift]`; an attempt with settings is written `{frontend: sift, n_features: 3000}`."""
+    max_gap_scale_sigma: float = Field(0.05, gt=0)
+    """Largest standard deviation (relative) of the scale beyond a gap, by the Hessian of its wide matches. Twice what
+    a link may have (`linking.max_live_scale_sigma`, by which the walk is judged in the end): the landmarks that are
+    found again beyond the gap halve it, if the gap relocalisation is right."""
+    relocalise_after: int | None = Field(15, ge=0)
+    """Frames that show something without a start, after which a lost map is looked for, and gone on with where it is
+    seen again; null: never. A map that starts sooner is better linked, by all that a walk back finds: most start within
+    2 to 5 frames, unless the camera turns in place, and then it may come back to what the lost map shows before any
+    can start."""
+    retry_keyframes: tuple[int, ...] = (5, 15)
+    """Keyframes of the new map, from its start on, at which a walk back that has found no link, or left buffered frames
+    without a pose, is made again: the map knows depths better then, and more of the scene. It is too when the camera
+    has been calibrated since, and, if any number stands here, when the run ends and the map has grown since. One for
+    poses alone that finds none is the last."""
+    covering_keyframes: int = Field(20, ge=0)
+    """Keyframes that a walk which only poses frames, or a search for a lost map, matches widely at most, beyond those
+    nearest in time (`tracking.wide_keyframes`): the ones that together show the most of the map, since in a gap the
+    camera may have looked anywhere. Each costs about 2 ms of CPU for a frame that is not found."""
+    min_shared_keyframes: int = Field(4, ge=2)
+    """Keyframes that both maps must hold before a link is tried."""
+    max_shared_keyframes: int = Field(40, ge=4)
+    """Healthy keyframes of a lost map that a walk holds when its last try to link them is made: ten times what a link
+    must stand on. A walk that fits none of so many is bent, and going on bends it further."""
+    workers: int = Field(0, ge=0, le=16)
+    """Processes in which walks back run beside the tracking, which never waits for them (`--workers`). 0: inline, in
+    the tracking process, which waits: the only way in which the same seed gives the same trajectory."""
+    time_limit_s: float = Field(120.0, gt=0)
+    """Time after which a worker counts as hung, and its recovery as failed. A walk over a full buffer of 10 s takes
+    about a tenth of it on a free core."""
+    finish_wait_s: float = Field(30.0, ge=0)
+    """How long the end of the run waits for walks that are still under way."""
+
+
+class BufferConfig(StrictModel):
+    """The frames that a walk back in time can still read."""
+
+    duration_s: float = Field(10.0, gt=0)
+    """Seconds of video that are kept (the paper's k) while there is a map to track; before it and after it, all is."""
+    max_mb: float = Field(256.0, gt=0)
+    """Hard bound on the memory of the kept features and images, mebibytes. Ten seconds of KITTI are 56, of 640 x 480 at
+    30 Hz 120. A long loss reaches it; then images are packed, and the stretch between the frames before the loss and
+    the newest ones thins out: first its images, then its frames. A bound too small for the rest costs the oldest."""
+
+
+class GraphConfig(StrictModel):
+    """The factor graph of a submap and its solver."""
+
+    robust_k: float = Field(0.8, gt=0)
+    """Huber threshold in sigmas: 1.345 keeps 95 % efficiency under Gaussian noise, 0.8 does where residuals are at
+    `least_noise` of their sigmas, and 88 % where the sigmas are right."""
+    outlier_chi2: float = Field(9.210, gt=0)
+    """Squared residual, in the residuals' own variance, above which an observation is an outlier: chi-square, 2 degrees
+    of freedom, 99 %, since what is dropped here is dropped for good."""
+    least_noise: float = Field(0.6, gt=0, le=1)
+    """Standard deviation, in the pixels' sigmas, that gates take residuals to have at least. Landmarks of four views
+    and more have 0.25 to 0.5 (the error of a lens model is much the same in neighbouring views), those of fewer, seen
+    from further apart, some more. 1: gates are never tighter than the pixels' sigmas."""
+    max_keyframes: int = Field(150, ge=20, le=1000)
+    """Keyframes at which a submap rolls over into the next: an update's cost grows with the map (on a road 65 ms on
+    average with this cap, 140 ms without), and the solver's Cholesky rejects chains of more than about 1,000."""
+    rollover_keyframes: int = Field(12, ge=3, le=19)
+    """Keyframes that a submap shares with the one that it rolls over into."""
+    max_depth_sigma: float = Field(0.25, gt=0)
+    """A landmark enters the graph once its views fix its distance to this relative standard deviation (0.25 is about
+    half a degree of parallax at 1 px and a focal length of 700 px); it leaves at twice that."""
+    min_views: int = Field(3, ge=2)
+    """Keyframes that must see a landmark before it enters the graph: two views fit almost any pair of poses."""
+    young_keyframes: int = Field(5, ge=2)
+    """Up to so many keyframes two views are enough, or there would be no graph to start with."""
+    enter_sigmas: float = Field(6.0, gt=0)
+    """Observations of a landmark that is new to the graph must fit within so many sigmas: two views of which one is
+    wrong throw their point behind a camera, and the solver fails."""
+    insert_sigmas: float = Field(25.0, gt=0)
+    """Observations of a landmark that is in the graph are refused only beyond this; the robust kernel has the rest."""
+    min_ties: int = Field(6, ge=3)
+    """Keyframes tied to the graph by fewer landmarks are held at their pose by a loose prior, until they have more."""
+    read_window: int = Field(20, ge=0)
+    """Keyframes (the last inserted ones, and their landmarks) whose estimate is read after each update; 0 reads all."""
+    read_all_every: int = Field(10, ge=1)
+    """Each so-many-th update reads the whole estimate."""
+    extra_iterations: int = Field(0, ge=0, le=10)
+    """Further Gauss-Newton steps of the incremental solver at each update, of which a keyframe has two: one poses it by
+    its matches, one takes in what was then mapped from there."""
+    rebuild_inlier_ratio: float = Field(0.65, ge=0, le=1)
+    """Share of a keyframe's matches that must agree with its pose, or the graph is made anew in batch: the incremental
+    estimate has then fallen behind its optimum, and good observations would be dropped as outliers."""
+    rebuild_spacing: int = Field(8, ge=1)
+    """Keyframes at least between two such batches."""
+    rebuild_iterations: int = Field(8, ge=1)
+    """Batch iterations at most when a graph is made anew."""
+    merge_iterations: int = Field(2, ge=1)
+    """The same when the parts of a submap are solved already, and tracking waits: merging what a walk back found (39
+    keyframes of KITTI 03) two reach the cost of eight to 0.4 %, in half the time."""
+
+
+class LinkingConfig(StrictModel):
+    """When two submaps that saw the same frames are linked by a similarity.
+
+    A wrong link is one that is off by more than 5 % in scale, 3 degrees or 5 % in position: the bounds on sigmas below
+    are a third of that.
+    """
+
+    deformation_sigma: float = Field(0.01, gt=0, le=0.1)
+    """Relative deformation (standard deviation: drift in scale, bending in radians) that two healthy maps may have
+    against each other over the length of their overlap, beyond their pixels' noise. It is the noise model of all gates
+    that compare parts of the maps with each other."""
+    gate_sigmas: float = Field(3.0, gt=0)
+    """Standard deviations at which such a comparison fails."""
+    pair_chi2: float = Field(11.345, gt=0)
+    """Gate of a matched pair's squared Mahalanobis distance: chi-square, 3 degrees of freedom, 99 %."""
+    pixel_chi2: float = Field(9.210, gt=0)
+    """Gate of a squared whitened reprojection residual: chi-square, 2 degrees of freedom, 99 %."""
+    strain_chi2: float = Field(20.515, gt=0)
+    """Gate of the stretching and shearing between the maps: chi-square, 5 degrees of freedom, 99.9 %."""
+    min_majority: float = Field(0.5, gt=0, lt=1)
+    """Share of the matched landmarks (over all, in a keyframe, in a map's own pixels) that must agree. Below a half
+    the pairs that disagree could hold a second similarity with more support."""
+    min_inliers: int = Field(20, ge=6)
+    """Matched landmarks that must agree."""
+    min_keyframes: int = Field(4, ge=2)
+    """Shared keyframes older than the suspected onset of corruption that must agree one by one. A rigid corrupted tail
+    passes every other gate: two keyframes fix it, so evidence starts with the third."""
+    min_pairs_per_keyframe: int = Field(8, ge=4)
+    """Matched landmarks that a keyframe must hold to have a say (four fix a similarity with one to spare)."""
+    max_misfits: int = Field(1, ge=0)
+    """Keyframes in a row that may disagree before this counts as a change point: one can be wrong by itself."""
+    descriptor_radius_px: float = Field(3.0, gt=0)
+    """Distance in the same image within which two keypoints can be the same point: the detector's own scatter."""
+    min_ties: int = Field(10, ge=3)
+    """Landmarks that keyframes on both sides of a place in the old map must see in agreement with their pixels; with
+    fewer the old map is broken there, and what is newer counts as suspected."""
+    tie_window: int = Field(5, ge=1)
+    """Keyframes on either side that are searched for ties."""
+    look_back: int = Field(10, ge=0)
+    """Keyframes of the old map, older than the oldest shared one, among which a break is still looked for."""
+    min_image_spread: float = Field(0.25, ge=0, le=1)
+    """Share of the image, along either axis, that the agreeing landmarks must cover (5 % to 95 % of them, against the
+    keypoints of the same keyframes)."""
+    min_depth_spread: float = Field(0.05, ge=0)
+    """Relative difference between near (10 %) and far (90 %) agreeing landmarks' depths in the shared keyframes: less
+    than triangulation itself scatters is a single depth, which cannot tell scale from motion along the axis."""
+    max_scale: float = Field(50.0, gt=1)
+    """Largest scale, and inverse of the smallest: submaps start with a median depth of 1, so that the scale is the
+    ratio of the depths at their starts."""
+    max_scale_sigma: float = Field(0.0167, gt=0)
+    """Largest standard deviation of the scale (relative)."""
+    max_live_scale_sigma: float = Field(0.025, gt=0)
+    """The same at the new map's live end, with what the walk back has lost of the scale on the way from there to the
+    overlap: as for a gap relocalisation (`recovery.max_gap_scale_sigma`), 5 %, two of these, is a wrong link."""
+    max_live_rotation_deg: float = Field(1.5, gt=0)
+    """Rotation by which the new map would bend, on the way from the overlap to its live end, under the camera that its
+    pixels ask for. Twice that, 3 degrees, is a wrong link."""
+    max_rotation_sigma_deg: float = Field(1.0, gt=0)
+    """Largest standard deviation of the rotation about any axis."""
+    max_position_sigma: float = Field(0.0167, gt=0)
+    """Largest standard deviation of the position of the matched landmarks' centre, relative to their median depth."""
+    max_hypotheses: int = Field(512, ge=16)
+    """Triplets that RANSAC draws at most."""
+
+
+class FusionConfig(StrictModel):
+    """How the overlap of two linked maps is refined."""
+
+    overlap_keyframes: int = Field(10, ge=0)
+    """Keyframes of the old map's healthy end that the new map takes in as observations, beside those that it holds:
+    half of what a frame's local map joins, so that the two overlap by as much as neighbouring frames do. 0 leaves the
+    overlap as the link found it."""
+    max_shift_chi2: float = Field(24.322, gt=0)
+    """Squared Mahalanobis distance of the link estimated again on the refined overlap from the first one, above which
+    neither is believed: chi-square, 7 degrees of freedom, 99.9 %."""
+
+
+class Config(StrictModel):
+    """The root of the configuration."""
+
+    seed: int = Field(0, ge=0, le=2**64 - 1)
+    """Seed of every random choice of the run; the solvers take 64 bits."""
+    frontend: FrontendConfig = FrontendConfig()
+    camera: CameraConfig = CameraConfig()
+    initialiser: InitialiserConfig = InitialiserConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    keyframes: KeyframeConfig = KeyframeConfig()
+    mapping: MappingConfig = MappingConfig()
+    health: HealthConfig = HealthConfig()
+    buffer: BufferConfig = BufferConfig()
+    recovery: RecoveryConfig = RecoveryConfig()
+    graph: GraphConfig = GraphConfig()
+    linking: LinkingConfig = LinkingConfig()
+    fusion: FusionConfig = FusionConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
+    corruptions: tuple[Corruption, ...] = ()
+    """What the failure lab does to the run on purpose, for example [{kind: blackout, start: 100, length: 10}]."""

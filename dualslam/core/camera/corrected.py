@@ -1,0 +1,189 @@
+"""A camera with a small correction after its own rectification: what self-calibration finds."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from dualslam.core.camera.models import Camera, camera_from_dict
+from dualslam.core.errors import InputError
+from dualslam.core.geometry import distortion
+from dualslam.core.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class LensCorrection:
+    """How a camera differs from the calibration that was given.
+
+    A ray (x, y, 1) is seen, in the rectified pixels of the given camera, at ``K diag(e^a, e^a, 1) (x_d, y_d, 1)``
+    moved by (du, dv), where ``(x_d, y_d) = (x, y) (1 + k1 r^2 + k2 r^4)``.
+
+    Attributes
+    ----------
+    log_focal : float
+        a, of both focal lengths.
+    du_px, dv_px : float
+        Of the principal point.
+    k1, k2 : float
+        Radial distortion that the given model has left.
+    """
+
+    log_focal: float = 0.0
+    du_px: float = 0.0
+    dv_px: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
+
+    @property
+    def vector(self) -> FloatArray:
+        """(5,) in the order of the attributes."""
+        return np.array(dataclasses.astuple(self))
+
+    @classmethod
+    def of_vector(cls, vector: FloatArray) -> LensCorrection:
+        """Return the correction whose `vector` this is."""
+        return cls(*(float(v) for v in vector))
+
+    def intrinsics(self, K: FloatArray) -> FloatArray:
+        """Return the (3, 3) intrinsics of the corrected camera, given those of the camera that was given."""
+        zoom = math.exp(self.log_focal)
+        corrected = K.copy()
+        corrected[0, 0] *= zoom
+        corrected[1, 1] *= zoom
+        corrected[0, 2] += self.du_px
+        corrected[1, 2] += self.dv_px
+        return corrected
+
+    def distort_px(self, K: FloatArray, xy: FloatArray) -> FloatArray:
+        """Return where rays (x, y, 1) of an (N, 2) array are seen, in the given camera's rectified pixels (N, 2)."""
+        moved = self.intrinsics(K)
+        bent = distortion.distort_radtan(xy, (self.k1, self.k2), 0.0, 0.0)
+        return np.asarray(bent * (moved[0, 0], moved[1, 1]) + moved[:2, 2], np.float64)
+
+
+@dataclass(frozen=True)
+class CorrectedCamera(Camera):
+    """A camera whose rectified pixels are those of another, corrected. Made by `correct`.
+
+    Attributes
+    ----------
+    base : Camera
+        As it was given; `width` to `cy` are its own.
+    correction : LensCorrection
+    """
+
+    model: ClassVar[str] = "corrected"
+
+    base: Camera = None  # type: ignore[assignment]  # dataclass inheritance wants a default
+    correction: LensCorrection = LensCorrection()
+
+    @classmethod
+    def of(cls, base: Camera, correction: LensCorrection) -> CorrectedCamera:
+        """Correct a camera.
+
+        Raises
+        ------
+        InputError
+            If the correction has no inverse somewhere in the image.
+        """
+        return cls(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base, correction)
+
+    @property
+    def K(self) -> FloatArray:
+        """(3, 3) intrinsics of the rectified pixels."""
+        return self.correction.intrinsics(self.base.K)
+
+    @property
+    def corners_matter(self) -> bool:  # type: ignore[override]
+        """As in the camera that was given."""
+        return self.base.corners_matter
+
+    def validate(self) -> None:
+        """Check the correction: every pixel that the given camera rectifies must have a corrected one."""
+        if not np.isfinite(self.correction.vector).all():
+            raise InputError(f"camera: the correction is not finite: {self.correction}")
+        rectified, _ = self.base.rectify(self._border())
+        known = np.isfinite(rectified).all(1)
+        lost = ~np.isfinite(self._correct_shutter(rectified[known])[0]).all(1)
+        if lost.any():
+            u, v = self._border()[known][int(np.argmax(lost))]
+            raise InputError(f"camera: the correction has no inverse at pixel ({u:.0f}, {v:.0f})")
+
+    def rectify(self, uv: Any) -> tuple[FloatArray, FloatArray]:
+        """Take raw pixels to rectified ones: see `Camera.rectify`."""
+        rectified, magnification = self.base.rectify(uv)
+        xy, ratio = self._correct_shutter(rectified)
+        K = self.K
+        return xy * (K[0, 0], K[1, 1]) + K[:2, 2], magnification / np.sqrt(np.where(ratio > 0, ratio, np.nan))
+
+    def scaled(self, factor: float) -> Self:
+        """Return the camera of the image resized by `factor`."""
+        base = self.base.scaled(factor)
+        moved = dataclasses.replace(
+            self.correction,
+            du_px=self.correction.du_px * base.width / self.width,
+            dv_px=self.correction.dv_px * base.height / self.height,
+        )
+        return type(self)(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base, moved)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers and names, for YAML or JSON."""
+        return {
+            "model": self.model,
+            "base": self.base.to_dict(),
+            "correction": dataclasses.asdict(self.correction),
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Return the camera of what `to_dict` gave."""
+        try:
+            base, correction = camera_from_dict(values["base"]), LensCorrection(**values["correction"])
+        except (KeyError, TypeError) as error:
+            raise InputError(f"camera: a corrected camera needs 'base' and 'correction': {error}") from error
+        return cls(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base, correction)
+
+    def _correct_shutter(self, rectified: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return true normalised coordinates (N, 2) of the base's rectified pixels, and the area ratio (N,)."""
+        K, k = self.K, (self.correction.k1, self.correction.k2)
+        xy = distortion.undistort_radtan((rectified - K[:2, 2]) / (K[0, 0], K[1, 1]), k, 0.0, 0.0)
+        J = distortion.radtan_jacobian(xy, k, 0.0, 0.0)
+        return xy, np.asarray(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0], np.float64)
+
+    def _distort(self, p_cam: FloatArray) -> FloatArray:
+        xy = p_cam[:, :2] / np.where(p_cam[:, 2] > 0, p_cam[:, 2], np.nan)[:, None]
+        k = (self.correction.k1, self.correction.k2)
+        xy = np.where(((xy * xy).sum(1) < distortion.radial_limit(k) ** 2)[:, None], xy, np.nan)
+        base = self.base.K
+        plane = (self.correction.distort_px(base, xy) - base[:2, 2]) / (base[0, 0], base[1, 1])
+        return self.base._distort(np.concatenate([plane, np.ones((len(plane), 1))], 1))
+
+    def _undistort(self, xy_distorted: FloatArray) -> FloatArray:
+        rays = self.base._undistort(xy_distorted)
+        base = self.base.K
+        plane = rays[:, :2] / np.where(rays[:, 2] > 0, rays[:, 2], np.nan)[:, None]
+        xy, _ = self._correct_shutter(plane * (base[0, 0], base[1, 1]) + base[:2, 2])
+        return np.concatenate([xy, np.ones((len(xy), 1))], 1)
+
+    def _area_ratio(self, xy: FloatArray) -> FloatArray:
+        raise NotImplementedError("a corrected camera overrides rectify(), which is all that would ask")
+
+
+def correct(camera: Camera, correction: LensCorrection) -> CorrectedCamera:
+    """Return `camera` with a correction to the calibration that was given (one that it has already is replaced)."""
+    return CorrectedCamera.of(given_camera(camera), correction)
+
+
+def given_camera(camera: Camera) -> Camera:
+    """Return the camera without its correction, if it has one."""
+    return camera.base if isinstance(camera, CorrectedCamera) else camera
+
+
+def correction_of(camera: Camera) -> LensCorrection:
+    """Return the correction that a camera has: none, unless it is a `CorrectedCamera`."""
+    return camera.correction if isinstance(camera, CorrectedCamera) else LensCorrection()

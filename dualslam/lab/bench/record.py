@@ -1,0 +1,215 @@
+"""The one line that a trial leaves: what was measured, whatever came of it; and the verdict on it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from enum import StrEnum
+from typing import Any
+
+from dualslam.core.types import FrameStatus
+from dualslam.lab.bench.plan import Trial
+from dualslam.lab.bench.spec import Thresholds
+
+STATUS_LETTERS = {
+    FrameStatus.INITIALISING: "i",
+    FrameStatus.TRACKED: "t",
+    FrameStatus.LOST: "l",
+    FrameStatus.RECOVERED: "r",
+    FrameStatus.BYPASSED: "b",
+    FrameStatus.DROPPED: "d",
+    FrameStatus.UNREADABLE: "u",
+}
+
+
+class TrialOutcome(StrEnum):
+    """How a trial ended."""
+
+    DONE = "done"
+    CRASHED = "crashed"  # an exception, or the death of its process
+    TIMED_OUT = "timed_out"
+
+
+class FailureKind(StrEnum):
+    """Why a trial has failed."""
+
+    CRASHED = "crashed"
+    TIMED_OUT = "timed out"
+    NO_MAP = "no map"
+    COVERAGE = "coverage"
+    ATE = "error"
+    WRONG_LINK = "wrong link"
+
+
+@dataclass(frozen=True, slots=True)
+class Breakage:
+    """A map that was lost, and what came of it.
+
+    Attributes
+    ----------
+    frame : int
+        Where the track was given up.
+    submap : int
+    reason : str
+    restart_frames : int or None
+        Frames of the source until the next map was initialised; None where none was.
+    restart_s : float or None
+        The same in seconds of the source.
+    attempts : int
+        Attempts at recovery that were made.
+    succeeded_at : int or None
+        The attempt that linked the map, from 1.
+    recovery_s : float or None
+        Seconds that the recovery took.
+    relocalised : bool
+        Whether the map was seen again before another had started, and gone on with.
+    """
+
+    frame: int
+    submap: int
+    reason: str
+    restart_frames: int | None = None
+    restart_s: float | None = None
+    attempts: int = 0
+    succeeded_at: int | None = None
+    recovery_s: float | None = None
+    relocalised: bool = False
+
+    @property
+    def recovered(self) -> bool:
+        """Whether it is part of what was mapped after it."""
+        return self.relocalised or self.succeeded_at is not None
+
+
+@dataclass(frozen=True, slots=True)
+class LinkError:
+    """An accepted link against the truth: relative, degrees, relative."""
+
+    scale: float
+    rotation_deg: float
+    position: float
+
+
+@dataclass(frozen=True, slots=True)
+class TrialRecord:
+    """A line of ``trials.jsonl``.
+
+    Attributes
+    ----------
+    key, fingerprint : str
+        Of the trial.
+    sequence, condition, variant : str
+    number : int
+    start : int
+        First frame.
+    outcome : TrialOutcome
+    error : str
+        What went wrong, if the trial did not end well.
+    status : str
+        A letter for each frame that came, of `STATUS_LETTERS`; a capital where the frame is in the main map.
+    initialised_at : int or None
+        Position among these frames of the one at which the first map was initialised.
+    initialised_after_s : float or None
+        Seconds of the source until then.
+    ate_m, path_m : float or None
+        RMS error after alignment, and the length of the path; None without ground truth.
+    end_point_error_m : float or None
+        Of a sequence that returns to its start.
+    breakages : tuple of Breakage
+    links : tuple of LinkError
+        Accepted links that ground truth can judge.
+    wall_s, cpu_s : float
+    """
+
+    key: str
+    fingerprint: str
+    sequence: str
+    condition: str
+    variant: str
+    number: int
+    start: int
+    outcome: TrialOutcome = TrialOutcome.DONE
+    error: str = ""
+    status: str = ""
+    initialised_at: int | None = None
+    initialised_after_s: float | None = None
+    ate_m: float | None = None
+    path_m: float | None = None
+    end_point_error_m: float | None = None
+    breakages: tuple[Breakage, ...] = ()
+    links: tuple[LinkError, ...] = ()
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+
+    @property
+    def coverage(self) -> float:
+        """Share (0 to 1) of the frames from the first initialisation on that are in the main map."""
+        if self.initialised_at is None:
+            return 0.0
+        later = self.status[self.initialised_at :]
+        return sum(letter.isupper() for letter in later) / max(len(later), 1)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> TrialRecord:
+        """Read what `as_dict` gave.
+
+        Raises
+        ------
+        ValueError, TypeError, KeyError
+            Where it is something else.
+        """
+        if set(data) != {f.name for f in fields(cls)}:
+            raise ValueError("these are not the fields of a trial")
+        return cls(
+            **data
+            | {
+                "outcome": TrialOutcome(data["outcome"]),
+                "breakages": tuple(Breakage(**b) for b in data["breakages"]),
+                "links": tuple(LinkError(**e) for e in data["links"]),
+            }
+        )
+
+
+def blank_record(trial: Trial, outcome: TrialOutcome, error: str, wall_s: float = 0.0) -> TrialRecord:
+    """Return the line of a trial that left nothing else."""
+    return TrialRecord(
+        trial.key,
+        trial.fingerprint,
+        trial.sequence,
+        trial.condition,
+        trial.variant,
+        trial.number,
+        trial.start,
+        outcome,
+        error,
+        wall_s=wall_s,
+    )
+
+
+def judge(record: TrialRecord, thresholds: Thresholds) -> FailureKind | None:
+    """Return why a trial has failed, or None where it has not. The first reason of those in `FailureKind` counts."""
+    if record.outcome is TrialOutcome.CRASHED:
+        return FailureKind.CRASHED
+    if record.outcome is TrialOutcome.TIMED_OUT:
+        return FailureKind.TIMED_OUT
+    if record.initialised_at is None:
+        return FailureKind.NO_MAP
+    if record.coverage < thresholds.min_coverage:
+        return FailureKind.COVERAGE
+    if record.ate_m is not None and record.path_m and record.ate_m > thresholds.max_ate * record.path_m:
+        return FailureKind.ATE
+    if any(is_wrong(link, thresholds) for link in record.links):
+        return FailureKind.WRONG_LINK
+    return None
+
+
+def is_wrong(link: LinkError, thresholds: Thresholds) -> bool:
+    """Return whether a link is one that should never have been made."""
+    return (
+        abs(link.scale) > thresholds.max_link_scale
+        or link.rotation_deg > thresholds.max_link_rotation_deg
+        or link.position > thresholds.max_link_position
+    )

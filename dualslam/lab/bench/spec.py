@@ -1,0 +1,217 @@
+"""What a bench is made of, as strict YAML."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import Field, model_validator
+
+from dualslam.config import strict_yaml
+from dualslam.config.corruption import Cause, Corruption, CorruptionKind
+from dualslam.config.files import model_from_dict
+from dualslam.config.strict_model import StrictModel
+from dualslam.core.errors import ConfigError
+
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9._+-]*$"
+
+
+class Half(StrEnum):
+    """Which half of all trials a bench runs: what is chosen on one is reported on the other.
+
+    The halves share no seed, no start frame and no place of a corruption, save where a spec fixes these.
+    """
+
+    DEVELOPMENT = "development"  # to look at, and to choose thresholds and settings on
+    REPORTING = "reporting"  # to publish; nothing may be chosen on it
+
+
+class SequenceSpec(StrictModel):
+    """A sequence, and which part of it a trial takes."""
+
+    name: str = Field(pattern=_NAME)
+    """What it is called in the tables, and its folder of trials."""
+    source: str
+    """As for `dualslam run`; a path is sought in the folder of `--data`."""
+    group: str = "all"
+    """The data set that it belongs to: failures are counted by group too."""
+    frames: int | None = Field(None, ge=10)
+    """Frames of the source that a trial spans (at stride 1); null: to the end."""
+    start: tuple[int, int] | None = None
+    """Trials start between these frames; null: anywhere that leaves room for `frames`, or at 0 where it is null."""
+    stride: int = Field(1, ge=1)
+    """One frame of so many is read."""
+    returns_to_start: bool = False
+    """Whether the camera ends where it began, so that the end-point error says something."""
+    camera: str | None = None
+    """Calibration file instead of the source's own, sought as `source` is."""
+
+    @model_validator(mode="after")
+    def _check_start(self) -> Self:
+        if self.start is not None and not 0 <= self.start[0] <= self.start[1]:
+            raise ValueError(f"start of {self.name} is {list(self.start)}; it must be [first, last], in order")
+        return self
+
+
+class VariantSpec(StrictModel):
+    """A way to run: a name and what it sets in the configuration."""
+
+    name: str = Field(pattern=_NAME)
+    """What it is called in the tables."""
+    set: dict[str, Any] = Field(default_factory=dict)
+    """Config fields by their path, such as {recovery.enabled: false}, over those of the bench."""
+
+
+class PlacedCorruption(StrictModel):
+    """A corruption whose place in the clip differs from trial to trial."""
+
+    kind: CorruptionKind
+    """As in the config's `corruptions`."""
+    strength: float | None = None
+    """As there; null: the kind's default."""
+    frames: int | None = Field(None, ge=1)
+    """How many frames of the source it lasts."""
+    seconds: float | None = Field(None, gt=0)
+    """The same in seconds of the source. Without either, it lasts to the end."""
+    at: tuple[float, float] = (0.35, 0.65)
+    """Where it begins: between these shares of the clip. [0, 0] is its first frame."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.frames is not None and self.seconds is not None:
+            raise ValueError(f"{self.kind} lasts both frames and seconds; give one of them")
+        if not 0 <= self.at[0] <= self.at[1] <= 1:
+            raise ValueError(f"at of {self.kind} is {list(self.at)}; it must be two shares of the clip, in order")
+        self.placed(0, 1.0, 0)  # a strength that is out of bounds is an error of the spec
+        return self
+
+    def placed(self, start: int, rate_hz: float, seed: int) -> Corruption:
+        """Return it at a frame of a source."""
+        length = self.frames
+        if self.seconds is not None:
+            length = max(1, round(self.seconds * rate_hz))
+        return Corruption(kind=self.kind, start=start, length=length, strength=self.strength, seed=seed)
+
+
+class ConditionSpec(StrictModel):
+    """What is done to the sequence in a trial."""
+
+    name: str = Field(pattern=_NAME)
+    """What it is called in the tables."""
+    corruptions: tuple[PlacedCorruption, ...] = ()
+    """None: the sequence as it is."""
+    sequences: tuple[str, ...] | None = None
+    """The sequences that it is tried on, by name; null: all."""
+
+    @property
+    def cause(self) -> Cause:
+        """Internal where any corruption is, else image, or natural without any."""
+        causes = {c.placed(0, 1.0, 0).cause for c in self.corruptions}
+        return max(causes, key=list(Cause).index, default=Cause.NATURAL)
+
+
+class Thresholds(StrictModel):
+    """When a trial has failed."""
+
+    min_coverage: float = Field(0.95, gt=0, le=1)
+    """Share of the frames from the first initialisation on that must be in the main map."""
+    max_ate: float = Field(0.05, gt=0)
+    """Largest RMS trajectory error, of the length of the path."""
+    max_link_scale: float = Field(0.05, gt=0)
+    """A link is wrong beyond this relative error of scale,"""
+    max_link_rotation_deg: float = Field(3.0, gt=0)
+    """or beyond this error of rotation,"""
+    max_link_position: float = Field(0.05, gt=0)
+    """or beyond this error of position, of the path that it links."""
+
+
+class BenchSpec(StrictModel):
+    """A bench: every sequence in every condition with every variant, so many trials each."""
+
+    name: str = Field(pattern=_NAME)
+    """What the bench is called."""
+    sequences: tuple[SequenceSpec, ...] = Field(min_length=1)
+    """What is run on."""
+    variants: tuple[VariantSpec, ...] = Field(min_length=1)
+    """What is compared; all of them run the same trials."""
+    reference: str = ""
+    """The variant that failures are reduced against; empty: the first."""
+    conditions: tuple[ConditionSpec, ...] = Field((ConditionSpec(name="natural"),), min_length=1)
+    """What is done to the sequences."""
+    trials: int = Field(10, ge=1)
+    """Of each sequence and condition. They differ in start frame, in the place of corruptions, and in seeds."""
+    seed: int = Field(0, ge=0)
+    """Of where trials start, where corruptions lie, and of each trial's own seeds."""
+    half: Half = Half.REPORTING
+    """Development trials are for choosing settings on, reporting trials for the tables that are published."""
+    set: dict[str, Any] = Field(default_factory=dict)
+    """Config fields of all variants."""
+    thresholds: Thresholds = Thresholds()
+    """When a trial has failed."""
+    timeout_s: float | None = Field(None, gt=0)
+    """A trial that takes longer (wall time) is ended after its frame, and has failed."""
+
+    @model_validator(mode="after")
+    def _check_names(self) -> Self:
+        for what in ("sequences", "variants", "conditions"):
+            twice = [name for name, n in Counter(item.name for item in getattr(self, what)).items() if n > 1]
+            if twice:
+                raise ValueError(f"two {what} are called {twice[0]}; names tell them apart")
+        if self.reference and self.reference not in self.variant_names:
+            raise ValueError(f"reference is {self.reference}; the variants are {', '.join(self.variant_names)}")
+        known = {sequence.name for sequence in self.sequences}
+        for condition in self.conditions:
+            for name in condition.sequences or ():
+                if name not in known:
+                    raise ValueError(f"condition {condition.name} is for {name}, which is none of the sequences")
+        return self
+
+    @property
+    def variant_names(self) -> tuple[str, ...]:
+        """Names of the variants, in order."""
+        return tuple(variant.name for variant in self.variants)
+
+    @property
+    def reference_name(self) -> str:
+        """The variant that others are compared with."""
+        return self.reference or self.variant_names[0]
+
+    def only(self, names: Iterable[str]) -> BenchSpec:
+        """Return the bench on these sequences alone (on all, where none is named).
+
+        Raises
+        ------
+        ConfigError
+        """
+        chosen = set(names)
+        unknown = chosen - {sequence.name for sequence in self.sequences}
+        if unknown:
+            known = ", ".join(sequence.name for sequence in self.sequences)
+            raise ConfigError(f"bench {self.name} has no sequence {sorted(unknown)[0]}; it has {known}")
+        if not chosen:
+            return self
+        kept = tuple(s for s in self.sequences if s.name in chosen)
+        conditions = tuple(c for c in self.conditions if c.sequences is None or chosen & set(c.sequences))
+        return self.model_copy(update={"sequences": kept, "conditions": conditions})
+
+    def with_trials(self, trials: int | None, half: str | None) -> BenchSpec:
+        """Return the bench with so many trials and of this half, where they are given."""
+        wanted: dict[str, Any] = {} if trials is None else {"trials": trials}
+        return self.model_copy(update=wanted if half is None else wanted | {"half": Half(half)})
+
+
+def load_spec(path: str | Path) -> BenchSpec:
+    """Read a bench.
+
+    Raises
+    ------
+    ConfigError
+        One sentence: where, which field, what is wrong, and the nearest known field.
+    """
+    data = strict_yaml.read(Path(path), "the bench")
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: a bench is a mapping with name, sequences and variants")
+    return model_from_dict(BenchSpec, data, str(path))

@@ -1,0 +1,223 @@
+"""A rendered sequence with exact truth: the same interface as a recording, and what no recording has."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.errors import ConfigError, InputError
+from dualslam.core.types import FloatArray, Frame, IntArray
+from dualslam.lab.synthetic.events import ScriptedEvent, disturbance, parse_events, yaw_offset_rad
+from dualslam.lab.synthetic.path import Drive, Walk, pose
+from dualslam.lab.synthetic.render import Renderer
+from dualslam.lab.synthetic.room import HALF_SIZE_M, make_room
+from dualslam.lab.synthetic.sensor import Sensor
+from dualslam.lab.synthetic.street import make_street
+
+if TYPE_CHECKING:
+    from dualslam.core.camera.models import PinholeCamera
+
+# A smear of motion blur is the average of images about three pixels apart, within these bounds on their number.
+_N_SUBFRAMES = (9, 33)
+SCENES = ("street", "room")
+
+
+class CameraPath(Protocol):
+    """A camera's pose as a smooth function of time."""
+
+    def T_world_cam(self, t_s: float) -> FloatArray:
+        """Return the pose (4, 4) at time `t_s`."""
+        ...
+
+
+class SyntheticSequence:
+    """Frames rendered when they are asked for. Made by `make_sequence`.
+
+    Any frame can be asked for at any time, and is the same bit for bit whatever was asked for before.
+
+    Attributes
+    ----------
+    name : str
+        The scene and its seed.
+    camera : PinholeCamera
+    rate_hz : float
+    n_frames : int
+        Frames recorded, those that an event drops included.
+    indices : (N,) int64
+        Indices of the frames that arrive: all but the dropped ones.
+    timestamps_s : (n_frames,) float64
+    ground_truth_T_world_cam : (n_frames, 4, 4) float64
+        Camera to world, metres, in the middle of the exposure; row i belongs to the frame with index i.
+    events : tuple of ScriptedEvent
+    parameters : dict
+        What `make_sequence` was called with, for the record.
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Any],
+        camera: PinholeCamera,
+        path: CameraPath,
+        renderer: Renderer,
+        sensor: Sensor,
+        events: tuple[ScriptedEvent, ...],
+    ) -> None:
+        self.parameters = dict(parameters)
+        self.name = f"synthetic_{parameters['scene']}_{parameters['seed']}"
+        self.camera = camera
+        self.rate_hz = float(parameters["rate_hz"])
+        self.n_frames = int(parameters["n_frames"])
+        self.events = events
+        self._path, self._renderer, self._sensor = path, renderer, sensor
+        self.timestamps_s: FloatArray = np.arange(self.n_frames) / self.rate_hz
+        kept = [i for i in range(self.n_frames) if not disturbance(events, i).dropped]
+        self.indices: IntArray = np.array(kept, np.int64)
+        poses = [self._T_world_cam(i) for i in range(self.n_frames)]
+        self.ground_truth_T_world_cam: FloatArray = np.stack(poses)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __iter__(self) -> Iterator[Frame]:
+        for index in self.indices:
+            yield self.frame(int(index))
+
+    def frame(self, index: int) -> Frame:
+        """Render the frame with this index.
+
+        Raises
+        ------
+        InputError
+            Where there is no such frame, or an event drops it.
+        """
+        self._check(index)
+        what = disturbance(self.events, index)
+        if what.dropped:
+            raise InputError(f"{self.name}: frame {index} is dropped by an event of the script; see `indices`")
+        if what.shutter:
+            # Averaged in display values, as most cameras' images are used; the truth is the middle of the exposure.
+            opened, closed = self._T_world_cam(index - what.shutter / 2), self._T_world_cam(index + what.shutter / 2)
+            turn_rad = np.arccos(np.clip(opened[:3, 2] @ closed[:3, 2], -1, 1))
+            n_subframes = int(np.clip(turn_rad * self.camera.K[0, 0] / 3, *_N_SUBFRAMES))
+            shifts = what.shutter * (np.arange(n_subframes) / (n_subframes - 1) - 0.5)
+            total = np.zeros((self.camera.height, self.camera.width), np.float32)
+            for shift in shifts:
+                cv2.accumulate(self._renderer.image(self._T_world_cam(index + shift)), total)
+            scene = np.rint(total / n_subframes).astype(np.uint8)
+        else:
+            scene = self._renderer.image(self.ground_truth_T_world_cam[index])
+        return Frame(index, float(self.timestamps_s[index]), self._sensor.expose(scene, index, what))
+
+    def depth(self, index: int) -> NDArray[np.float32]:
+        """Return the true depth z (height, width) at each pixel's centre, metres, inf for the sky.
+
+        Raises
+        ------
+        InputError
+            Where there is no such frame.
+        """
+        self._check(index)
+        return self._renderer.depth(self.ground_truth_T_world_cam[index])
+
+    def points_world(self, index: int, uv_px: FloatArray) -> FloatArray:
+        """Return the surface points (N, 3) seen at whole pixels (N, 2) of a frame, world, NaN for the sky."""
+        column, row = np.rint(np.asarray(uv_px)).astype(np.int64).T
+        z = self.depth(index)[row, column].astype(np.float64)
+        rays = np.stack([column, row, np.ones(len(row))], 1) @ np.linalg.inv(self.camera.K).T
+        with np.errstate(invalid="ignore"):
+            points = np.where(np.isfinite(z)[:, None], rays * z[:, None], np.nan)
+        T_world_cam = self.ground_truth_T_world_cam[index]
+        return np.asarray(points @ T_world_cam[:3, :3].T + T_world_cam[:3, 3])
+
+    def _check(self, index: int) -> None:
+        if not 0 <= index < self.n_frames:
+            raise InputError(f"{self.name}: there is no frame {index}; its frames are 0 to {self.n_frames - 1}")
+
+    def _T_world_cam(self, index: float) -> FloatArray:
+        """Return the pose at a (fractional) frame."""
+        T_world_cam = self._path.T_world_cam(index / self.rate_hz)
+        yaw_rad = yaw_offset_rad(self.events, index)
+        return T_world_cam @ pose(np.zeros(3), yaw_rad, 0.0, 0.0) if yaw_rad else T_world_cam
+
+
+def make_sequence(
+    scene: str = "street",
+    n_frames: int = 300,
+    seed: int = 0,
+    width: int = 640,
+    height: int = 480,
+    events: Iterable[ScriptedEvent | Mapping[str, Any]] = (),
+    rate_hz: float | None = None,
+    supersampling: float = 1.5,
+) -> SyntheticSequence:
+    """Make a world, a way through it, and a camera.
+
+    Parameters
+    ----------
+    scene : {"street", "room"}
+        A drive of about 9 m/s between houses, or a hand-held camera in a furnished room.
+    n_frames : int
+    seed : int
+        Of the world, the path and the noise: the same seed gives the same images, bit for bit.
+    width, height : int
+        Image size, pixels. The horizontal field of view does not depend on it.
+    events : iterable of ScriptedEvent or mapping
+        Disturbances of some of the frames.
+    rate_hz : float, optional
+        Frames a second: 10 on the street, 30 in the room.
+    supersampling : float
+        Silhouettes are smoother and rendering slower with more.
+
+    Raises
+    ------
+    ConfigError
+        Where a parameter makes no sense.
+    """
+    if scene not in SCENES:
+        raise ConfigError(f"synthetic scene {scene!r} is unknown; use one of {', '.join(SCENES)}")
+    rate_hz = float(rate_hz) if rate_hz is not None else (10.0 if scene == "street" else 30.0)
+    limits = {"n_frames": (1, 100_000), "seed": (0, 2**63), "width": (32, 4096), "height": (32, 4096)}
+    for name, (low, high) in limits.items():
+        value = locals()[name]
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= high:
+            raise ConfigError(f"synthetic sequence: {name} is {value!r}; it must be a whole number, {low} to {high}")
+    if not 0.5 <= rate_hz <= 1000:
+        raise ConfigError(f"synthetic sequence: rate_hz is {rate_hz:g}; it must lie between 0.5 and 1000")
+    if not 1 <= supersampling <= 4:
+        raise ConfigError(f"synthetic sequence: supersampling is {supersampling:g}; it must lie between 1 and 4")
+    script = parse_events(events)
+    duration_s = n_frames / rate_hz
+    rng = np.random.default_rng([seed, 0xCA4])
+    path: CameraPath
+    if scene == "street":
+        world, road = make_street(seed, 10.0 * duration_s + 30)
+        path, focal = Drive(road, rng, duration_s, speed_m_s=10.0), 0.72
+        sensor = Sensor(seed, width, height, blur_px=0.45)
+    else:
+        world = make_room(seed)
+        path, focal = Walk(rng, duration_s, (HALF_SIZE_M[0] - 1.3, HALF_SIZE_M[1] - 1.3)), 0.82
+        # A cheap camera in the hand: softer than the one on the car.
+        sensor = Sensor(seed, width, height, blur_px=0.9, noise=1.2, stops=0.4)
+    camera = _pinhole(focal * width, width, height)
+    renderer = Renderer(world, camera.K, width, height, detail=min(1.0, width / 640), supersampling=supersampling)
+    parameters = {
+        "scene": scene,
+        "n_frames": int(n_frames),
+        "seed": int(seed),
+        "width": int(width),
+        "height": int(height),
+        "rate_hz": rate_hz,
+        "supersampling": float(supersampling),
+    }
+    return SyntheticSequence(parameters, camera, path, renderer, sensor, script)
+
+
+def _pinhole(focal_px: float, width: int, height: int) -> PinholeCamera:
+    """Return a camera with square pixels and the principal point in the middle of the image."""
+    from dualslam.core.camera.models import PinholeCamera
+
+    return PinholeCamera(width=width, height=height, fx=focal_px, fy=focal_px, cx=(width - 1) / 2, cy=(height - 1) / 2)

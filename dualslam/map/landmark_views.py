@@ -1,0 +1,71 @@
+"""Where a submap's landmarks are, and how well that is known, by the pixels that its keyframes see of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.triangulation import point_covariance, triangulate_n_view
+from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.submap import Submap
+
+
+def landmark_covariances(
+    submap: Submap, landmark_ids: IntArray, xyz: FloatArray | None = None, before: int | None = None
+) -> FloatArray:
+    """Return the covariances (N, 3, 3) of landmarks given the poses of their keyframes; NaN where these fix them not.
+
+    Parameters
+    ----------
+    submap : Submap
+    landmark_ids : (N,) int64
+        Each once.
+    xyz : (N, 3), optional
+        Their places in the submap, where these are not its own.
+    before : int, optional
+        Only keyframes older than this one count.
+    """
+    rows, point = _views(submap, landmark_ids, before)
+    if len(rows) == 0:
+        return np.full((len(landmark_ids), 3, 3), np.nan)
+    _, sigma = submap.observed_pixels(rows)
+    ids, view = np.unique(submap.observations["kf"][rows], return_inverse=True)
+    T_kf_submap = se3.inverse(submap.keyframe_poses(ids))[view]
+    places = submap.landmarks["xyz_mu"][landmark_ids] if xyz is None else xyz
+    return point_covariance(places, submap.K, point, T_kf_submap, sigma)
+
+
+def triangulate_landmarks(submap: Submap, landmark_ids: IntArray, before: int) -> FloatArray:
+    """Return the places (N, 3) of landmarks as the keyframes older than one alone triangulate them.
+
+    NaN where fewer than two of these see a landmark.
+
+    Parameters
+    ----------
+    submap : Submap
+    landmark_ids : (N,) int64
+        Each once.
+    before : int
+    """
+    rows, point = _views(submap, landmark_ids, before)
+    if len(rows) == 0:
+        return np.full((len(landmark_ids), 3), np.nan)
+    pixels, _ = submap.observed_pixels(rows)
+    ids, column = np.unique(submap.observations["kf"][rows], return_inverse=True)
+    uv, visible = np.zeros((len(landmark_ids), len(ids), 2)), np.zeros((len(landmark_ids), len(ids)), bool)
+    uv[point, column], visible[point, column] = pixels, True
+    xyz = np.full((len(landmark_ids), 3), np.nan)
+    enough = visible.sum(1) >= 2
+    T_kf_submap = se3.inverse(submap.keyframe_poses(ids))
+    xyz[enough] = triangulate_n_view(uv[enough], submap.K, T_kf_submap, visible[enough]).xyz
+    return xyz
+
+
+def _views(submap: Submap, landmark_ids: IntArray, before: int | None) -> tuple[IntArray, IntArray]:
+    """Return the live observation rows of landmarks in the keyframes before one, and each row's place in the ids."""
+    rows = submap.rows_of_landmarks(landmark_ids)
+    if before is not None:
+        rows = rows[submap.observations["kf"][rows] < before]
+    position = np.full(len(submap.landmarks), -1)
+    position[landmark_ids] = np.arange(len(landmark_ids))
+    return rows, position[submap.observations["landmark"][rows]]

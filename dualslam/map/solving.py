@@ -1,0 +1,26 @@
+"""A submap to which much was added at once, solved in batch."""
+
+from __future__ import annotations
+
+from dualslam.core.interfaces import SubmapGraph
+from dualslam.map.submap import Submap
+
+
+def solve(submap: Submap, graph: SubmapGraph, near_optimum: bool = False) -> int:
+    """Solve a submap in a graph made anew, and drop what the solution contradicts; return how many observations.
+
+    Parameters
+    ----------
+    submap : Submap
+    graph : SubmapGraph
+    near_optimum : bool
+        Whether its parts are solved already.
+
+    Raises
+    ------
+    SolverError
+    """
+    estimate = graph.rebuild(submap, near_optimum)
+    submap.apply_estimate(*estimate.values)
+    submap.remove_outliers(estimate.outlier_rows)
+    return len(estimate.outlier_rows)

@@ -1,0 +1,57 @@
+"""A full submap hands on to the next: shared keyframes and landmarks, one common frame, an exact link."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dualslam.map.submap import NO_LANDMARK, Submap
+
+
+def next_submap(full: Submap, submap_id: int, n_shared: int) -> Submap:
+    """Start a submap from the newest keyframes of a full one, in the same coordinates.
+
+    Parameters
+    ----------
+    full : Submap
+    submap_id : int
+    n_shared : int
+        How many of the newest keyframes (in order of insertion) both submaps hold.
+
+    Returns
+    -------
+    Submap
+        With the shared keyframes and those of their landmarks that at least two of them see. Its gauge is the pair of
+        shared keyframes that stand farthest apart, as the full submap knows them, so that the link between the two is
+        the identity.
+    """
+    shared = list(full.keyframes)[-n_shared:]
+    twin = Submap(submap_id, full.K, full.landmarks["descriptor"][0])
+    for k in shared:
+        twin.add_keyframe(full.keyframes[k], full.T_submap_kf[k])
+    old = full.landmarks_of_keyframes(shared)
+    n_seen = np.zeros(len(full.landmarks), np.int64)
+    for k in shared:
+        ids = full.landmark_of[k]
+        n_seen[ids[ids >= 0]] += 1
+    old = old[n_seen[old] >= 2]
+    twin.copy_landmarks(full, old)
+    new_id = np.full(len(full.landmarks), NO_LANDMARK, np.int64)
+    new_id[old] = np.arange(len(old))
+    for k in shared:
+        ids = full.landmark_of[k]
+        feature = np.flatnonzero(ids >= 0)
+        kept = new_id[ids[feature]] >= 0
+        twin.add_observations(k, feature[kept], new_id[ids[feature[kept]]])
+    twin.gauge = _widest_pair(full, shared)
+    return twin
+
+
+def _widest_pair(submap: Submap, keyframe_ids: list[int]) -> tuple[int, int]:
+    """Return the two keyframes that are farthest apart: a distance that is known the better the longer it is.
+
+    The first and the last one may stand side by side, where a hand moves to and fro.
+    """
+    centres = submap.keyframe_poses(keyframe_ids)[:, :3, 3]
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
+    first, second = np.unravel_index(int(apart.argmax()), apart.shape)
+    return keyframe_ids[int(first)], keyframe_ids[int(second)]

@@ -1,0 +1,403 @@
+"""A submap: keyframes and landmarks in one local frame, as numpy arrays: the truth that graphs are made from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe, Start
+from dualslam.map.tables import Table
+
+NO_LANDMARK = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Anchor:
+    """Where a culled keyframe (or a plain frame) stands: a pose relative to a keyframe that is still there."""
+
+    keyframe_id: int
+    T_kf_cam: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativePose:
+    """Where a keyframe stands by what is no observation of the submap's landmarks: another front end's leap.
+
+    Attributes
+    ----------
+    keyframe_id : int
+        Relative to which other keyframe.
+    T_ref_kf : (4, 4)
+    covariance : (6, 6)
+        Of xi in ``T_ref_kf @ exp(xi)``: rotation, translation; positive definite.
+    """
+
+    keyframe_id: int
+    T_ref_kf: FloatArray
+    covariance: FloatArray
+
+    def scaled(self, scale: float) -> RelativePose:
+        """Return the same in another unit of length."""
+        T, units = self.T_ref_kf.copy(), np.repeat([1.0, scale], 3)
+        T[:3, 3] *= scale
+        return RelativePose(self.keyframe_id, T, units[:, None] * self.covariance * units)
+
+    def seen_from(self, keyframe_id: int, T_kf_ref: FloatArray) -> RelativePose:
+        """Return the same relative to another keyframe, of which the old one's place is known."""
+        return RelativePose(keyframe_id, T_kf_ref @ self.T_ref_kf, self.covariance)
+
+
+class Submap:
+    """Keyframes, landmarks and observations in one local frame, in that frame's own unit of length.
+
+    Landmark ids and observation rows only grow and are never reused, so that a graph can follow the submap by looking
+    at the rows added since its last update and at the rows that died. Keyframe ids are the indices of their frames.
+
+    Attributes
+    ----------
+    id : int
+    K : (3, 3) float64
+        Pinhole intrinsics of the rectified pixels (`Features.uv_rect_px`).
+    keyframes : dict of int to Keyframe
+        In order of insertion.
+    T_submap_kf : dict of int to (4, 4) float64
+        Poses, camera to submap.
+    landmark_of : dict of int to (N,) int64
+        For each feature of a keyframe its landmark, or `NO_LANDMARK`.
+    landmarks : Table
+        ``xyz_mu`` (3), ``alive``, ``descriptor``, ``normal`` (3, mean unit vector from landmark to cameras),
+        ``distance_mu`` (at the reference view), ``scale`` (patch scale there), ``first_kf``, ``replaced_by``,
+        ``n_visible``, ``n_found`` (how often tracking should have seen it, and did).
+    observations : Table
+        ``kf``, ``feature``, ``landmark``, ``alive``.
+    anchors : dict of int to Anchor
+        Keyframes that were culled as redundant.
+    relative_poses : dict of int to RelativePose
+        Keyframes of which more is known than their observations say.
+    gauge : tuple of int
+        The two keyframes of the first baseline: the first pose is fixed, their distance fixes the scale.
+    """
+
+    def __init__(self, submap_id: int, K: FloatArray, descriptor: NDArray[np.generic]) -> None:
+        """`descriptor` is an example row of the front end's descriptors: it gives type and length."""
+        self.id = submap_id
+        self.K = np.asarray(K, float)
+        self.keyframes: dict[int, Keyframe] = {}
+        self.T_submap_kf: dict[int, FloatArray] = {}
+        self.landmark_of: dict[int, IntArray] = {}
+        self.anchors: dict[int, Anchor] = {}
+        self.relative_poses: dict[int, RelativePose] = {}
+        self.gauge: tuple[int, int] = (-1, -1)
+        self.landmarks = Table(
+            xyz_mu=(np.float64, (3,)),
+            alive=(np.bool_, ()),
+            descriptor=(descriptor.dtype, descriptor.shape),
+            normal=(np.float64, (3,)),
+            distance_mu=(np.float64, ()),
+            scale=(np.float64, ()),
+            first_kf=(np.int64, ()),
+            replaced_by=(np.int64, ()),
+            n_visible=(np.int64, ()),
+            n_found=(np.int64, ()),
+        )
+        self.observations = Table(
+            kf=(np.int64, ()), feature=(np.int64, ()), landmark=(np.int64, ()), alive=(np.bool_, ())
+        )
+
+    @classmethod
+    def from_start(cls, start: Start, submap_id: int, K: FloatArray) -> Submap:
+        """Make a submap of a verified start: its views become keyframes, its points landmarks."""
+        submap = cls(submap_id, K, start.views[0].features.descriptors[0])
+        for view, T in zip(start.views, start.T_first_cam, strict=True):
+            submap.add_keyframe(Keyframe(view.index, view.timestamp_s, view.features), T)
+        last, feature = start.views[-1], start.feature
+        ids = submap.add_landmarks(
+            start.xyz, last.features.descriptors[feature[-1]], last.features.scale[feature[-1]], last.index
+        )
+        for v, view in enumerate(start.views):
+            seen = feature[v] >= 0
+            submap.add_observations(view.index, feature[v][seen], ids[seen])
+        submap.gauge = (start.views[0].index, last.index)
+        return submap
+
+    # --- keyframes
+
+    def add_keyframe(self, keyframe: Keyframe, T_submap_kf: FloatArray) -> None:
+        """Insert a keyframe without observations."""
+        if keyframe.id in self.keyframes:
+            raise ValueError(f"submap {self.id} has keyframe {keyframe.id} already")
+        self.keyframes[keyframe.id] = keyframe
+        self.T_submap_kf[keyframe.id] = np.array(T_submap_kf, float)
+        self.landmark_of[keyframe.id] = np.full(len(keyframe.features), NO_LANDMARK, np.int64)
+
+    def remove_keyframe(self, keyframe_id: int, anchor_id: int) -> None:
+        """Cull a keyframe: its observations die, its pose lives on relative to `anchor_id`."""
+        rows = np.flatnonzero((self.observations["kf"] == keyframe_id) & self.observations["alive"])
+        self.remove_observations(rows)
+        T_kf_cam = se3.inverse(self.T_submap_kf[anchor_id]) @ self.T_submap_kf[keyframe_id]
+        self.anchors[keyframe_id] = Anchor(anchor_id, T_kf_cam)
+        self.relative_poses.pop(keyframe_id, None)
+        for k, known in self.relative_poses.items():
+            if known.keyframe_id == keyframe_id:
+                self.relative_poses[k] = known.seen_from(anchor_id, T_kf_cam)
+        if anchor_id in self.relative_poses and self.relative_poses[anchor_id].keyframe_id == anchor_id:
+            del self.relative_poses[anchor_id]
+        del self.keyframes[keyframe_id], self.T_submap_kf[keyframe_id], self.landmark_of[keyframe_id]
+
+    def resolve_anchor(self, keyframe_id: int, T_kf_cam: FloatArray) -> FloatArray:
+        """Return ``T_submap_cam`` of a frame posed relative to a keyframe, also if that keyframe was culled since."""
+        while keyframe_id not in self.T_submap_kf:
+            anchor = self.anchors[keyframe_id]
+            keyframe_id, T_kf_cam = anchor.keyframe_id, anchor.T_kf_cam @ T_kf_cam
+        return self.T_submap_kf[keyframe_id] @ T_kf_cam
+
+    def keyframe_poses(self, keyframe_ids: IntArray | list[int]) -> FloatArray:
+        """Return (K, 4, 4) poses, camera to submap."""
+        return np.array([self.T_submap_kf[int(k)] for k in keyframe_ids]).reshape(-1, 4, 4)
+
+    def keyframes_near(self, index: int) -> list[int]:
+        """Return all keyframes by their distance in time from frame `index`, the nearest first (ties: lower id)."""
+        return sorted(self.keyframes, key=lambda k: (abs(k - index), k))
+
+    # --- landmarks
+
+    def depths(self, landmark_ids: IntArray, T_cam_submap: FloatArray) -> FloatArray:
+        """Return the depths (N,) of landmarks in a camera."""
+        return np.asarray(self.landmarks["xyz_mu"][landmark_ids] @ T_cam_submap[2, :3] + T_cam_submap[2, 3])
+
+    def add_landmarks(
+        self, xyz_mu: FloatArray, descriptors: NDArray[Any], scale: FloatArray, keyframe_id: int
+    ) -> IntArray:
+        """Append landmarks first described in `keyframe_id` (scale: of the feature there); return their ids."""
+        to_camera = self.T_submap_kf[keyframe_id][:3, 3] - xyz_mu
+        distance = np.linalg.norm(to_camera, axis=1)
+        return self.landmarks.append(
+            len(xyz_mu),
+            xyz_mu=xyz_mu,
+            alive=True,
+            descriptor=descriptors,
+            normal=to_camera / np.maximum(distance, 1e-12)[:, None],
+            distance_mu=distance,
+            scale=scale,
+            first_kf=keyframe_id,
+            replaced_by=NO_LANDMARK,
+            n_visible=1,
+            n_found=1,
+        )
+
+    def copy_landmarks(self, other: Submap, landmark_ids: IntArray, S_self_other: FloatArray | None = None) -> IntArray:
+        """Append copies of another submap's landmarks, without observations; return their ids here.
+
+        Parameters
+        ----------
+        other : Submap
+        landmark_ids : (N,) int64
+        S_self_other : (4, 4), optional
+            Similarity that takes them here; by default they stay where they are.
+        """
+        columns = {name: column[landmark_ids] for name, column in other.landmarks.columns().items()}
+        columns["replaced_by"] = np.full(len(landmark_ids), NO_LANDMARK)
+        if S_self_other is not None:
+            columns["xyz_mu"] = sim3.act(S_self_other, columns["xyz_mu"])
+            columns["normal"] = columns["normal"] @ sim3.rotation(S_self_other).T
+            columns["distance_mu"] = columns["distance_mu"] * float(sim3.scale(S_self_other))
+        return self.landmarks.append(len(landmark_ids), **columns)
+
+    def remove_landmarks(self, landmark_ids: IntArray) -> None:
+        """Cull landmarks and their observations."""
+        if len(landmark_ids) == 0:
+            return
+        self.landmarks["alive"][landmark_ids] = False
+        self.remove_observations(self.rows_of_landmarks(landmark_ids))
+
+    def merge_landmarks(self, keep: IntArray, drop: IntArray) -> None:
+        """Make each ``drop[i]`` one with ``keep[i]``: its observations move over, save where both are in a keyframe."""
+        rows_of = self._rows_by_landmark([self.current_id(j) for j in (*keep.tolist(), *drop.tolist())])
+        for kept, dropped in zip(keep.tolist(), drop.tolist(), strict=True):
+            kept, dropped = self.current_id(kept), self.current_id(dropped)
+            if kept == dropped:
+                continue
+            obs, rows = self.observations, rows_of[dropped]
+            kf, feature = obs["kf"][rows], obs["feature"][rows]
+            taken = set(obs["kf"][rows_of[kept]].tolist())
+            self.remove_observations(rows)
+            free = np.array([k not in taken for k in kf.tolist()], bool)
+            moved = self.add_observations(kf[free], feature[free], np.full(int(free.sum()), kept))
+            rows_of[kept] = np.concatenate((rows_of[kept], moved))
+            lm = self.landmarks
+            lm["alive"][dropped] = False
+            lm["replaced_by"][dropped] = kept
+            lm["n_visible"][kept] += lm["n_visible"][dropped]
+            lm["n_found"][kept] += lm["n_found"][dropped]
+
+    def current_id(self, landmark_id: int) -> int:
+        """Follow `replaced_by` to the landmark that stands for `landmark_id` now (it may be dead)."""
+        replaced_by = self.landmarks["replaced_by"]
+        while replaced_by[landmark_id] != NO_LANDMARK:
+            landmark_id = int(replaced_by[landmark_id])
+        return landmark_id
+
+    def current_ids(self, landmark_ids: IntArray) -> IntArray:
+        """`current_id` for an array in which `NO_LANDMARK` may stand; dead landmarks become `NO_LANDMARK`."""
+        ids = np.array(landmark_ids, np.int64)
+        if len(self.landmarks) == 0:
+            return ids
+        while True:
+            heir = np.where(ids >= 0, self.landmarks["replaced_by"][ids], NO_LANDMARK)
+            moved = heir != NO_LANDMARK
+            if not moved.any():
+                break
+            ids[moved] = heir[moved]
+        ids[(ids >= 0) & ~self.landmarks["alive"][ids]] = NO_LANDMARK
+        return ids
+
+    # --- observations
+
+    def add_observations(self, kf: IntArray | int, feature: IntArray, landmark: IntArray) -> IntArray:
+        """Append observations; a feature that has a landmark already, or a landmark seen twice, is the caller's bug."""
+        n = len(feature)
+        rows = self.observations.append(n, kf=kf, feature=feature, landmark=landmark, alive=True)
+        if np.ndim(kf) == 0:
+            self.landmark_of[int(kf)][feature] = landmark
+        else:
+            for k, f, j in zip(np.asarray(kf).tolist(), feature.tolist(), landmark.tolist(), strict=True):
+                self.landmark_of[k][f] = j
+        return rows
+
+    def remove_observations(self, rows: IntArray) -> None:
+        """Let observation rows die; they stay in the table."""
+        obs = self.observations
+        rows = rows[obs["alive"][rows]]
+        obs["alive"][rows] = False
+        for k in np.unique(obs["kf"][rows]).tolist():
+            if k in self.landmark_of:
+                self.landmark_of[k][obs["feature"][rows[obs["kf"][rows] == k]]] = NO_LANDMARK
+
+    def remove_outliers(self, rows: IntArray) -> None:
+        """Drop observations that a solution contradicts, and landmarks left with fewer than two."""
+        touched = np.unique(self.observations["landmark"][rows])
+        self.remove_observations(rows)
+        self.remove_landmarks(touched[self.n_observations(touched) < 2])
+
+    def rows_of_landmarks(self, landmark_ids: IntArray) -> IntArray:
+        """Return the live observation rows of a set of landmarks."""
+        wanted = self._mask(landmark_ids)
+        return np.flatnonzero(self.observations["alive"] & wanted[self.observations["landmark"]])
+
+    def _rows_by_landmark(self, landmark_ids: list[int]) -> dict[int, IntArray]:
+        """Return the live observation rows of each landmark, ascending."""
+        rows = self.rows_of_landmarks(np.array(landmark_ids, np.int64))
+        rows = rows[np.argsort(self.observations["landmark"][rows], kind="stable")]
+        ids, starts = np.unique(self.observations["landmark"][rows], return_index=True)
+        found = dict(zip(ids.tolist(), np.split(rows, starts[1:]), strict=False))
+        return {j: found.get(j, rows[:0]) for j in landmark_ids}
+
+    def n_observations(self, landmark_ids: IntArray) -> IntArray:
+        """Return how many keyframes see each landmark."""
+        obs = self.observations
+        counts = np.bincount(obs["landmark"][obs["alive"]], minlength=len(self.landmarks))
+        return counts[landmark_ids]
+
+    def covisible(self, landmark_ids: IntArray) -> tuple[IntArray, IntArray]:
+        """Return the keyframes that see any of `landmark_ids` and how many each sees, most first (ties: older id)."""
+        rows = self.rows_of_landmarks(landmark_ids)
+        ids, counts = np.unique(self.observations["kf"][rows], return_counts=True)
+        order = np.lexsort((ids, -counts))
+        return ids[order], counts[order]
+
+    def landmarks_of_keyframes(self, keyframe_ids: IntArray | list[int]) -> IntArray:
+        """Return the ids of all live landmarks that any of the keyframes sees, ascending."""
+        seen = np.zeros(len(self.landmarks), bool)
+        for k in keyframe_ids:
+            ids = self.landmark_of[int(k)]
+            seen[ids[ids >= 0]] = True
+        return np.flatnonzero(seen & self.landmarks["alive"])
+
+    def observed_pixels(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return rectified pixels (R, 2) and their sigmas (R,) of observation rows."""
+        uv = np.empty((len(rows), 2))
+        sigma = np.empty(len(rows))
+        kf, feature = self.observations["kf"][rows], self.observations["feature"][rows]
+        order = np.argsort(kf, kind="stable")
+        ids, starts = np.unique(kf[order], return_index=True)
+        for k, here in zip(ids.tolist(), np.split(order, starts[1:]), strict=False):
+            features = self.keyframes[k].features
+            uv[here] = features.uv_rect_px[feature[here]]
+            sigma[here] = features.sigma_px[feature[here]]
+        return uv, sigma
+
+    def _mask(self, landmark_ids: IntArray) -> BoolArray:
+        mask = np.zeros(len(self.landmarks), bool)
+        mask[landmark_ids] = True
+        return mask
+
+    # --- whole map
+
+    def transform(self, scale: float, T_new_old: FloatArray) -> None:
+        """Apply ``p_new = scale * R p + t`` to all poses and points (a change of gauge)."""
+        R, t = T_new_old[:3, :3], T_new_old[:3, 3]
+        for k, T in self.T_submap_kf.items():
+            moved = np.eye(4)
+            moved[:3, :3] = R @ T[:3, :3]
+            moved[:3, 3] = scale * R @ T[:3, 3] + t
+            self.T_submap_kf[k] = moved
+        for k, anchor in self.anchors.items():
+            T_kf_cam = anchor.T_kf_cam.copy()
+            T_kf_cam[:3, 3] *= scale
+            self.anchors[k] = Anchor(anchor.keyframe_id, T_kf_cam)
+        self.relative_poses = {k: known.scaled(scale) for k, known in self.relative_poses.items()}
+        lm = self.landmarks
+        lm["xyz_mu"][:] = scale * lm["xyz_mu"] @ R.T + t
+        lm["normal"][:] = lm["normal"] @ R.T
+        lm["distance_mu"][:] *= scale
+
+    def apply_estimate(
+        self, keyframe_ids: IntArray, T_submap_kf: FloatArray, landmark_ids: IntArray, xyz_mu: FloatArray
+    ) -> None:
+        """Take refined poses and points over; those of keyframes that were culled since are passed over."""
+        for k, T in zip(keyframe_ids.tolist(), T_submap_kf, strict=True):
+            if k in self.keyframes:
+                self.T_submap_kf[k] = np.array(T)
+        self.landmarks["xyz_mu"][landmark_ids] = xyz_mu
+
+    def copy(self) -> Submap:
+        """Return an independent copy (keyframes and features are immutable and shared)."""
+        twin = Submap(self.id, self.K, self.landmarks["descriptor"][0] if len(self.landmarks) else np.zeros(0))
+        twin.keyframes = dict(self.keyframes)
+        twin.T_submap_kf = {k: T.copy() for k, T in self.T_submap_kf.items()}
+        twin.landmark_of = {k: a.copy() for k, a in self.landmark_of.items()}
+        twin.anchors = dict(self.anchors)
+        twin.relative_poses = dict(self.relative_poses)
+        twin.gauge = self.gauge
+        twin.landmarks = Table.from_columns(self.landmarks.columns())
+        twin.observations = Table.from_columns(self.observations.columns())
+        return twin
+
+    def renumbered(self, number_of: Callable[[int], int]) -> Submap:
+        """Return a copy with other ids for its keyframes; landmarks and rows keep theirs."""
+        twin = self.copy()
+        twin.keyframes = {number_of(k): replace(kf, id=number_of(k)) for k, kf in twin.keyframes.items()}
+        twin.T_submap_kf = {number_of(k): T for k, T in twin.T_submap_kf.items()}
+        twin.landmark_of = {number_of(k): ids for k, ids in twin.landmark_of.items()}
+        twin.anchors = {number_of(k): Anchor(number_of(a.keyframe_id), a.T_kf_cam) for k, a in twin.anchors.items()}
+        twin.relative_poses = {
+            number_of(k): replace(known, keyframe_id=number_of(known.keyframe_id))
+            for k, known in twin.relative_poses.items()
+        }
+        twin.gauge = (number_of(self.gauge[0]), number_of(self.gauge[1]))
+        for column in (twin.observations["kf"], twin.landmarks["first_kf"]):
+            column[:] = [number_of(k) for k in column.tolist()]
+        return twin
+
+    def take_over(self, changed: Submap) -> None:
+        """Become what a copy of this submap was changed to."""
+        self.K, self.gauge = changed.K, changed.gauge
+        self.keyframes, self.T_submap_kf = changed.keyframes, changed.T_submap_kf
+        self.landmark_of, self.anchors = changed.landmark_of, changed.anchors
+        self.relative_poses = changed.relative_poses
+        self.landmarks, self.observations = changed.landmarks, changed.observations

@@ -1,0 +1,90 @@
+"""Frames of a lost map that change to the map that walked back over them, or stay without a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from dualslam.core.events import EventKind
+from dualslam.core.types import FrameStatus
+from dualslam.map.record import FrameStamp, Record
+from dualslam.recovery.reverse_tracking import RecoveredFrame
+
+
+def bypass(record: Record, recovered_frames: Collection[RecoveredFrame], new_id: int, handover: int, order: int) -> int:
+    """Let the newest part of a linked old map take its poses from the new one; return of how many frames.
+
+    Parameters
+    ----------
+    record : Record
+    recovered_frames : collection of RecoveredFrame
+    new_id : int
+        The submap that walked.
+    handover : int
+        The newest keyframe that agrees in both maps: what is beyond it changes.
+    order : int
+        1 where the frames' numbers ascend with time, as it is read; -1 where they descend.
+    """
+    poses, n_bypassed = record.poses, 0
+    for frame in recovered_frames:
+        i = frame.pose.index
+        if order * i <= order * handover or poses[i].submap_id == new_id:
+            continue
+        record.pose(frame.pose)
+        record.rows[i].status = FrameStatus.BYPASSED
+        n_bypassed += 1
+    return n_bypassed
+
+
+def drop_corrupted(record: Record, old_id: int, since: int, order: int) -> int:
+    """Take the pose from frames of the corrupted tail that the walk has skipped: that of the old map may be wrong.
+
+    They keep their row. `since` is in the order of reading: a frame's number times `order`.
+    """
+    poses = record.poses
+    corrupted = [i for i, pose in poses.items() if pose.submap_id == old_id and order * i >= since]
+    for i in corrupted:
+        del poses[i]
+        record.rows[i].status, record.rows[i].submap_id = FrameStatus.BYPASSED, None
+    return len(corrupted)
+
+
+def absorb(
+    record: Record, recovered_frames: Collection[RecoveredFrame], new_id: int, lost: Collection[int], now: FrameStamp
+) -> list[int]:
+    """Let lost maps go of which the new one has posed every frame, where it holds more frames besides.
+
+    A map of a few frames hardly knows its own scale, so that no similarity to it is sure. None is needed: what it saw
+    has its place in the larger map. The smaller one stays archived, without frames. A lost map that holds more than
+    the new one stays: what a long map says is not given up for a short one that would not fit it.
+
+    Parameters
+    ----------
+    record : Record
+    recovered_frames : collection of RecoveredFrame
+    new_id : int
+        The submap that walked.
+    lost : collection of int
+        Submaps that wait for a link; with those that they are linked to they go or stay.
+    now : FrameStamp
+
+    Returns
+    -------
+    list of int
+        The submaps that have gone.
+    """
+    found = {frame.pose.index: frame.pose for frame in recovered_frames}
+    components = record.atlas.components()
+    own = next(c for c in components if new_id in c)
+    n_own = sum(pose.submap_id in own for pose in record.poses.values())
+    gone = []
+    for component in components:
+        frames = {i for i, pose in record.poses.items() if pose.submap_id in component}
+        is_covered = 0 < len(frames) < n_own and frames <= found.keys()
+        if component == own or not is_covered or set(lost).isdisjoint(component):
+            continue
+        for i in frames:
+            record.pose(found[i])
+            record.rows[i].status = FrameStatus.BYPASSED
+        gone += component
+        record.event(EventKind.ABSORBED, now, new_id, old_submaps=component, frames=len(frames))
+    return gone

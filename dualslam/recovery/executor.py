@@ -1,0 +1,48 @@
+"""What runs walks back in time: here in the process that tracks; `dualslam/recovery/worker.py` has the one with processes."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from dualslam.core.types import Failure
+from dualslam.recovery.direction import recover
+from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryParts, RecoveryResult
+
+Outcome = tuple[RecoveryJob, RecoveryResult | Failure]
+
+
+class RecoveryExecutor(Protocol):
+    """Runs jobs, somewhere: the system neither knows where nor waits for them."""
+
+    def submit(self, job: RecoveryJob) -> None:
+        """Take a job on."""
+        ...
+
+    def poll(self) -> list[Outcome]:
+        """Return what has ended since the last call."""
+        ...
+
+    def finish(self) -> list[Outcome]:
+        """Take no more jobs, and return what came of all that are left."""
+        ...
+
+
+class InlineExecutor:
+    """Runs each job when it is submitted: one process, deterministic."""
+
+    def __init__(self, parts: RecoveryParts) -> None:
+        self._parts = parts
+        self._done: list[Outcome] = []
+
+    def submit(self, job: RecoveryJob) -> None:
+        """Run the job."""
+        self._done.append((job, recover(job, self._parts)))
+
+    def poll(self) -> list[Outcome]:
+        """Return what has run since the last call."""
+        done, self._done = self._done, []
+        return done
+
+    def finish(self) -> list[Outcome]:
+        """Return what has run since the last call."""
+        return self.poll()

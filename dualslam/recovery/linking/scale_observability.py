@@ -1,0 +1,163 @@
+"""How firmly a map holds its scale from one place to another.
+
+A link is measured where two maps overlap; what it is made for lies elsewhere, at the new map's live end. Between the
+two places the scale is handed on from landmark to landmark, and where few are shared, or all are seen under one angle,
+little of it arrives. How much is known of it stands in the normal equations of the map: all poses and points between
+the places are unknown together, and what is asked is the ratio of the scales at which the cameras of either place see
+their points. That ratio does not depend on the gauge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.alignment import COVARIANCE_INFLATION
+from dualslam.core.geometry.projection import project_points, projection_jacobians
+from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.submap import Submap
+
+N_AROUND = 10
+"""Keyframes before and after the two places that hold them in shape: what lies farther off shares little with them."""
+N_GAUGE = 7
+"""Directions of the poses that no observation fixes: a similarity of the whole."""
+SLACK = 1e-12
+"""Relative to a block of the normal equations: what keeps a point without parallax from being singular."""
+NO_TIE = 1e-7
+"""Relative to the median stiffness: directions that are softer than this are as free as the gauge."""
+
+
+def scale_sigma_between(submap: Submap, here: IntArray, there: IntArray, pixel_chi2: float) -> float:
+    """Return the standard deviation of the log of the scale at one place relative to another.
+
+    Parameters
+    ----------
+    submap : Submap
+        Solved. Its keyframes from the first to the last of those given, and some around, count with what they saw.
+    here, there : IntArray
+        Keyframe ids of the two places, which may overlap; those that the submap does not hold are passed over.
+    pixel_chi2 : float
+        Observations that are off by more than this tell nothing.
+
+    Returns
+    -------
+    float
+        Inflated as the links' own covariances are. Infinite where the places do not hang together, or one is empty.
+    """
+    held = np.array(sorted(submap.keyframes))
+    here, there = (ids[np.isin(ids, held)] for ids in (here, there))
+    if not len(here) or not len(there):
+        return np.inf
+    place = np.searchsorted(held, [min(here.min(), there.min()), max(here.max(), there.max())])
+    problem = _linearise(submap, held[max(place[0] - N_AROUND, 0) : place[1] + N_AROUND + 1], pixel_chi2)
+    g = [_scale_at(problem, ids) for ids in (there, here)]
+    if g[0] is None or g[1] is None:
+        return np.inf
+    g_pose, g_point = g[0][0] - g[1][0], g[0][1] - g[1][1]
+    # The points are eliminated: what remains of the functional is one of the poses.
+    through = np.einsum("nij,nj->ni", problem.inverse, g_point)
+    g_pose = g_pose - problem.H_cross @ through.reshape(-1)
+    values, vectors = np.linalg.eigh(problem.reduced)
+    along = vectors.T @ g_pose
+    stiff = values > NO_TIE * float(np.median(values))
+    stiff[:N_GAUGE] = False
+    free = ~stiff
+    free[:N_GAUGE] = False
+    if (along[free] ** 2 > SLACK).any():
+        return np.inf
+    variance = float((g_point * through).sum() + (along[stiff] ** 2 / values[stiff]).sum())
+    return float(np.sqrt(COVARIANCE_INFLATION * max(variance, 0.0)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """The normal equations of F keyframes and N points, the points' blocks inverted.
+
+    Attributes
+    ----------
+    ids : (F,) int64
+    T_cam_submap : (F, 4, 4)
+    xyz : (N, 3)
+    kf, point : (R,) int64
+        Rows of each observation.
+    inverse : (N, 3, 3)
+        Covariances of the points, given the poses.
+    H_cross : (6 F, 3 N) sparse
+    reduced : (6 F, 6 F)
+        Of the poses, the points eliminated.
+    """
+
+    ids: IntArray
+    T_cam_submap: FloatArray
+    xyz: FloatArray
+    kf: IntArray
+    point: IntArray
+    inverse: FloatArray
+    H_cross: sparse.csr_array
+    reduced: FloatArray
+
+
+def _linearise(submap: Submap, ids: IntArray, pixel_chi2: float) -> _Problem:
+    obs = submap.observations
+    rows = np.flatnonzero(obs["alive"] & np.isin(obs["kf"], ids))
+    uv, sigma = submap.observed_pixels(rows)
+    kf = np.searchsorted(ids, obs["kf"][rows])
+    T = se3.inverse(submap.keyframe_poses(ids))
+    all_xyz = submap.landmarks["xyz_mu"][obs["landmark"][rows]]
+    J_pose, J_point, good = np.zeros((len(rows), 2, 6)), np.zeros((len(rows), 2, 3)), np.zeros(len(rows), bool)
+    for f in range(len(ids)):
+        seen = np.flatnonzero(kf == f)
+        seen = seen[submap.depths(obs["landmark"][rows[seen]], T[f]) > 0]
+        J_pose[seen], J_point[seen] = projection_jacobians(submap.K, T[f], all_xyz[seen])
+        predicted, _ = project_points(submap.K, T[f], all_xyz[seen])
+        good[seen] = ((predicted - uv[seen]) ** 2).sum(1) < pixel_chi2 * sigma[seen] ** 2
+    # A point seen once says nothing of the poses.
+    landmark = obs["landmark"][rows]
+    good &= np.bincount(landmark[good], minlength=len(submap.landmarks))[landmark] >= 2
+    kf, landmark, weight = kf[good], landmark[good], 1.0 / sigma[good] ** 2
+    J_pose, J_point = J_pose[good], J_point[good]
+    points, point = np.unique(landmark, return_inverse=True)
+    n_f, n_p = len(ids), len(points)
+    H_point = np.zeros((n_p, 3, 3))
+    np.add.at(H_point, point, np.einsum("rai,r,raj->rij", J_point, weight, J_point))
+    H_point += SLACK * np.trace(H_point, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    inverse = np.asarray(np.linalg.inv(H_point), np.float64)
+    H_pose = np.zeros((n_f, 6, 6))
+    np.add.at(H_pose, kf, np.einsum("rai,r,raj->rij", J_pose, weight, J_pose))
+    blocks = np.einsum("rai,r,raj->rij", J_pose, weight, J_point)
+    row = 6 * kf[:, None, None] + np.arange(6)[:, None]
+    column = 3 * point[:, None, None] + np.arange(3)
+    through = np.einsum("rij,rjk->rik", blocks, inverse[point])
+    shape = 6 * n_f, 3 * n_p
+    places = np.broadcast_to(row, blocks.shape).reshape(-1), np.broadcast_to(column, blocks.shape).reshape(-1)
+    H_cross = sparse.csr_array((blocks.reshape(-1), places), shape=shape)
+    reduced = -np.asarray((sparse.csr_array((through.reshape(-1), places), shape=shape) @ H_cross.T).toarray())
+    for f in range(n_f):
+        reduced[6 * f : 6 * f + 6, 6 * f : 6 * f + 6] += H_pose[f]
+    return _Problem(
+        ids, T, submap.landmarks["xyz_mu"][points], kf, point, inverse, H_cross, 0.5 * (reduced + reduced.T)
+    )
+
+
+def _scale_at(problem: _Problem, ids: IntArray) -> tuple[FloatArray, FloatArray] | None:
+    """Return the derivative of the mean log depth that some keyframes see: by the poses (6 F,), the points (N, 3).
+
+    A point counts by how well its own depth is known where the poses are.
+    """
+    seen = np.isin(problem.kf, np.searchsorted(problem.ids, ids))
+    if not seen.any():
+        return None
+    kf, point = problem.kf[seen], problem.point[seen]
+    T = problem.T_cam_submap[kf]
+    p = se3.act_each(T, problem.xyz[point])
+    by_pose = np.column_stack([p[:, 1], -p[:, 0], np.zeros((len(p), 3)), np.ones(len(p))]) / p[:, 2:]
+    by_point = T[:, 2, :3] / p[:, 2:]
+    share = 1.0 / np.maximum(np.einsum("ri,rij,rj->r", by_point, problem.inverse[point], by_point), 1e-12)
+    share /= share.sum()
+    g_pose, g_point = np.zeros((len(problem.ids), 6)), np.zeros_like(problem.xyz)
+    np.add.at(g_pose, kf, share[:, None] * by_pose)
+    np.add.at(g_point, point, share[:, None] * by_point)
+    return g_pose.reshape(-1), g_point

@@ -1,0 +1,142 @@
+"""The gates of a link: a wide enough overlap, and the same shape of both maps there."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from dualslam.config.settings import LinkingConfig
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
+from dualslam.map.submap import Submap
+from dualslam.recovery.linking.pairs import PairModel
+from dualslam.recovery.linking.scale_observability import scale_sigma_between
+from dualslam.recovery.linking.shape import Shape
+
+
+def check_own_pixels(model: PairModel, views: BoolArray, config: LinkingConfig) -> Failure | None:
+    """Refuse where either map's points do not lie on that map's own pixels: mirrored or bent copies give way here."""
+    in_old, in_new = model.own_reprojection2()
+    for name, chi2 in (("old", in_old), ("new", in_new)):
+        share = float((chi2[views] < config.pixel_chi2).mean())
+        if share <= config.min_majority:
+            detail = f"{share:.0%} of the {name} map's matched points lie on their own pixels"
+            return Failure(FailureReason.REPROJECTION, detail, {f"own_share_{name}": share})
+    return None
+
+
+def check_reprojection(
+    model: PairModel, S_old_new: FloatArray, views: BoolArray, config: LinkingConfig
+) -> Failure | None:
+    """Refuse where the points of one map do not fall on the pixels of the other, in either direction."""
+    in_old, in_new = model.reprojection2(S_old_new)
+    for name, chi2 in (("old", in_old), ("new", in_new)):
+        share = float((chi2[views] < config.pixel_chi2).mean())
+        if share <= config.min_majority:
+            detail = f"{share:.0%} of the points of the other map fall on the {name} map's pixels"
+            return Failure(FailureReason.REPROJECTION, detail, {f"share_in_{name}": share})
+    return None
+
+
+def check_spread(
+    model: PairModel, old: Submap, pair_mask: BoolArray, keyframes: BoolArray, config: LinkingConfig
+) -> Failure | None:
+    """Refuse where the agreeing landmarks cover too little of the image, along either axis, or of depth."""
+    c = model.pairs
+    views = pair_mask[c.view_pair] & keyframes[c.view_keyframe]
+    ids = c.keyframes[keyframes]
+    features = np.concatenate([old.keyframes[k].features.uv_rect_px for k in ids.tolist()])
+    covered = np.ptp(np.percentile(c.uv_old[views], [5, 95], axis=0), axis=0)
+    share = covered / np.maximum(np.ptp(np.percentile(features, [5, 95], axis=0), axis=0), 1e-9)
+    numbers = {"spread_u": float(share[0]), "spread_v": float(share[1])}
+    if share.min() < config.min_image_spread:
+        return Failure(FailureReason.SPREAD, f"{share.min():.0%} of the image is covered", numbers)
+    depth = model.depths_old()
+    ranges = []
+    for k in np.flatnonzero(keyframes).tolist():
+        near, middle, far = np.percentile(depth[views & (c.view_keyframe == k)], [10, 50, 90])
+        ranges.append((far - near) / middle)
+    numbers["spread_depth"] = float(np.median(ranges))
+    if np.median(ranges) < config.min_depth_spread:
+        return Failure(FailureReason.SPREAD, f"depths differ by {np.median(ranges):.1%}", numbers)
+    return None
+
+
+def check_parting(
+    model: PairModel,
+    S_old_new: FloatArray,
+    old: Submap,
+    new: Submap,
+    agreeing: IntArray,
+    parted: IntArray,
+    config: LinkingConfig,
+) -> Failure | None:
+    """Refuse where maps that agree at some keyframes (ids) part at newer ones, unless it is the old one that gave way.
+
+    One of the two is bent in between. Is it the old one, the link holds and goes round its tail; is it the new one, the
+    link is true where it is measured and wrong at the live end, for which it is made. What parts them is shared out in
+    proportion to their variances between the two places, so the old map is to blame only where it is the looser one by
+    far. That holds for what the variances allow: where the scales differ by more, one of the maps is broken, and says
+    nothing of it (HoloLens, a gap relocalisation of 24 frames: 47 % off, where the old map left 3 % open and the new one 0.7 %).
+    """
+    sigma_old, sigma_new = (scale_sigma_between(m, agreeing, parted, config.pixel_chi2) for m in (old, new))
+    apart = _log_scale_at(model, parted) - math.log(sim3.scale(S_old_new))
+    numbers = {"parted": float(len(parted)), "change_point": float(parted[0])}
+    numbers |= {"held_old": sigma_old, "held_new": sigma_new, "log_scale": apart}
+    if abs(apart) > config.gate_sigmas * math.hypot(sigma_old, sigma_new):
+        detail = f"the maps part by {apart:+.0%} in scale at {len(parted)} newer keyframes, and neither is torn"
+        return Failure(FailureReason.AGREEMENT, detail, numbers)
+    if math.isfinite(sigma_new) and sigma_old > config.gate_sigmas * sigma_new:
+        return None
+    detail = f"the maps part at {len(parted)} newer keyframes, and either may be the bent one"
+    return Failure(FailureReason.AGREEMENT, detail, numbers)
+
+
+def _log_scale_at(model: PairModel, keyframes: IntArray) -> float:
+    """Return the log of the scale of the old map to the new one, as some keyframes (ids) see their points."""
+    in_old, in_new = model.depths_old(), model.depths_new()
+    seen = np.isin(model.pairs.keyframes, keyframes)[model.pairs.view_keyframe] & (in_old > 0) & (in_new > 0)
+    return float(np.median(np.log(in_old[seen] / in_new[seen]))) if seen.any() else math.inf
+
+
+def check_sigmas(
+    model: PairModel, S_old_new: FloatArray, covariance: FloatArray, config: LinkingConfig
+) -> Failure | None:
+    """Refuse a similarity that the landmarks do not fix (collinear, all at one place), by its own covariance."""
+    numbers = sigma_numbers(model, S_old_new, covariance)
+    if numbers["sigma_scale"] > config.max_scale_sigma:
+        return Failure(FailureReason.SCALE, f"scale known to {numbers['sigma_scale']:.1%}", numbers)
+    if numbers["sigma_rot_deg"] > config.max_rotation_sigma_deg:
+        return Failure(FailureReason.DEGENERATE, f"rotation known to {numbers['sigma_rot_deg']:.2f} deg", numbers)
+    if numbers["sigma_trans_mu"] > config.max_position_sigma * numbers["depth_mu"]:
+        return Failure(FailureReason.DEGENERATE, f"position known to {numbers['sigma_trans_mu']:.3g}", numbers)
+    return None
+
+
+def sigma_numbers(model: PairModel, S_old_new: FloatArray, covariance: FloatArray) -> dict[str, float]:
+    """Return the sigmas of scale (relative), rotation, and position of the overlap's centre (unit of the old map)."""
+    at_centre = sim3.adjoint(se3.from_parts(np.eye(3), -model.centre_new))
+    C = at_centre @ covariance @ at_centre.T
+    distance = np.linalg.norm(model.pairs.xyz_old[:, None] - model.T_old_kf[None, :, :3, 3], axis=2)
+    return {
+        "sigma_scale": math.sqrt(C[6, 6]),
+        "sigma_rot_deg": math.degrees(math.sqrt(np.linalg.eigvalsh(C[:3, :3])[-1])),
+        "sigma_trans_mu": float(sim3.scale(S_old_new)) * math.sqrt(np.linalg.eigvalsh(C[3:6, 3:6])[-1]),
+        "depth_mu": float(np.median(distance)),
+    }
+
+
+def check_shape(shape: Shape, config: LinkingConfig) -> Failure | None:
+    """Refuse maps of different shape: stretched or sheared as a whole, or parts that want another scale or rotation."""
+    chi2 = shape.strain_chi2(config)
+    if chi2 > config.strain_chi2:
+        strain = float(np.linalg.norm(shape.strain))
+        numbers = {"strain": strain, "strain_chi2": chi2}
+        return Failure(FailureReason.DEFORMED, f"stretched by {strain:.1%}", numbers)
+    for d in shape.parts:
+        if d.scale_deviates(config) or d.turn_deviates(config):
+            degrees = math.degrees(d.turn_rad)
+            detail = f"part of the maps ({d.part}) differs by {d.log_scale:+.1%} in scale, {degrees:.2f} deg"
+            return Failure(FailureReason.DEFORMED, detail, {"log_scale": d.log_scale, "rotation_deg": degrees})
+    return None

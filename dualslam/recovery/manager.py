@@ -1,0 +1,384 @@
+"""The lost submaps that wait for a link, the walks that look for it, and how their results come into the live map."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from itertools import takewhile
+from typing import Any
+
+from dualslam.calibration.lens import Calibration
+from dualslam.config.settings import RecoveryConfig
+from dualslam.core.errors import SolverError
+from dualslam.core.events import EventKind
+from dualslam.core.geometry import sim3
+from dualslam.core.interfaces import SubmapGraph, VisualOdometry
+from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus, Keyframe, View
+from dualslam.map.atlas import Link, LinkKind
+from dualslam.map.propagation import propagate_poses
+from dualslam.map.record import FrameStamp, Record
+from dualslam.map.solving import solve
+from dualslam.map.submap import Submap
+from dualslam.map.submap_change import change_of_frame
+from dualslam.recovery.bypass import absorb, bypass, drop_corrupted
+from dualslam.recovery.direction import reads_backwards
+from dualslam.recovery.executor import Outcome, RecoveryExecutor
+from dualslam.recovery.frame_buffer import FrameBuffer
+from dualslam.recovery.merge import Merged, merge_recovery, propagate_links
+from dualslam.recovery.overlap_refinement import gauge_at_overlap
+from dualslam.recovery.reverse_tracking import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult
+from dualslam.recovery.schedule import RetrySchedule, way_to_gaps
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """How a submap was lost: suspected from frame `onset` on, why, and the first frame without a pose."""
+
+    onset: int
+    cause: str
+    first_frame: int
+
+
+@dataclass(frozen=True, slots=True)
+class _UnderWay:
+    """A walk that has begun: when, with how many live keyframes, and whether it is not the submap's first."""
+
+    began_s: float
+    n_live: int
+    again: bool
+
+
+class Recoveries:
+    """Starts a walk back for each new submap, and merges what it found at a frame boundary.
+
+    Parameters
+    ----------
+    record : Record
+    buffer : FrameBuffer
+    executor : RecoveryExecutor
+    new_graph : callable
+    calibration : Calibration
+    config : RecoveryConfig
+    """
+
+    def __init__(
+        self,
+        record: Record,
+        buffer: FrameBuffer,
+        executor: RecoveryExecutor,
+        new_graph: Callable[[], SubmapGraph],
+        calibration: Calibration,
+        config: RecoveryConfig,
+    ) -> None:
+        self._record = record
+        self._buffer = buffer
+        self._executor = executor
+        self._new_graph = new_graph
+        self._calibration = calibration
+        self._config = config
+        self._lost: dict[int, Loss] = {}  # submaps that are not linked yet
+        self._under_way: dict[int, _UnderWay] = {}  # by the new submap's id
+        self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
+        self._retries = RetrySchedule(config.retry_keyframes)
+
+    @property
+    def waiting(self) -> list[int]:
+        """The lost submaps that are not linked yet."""
+        return sorted(self._lost)
+
+    def declare_lost(self, submap_id: int, onset: int, cause: str, first_lost: int) -> None:
+        """Let the walks to come look for a submap: lost at frame `first_lost`, suspected from `onset` on."""
+        if self._config.enabled:
+            self._lost[submap_id] = Loss(onset, cause, first_lost)
+
+    def is_under_way(self, submap: Submap) -> bool:
+        """Whether a walk back from a submap has not come to its end yet."""
+        return submap.id in self._under_way
+
+    def found_again(self, submap: Submap) -> None:
+        """Let no walk look for a submap that is live again; from its next keyframe one poses the frames of the gap."""
+        self._lost.pop(submap.id, None)
+        self._retries.start_of(submap, min(submap.keyframes))
+        self._retries.leave_open(submap.id, 0, self._calibration.camera)
+
+    def start(self, submap: Submap, newest: View, now: FrameStamp | None = None) -> None:
+        """Start the walk back from a new submap: over the frames without a pose, then on into the lost submaps.
+
+        It begins at its keyframe `newest`, also where it is made again later (`now`).
+        """
+        onsets = {m: loss.onset for m, loss in self._lost.items()}
+        if onsets:
+            self._circumstances[submap.id] = self._circumstances_of_loss()
+            numbers = {**self._circumstances[submap.id], **self._buffer.numbers}
+            self._record.event(
+                EventKind.RECOVERY_STARTED,
+                now or newest,
+                submap.id,
+                lost=sorted(onsets),
+                again=now is not None,
+                **numbers,
+            )
+        self._submit(submap, newest, self._views_before(newest, submap), onsets, now)
+
+    def retry(self, submap: Submap, now: FrameStamp, last_chance: bool = False) -> None:
+        """Walk back again where something was left to find, once the new map has grown or its camera was calibrated.
+
+        A link, while the buffer holds frames that a lost map saw; else poses of buffered frames that have none.
+        `last_chance`: no frame comes any more.
+        """
+        if submap.id in self._under_way:
+            return
+        if not self._retries.take_if_due(submap, now.index, self._calibration.camera, last_chance):
+            return
+        lost = {k for m in self._lost for k in self._record.atlas.submaps[m].keyframes}
+        own = [view for view in self._buffer if view.index in submap.keyframes]
+        if own and any(view.index in lost for view in self._buffer):
+            first = self._retries.start_of(submap, now.index)
+            self.start(submap, min(own, key=lambda view: (abs(view.index - first), view.index)), now)
+        elif way := self._way_to_gaps(submap):
+            self._submit(submap, way[0], way[1:], {}, now)
+
+    def _submit(
+        self, submap: Submap, newest: View, views: Iterable[View], onsets: dict[int, int], now: FrameStamp | None
+    ) -> None:
+        job = RecoveryJob(
+            submap=submap.copy(),
+            newest_id=newest.index,
+            lost={m: self._record.atlas.submaps[m].copy() for m in onsets},
+            onsets=onsets,
+            views=tuple(views),
+            own=tuple(view for view in self._buffer if view.index in submap.keyframes),
+            camera=self._calibration.camera,
+            camera_covariance=self._calibration.covariance,
+        )
+        self._retries.start_of(submap, newest.index)
+        n_live = self._retries.n_live(submap, (now or newest).index)
+        self._under_way[submap.id] = _UnderWay(time.perf_counter(), n_live, again=now is not None)
+        self._executor.submit(job)
+
+    def _way_to_gaps(self, submap: Submap) -> list[View]:
+        """Return the buffered frames without a pose, and what leads to them from the submap; the latest first.
+
+        What another map has posed that is not linked with this one, and all that is older, is not this one's to pose.
+        """
+        poses, own = self._record.poses, next(c for c in self._record.atlas.components() if submap.id in c)
+        views = takewhile(
+            lambda view: view.index not in poses or poses[view.index].submap_id in own, reversed(tuple(self._buffer))
+        )
+        return way_to_gaps(tuple(views), poses.keys(), submap.keyframes.keys())
+
+    def collect(self, live: VisualOdometry | None, now: FrameStamp) -> None:
+        """Merge the walks that have ended. `live` goes on in its submap as it is after that."""
+        self._take(self._executor.poll(), live, now)
+
+    def finish(self, live: VisualOdometry | None, last: FrameStamp | None, interrupted: bool) -> None:
+        """Walk back once more, merge what is under way after the last frame, if it ends soon, and end the executor.
+
+        `interrupted`: no walk is begun any more.
+        """
+        if live is not None and last is not None and not interrupted:
+            self.collect(live, last)
+            self.retry(live.submap, last, last_chance=True)
+        outcomes = self._executor.finish()
+        if last is not None:
+            self._take(outcomes, live, last)
+
+    def _take(self, outcomes: list[Outcome], live: VisualOdometry | None, now: FrameStamp) -> None:
+        for job, result in outcomes:
+            walk = self._under_way.pop(job.submap.id)
+            if isinstance(result, Failure):
+                self._failed(job, now, result, time.perf_counter() - walk.began_s)
+            else:
+                self._record.timer.add("walk back", result.cpu_s)
+            if walk.again and not job.onsets and not self._poses_any(result):
+                continue  # the last one for these frames; what it would add to the map is not worth a solution
+            if not isinstance(result, Failure):
+                with self._record.timer.measure("merging"):
+                    self._take_in(job, result, live, now, walk.began_s)
+            unlinked = bool(job.onsets) and (isinstance(result, Failure) or result.link is None)
+            if unlinked or self._way_to_gaps(self._record.atlas.submaps[job.submap.id]):
+                self._retries.leave_open(job.submap.id, walk.n_live, job.camera)
+
+    def _poses_any(self, result: RecoveryResult | Failure) -> bool:
+        """Whether a walk has found a pose for a frame that has none."""
+        if isinstance(result, Failure):
+            return False
+        return any(frame.pose.index not in self._record.poses for frame in result.frames)
+
+    def _views_before(self, newest: View, submap: Submap) -> list[View]:
+        """Return the buffered frames before a keyframe, the latest first: as far back as a lost map has seen any.
+
+        Where none has, as far as none is posed in another map.
+        """
+        views, poses = list(self._buffer.backwards_from(newest.index)), self._record.poses
+        seen = {i for i, pose in poses.items() if pose.submap_id in self._lost}
+        seen.update(k for m in self._lost for k in self._record.atlas.submaps[m].keyframes)
+        of_lost = [n for n, view in enumerate(views) if view.index in seen]
+        if of_lost:
+            return views[: of_lost[-1] + 1]
+        return list(takewhile(lambda v: v.index not in poses or poses[v.index].submap_id == submap.id, views))
+
+    def _circumstances_of_loss(self) -> dict[str, Any]:
+        """Why the newest of the lost maps was lost, and how many frames are buffered of before (k) and since (k_r)."""
+        loss = self._lost[max(self._lost)]
+        indices = [view.index for view in self._buffer]
+        k = indices.index(loss.first_frame) if loss.first_frame in indices else 0
+        return {"cause": loss.cause, "k": k, "k_r": len(indices) - k}
+
+    def _failed(self, job: RecoveryJob, now: FrameStamp, failure: Failure, seconds: float) -> None:
+        self._record.event(
+            EventKind.RECOVERY_FAILED,
+            now,
+            job.submap.id,
+            lost=sorted(job.onsets),
+            reason=str(failure.reason),
+            detail=failure.detail,
+            seconds=seconds,
+        )
+
+    # --- taking a result in
+
+    def _take_in(
+        self, job: RecoveryJob, result: RecoveryResult, live: VisualOdometry | None, now: FrameStamp, started_s: float
+    ) -> None:
+        """Merge a result into its submap, live or archived by now; solve it; pose and link by what came of it."""
+        submap = self._record.atlas.submaps[job.submap.id]
+        merged = merge_recovery(submap, job.submap, result.submap, self._rectifier(job, submap))
+        if result.link is not None:
+            merged.submap.gauge = gauge_at_overlap(merged.submap, result.link.estimate.agreeing_keyframes)
+        unsolved, graph = merged.submap.copy(), self._new_graph()
+        try:
+            solve(merged.submap, graph, near_optimum=_same_camera(job, submap))
+        except SolverError as error:
+            failure = Failure(FailureReason.SOLVER, str(error))
+            self._failed(job, now, failure, time.perf_counter() - started_s)
+            return
+        before = submap.copy()
+        submap.take_over(merged.submap)
+        propagate_links(self._record.atlas, before, submap)
+        if live is not None and live.submap is submap:
+            live.adopt(graph, before)
+        told = self._circumstances.get(submap.id, {})
+        for event in result.events:
+            data = event.data | (told if event.event is EventKind.RECOVERY_ATTEMPT else {})
+            self._record.events.add(event.event, event.frame, event.timestamp_s, event.submap, **data)
+        recovered_frames = self._pose_frames(result, merged, submap)
+        seconds = time.perf_counter() - started_s
+        if job.onsets:
+            self._record.event(
+                EventKind.RECOVERY_ENDED,
+                now,
+                submap.id,
+                linked=result.link is not None,
+                frames=len(recovered_frames),
+                keyframes=len(result.submap.keyframes.keys() - job.submap.keyframes.keys()),
+                recovery_s=result.seconds,
+                seconds=seconds,
+            )
+        if result.link is not None:
+            estimate = result.link.estimate
+            S_now_then = change_of_frame(unsolved, submap, estimate.agreeing_keyframes.tolist()) @ merged.S_live_grown
+            self._fuse(job, result.link, S_now_then, recovered_frames, now, seconds)
+            self._settle(result.link.old_id, live)
+        for gone in absorb(self._record, recovered_frames, submap.id, self._lost.keys(), now):
+            self._lost.pop(gone, None)
+
+    def _rectifier(self, job: RecoveryJob, submap: Submap) -> Callable[[Keyframe], Keyframe]:
+        """Return what gives the walk's keyframes the pixels of the camera that the submap has now."""
+
+        def rectify(keyframe: Keyframe) -> Keyframe:
+            if _same_camera(job, submap):
+                return keyframe
+            view = View(keyframe.id, keyframe.timestamp_s, keyframe.features)
+            return replace(keyframe, features=self._calibration.rectified(view).features)
+
+        return rectify
+
+    def _pose_frames(self, result: RecoveryResult, merged: Merged, submap: Submap) -> list[RecoveredFrame]:
+        """Carry the frames of the walk into the solved submap, and enter those that had no pose."""
+        scale = float(sim3.scale(merged.S_live_grown))
+        scaled = [replace(frame.pose, T_kf_cam=_scaled(frame.pose.T_kf_cam, scale)) for frame in result.frames]
+        carried = {pose.index: pose for pose in propagate_poses(scaled, merged.moved, submap)}
+        recovered_frames = []
+        for frame, pose in zip(result.frames, scaled, strict=True):
+            recovered_frames.append(replace(frame, pose=carried.get(pose.index, pose)))
+            if pose.index not in self._record.poses:
+                self._record.pose(recovered_frames[-1].pose, frame.n_matches, frame.n_inliers)
+        return recovered_frames
+
+    def _fuse(
+        self,
+        job: RecoveryJob,
+        found: FoundLink,
+        S_now_then: FloatArray,
+        recovered_frames: list[RecoveredFrame],
+        now: FrameStamp,
+        seconds: float,
+    ) -> None:
+        """Join the two submaps by the link; frames of the old map's end take their pose from the new one.
+
+        The link was measured between a copy of the old submap and the new one at the end of the walk. Both may have
+        moved since, and the link with them.
+        """
+        record, link, new_id = self._record, found.estimate, job.submap.id
+        agreeing = link.agreeing_keyframes.tolist()
+        S_old_now_then = change_of_frame(job.lost[found.old_id], record.atlas.submaps[found.old_id], agreeing)
+        S_old_new = S_old_now_then @ link.S_old_new @ sim3.inverse(S_now_then)
+        Ad = sim3.adjoint(S_now_then)
+        covariance = Ad @ link.covariance @ Ad.T
+        record.atlas.link(Link(found.old_id, new_id, S_old_new, covariance, LinkKind.RECOVERY, tuple(agreeing)))
+        record.event(
+            EventKind.LINKED,
+            now,
+            new_id,
+            old_submap=found.old_id,
+            attempt=found.attempt,
+            matches=link.n_matches,
+            inliers=link.n_inliers,
+            agreeing_keyframes=agreeing,
+            change_point=link.change_point,
+            S_old_new=S_old_new.tolist(),
+            seconds=seconds,
+            **(link.numbers | {"scale": float(sim3.scale(S_old_new))}),
+        )
+        order = -1 if reads_backwards(job) else 1  # times a frame's number: ascends with time, as it is read
+        onset = job.onsets[found.old_id]
+        corrupted_since = order * onset
+        if link.change_point is not None:
+            corrupted_since = min(corrupted_since, order * link.change_point)
+        n_bypassed = bypass(record, recovered_frames, new_id, agreeing[-1], order)
+        n_dropped = drop_corrupted(record, found.old_id, corrupted_since, order)
+        for frame in recovered_frames:
+            if order * frame.pose.index >= order * onset and self._was_lost(frame.pose.index, found.old_id):
+                record.rows[frame.pose.index].status = FrameStatus.RECOVERED
+        refinement = found.refinement
+        numbers = (
+            {"overlap": str(refinement.reason)}
+            if isinstance(refinement, Failure)
+            else {"overlap": "refined", **refinement.numbers}
+        )
+        record.event(
+            EventKind.FUSED, now, new_id, old_submap=found.old_id, bypassed=n_bypassed, dropped=n_dropped, **numbers
+        )
+
+    def _settle(self, old_id: int, live: VisualOdometry | None) -> None:
+        """Let no walk look any more for what is linked: the old submap, and all that is one map with the live one."""
+        settled = {old_id}
+        if live is not None:
+            settled.update(next(c for c in self._record.atlas.components() if live.submap.id in c))
+        self._lost = {m: loss for m, loss in self._lost.items() if m not in settled}
+
+    def _was_lost(self, index: int, old_id: int) -> bool:
+        tracked = self._record.rows[index].status is FrameStatus.TRACKED
+        return tracked and self._record.poses[index].submap_id != old_id
+
+
+def _same_camera(job: RecoveryJob, submap: Submap) -> bool:
+    return bool((submap.K == job.submap.K).all())
+
+
+def _scaled(T: FloatArray, scale: float) -> FloatArray:
+    scaled = T.copy()
+    scaled[:3, 3] *= scale
+    return scaled

@@ -1,0 +1,199 @@
+"""What a walk back added to a snapshot of a submap, put into that submap as it has become meanwhile.
+
+Three states of one submap: the snapshot (`base`), the snapshot with what the walk added (`grown`), and the submap that
+went on (`live`): it may have grown at its other end, been solved again, changed its camera, or been archived. Landmark
+ids and observation rows only grow, so that all which is older than the snapshot has the same ids in all three. What the
+walk added are observations; its poses and points are initial values for the next solution, no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe
+from dualslam.map.atlas import Atlas
+from dualslam.map.submap import NO_LANDMARK, Anchor, Submap
+from dualslam.map.submap_change import change_of_frame
+
+Rectify = Callable[[Keyframe], Keyframe]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Merged:
+    """A submap with what a walk back added, not solved yet.
+
+    Attributes
+    ----------
+    submap : Submap
+        A copy of the live one with the additions.
+    moved : Submap
+        The walk's own state of it, in the frame and unit of the live one.
+    S_live_grown : (4, 4)
+        From the frame in which the walk has ended to the live one's.
+    """
+
+    submap: Submap
+    moved: Submap
+    S_live_grown: FloatArray
+
+
+def merge_recovery(live: Submap, base: Submap, grown: Submap, rectify: Rectify) -> Merged:
+    """Put the additions of a walk back into a copy of the live submap.
+
+    Parameters
+    ----------
+    live, base, grown : Submap
+        Three states of one submap, see above. The keyframes of its gauge stand in all of them.
+    rectify : callable
+        Gives a keyframe of the walk the pixels of the camera that the live submap has now.
+    """
+    S_live_grown = change_of_frame(grown, live, base.keyframes, len(base.landmarks))
+    moved = grown.copy()
+    moved.transform(
+        float(sim3.scale(S_live_grown)),
+        se3.from_parts(sim3.rotation(S_live_grown), sim3.translation(S_live_grown)),
+    )
+    merged = live.copy()
+    _add_keyframes(merged, base, moved, rectify)
+    _remove_rejected(merged, base, moved)
+    id_of = _identify(merged, base, moved)
+    id_of = _add_landmarks(merged, base, moved, id_of)
+    merged.add_observations(*_new_rows(merged, base, moved, id_of))
+    _add_counts(merged, base, moved)
+    return Merged(merged, moved, S_live_grown)
+
+
+def propagate_links(atlas: Atlas, before: Submap, after: Submap) -> None:
+    """Let the links of a submap follow a change of it: each stands on keyframes that both its submaps hold."""
+    for i, link in enumerate(atlas.links):
+        if after.id not in (link.a, link.b):
+            continue
+        other = atlas.submaps[link.a if link.b == after.id else link.b]
+        stands_on = link.keyframes or other.keyframes
+        shared = [k for k in stands_on if k in before.keyframes and k in after.keyframes]
+        S_after_before = change_of_frame(before, after, shared or before.keyframes)
+        if link.a == after.id:
+            atlas.links[i] = replace(link, S_a_b=S_after_before @ link.S_a_b)
+        else:
+            Ad = sim3.adjoint(S_after_before)
+            S_a_b = link.S_a_b @ sim3.inverse(S_after_before)
+            atlas.links[i] = replace(link, S_a_b=S_a_b, covariance=Ad @ link.covariance @ Ad.T)
+
+
+def _add_keyframes(merged: Submap, base: Submap, moved: Submap, rectify: Rectify) -> None:
+    """The walk's keyframes stand before the live ones, oldest first: the last in order stay the live end's newest."""
+    new = sorted(k for k in moved.keyframes if k not in base.keyframes and k not in merged.keyframes)
+    added = {k: rectify(moved.keyframes[k]) for k in new}
+    merged.keyframes = added | merged.keyframes
+    for k, keyframe in added.items():
+        merged.T_submap_kf[k] = moved.T_submap_kf[k]
+        merged.landmark_of[k] = np.full(len(keyframe.features), NO_LANDMARK, np.int64)
+    for k, anchor in moved.anchors.items():
+        if k not in merged.keyframes and k not in merged.anchors:
+            merged.anchors[k] = Anchor(anchor.keyframe_id, anchor.T_kf_cam)
+    for k, known in moved.relative_poses.items():
+        if k in added and known.keyframe_id in merged.keyframes:
+            merged.relative_poses[k] = known
+
+
+def _remove_rejected(merged: Submap, base: Submap, moved: Submap) -> None:
+    """Drop the observations that the walk's solver found to disagree."""
+    n = len(base.observations)
+    died = np.flatnonzero(base.observations["alive"] & ~moved.observations["alive"][:n])
+    landmark, kf = base.observations["landmark"][died], base.observations["kf"][died]
+    heir = moved.current_ids(landmark)
+    # Those of merged landmarks went over to another one, and those of culled keyframes went with them.
+    judged = ((heir == landmark) | (heir == NO_LANDMARK)) & _held_by(moved, kf)
+    merged.remove_observations(died[judged])
+    touched = np.unique(landmark[judged])
+    merged.remove_landmarks(touched[merged.n_observations(touched) < 2])
+
+
+def _identify(merged: Submap, base: Submap, moved: Submap) -> IntArray:
+    """Return for each landmark of the walk the one that it is in the merged submap, if that is known already.
+
+    Older than the snapshot: the same, and where the walk found two of them to be one, they become one. Newer: one that
+    holds a feature which the live submap has given a landmark meanwhile is that landmark.
+    """
+    n = len(base.landmarks)
+    id_of = np.full(len(moved.landmarks), NO_LANDMARK, np.int64)
+    heir = moved.current_ids(np.arange(n))
+    for j in np.flatnonzero((heir != np.arange(n)) & (heir != NO_LANDMARK) & merged.landmarks["alive"][:n]).tolist():
+        h = int(heir[j])
+        if h >= n and id_of[h] == NO_LANDMARK:
+            id_of[h] = j
+            continue
+        kept = merged.current_id(h if h < n else int(id_of[h]))
+        if merged.landmarks["alive"][kept]:
+            merged.merge_landmarks(np.array([kept]), np.array([j]))
+    id_of[:n] = merged.current_ids(np.arange(n))
+    id_of[n:] = merged.current_ids(id_of[n:])
+    kf, feature, landmark = _rows_with_a_place(merged, base, moved)
+    for k in np.unique(kf).tolist():
+        here = (kf == k) & (landmark >= n)
+        there = merged.landmark_of[k][feature[here]]
+        same = (there != NO_LANDMARK) & (id_of[landmark[here]] == NO_LANDMARK)
+        id_of[landmark[here][same]] = there[same]
+    return id_of
+
+
+def _add_landmarks(merged: Submap, base: Submap, moved: Submap, id_of: IntArray) -> IntArray:
+    """Append the walk's landmarks that are new and still seen by two keyframes; return the completed `id_of`."""
+    n = len(base.landmarks)
+    _, _, landmark = _rows_with_a_place(merged, base, moved)
+    seen = np.bincount(landmark, minlength=len(moved.landmarks))
+    new = np.flatnonzero((id_of == NO_LANDMARK) & moved.landmarks["alive"] & (seen >= 2))
+    new = new[new >= n]
+    id_of = id_of.copy()
+    id_of[new] = merged.copy_landmarks(moved, new)
+    return id_of
+
+
+def _new_rows(merged: Submap, base: Submap, moved: Submap, id_of: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Return keyframe, feature and landmark of the walk's observations that have a place in the merged submap."""
+    kf, feature, landmark = _rows_with_a_place(merged, base, moved)
+    ids = id_of[landmark]
+    free = ids != NO_LANDMARK
+    for k in np.unique(kf[free]).tolist():
+        here = np.flatnonzero(free & (kf == k))
+        there = merged.landmark_of[k]
+        ok = (there[feature[here]] == NO_LANDMARK) & ~np.isin(ids[here], there)
+        ok &= _is_first(ids[here]) & _is_first(feature[here])
+        free[here] = ok
+    return kf[free], feature[free], ids[free]
+
+
+def _add_counts(merged: Submap, base: Submap, moved: Submap) -> None:
+    """How often tracking should have seen a landmark, and did, holds for both ends."""
+    n = len(base.landmarks)
+    own = np.flatnonzero(moved.landmarks["alive"][:n] & merged.landmarks["alive"][:n])
+    for name in ("n_visible", "n_found"):
+        merged.landmarks[name][own] += moved.landmarks[name][own] - base.landmarks[name][own]
+
+
+def _rows_with_a_place(merged: Submap, base: Submap, moved: Submap) -> tuple[IntArray, IntArray, IntArray]:
+    """Keyframe, feature and landmark of what the walk observed and still holds, where `merged` has that feature too."""
+    obs, n = moved.observations, len(base.observations)
+    rows = n + np.flatnonzero(obs["alive"][n:])
+    kf, feature, landmark = obs["kf"][rows], obs["feature"][rows], obs["landmark"][rows]
+    n_common = {
+        k: merged.keyframes[k].features.n_common(moved.keyframes[k].features)
+        for k in np.unique(kf).tolist()
+        if k in merged.keyframes
+    }
+    held = feature < np.array([n_common.get(k, 0) for k in kf.tolist()], np.int64)
+    return kf[held], feature[held], landmark[held]
+
+
+def _held_by(submap: Submap, kf: IntArray) -> BoolArray:
+    return np.isin(kf, np.fromiter(submap.keyframes, np.int64, len(submap.keyframes)))
+
+
+def _is_first(values: IntArray) -> BoolArray:
+    first = np.zeros(len(values), bool)
+    first[np.unique(values, return_index=True)[1]] = True
+    return first

@@ -1,0 +1,86 @@
+"""When a walk back tries to link its submap with the lost ones, and when it has tried enough."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from dualslam.config.settings import RecoveryConfig
+from dualslam.core.types import Failure
+from dualslam.map.submap import Submap
+from dualslam.recovery.linking import LinkEstimate
+
+Linker = Callable[[Submap, Submap, int | None], LinkEstimate | Failure]
+
+EACH_KEYFRAME = 12
+"""Shared keyframes up to which each new one is a reason to try."""
+GROWTH = 1.1
+"""Beyond, a try comes when they have become so many times more: it costs as much as there are of them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinkTry:
+    """One try to link the growing submap with an older one."""
+
+    old_id: int
+    n_shared: int
+    result: LinkEstimate | Failure
+
+
+class Relinker:
+    """Tries, at new keyframes of a walk, to link the growing submap with those that it has come to overlap.
+
+    Parameters
+    ----------
+    submap : Submap
+        The growing one.
+    lost : dict of int to Submap
+    onsets : dict of int to int
+        For each lost submap the frame from which on it is suspected to be corrupted.
+    linker : callable
+    config : RecoveryConfig
+
+    Attributes
+    ----------
+    has_seen_enough : bool
+        Whether the walk has met so many keyframes of a lost submap's healthy part that the next ones change nothing.
+    """
+
+    def __init__(
+        self,
+        submap: Submap,
+        lost: dict[int, Submap],
+        onsets: dict[int, int],
+        linker: Linker,
+        config: RecoveryConfig,
+    ) -> None:
+        self._submap = submap
+        self._linker = linker
+        self._config = config
+        self._onsets = onsets
+        self._old = [lost[m] for m in sorted(lost)]
+        self._tried_with: dict[int, int] = {}  # by old map: how many keyframes were shared at the last try
+        self.has_seen_enough = False
+
+    @property
+    def keyframe_ids(self) -> set[int]:
+        """Keyframes of the lost submaps."""
+        return {k for old in self._old for k in old.keyframes}
+
+    def attempts(self, keyframe_id: int) -> Iterator[LinkTry]:
+        """Try each lost submap that holds the newest keyframe of the walk, the latest lost one first."""
+        for old in reversed(self._old):
+            shared = old.keyframes.keys() & self._submap.keyframes.keys()
+            if keyframe_id not in shared or not self._is_due(old.id, len(shared)):
+                continue
+            n_healthy = sum(k < self._onsets[old.id] for k in shared)
+            self.has_seen_enough |= n_healthy >= self._config.max_shared_keyframes
+            yield LinkTry(old.id, len(shared), self._linker(old, self._submap, self._onsets[old.id]))
+
+    def _is_due(self, old_id: int, n_shared: int) -> bool:
+        if n_shared < self._config.min_shared_keyframes:
+            return False
+        if n_shared > EACH_KEYFRAME and n_shared < GROWTH * self._tried_with.get(old_id, 0):
+            return False
+        self._tried_with[old_id] = n_shared
+        return True

@@ -1,0 +1,384 @@
+"""Algorithm 1: progress back in time from a new submap until it overlaps a lost one so well that a Sim(3) links the two.
+
+The progress is a visual front end, given the buffered frames latest first. It sees images and features only, never the
+old map's poses or landmarks: a link must not confirm itself. What it takes from the old map is which frames were
+keyframes, so that both maps hold the same ones. Several attempts, each with poses from another front end, start from
+the same snapshot one after the other until one leads to a link; what one of them got wrong does not reach the next.
+
+It is a job on a snapshot that nobody else changes: it can run in a process of its own, and be merged when it is ready.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from dualslam.config.settings import FusionConfig, RecoveryConfig
+from dualslam.core.camera.models import Camera
+from dualslam.core.errors import SolverError
+from dualslam.core.events import Event, EventKind
+from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry
+from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
+from dualslam.map.submap import Submap
+from dualslam.map.trajectory import FramePose
+from dualslam.recovery.linking import NO_BEND, Bend, LinkEstimate
+from dualslam.recovery.overlap_refinement import OverlapReport, refine_overlap
+from dualslam.recovery.relinker import Linker, LinkTry, Relinker
+from dualslam.recovery.schedule import way_to_gaps
+
+log = logging.getLogger(__name__)
+
+Judge = Callable[[Track | Failure], Track | Failure]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecoveryJob:
+    """Everything that a progress back needs, as it was when the new submap started. It can be pickled.
+
+    Attributes
+    ----------
+    submap : Submap
+        The new one, a copy.
+    newest_id : int
+        The keyframe of it to start from.
+    lost : dict of int to Submap
+        Copies of the lost submaps that it may link to. With none the progress only poses the frames before the start.
+    onsets : dict of int to int
+        For each of them the frame from which on it is suspected to be corrupted.
+    views : tuple of View
+        What is buffered, latest first, from the frame before `newest_id` on. Where a progress is made again for the sake of
+        frames without a pose: those, and what leads to them.
+    own : tuple of View
+        Buffered views of the new submap's keyframes, `newest_id` included: for attempts that need their images.
+    camera : Camera
+        The one that rectified them.
+    camera_covariance : (5, 5) or None
+        Of the correction that it has, if it was estimated.
+    """
+
+    submap: Submap
+    newest_id: int
+    lost: dict[int, Submap]
+    onsets: dict[int, int]
+    views: tuple[View, ...]
+    own: tuple[View, ...]
+    camera: Camera
+    camera_covariance: FloatArray | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecoveredFrame:
+    """A frame that the progress posed, relative to a keyframe of its submap."""
+
+    pose: FramePose
+    n_matches: int
+    n_inliers: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundLink:
+    """The link that a progress ended with, and the attempt that it was. `overlap`: how that was refined, or why it was not."""
+
+    old_id: int
+    estimate: LinkEstimate
+    refinement: OverlapReport | Failure
+    attempt: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecoveryResult:
+    """What a recovery found out: the attempt that led to a link, or else the first one that walked at all.
+
+    Attributes
+    ----------
+    submap : Submap
+        The job's, grown at its early end.
+    frames : tuple of RecoveredFrame
+        In the order of the progress.
+    link : FoundLink or None
+    events : tuple of Event
+        Of all attempts, in order.
+    seconds, cpu_s : float
+        Wall time of all attempts, and CPU time of the process, whose threads find features beside the progress.
+    """
+
+    submap: Submap
+    frames: tuple[RecoveredFrame, ...]
+    link: FoundLink | None
+    events: tuple[Event, ...]
+    seconds: float
+    cpu_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attempt:
+    """One way to progress back, by the name of the front end that its poses come from."""
+
+    name: str
+    new_odometry: Callable[[RecoveryJob, Submap, SubmapGraph], VisualOdometry]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecoveryParts:
+    """What a recovery is made of; put together by the composition root of the process in which it runs.
+
+    `posing`: the way back where there is no lost map, but frames without a pose.
+    `budget_s`: wall time after which it comes to an end with what it has, where it does not run inline.
+    """
+
+    attempts: tuple[Attempt, ...]
+    posing: Attempt
+    new_graph: Callable[[], SubmapGraph]
+    link: Linker
+    propagate: Callable[[LinkEstimate, Submap, int, Bend], LinkEstimate | Failure]
+    check_camera: Callable[[Submap, LinkEstimate, RecoveryJob], Bend | Failure]
+    judge: Judge
+    config: RecoveryConfig
+    fusion: FusionConfig
+    budget_s: float | None = None
+
+
+def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Failure:
+    """Walk back from the job's submap until a link to a lost one passes its gates, or nothing is left to progress on.
+
+    The job is left as it was. Where there is no map to link with, the live features pose the frames before the start.
+    """
+    started, cpu_started = time.perf_counter(), time.process_time()
+    best: _Progress | None = None
+    problem = Failure(FailureReason.SOLVER)
+    events: list[Event] = []
+    until = np.inf if parts.budget_s is None else started + parts.budget_s
+    for attempt in parts.attempts if job.lost else (parts.posing,):
+        if best is not None and time.perf_counter() > until:
+            break
+        progress = _make_attempt(job, parts, attempt, until)
+        if isinstance(progress, Failure):
+            problem = progress
+            continue
+        events += progress.events
+        if best is None or progress.link is not None:
+            best = progress
+        if progress.link is not None or progress.needs_camera:
+            break
+    if best is None:
+        return problem
+    seconds, cpu_s = time.perf_counter() - started, time.process_time() - cpu_started
+    return RecoveryResult(best.submap, tuple(best.frames.values()), best.link, tuple(events), seconds, cpu_s)
+
+
+@dataclass(slots=True, eq=False)
+class _Progress:
+    """What one attempt has come to so far."""
+
+    submap: Submap
+    frames: dict[int, RecoveredFrame] = field(default_factory=dict)  # in the order in which they were posed first
+    events: list[Event] = field(default_factory=list)
+    link: FoundLink | None = None
+    n_keyframes: int = 0
+    n_gaps: int = 0
+    n_skipped: int = 0  # frames without a pose between some that have one
+    n_unusable: int = 0  # the last frames
+    out_of_time: bool = False
+    given_up: bool = False
+    needs_camera: bool = False  # no other progress would do better, before the camera is calibrated
+    why_unusable: str = ""
+    why_not_linked: str = ""
+
+    @property
+    def verdict(self) -> str:
+        if self.link is not None:
+            return "linked"
+        ended = "out of time" if self.out_of_time else self.why_unusable if self.n_unusable else "the buffer ends"
+        ended = "given up" if self.given_up else ended
+        return f"{ended}; no link: {self.why_not_linked}" if self.why_not_linked else ended
+
+    def note_unusable(self, failure: Failure) -> None:
+        self.n_unusable += 1
+        self.why_unusable = failure.detail or str(failure.reason)
+
+    def note_posed(self, frame: RecoveredFrame, new_keyframe: bool) -> None:
+        self.frames.setdefault(frame.pose.index, frame)
+        self.n_keyframes += new_keyframe
+        self.n_gaps += self.n_unusable > 0
+        self.n_skipped += self.n_unusable
+        self.n_unusable = 0
+
+    def note_confirmed(self, frame: RecoveredFrame) -> None:
+        self.frames.setdefault(frame.pose.index, frame)
+        self.n_skipped -= 1
+
+
+def _make_attempt(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float) -> _Progress | Failure:
+    """Make one attempt, from a copy of the job's submap; it stops at the time `until`."""
+    started = time.perf_counter()
+    submap, graph = job.submap.copy(), parts.new_graph()
+    try:
+        estimate = graph.update(submap)
+    except SolverError as error:
+        return Failure(FailureReason.SOLVER, str(error))
+    submap.apply_estimate(*estimate.values)
+    reverse_tracker = attempt.new_odometry(job, submap, graph)
+    reverse_tracker.start_at(job.newest_id)
+    relinker = Relinker(submap, job.lost, job.onsets, parts.link, parts.config)
+    reverse_tracker.keep(relinker.keyframe_ids)  # redundant or not: linking stands on keyframes that both maps hold
+    progress = _Progress(submap)
+    # Frames before a start are worth a look each, however many show nothing; no map waits for the end of that progress.
+    max_gap_frames = parts.config.max_gap_frames if job.lost else len(job.views)
+    views = job.views if job.lost else _there_and_back(job.views, progress)
+    for step in track_in_reverse(reverse_tracker, views, parts.judge, relinker.keyframe_ids, max_gap_frames):
+        progress.out_of_time = time.perf_counter() > until
+        if progress.out_of_time:
+            break
+        if isinstance(step.track, Failure):
+            progress.note_unusable(step.track)
+            continue
+        progress.note_posed(_recovered_frame(reverse_tracker, step.view, step.track), step.report is not None)
+        if (earlier := reverse_tracker.confirmed()) is not None:
+            progress.note_confirmed(_recovered_frame(reverse_tracker, earlier.view, earlier))
+        if step.view.index not in submap.keyframes:
+            continue
+        for tried in relinker.attempts(step.view.index):
+            found = _fused(tried, job, submap, attempt.name, parts)
+            if not isinstance(found, Failure):
+                progress.link = found
+                break
+            progress.why_not_linked = found.detail
+            progress.needs_camera |= found.reason is FailureReason.CAMERA
+            progress.given_up |= progress.needs_camera or found.reason is FailureReason.SCALE_LOST
+            progress.events.append(_refusal(tried, found, attempt.name, step.view, submap.id))
+        progress.given_up |= relinker.has_seen_enough
+        if progress.link is not None or progress.given_up:
+            break
+    if job.lost:
+        progress.events.append(_event_of(job, progress, attempt.name, time.perf_counter() - started))
+    return progress
+
+
+def _there_and_back(views: tuple[View, ...], progress: _Progress) -> Iterator[View]:
+    """Yield the views, and then, the other way round, those that the progress has found no pose for.
+
+    A camera that turns away slowly and back at once is lost on the way back in time, and followed on the way there.
+    """
+    yield from views
+    yield from way_to_gaps(views[::-1], progress.frames, progress.submap.keyframes)
+
+
+def _fused(tried: LinkTry, job: RecoveryJob, submap: Submap, attempt: str, parts: RecoveryParts) -> FoundLink | Failure:
+    """Refine the overlap and with it the link, which must hold as far as where the progress set out, and beyond."""
+    found = tried.result
+    if isinstance(found, Failure):
+        return found
+    link = parts.propagate(found, submap, job.newest_id, NO_BEND)
+    if isinstance(link, Failure):
+        return link
+    bend = parts.check_camera(submap, link, job)
+    if isinstance(bend, Failure):
+        return bend
+    refinement = refine_overlap(job.lost[tried.old_id], submap, found, parts.new_graph, parts.link, parts.fusion)
+    if isinstance(refinement, Failure):
+        unrefined = refinement.reason in (FailureReason.DISABLED, FailureReason.SOLVER)
+        if not unrefined:
+            return refinement
+        link = parts.propagate(found, submap, job.newest_id, bend)
+        return link if isinstance(link, Failure) else FoundLink(tried.old_id, link, refinement, attempt)
+    link = parts.propagate(refinement.link, refinement.submap, job.newest_id, bend)
+    if isinstance(link, Failure):
+        return link
+    submap.take_over(refinement.submap)
+    return FoundLink(tried.old_id, link, refinement.report, attempt)
+
+
+def _recovered_frame(reverse_tracker: VisualOdometry, view: View, track: Track) -> RecoveredFrame:
+    T_kf_cam = reverse_tracker.relative_pose(track)
+    pose = FramePose(view.index, view.timestamp_s, reverse_tracker.submap.id, reverse_tracker.reference_id, T_kf_cam)
+    return RecoveredFrame(pose, track.n_matches, track.n_inliers)
+
+
+def _refusal(tried: LinkTry, failure: Failure, attempt: str, view: View, submap_id: int) -> Event:
+    data = {
+        "attempt": attempt,
+        "old_submap": tried.old_id,
+        "shared_keyframes": tried.n_shared,
+        "verdict": failure.detail,
+        "reason": str(failure.reason),
+        **failure.numbers,
+    }
+    return Event(EventKind.LINK_REFUSED, view.index, view.timestamp_s, submap_id, data)
+
+
+def _event_of(job: RecoveryJob, progress: _Progress, attempt: str, seconds: float) -> Event:
+    """One attempt in one line, at the frame where it ended."""
+    by_index = {view.index: view for view in (*job.own, *job.views)}
+    frames = list(progress.frames.values())
+    last = frames[-1].pose.index if frames else job.newest_id
+    data: dict[str, Any] = {
+        "attempt": attempt,
+        "frames": len(frames),
+        "new_keyframes": progress.n_keyframes,
+        "gaps": progress.n_gaps,
+        "skipped_frames": progress.n_skipped,
+        "unusable_at_end": progress.n_unusable,
+        "matches": sum(frame.n_matches for frame in frames),
+        "inliers": sum(frame.n_inliers for frame in frames),
+        "verdict": progress.verdict,
+        "seconds": seconds,
+    }
+    if progress.link is not None:
+        data |= {"old_submap": progress.link.old_id, **progress.link.estimate.numbers}
+    return Event(EventKind.RECOVERY_ATTEMPT, last, by_index[last].timestamp_s, job.submap.id, data)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReverseStep:
+    """One frame of a progress back: where it was found to be or why not, and whether it became a keyframe."""
+
+    view: View
+    track: Track | Failure
+    report: KeyframeReport | None
+
+
+def track_in_reverse(
+    reverse_tracker: VisualOdometry, views: Iterable[View], judge: Judge, keyframe_ids: set[int], max_gap_frames: int
+) -> Iterator[ReverseStep]:
+    """Pose frames one after the other in the order given, and extend the walker's submap by keyframes.
+
+    Parameters
+    ----------
+    reverse_tracker : VisualOdometry
+        Started at a keyframe of its submap.
+    views : iterable of View
+        Latest first.
+    judge : callable
+        The health verdict on a track.
+    keyframe_ids : set of int
+        Frames that become keyframes in any case: those that were keyframes of an older submap.
+    max_gap_frames : int
+        So many frames in a row may be unusable before the progress ends.
+    """
+    n_failed = 0
+    for view in views:
+        try:
+            step = _track_one(reverse_tracker, view, judge(reverse_tracker.track(view)), view.index in keyframe_ids)
+        except SolverError as error:
+            log.warning("the progress back ends: %s", error)
+            return
+        yield step
+        n_failed = 0 if step.track else n_failed + 1
+        if n_failed > max_gap_frames:
+            return
+
+
+def _track_one(reverse_tracker: VisualOdometry, view: View, track: Track | Failure, is_wanted: bool) -> ReverseStep:
+    """Make a frame that was posed a keyframe where it is wanted or due."""
+    if isinstance(track, Failure):
+        return ReverseStep(view, track, None)
+    is_new = view.index not in reverse_tracker.submap.keyframes
+    if not ((is_wanted and is_new) or reverse_tracker.keyframe_due(track)):
+        return ReverseStep(view, track, None)
+    report = reverse_tracker.insert_keyframe(track)
+    return ReverseStep(view, report, None) if isinstance(report, Failure) else ReverseStep(view, track, report)

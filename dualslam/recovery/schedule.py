@@ -1,0 +1,79 @@
+"""When a walk back is made again, and over which frames: those without a pose, and what leads to them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+from dualslam.core.camera.models import Camera
+from dualslam.core.types import View
+from dualslam.map.submap import Submap
+
+
+class RetrySchedule:
+    """Knows of each submap whose walk has left something to find when the next walk is due.
+
+    That is when the submap has grown at its live end, or its camera has been calibrated: it knows depths better then,
+    and more of what there is to see.
+
+    Parameters
+    ----------
+    keyframes : tuple of int
+        Live keyframes at which a walk is made again, see `RecoveryConfig.retry_keyframes`.
+    """
+
+    def __init__(self, keyframes: tuple[int, ...]) -> None:
+        self._keyframes = keyframes
+        self._starts: dict[int, int] = {}
+        self._tried: dict[int, tuple[int, Camera]] = {}
+
+    def start_of(self, submap: Submap, newest_id: int) -> int:
+        """Return the keyframe that the submap's first walk started from: `newest_id`, if this is the first."""
+        return self._starts.setdefault(submap.id, newest_id)
+
+    def n_live(self, submap: Submap, now: int) -> int:
+        """Count the keyframes from the start to frame `now`, in either direction: not those that walks have added."""
+        first, last = sorted((self._starts[submap.id], now))
+        return sum(first <= k <= last for k in submap.keyframes)
+
+    def leave_open(self, submap_id: int, n_live: int, camera: Camera) -> None:
+        """Note that a walk which knew so many live keyframes, and this camera, has left something to find."""
+        self._tried[submap_id] = n_live, camera
+
+    def take_if_due(self, submap: Submap, now: int, camera: Camera, last_chance: bool = False) -> bool:
+        """Return whether the next walk is due; if so it is off the list, until it too leaves something to find.
+
+        `last_chance`: the submap grows no more, so that any growth since the last walk will do.
+        """
+        if submap.id not in self._tried:
+            return False
+        tried_with, tried_camera = self._tried[submap.id]
+        n_live = self.n_live(submap, now)
+        sizes = (*self._keyframes, n_live) if last_chance and self._keyframes else self._keyframes
+        due = camera != tried_camera or any(tried_with < n <= n_live for n in sizes)
+        if due:
+            del self._tried[submap.id]
+        return due
+
+
+def way_to_gaps(views: Sequence[View], posed: Collection[int], keyframe_ids: Collection[int]) -> list[View]:
+    """Return, of the views in the order of a walk, those without a pose that a keyframe leads to, and what leads there.
+
+    It begins with the last keyframe before the first of them, and ends with the last of them. Between gaps it goes by
+    the keyframes, and by the last frame before each gap.
+
+    Parameters
+    ----------
+    views : sequence of View
+    posed : collection of int
+        Frames that have a pose.
+    keyframe_ids : collection of int
+        The submap's.
+    """
+    lacking = [view.index not in posed and view.index not in keyframe_ids for view in views]
+    places = [i for i, view in enumerate(views) if view.index in keyframe_ids]
+    gaps = [i for i, lacks in enumerate(lacking) if lacks and places and i > places[0]]
+    if not gaps:
+        return []
+    first, last = max(i for i in places if i < gaps[0]), gaps[-1]
+    wanted = {*places, *gaps, *(i - 1 for i in gaps)}
+    return [views[i] for i in range(first, last + 1) if i in wanted]

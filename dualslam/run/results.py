@@ -1,0 +1,172 @@
+"""From a finished system to what a run leaves behind: composed trajectories, a row for every frame, and the summary."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from platform import python_version
+from typing import Any
+
+import numpy as np
+
+from dualslam.config.settings import Config
+from dualslam.core.events import EventKind
+from dualslam.core.types import FrameStatus
+from dualslam.io.run_folder import FrameRow, PosedFrames
+from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
+from dualslam.lab.metrics.trajectory_metrics import score_trajectory
+from dualslam.map.atlas import LinkKind
+from dualslam.map.trajectory import compose
+from dualslam.recovery.frame_buffer import MB
+from dualslam.run.runner import RunReport
+from dualslam.system import System
+
+PACKAGES = ("dualslam", "numpy", "scipy", "opencv-python-headless", "gtsam", "poselib", "pydantic")
+PACKAGES_OF_EXTRAS = ("torch", "kornia")
+"""Named where a front end has loaded them; their modules have the packages' names."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectories:
+    """All poses of a run.
+
+    Attributes
+    ----------
+    main_submaps : list of int
+        The largest linked set of submaps, by the number of posed frames: the main map.
+    main : PosedFrames
+        Frames posed in it.
+    unlinked : dict of int to PosedFrames
+        Each other submap, in its own unit.
+    """
+
+    main_submaps: list[int]
+    main: PosedFrames
+    unlinked: dict[int, PosedFrames]
+
+
+def trajectories_of(system: System) -> Trajectories:
+    """Compose the poses of all frames, each from its own keyframe, by the map as it is now."""
+    count = dict.fromkeys(system.atlas.submaps, 0)
+    for pose in system.poses.values():
+        count[pose.submap_id] += 1
+    components = system.atlas.components()
+    largest = max(components, key=lambda c: sum(count[m] for m in c), default=[])
+    unlinked = {m: _posed(system, [m]) for m in count if m not in largest and count[m]}
+    return Trajectories(largest, _posed(system, largest), unlinked)
+
+
+def frame_rows(system: System, main: PosedFrames, dropped: Iterable[tuple[int, float]] = ()) -> list[FrameRow]:
+    """Return a row for every frame of the source, in the order in which they came; dropped ones where they belong."""
+    in_main = set(main.index.tolist())
+    rows = [
+        FrameRow(
+            row.index,
+            row.timestamp_s,
+            row.status,
+            row.submap_id,
+            row.index in in_main,
+            row.n_matches,
+            row.n_inliers,
+            row.latency_ms,
+        )
+        for row in system.rows.values()
+    ]
+    late = [FrameRow(i, t, FrameStatus.DROPPED, None, False, 0, 0, 0.0) for i, t in dropped]
+    if not late:
+        return rows
+    backwards = len(rows) > 1 and rows[-1].index < rows[0].index
+    return sorted(rows + late, key=lambda row: row.index, reverse=backwards)
+
+
+def summarise(
+    system: System, report: RunReport, trajectories: Trajectories, config: Config, truth: Trajectory | None = None
+) -> dict[str, Any]:
+    """Return what ``summary.json`` holds.
+
+    ``coverage`` is the share of all frames, dropped ones too, that have a pose in the main map (0 to 1).
+    """
+    main = trajectories.main
+    posed = len(main)
+    summary: dict[str, Any] = {
+        "frames": report.n_frames,
+        "posed": posed,
+        "coverage": posed / report.n_frames if report.n_frames else 0.0,
+        "posed_in_all_submaps": posed + sum(len(frames) for frames in trajectories.unlinked.values()),
+        "failures": len(system.events.of_kind(EventKind.FAILED)),
+        "recoveries": sum(link.kind is LinkKind.RECOVERY for link in system.atlas.links),
+        "relocalised": len(system.events.of_kind(EventKind.RELOCALISED)),
+        "recoveries_failed": len(system.events.of_kind(EventKind.RECOVERY_FAILED)),
+        "submaps": len(system.atlas.submaps),
+        "links": len(system.atlas.links),
+        "keyframes": sum(len(submap.keyframes) for submap in system.atlas.submaps.values()),
+        "landmarks": sum(int(submap.landmarks["alive"].sum()) for submap in system.atlas.submaps.values()),
+        "seed": config.seed,
+        "dropped": len(report.dropped),
+        "interrupted": report.interrupted,
+        "crashed": report.bug is not None,
+        "fps": report.fps,
+        "wall_s": report.wall_s,
+        "cpu_ms_per_frame": 1e3 * report.cpu_s / max(len(report.latencies_ms), 1),
+        "latency_ms": _latency(report.latencies_ms),
+        "recovery_s": [
+            event.data["seconds"] for event in system.events.of_kind(EventKind.LINKED) if "seconds" in event.data
+        ],
+        "peak_rss_mb": report.peak_rss_mb,
+        "peak_buffer_mb": system.buffer.peak_bytes / MB,
+        "stages_cpu_s": {name: stage.seconds for name, stage in system.timer.stages.items()},
+        "versions": versions(),
+    }
+    if truth is not None:
+        summary |= _errors(system, main, truth, report)
+    return summary
+
+
+def truth_of_frames(truth: Trajectory, rows: Iterable[FrameRow]) -> Trajectory:
+    """Return the true poses that are nearest to the frames in time, each once, on the truth's own clock."""
+    pose, near = associate(truth.timestamps_s, np.array([row.timestamp_s for row in rows]), MAX_DT_S)
+    chosen = np.unique(pose[near])
+    return Trajectory(truth.timestamps_s[chosen], truth.T_world_cam[chosen])
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a run's numbers depend on."""
+    found = {"python": python_version()}
+    for name in (*PACKAGES, *(extra for extra in PACKAGES_OF_EXTRAS if extra in sys.modules)):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "unknown"
+    return found
+
+
+def _posed(system: System, submap_ids: list[int]) -> PosedFrames:
+    S_world_submap = system.atlas.S_world_submap(submap_ids) if submap_ids else {}
+    composed = compose(system.poses.values(), system.atlas, S_world_submap)
+    return PosedFrames(np.asarray(composed.index, np.int64), composed.timestamp_s, composed.T_world_cam)
+
+
+def _latency(latencies_ms: tuple[float, ...]) -> dict[str, float]:
+    if not latencies_ms:
+        return {}
+    median, p95, p99 = np.percentile(latencies_ms, [50, 95, 99]).tolist()
+    return {"median": median, "p95": p95, "p99": p99, "max": max(latencies_ms)}
+
+
+def _errors(system: System, main: PosedFrames, truth: Trajectory, report: RunReport) -> dict[str, Any]:
+    times = [row.timestamp_s for row in system.rows.values()] + [t for _, t in report.dropped]
+    if len(times) < 2 or not len(main):
+        return {}
+    ordered = main.in_time_order()
+    estimate = Trajectory(ordered.timestamps_s, ordered.T_world_cam)
+    score = asdict(score_trajectory(estimate, truth, np.array(times)))
+    return {
+        "ate_rmse_m": score["ate_rmse_m"],
+        "rpe": {
+            "interval_s": 1.0,
+            "rotation_deg_median": score["rpe_1s_rot_deg_median"],
+            "translation_pct_median": score["rpe_1s_trans_pct_median"],
+        },
+    }

@@ -1,0 +1,225 @@
+"""The harness around the algorithm: feeds a system the frames of a sequence, keeps time, and stops when asked to."""
+
+from __future__ import annotations
+
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+from typing import Protocol
+
+from dualslam.core.errors import InputError
+from dualslam.core.interfaces import Sequence
+from dualslam.core.types import Frame
+from dualslam.map.frame_records import FrameResult
+
+
+class Steppable(Protocol):
+    """What the harness needs of a system."""
+
+    def step(self, frame: Frame) -> FrameResult:
+        """Take one frame."""
+        ...
+
+    def finish(self, interrupted: bool = False) -> None:
+        """End the run; in a `interrupted` with what there is."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class RunReport:
+    """What a run cost and how it ended. The map itself stays in the system.
+
+    Attributes
+    ----------
+    n_frames : int
+        Frames that the source gave, those dropped included.
+    dropped : tuple of (int, float)
+        Index and time of the frames that came too late to be looked at (`realtime`).
+    latencies_ms : tuple of float
+        Wall time of each step.
+    wall_s, cpu_s : float
+        From the first frame to the end; user and system time of this process and of the children that have ended.
+    peak_rss_mb : float
+        Highest resident memory of the process since it started, and of the largest of its children that have ended.
+    interrupted : bool
+        True where a signal ended the run early.
+    error : InputError or None
+        What ended the source early.
+    bug : Exception or None
+        What the system raised, which ended the run: its maker's mistake, no property of the input.
+    """
+
+    n_frames: int
+    dropped: tuple[tuple[int, float], ...]
+    latencies_ms: tuple[float, ...]
+    wall_s: float
+    cpu_s: float
+    peak_rss_mb: float
+    interrupted: bool
+    error: InputError | None
+    bug: Exception | None
+
+    @property
+    def fps(self) -> float:
+        """Frames a second, dropped ones not counted."""
+        return len(self.latencies_ms) / self.wall_s if self.wall_s > 0 else 0.0
+
+
+def run_sequence(
+    system: Steppable,
+    sequence: Sequence,
+    *,
+    realtime: bool = False,
+    on_frame: Callable[[FrameResult], None] | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+    sleep: Callable[[float], None] = time.sleep,
+) -> RunReport:
+    """Feed a system all frames of a sequence, then finish it.
+
+    The first SIGINT or SIGTERM ends the run after the frame in hand, so that what there is can be saved; the second one
+    acts as ever. A source that breaks after its first frame ends the run in the same way, and so does a system that
+    raises; what it raised is in the report, for the caller to raise again once the rest is saved.
+
+    Parameters
+    ----------
+    system : Steppable
+    sequence : Sequence
+    realtime : bool
+        Frames come at the times that their timestamps tell. A frame is dropped when the next one has come before the
+        system was ready for it, as with a camera that keeps its latest image only.
+    on_frame : callable, optional
+        Called with the result of each step.
+    clock, sleep : callables
+        For tests.
+
+    Returns
+    -------
+    RunReport
+
+    Raises
+    ------
+    InputError
+        If the source gives no frame at all.
+    """
+    dropped: list[tuple[int, float]] = []
+    latencies_ms: list[float] = []
+    error: InputError | None = None
+    bug: Exception | None = None
+    began, cpu_began = clock(), _cpu_s()
+    source = iter(sequence)
+    frames = _in_real_time(source, dropped, clock, sleep) if realtime else source
+    with _closing(source), _stop_on_signal() as stop:
+        while not stop.is_set():
+            try:
+                frame = next(frames)
+            except StopIteration:
+                break
+            except InputError as problem:
+                if not latencies_ms:
+                    raise
+                error = problem
+                break
+            before = clock()
+            try:
+                result = system.step(frame)
+            except Exception as problem:
+                bug = problem
+                break
+            finally:
+                latencies_ms.append(1e3 * (clock() - before))
+            if on_frame is not None:
+                on_frame(result)
+        interrupted = stop.is_set()
+        if not latencies_ms and not interrupted:
+            raise InputError(f"{sequence.name} gave no frame; check the source and which frames were asked for.")
+        try:
+            system.finish(interrupted=interrupted)
+        except Exception as problem:
+            bug = bug or problem  # a system that broke may well break again here: the first one tells why
+    return RunReport(
+        n_frames=len(latencies_ms) + len(dropped),
+        dropped=tuple(dropped),
+        latencies_ms=tuple(latencies_ms),
+        wall_s=clock() - began,
+        cpu_s=_cpu_s() - cpu_began,
+        peak_rss_mb=_peak_rss_mb(),
+        interrupted=interrupted,
+        error=error,
+        bug=bug,
+    )
+
+
+def _in_real_time(
+    frames: Iterator[Frame],
+    dropped: list[tuple[int, float]],
+    clock: Callable[[], float],
+    sleep: Callable[[float], None],
+) -> Iterator[Frame]:
+    """Yield each frame when its time has come, and note as dropped those that the next one overtook."""
+    frame = next(frames, None)
+    if frame is None:
+        return
+    first_s, began = frame.timestamp_s, clock()
+    while frame is not None:
+        upcoming = next(frames, None)
+        # Absolute: a sequence that is read in reverse runs at the same rate.
+        if upcoming is not None and clock() - began >= abs(upcoming.timestamp_s - first_s):
+            dropped.append((frame.index, frame.timestamp_s))
+        else:
+            early_s = abs(frame.timestamp_s - first_s) - (clock() - began)
+            if early_s > 0:
+                sleep(early_s)
+            yield frame
+        frame = upcoming
+
+
+@contextmanager
+def _closing(frames: Iterator[Frame]) -> Iterator[None]:
+    """Close a source that can be closed: one that reads ahead on a thread ends it then."""
+    try:
+        yield
+    finally:
+        close = getattr(frames, "close", None)
+        if close is not None:
+            close()
+
+
+@contextmanager
+def _stop_on_signal() -> Iterator[threading.Event]:
+    """Turn the first SIGINT or SIGTERM into an event; outside the main thread, where no signal comes, do nothing."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    def handle(number: int, stack: FrameType | None) -> None:
+        stop.set()
+        restore()
+
+    for number in before:
+        signal.signal(number, handle)
+    try:
+        yield stop
+    finally:
+        restore()
+
+
+def _cpu_s() -> float:
+    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
+
+
+def _peak_rss_mb() -> float:
+    peak = sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10

@@ -1,0 +1,167 @@
+"""One whole run: build the system, feed it a sequence, keep what it found in a run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from dualslam.build import build_system
+from dualslam.config.files import dump_config
+from dualslam.config.settings import Config
+from dualslam.core.camera.models import Camera
+from dualslam.core.errors import InputError
+from dualslam.core.events import EventKind
+from dualslam.core.interfaces import Sequence
+from dualslam.core.types import Frame
+from dualslam.io.map_store import save_atlas
+from dualslam.io.run_folder import RunFolder, RunRecord
+from dualslam.io.sequence import Selection
+from dualslam.io.trajectory_files import Trajectory
+from dualslam.lab.disturbances import corrupted
+from dualslam.map.frame_records import FrameResult
+from dualslam.report import SampleKeeper, read_run, report_page
+from dualslam.run.results import frame_rows, summarise, trajectories_of, truth_of_frames
+from dualslam.run.runner import RunReport, run_sequence
+from dualslam.system import System
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """A run that has been written down.
+
+    Attributes
+    ----------
+    out : Path
+    summary : dict
+        As in ``summary.json``.
+    report : RunReport
+    system : System
+        With the whole map.
+    """
+
+    out: Path
+    summary: dict[str, Any]
+    report: RunReport
+    system: System
+
+    @property
+    def has_map(self) -> bool:
+        """Whether any frame has a pose."""
+        return bool(self.summary["posed"])
+
+
+def run_to_folder(
+    config: Config,
+    sequence: Sequence,
+    out: str | Path,
+    *,
+    overwrite: bool = False,
+    realtime: bool = False,
+    on_frame: Callable[[FrameResult], None] | None = None,
+    build: Callable[[Config, Camera], System] | None = None,
+) -> Outcome:
+    """Run on a sequence and write a run folder. What an interrupted run, or one that crashed, has found is kept.
+
+    Parameters
+    ----------
+    config : Config
+    sequence : Sequence
+        As it is recorded: the config's corruptions are put on it here. With ground truth (an attribute
+        `ground_truth`), the summary holds the errors.
+    out : path
+    overwrite, realtime : bool
+    on_frame : callable, optional
+        Called with each frame's result.
+    build : callable, optional
+        Makes the system of a config and a camera; `build_system` if it is not given.
+
+    Raises
+    ------
+    ConfigError, InputError, OutputError
+    Exception
+        Whatever the system raised, once what it had found until then is written; a note on it says where.
+    """
+    given = _given(sequence, realtime)
+    sequence = corrupted(sequence, config.corruptions)
+    system = (build or build_system)(config, sequence.camera)
+    with RunFolder(out, overwrite=overwrite) as folder:
+        folder.write_config(dump_config(config))
+        n_events = 0
+
+        def after_frame(result: FrameResult) -> None:
+            nonlocal n_events
+            n_events = _write_new_events(system, folder, n_events)
+            if on_frame is not None:
+                on_frame(result)
+
+        watched = _Watched(system, SampleKeeper(folder.write_sample))
+        report = run_sequence(watched, sequence, realtime=realtime, on_frame=after_frame)
+        if report.interrupted and system.rows:
+            last = next(reversed(system.rows.values()))
+            system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap_id)
+        _write_new_events(system, folder, n_events)
+        try:
+            summary = _write_results(system, report, config, sequence, folder, given)
+        except Exception as error:
+            if report.bug is None:
+                raise
+            raise report.bug from error  # the map of a system that broke may be in pieces
+    if report.bug is not None:
+        report.bug.add_note(f"What was found until then is in {out}.")
+        raise report.bug
+    if report.error is not None:
+        raise InputError(f"{report.error} What was found until then is in {out}.")
+    return Outcome(Path(out), summary, report, system)
+
+
+def _given(sequence: Sequence, realtime: bool) -> dict[str, Any]:
+    """Return what a run takes besides its config, without which the config does not give the same run again."""
+    selection: Selection | None = getattr(sequence, "selection", None)  # not every sequence has one
+    return {
+        "sequence": sequence.name,
+        "selection": None if selection is None else asdict(selection),
+        "realtime": realtime,
+        "camera": sequence.camera.to_dict(),
+    }
+
+
+def _write_results(
+    system: System, report: RunReport, config: Config, sequence: Sequence, folder: RunFolder, given: dict[str, Any]
+) -> dict[str, Any]:
+    """Write all that comes at the end of a run, and return the summary, which begins with what was given."""
+    trajectories = trajectories_of(system)
+    truth: Trajectory | None = getattr(sequence, "ground_truth", None)
+    summary = given | summarise(system, report, trajectories, config, truth)
+    rows = frame_rows(system, trajectories.main, report.dropped)
+    folder.write(RunRecord(rows, trajectories.main, trajectories.unlinked, summary))
+    if truth is not None:
+        folder.write_truth(truth_of_frames(truth, rows))
+    save_atlas(folder.map_path, system.atlas, system.poses)
+    folder.write_report(report_page(read_run(folder.path)))
+    return summary
+
+
+class _Watched:
+    """A system whose frames are looked at for sample pictures."""
+
+    def __init__(self, system: System, samples: SampleKeeper) -> None:
+        self._system, self._samples = system, samples
+
+    def step(self, frame: Frame) -> FrameResult:
+        result = self._system.step(frame)
+        self._samples.take(frame, result.status)
+        return result
+
+    def finish(self, interrupted: bool = False) -> None:
+        self._samples.finish()
+        self._system.finish(interrupted)
+
+
+def _write_new_events(system: System, folder: RunFolder, n_written: int) -> int:
+    if len(system.events) > n_written:
+        for event in islice(system.events, n_written, None):
+            folder.append_event(event)
+    return len(system.events)

@@ -1,0 +1,164 @@
+"""Opening whatever a run can read: recorded sequences, videos, webcams, and the embedded synthetic worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dualslam.config import strict_yaml
+from dualslam.core.camera.models import Camera
+from dualslam.core.errors import ConfigError, InputError
+from dualslam.core.interfaces import Sequence
+from dualslam.core.types import Frame
+from dualslam.io.open_sequence import open_sequence
+from dualslam.io.read_ahead import read_ahead
+from dualslam.io.sequence import Selection
+from dualslam.io.trajectory_files import Trajectory
+from dualslam.lab.synthetic import SyntheticSequence, make_sequence, parse_events
+
+SYNTHETIC = "synthetic:"
+WORLD_NUMBERS = {"frames": 300, "seed": 0, "width": 640, "height": 480}
+"""What a synthetic source states in numbers, and what it takes where it does not."""
+RENDER_AHEAD_FRAMES = 4
+
+
+def open_source(
+    source: str | Path | int,
+    *,
+    camera_file: str | Path | None = None,
+    fov_degrees: float | None = None,
+    start: int = 0,
+    stride: int = 1,
+    max_frames: int | None = None,
+    reverse: bool = False,
+) -> Sequence:
+    """Open a source of frames.
+
+    Parameters
+    ----------
+    source : path, str or int
+        What `dualslam.io.open_sequence` takes, or ``synthetic:street`` or ``synthetic:room``, with options behind
+        commas: ``synthetic:street,frames=300,seed=1,width=640,height=480,events=FILE``.
+    camera_file, fov_degrees : optional
+        Calibration of a source that has none.
+    start, stride, max_frames, reverse : optional
+        Which frames, counted in the source.
+
+    Raises
+    ------
+    InputError
+    """
+    if isinstance(source, str) and source.startswith(SYNTHETIC):
+        if camera_file is not None or fov_degrees is not None:
+            raise InputError(f"{source} has a camera of its own; leave out --camera and --fov.")
+        return WorldSequence(parse_world(source), Selection(start, stride, max_frames, reverse))
+    return open_sequence(
+        source,
+        camera_file=camera_file,
+        fov_degrees=fov_degrees,
+        start=start,
+        stride=stride,
+        max_frames=max_frames,
+        reverse=reverse,
+    )
+
+
+class WorldSequence:
+    """Frames of a synthetic world, rendered ahead on a thread, with what a recording offers.
+
+    Attributes
+    ----------
+    name : str
+    camera : Camera
+    rate_hz : float
+        Of the frames that are read, so the stride counts.
+    ground_truth : Trajectory
+        Of the whole world, metres.
+    selection : Selection
+    source_indices : (N,) int64
+    frame_timestamps : (N,) float64
+    """
+
+    def __init__(self, world: SyntheticSequence, selection: Selection | None = None) -> None:
+        selection = selection or Selection()
+        self._world = world
+        self.selection = selection
+        self.name = world.name
+        self.camera: Camera = world.camera
+        self.rate_hz = world.rate_hz / selection.stride
+        self.ground_truth = Trajectory(world.timestamps_s, world.ground_truth_T_world_cam)
+        chosen = selection.indices(world.n_frames, world.name)
+        self.source_indices = chosen[np.isin(chosen, world.indices)]
+        self.frame_timestamps = world.timestamps_s[self.source_indices]
+
+    def __len__(self) -> int:
+        return len(self.source_indices)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return read_ahead(map(self._world.frame, self.source_indices.tolist()), RENDER_AHEAD_FRAMES)
+
+
+def make_world(
+    name: str,
+    n_frames: int,
+    seed: int,
+    events: Iterable[Any] = (),
+    width: int = WORLD_NUMBERS["width"],
+    height: int = WORLD_NUMBERS["height"],
+) -> SyntheticSequence:
+    """Make a synthetic world; a wrong name or number is bad input here, as it comes from what a user names as source.
+
+    Raises
+    ------
+    InputError
+    """
+    try:
+        return make_sequence(name, n_frames, seed, width, height, events)
+    except ConfigError as error:
+        raise InputError(str(error)) from error
+
+
+def read_script(path: str | Path) -> list[Mapping[str, Any]]:
+    """Read a script of disturbances: a YAML list of mappings with `kind`, `start`, `length` and perhaps `strength`.
+
+    Raises
+    ------
+    InputError
+    """
+    try:
+        items = strict_yaml.loads(Path(path).read_text(encoding="utf-8"))
+        if not isinstance(items, list):
+            raise InputError(f"{path}: a script is a list of mappings, such as - {{kind: blur, start: 50, length: 9}}.")
+        parse_events(items)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except (ValueError, ConfigError) as error:
+        raise InputError(f"{path}: {error}") from error
+    return items
+
+
+def parse_world(source: str) -> SyntheticSequence:
+    """Make the world that ``synthetic:NAME,key=value,...`` names.
+
+    Raises
+    ------
+    InputError
+    """
+    name, *pairs = source.removeprefix(SYNTHETIC).split(",")
+    numbers, events = dict(WORLD_NUMBERS), None
+    for pair in pairs:
+        key, _, value = pair.partition("=")
+        if key == "events":
+            events = Path(value)
+        elif key not in numbers:
+            known = ", ".join(numbers)
+            raise InputError(f"{source}: a synthetic world has no option {key!r}; it has {known} and events.")
+        elif not value.isdecimal():
+            raise InputError(f"{source}: {key} must be a whole number, not {value!r}.")
+        else:
+            numbers[key] = int(value)
+    script = read_script(events) if events is not None else ()
+    return make_world(name, numbers["frames"], numbers["seed"], script, numbers["width"], numbers["height"])

@@ -1,0 +1,269 @@
+"""Well-spread FAST corners on one pyramid level, and a sub-pixel step for them. Knows nothing of descriptors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.frontends.features.groups import rank_in_runs
+
+FAST_RADIUS_PX = 3
+"""FAST reads a circle of this radius, so it finds nothing nearer to the edge of what it is given."""
+MIN_CURVATURE = 0.01
+"""Grey levels per square pixel: below that the peak is made of rounding."""
+_DOG_SIGMAS_PX = (1.0, 1.6)
+"""Wide enough to be smooth under FAST's noise, narrow enough to stay at the corner."""
+_DOG_REACH_PX = 6
+"""Radius of the filter."""
+_DOG_CURVATURE_NOISE = 0.165
+"""Standard deviation of the filter's second difference along an axis, relative to that of white noise in the image."""
+_STANDS_OUT_SIGMAS = 3.0
+"""By so many the least curvature of a peak differs from none. Of the corners of noise alone 3 % reach that: FAST
+chooses the boldest."""
+
+
+def detect_corners(
+    image: NDArray[np.uint8], thresholds: Sequence[int], margin_px: int, cell_px: int
+) -> tuple[IntArray, FloatArray]:
+    """FAST corners of one pyramid level: the first threshold everywhere, lower ones only in cells still empty.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+    thresholds : sequence of int
+        Grey-level contrasts, descending.
+    margin_px : int
+        Width of the rim without corners, >= 3.
+    cell_px : int
+        Side of the square cells in which emptiness is judged.
+
+    Returns
+    -------
+    xy : (N, 2) int64
+        Pixel (column, row).
+    response : (N,) float64
+        FAST score: the largest threshold at which the corner would still be one.
+    """
+    height, width = image.shape
+    if min(height, width) <= 2 * margin_px:
+        return np.empty((0, 2), np.int64), np.empty(0)
+    window = (margin_px, margin_px, width - margin_px, height - margin_px)
+    xy, response = _fast(image, thresholds[0], window)
+    for threshold in thresholds[1:]:
+        windows = _empty_runs(_occupied_cells(xy, window, cell_px), window, cell_px)
+        found = [_fast(image, threshold, each) for each in windows]
+        xy = np.concatenate([xy, *(each[0] for each in found)])
+        response = np.concatenate([response, *(each[1] for each in found)])
+    return xy, response
+
+
+def select_spread(xy: IntArray, response: FloatArray, n_wanted: int) -> IntArray:
+    """Choose corners that are strong and cover the level: the best of each cell first, then the second best, ...
+
+    The cells are as many as the corners wanted, over the corners' bounding box.
+
+    Parameters
+    ----------
+    xy : (N, 2) int64
+    response : (N,) float64
+        Strength, whole numbers below 256.
+    n_wanted : int
+
+    Returns
+    -------
+    (min(N, n_wanted),) int64
+        Rows, ascending.
+    """
+    if len(xy) <= n_wanted:
+        return np.arange(len(xy))
+    if n_wanted == 0:
+        return np.empty(0, np.int64)
+    low = xy.min(axis=0)
+    extent = xy.max(axis=0) - low + 1
+    cell_px = max(1.0, float(np.sqrt(extent[0] * extent[1] / n_wanted)))
+    column, row = ((xy - low) / cell_px).astype(np.int64).T
+    cell = row * int(extent[0] / cell_px + 1) + column
+    # FAST scores are whole numbers below 256, so one integer key sorts by two things at once. The sorts are stable:
+    # ties go to the earlier corner, and the choice depends on nothing but the image.
+    weakness = 256 - response.astype(np.int64)
+    by_cell = np.argsort(cell * 512 + weakness, kind="stable")
+    rank = rank_in_runs(cell[by_cell])
+    by_rank = np.argsort(rank * 512 + weakness[by_cell], kind="stable")
+    return np.sort(by_cell[by_rank[:n_wanted]])
+
+
+def grades(response: FloatArray) -> FloatArray:
+    """Responses of any kind as whole numbers from 0 to 255, equally many of each, for `select_spread`."""
+    rank = np.empty(len(response))
+    rank[np.argsort(response, kind="stable")] = np.arange(len(response))
+    return np.floor(rank * 256 / max(len(response), 1))
+
+
+def share_out(n_available: Sequence[int], weights: FloatArray, n_wanted: int) -> list[int]:
+    """Divide `n_wanted` among levels by weight; what a poor level cannot fill goes to the others, finest first.
+
+    Parameters
+    ----------
+    n_available : sequence of int
+        Corners of each level.
+    weights : (L,) float64
+        Positive; only their ratios count.
+    """
+    available = np.asarray(n_available, np.int64)
+    quota = np.zeros(len(available), np.int64)
+    n_wanted = min(n_wanted, int(available.sum()))
+    while (left := n_wanted - int(quota.sum())) > 0:
+        open_weight = np.where(quota < available, weights[: len(available)], 0.0)
+        extra = np.floor(left * open_weight / open_weight.sum()).astype(np.int64)
+        if not extra.any():
+            extra[np.flatnonzero(open_weight)[:left]] = 1
+        quota = np.minimum(quota + extra, available)
+    return [int(each) for each in quota]
+
+
+def refine_corners(patches: NDArray[np.uint8]) -> tuple[FloatArray, BoolArray]:
+    """Sub-pixel offset from the centre of each patch to the extremum of a difference of Gaussians beside it.
+
+    A FAST corner is a whole pixel, and which pixel of the blob it picks depends on noise; the extremum is a smooth
+    function of the image. On KITTI and 7-Scenes pairs it brings the median epipolar residual from 0.31 to 0.13 pixels
+    of the level (Harris, minimal eigenvalue and Foerstner gain almost nothing: they peak somewhere else).
+
+    Parameters
+    ----------
+    patches : (N, S, S) uint8
+        S odd and >= 17.
+
+    Returns
+    -------
+    offset : (N, 2) float64
+        (du, dv) in pixels of the level, at most 1.75; zero where there is no extremum.
+    found : (N,) bool
+    """
+    response, middle = _peaks(patches)
+    offset, found = quadratic_peak(response, MIN_CURVATURE)
+    offset += middle
+    return np.where(found[:, None], offset, 0.0), found
+
+
+def stand_out(patches: NDArray[np.uint8], noise: FloatArray) -> BoolArray:
+    """Which corners (N,) are placed by the scene, and not by the image's noise.
+
+    What tells is how the extremum that `refine_corners` looks for curves in the direction in which it curves least: in
+    a soft image, and along an edge in any, not more than noise makes it.
+
+    Parameters
+    ----------
+    patches : (N, S, S) uint8
+        As for `refine_corners`.
+    noise : (N,) float64
+        Its standard deviation about each of them, grey levels.
+    """
+    least = _least_curvature(_peaks(patches)[0])
+    return np.asarray(least > _STANDS_OUT_SIGMAS * _DOG_CURVATURE_NOISE * noise)
+
+
+def _peaks(patches: NDArray[np.uint8]) -> tuple[NDArray[np.float32], IntArray]:
+    """Difference of Gaussians about its extremum beside each patch's centre (N, 3, 3), upwards, and where that is."""
+    centre, reach = patches.shape[1] // 2, _DOG_REACH_PX + 2
+    part = slice(centre - reach, centre + reach + 1)
+    grey = patches[:, part, part].reshape(len(patches), (2 * reach + 1) ** 2).astype(np.float32)
+    response = (grey @ _dog_weights()).reshape(-1, 5, 5)
+    response *= np.where(response[:, 2:3, 2:3] < 0, -1, 1)
+    v, u = np.divmod(response[:, 1:4, 1:4].reshape(-1, 9).argmax(axis=1), 3)
+    peaks = sliding_window_view(response, (3, 3), axis=(1, 2))[np.arange(len(u)), v, u]
+    return peaks, np.stack([u - 1, v - 1], axis=1)
+
+
+def _least_curvature(response: NDArray[np.floating]) -> FloatArray:
+    """By how much each 3 x 3 neighbourhood (N, 3, 3) curves downwards at its middle, where it does so least."""
+    uu, vv, uv = _second_derivatives(response.astype(np.float64))
+    return np.asarray(-(uu + vv) / 2 - np.hypot((uu - vv) / 2, uv))
+
+
+def _second_derivatives(r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Along u, along v and mixed, (N,) each, at the middle of 3 x 3 neighbourhoods (N, 3, 3)."""
+    uu, vv = r[:, 1, 2] - 2 * r[:, 1, 1] + r[:, 1, 0], r[:, 2, 1] - 2 * r[:, 1, 1] + r[:, 0, 1]
+    return uu, vv, (r[:, 2, 2] - r[:, 2, 0] - r[:, 0, 2] + r[:, 0, 0]) / 4
+
+
+def quadratic_peak(response: NDArray[np.floating], min_curvature: float = 0.0) -> tuple[FloatArray, BoolArray]:
+    """Maximum of the parabola through each 3 x 3 neighbourhood, and whether it lies within 0.75 px.
+
+    Parameters
+    ----------
+    response : (N, 3, 3)
+        The middle is the highest, or nearly.
+    min_curvature : float
+        By so much a peak curves downwards at least, in both directions together.
+
+    Returns
+    -------
+    offset : (N, 2) float64
+        (du, dv) from the middle; anything where there is no such maximum.
+    found : (N,) bool
+    """
+    r = response.astype(np.float64)
+    gradient_u, gradient_v = (r[:, 1, 2] - r[:, 1, 0]) / 2, (r[:, 2, 1] - r[:, 0, 1]) / 2
+    uu, vv, uv = _second_derivatives(r)
+    determinant = uu * vv - uv**2
+    # Curved downwards in every direction.
+    peaked = (determinant > 0) & (uu + vv < -min_curvature)
+    safe = np.where(peaked, determinant, 1.0)
+    offset = np.stack([uv * gradient_v - vv * gradient_u, uv * gradient_u - uu * gradient_v], axis=1) / safe[:, None]
+    return offset, peaked & (np.abs(offset) <= 0.75).all(axis=1)
+
+
+@lru_cache(maxsize=1)
+def _dog_weights() -> NDArray[np.float32]:
+    """((2 r + 1)^2, 25): the difference of Gaussians at each pixel of the 5 x 5 centre of a patch of radius r."""
+    axis = np.arange(-_DOG_REACH_PX, _DOG_REACH_PX + 1)
+    gaussians = [np.exp(-(axis**2) / (2 * sigma**2)) for sigma in _DOG_SIGMAS_PX]
+    fine, coarse = (np.outer(each, each) / each.sum() ** 2 for each in gaussians)
+    kernels = [np.pad(coarse - fine, ((row, 4 - row), (column, 4 - column))) for row in range(5) for column in range(5)]
+    return np.stack(kernels, axis=-1).reshape(-1, 25).astype(np.float32)
+
+
+def _fast(image: NDArray[np.uint8], threshold: int, window: tuple[int, int, int, int]) -> tuple[IntArray, FloatArray]:
+    """FAST corners inside `window` (left, top, right, bottom, the last two exclusive), in pixels of the image."""
+    left, top, right, bottom = window
+    rim = FAST_RADIUS_PX
+    view = image[top - rim : bottom + rim, left - rim : right + rim]
+    keypoints = cv2.FastFeatureDetector.create(threshold).detect(view)
+    if not keypoints:
+        return np.empty((0, 2), np.int64), np.empty(0)
+    xy = np.asarray(cv2.KeyPoint.convert(keypoints)).astype(np.int64)
+    xy += np.array([left - rim, top - rim])
+    return xy, np.array([keypoint.response for keypoint in keypoints])
+
+
+def _occupied_cells(xy: IntArray, window: tuple[int, int, int, int], cell_px: int) -> BoolArray:
+    """Which cells of the window hold a corner, (rows, columns)."""
+    left, top, right, bottom = window
+    occupied = np.zeros((-(-(bottom - top) // cell_px), -(-(right - left) // cell_px)), np.bool_)
+    occupied[(xy[:, 1] - top) // cell_px, (xy[:, 0] - left) // cell_px] = True
+    return occupied
+
+
+def _empty_runs(
+    occupied: BoolArray, window: tuple[int, int, int, int], cell_px: int
+) -> list[tuple[int, int, int, int]]:
+    """Join neighbouring empty cells of a row into windows: FAST costs more per call than per pixel."""
+    left, top, right, bottom = window
+    edges = np.diff(np.pad(~occupied, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    rows, starts = np.nonzero(edges == 1)
+    _, stops = np.nonzero(edges == -1)
+    return [
+        (
+            left + start * cell_px,
+            top + row * cell_px,
+            min(left + stop * cell_px, right),
+            min(top + (row + 1) * cell_px, bottom),
+        )
+        for row, start, stop in zip(rows.tolist(), starts.tolist(), stops.tolist(), strict=True)
+    ]

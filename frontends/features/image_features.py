@@ -1,0 +1,80 @@
+"""Another front end's features of buffered images, each found once, and beforehand where they can be prefetched.
+
+Attempts at a recovery walk the same frames one after the other, and so does a recovery that is tried again: finding
+SIFT features anew each time was more than half of what walks cost that come to nothing. And of what a walk over a gap
+costs that comes to a link, half was waiting for features, while the images that it would come to next were known:
+their features are found beside what it does with those before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from weakref import WeakKeyDictionary
+
+from dualslam.core.grey_image import GreyImage
+from dualslam.core.interfaces import Frontend
+from dualslam.core.types import Features
+
+MAX_BYTES = 48 * 2**20
+"""About 120 images of 2000 SIFT features: what a walk sees that ends in a gap. One that gets farther needs no other."""
+
+
+class ImageFeatures:
+    """Features of images, as long as somebody holds these, and up to `MAX_BYTES`: then the one goes first that was
+    not used for longest.
+
+    Parameters
+    ----------
+    frontend : Frontend
+    n_threads : int
+        That look at prefetched images; at a gap six to eight are wanted at once, and the walk goes no further without
+        them. With none they are looked at when they are wanted.
+    """
+
+    def __init__(self, frontend: Frontend, n_threads: int) -> None:
+        self.frontend = frontend
+        self._known: WeakKeyDictionary[GreyImage, Features] = WeakKeyDictionary()  # the last used one stands last
+        self._begun: WeakKeyDictionary[GreyImage, Future[Features]] = WeakKeyDictionary()
+        self._threads = ThreadPoolExecutor(n_threads, "dualslam-features") if n_threads else None
+
+    def of(self, image: GreyImage) -> Features:
+        """Return the features of an image, in its own pixels."""
+        features = self._known.pop(image, None)
+        if features is None:
+            begun = self._begun.pop(image, None)
+            if begun is None:  # what was prefetched did not come: it shall keep nobody waiting
+                self.prefetch([])
+            features = self._look_at(image) if begun is None else begun.result()
+        self._known[image] = features
+        self._make_room()
+        return features
+
+    def prefetch(self, images: Iterable[GreyImage]) -> None:
+        """Say which images will be asked for next, in this order: the threads look at them, and at no others."""
+        if self._threads is None:
+            return
+        wanted = list(images)
+        for image, features in list(self._begun.items()):
+            if image not in wanted and (features.cancel() or features.done()):
+                del self._begun[image]
+                if not features.cancelled() and features.exception() is None:
+                    self._known[image] = features.result()
+        for image in wanted:
+            if image not in self._known and image not in self._begun:
+                self._begun[image] = self._threads.submit(self._look_at, image)
+
+    def _look_at(self, image: GreyImage) -> Features:
+        return self.frontend.extract(image.pixels())
+
+    def _make_room(self) -> None:
+        nbytes = sum(features.nbytes for features in self._known.values())
+        for image, features in list(self._known.items())[:-1]:
+            if nbytes <= MAX_BYTES:
+                return
+            del self._known[image]
+            nbytes -= features.nbytes
+
+    def __len__(self) -> int:
+        """Images whose features are known."""
+        return len(self._known)

@@ -1,0 +1,325 @@
+"""Guided matching, for any front end: descriptors are compared through `Frontend.distance` alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.interfaces import Frontend
+from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Matches
+from dualslam.frontends.features.groups import NO_MATCHES, best_pairs, best_per_group, consistent_rotation
+from dualslam.frontends.gates import CHI2_1DOF_95
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FeatureGrid:
+    """Features sorted into square cells, row by row, so that a disc is a few contiguous runs of the sorted list.
+
+    Attributes
+    ----------
+    uv_px : (N, 2) float64
+        The features' positions, in their own order.
+    cell_px : float
+    origin_px : (2,) float64
+        Corner of the first cell.
+    shape : (int, int)
+        Cell rows and columns.
+    order : (N,) int64
+        Feature rows sorted by cell.
+    start : (rows * columns + 1,) int64
+        Where each cell begins in `order`.
+    """
+
+    uv_px: FloatArray
+    cell_px: float
+    origin_px: FloatArray
+    shape: tuple[int, int]
+    order: IntArray
+    start: IntArray
+
+    @classmethod
+    def build(
+        cls, uv_px: FloatArray, cell_px: float = 16.0, bounds: tuple[float, float, float, float] | None = None
+    ) -> FeatureGrid:
+        """Sort features into cells.
+
+        Parameters
+        ----------
+        uv_px : (N, 2) float64
+            Usually `features.uv_rect_px`. Non-finite positions are never found.
+        cell_px : float
+            About the usual search radius.
+        bounds : (left, top, right, bottom), optional
+            What the cells cover, pixels; the features' bounding box by default. Features outside are found all the
+            same: they are kept in the cells of the rim.
+        """
+        finite = np.isfinite(uv_px).all(axis=1)
+        if bounds is None:
+            box = uv_px[finite] if finite.any() else np.zeros((1, 2))
+            low, high = box.min(axis=0), box.max(axis=0)
+        else:
+            low, high = np.array(bounds[:2], np.float64), np.array(bounds[2:], np.float64)
+        columns, rows = (int(extent // cell_px) + 1 for extent in np.maximum(high - low, 0.0))
+        cell = _cells(uv_px[finite], low, cell_px, (rows, columns))
+        flat = cell[:, 1] * columns + cell[:, 0]
+        start = np.zeros(rows * columns + 1, np.int64)
+        np.cumsum(np.bincount(flat, minlength=rows * columns), out=start[1:])
+        order = np.flatnonzero(finite)[np.argsort(flat, kind="stable")]
+        return cls(uv_px, cell_px, low, (rows, columns), order, start)
+
+    def within(self, uv_px: FloatArray, radius_px: FloatArray) -> tuple[IntArray, IntArray]:
+        """Every feature in a disc around each position.
+
+        Parameters
+        ----------
+        uv_px : (M, 2) float64
+            Non-finite positions find nothing.
+        radius_px : (M,) float64
+
+        Returns
+        -------
+        query, feature : (P,) int64
+            Rows of `uv_px` (ascending) and of the features.
+        """
+        asked = np.flatnonzero(np.isfinite(uv_px).all(axis=1) & (radius_px >= 0))
+        low = _cells(uv_px[asked] - radius_px[asked, None], self.origin_px, self.cell_px, self.shape)
+        high = _cells(uv_px[asked] + radius_px[asked, None], self.origin_px, self.cell_px, self.shape)
+        # A disc touches a run of cells in each of its cell rows: first one entry per (query, cell row), ...
+        which, cell_row = _ranges(low[:, 1], high[:, 1] + 1)
+        begin = self.start[cell_row * self.shape[1] + low[which, 0]]
+        end = self.start[cell_row * self.shape[1] + high[which, 0] + 1]
+        # ... then one per feature of the run.
+        run, place = _ranges(begin, end)
+        query, feature = asked[which[run]], self.order[place]
+        step = self.uv_px[feature] - uv_px[query]
+        inside = step[:, 0] ** 2 + step[:, 1] ** 2 <= radius_px[query] ** 2
+        return query[inside], feature[inside]
+
+
+def match_projected(
+    frontend: Frontend,
+    grid: FeatureGrid,
+    features: Features,
+    uv_pred: FloatArray,
+    radius_px: NDArray[np.floating[Any]],
+    descriptors: NDArray[np.generic],
+    *,
+    octave: IntArray | FloatArray | None = None,
+    octave_tolerance: float = 1.0,
+    max_distance: float | None = None,
+    ratio: float = 0.9,
+    taken: BoolArray | None = None,
+    angle_rad: FloatArray | None = None,
+) -> Matches:
+    """Match points whose positions in an image are predicted to its features, one to one.
+
+    Parameters
+    ----------
+    frontend : Frontend
+    grid : FeatureGrid
+        Of `features.uv_rect_px`.
+    features : Features
+        Of the image, N of them.
+    uv_pred : (M, 2) float64
+        Predicted pixels, rectified; non-finite rows stay unmatched.
+    radius_px : (M,) float64
+        Search radius.
+    descriptors : (M, D)
+        Of the predicted points.
+    octave : (M,), optional
+        Predicted pyramid level, may be fractional; features further than `octave_tolerance` from it are passed over.
+    max_distance : float, optional
+        `frontend.max_distance` by default.
+    ratio : float
+        Greatest best distance over second best, among the candidates of the best one's octave. 1: no test.
+    taken : (N,) bool, optional
+        Features that may not be chosen.
+    angle_rad : (M,) float64, optional
+        Orientation of the predicted points where they were seen before: pairs that do not share the common rotation
+        are dropped.
+
+    Returns
+    -------
+    Matches
+        Rows of `uv_pred` (ascending), rows of `features`.
+    """
+    query, feature = grid.within(uv_pred, np.asarray(radius_px, np.float64))
+    usable = np.ones(len(query), np.bool_)
+    if octave is not None:
+        usable &= np.abs(features.octave[feature] - octave[query]) <= octave_tolerance
+    if taken is not None:
+        usable &= ~taken[feature]
+    query, feature = query[usable], feature[usable]
+    if len(query) == 0:
+        return NO_MATCHES
+    limit = frontend.max_distance if max_distance is None else max_distance
+    distance = frontend.distance(descriptors[query], features.descriptors[feature])
+    chosen = best_pairs(query, feature, distance, features.octave[feature], ratio, len(uv_pred), len(features))
+    chosen = chosen[distance[chosen] <= limit]
+    if angle_rad is not None:
+        turn = features.angle_rad[feature[chosen]] - angle_rad[query[chosen]]
+        chosen = chosen[consistent_rotation(turn)]
+    return Matches(np.stack([query[chosen], feature[chosen]], axis=1), distance[chosen])
+
+
+def match_epipolar(
+    frontend: Frontend,
+    a: Features,
+    b: Features,
+    rows_a: IntArray,
+    rows_b: IntArray,
+    F_b_a: FloatArray,
+    *,
+    segments: FloatArray | None = None,
+    pose_sigma_px: float = 0.0,
+    epipole_px: float = 10.0,
+    octave_tolerance: int = 1,
+    max_distance: float | None = None,
+    ratio: float = 0.85,
+    check_rotation: bool = True,
+) -> Matches:
+    """Match features of two keyframes of known relative pose, along epipolar lines, one to one.
+
+    A pair is a candidate where the feature of b lies on the epipolar line of the feature of a within the 95 % gate of
+    both features' noise, and the octaves are close. Of the candidates, pairs that are best for each other are kept.
+
+    Parameters
+    ----------
+    frontend : Frontend
+    a, b : Features
+    rows_a : (A,) int64, rows_b : (B,) int64
+        Features that take part, usually those without a landmark.
+    F_b_a : (3, 3) float64
+        Fundamental matrix on rectified pixels: the line in b of x_a is ``F_b_a @ x_a``, its sign and scale are free.
+    segments : (A, 2, 2) float64, optional
+        From `ray_segments`: pixels in b of the nearest and the farthest point that each ray of `rows_a` may hold;
+        candidates must lie between them. A row with a non-finite number is not limited.
+    pose_sigma_px : float
+        Standard deviation of the line's place caused by the relative pose's own error.
+    epipole_px : float
+        Features nearer than this to the epipole of their image are passed over: no parallax there.
+    octave_tolerance : int
+    max_distance : float, optional
+        `frontend.max_distance` by default.
+    ratio : float
+        Greatest best distance over second best on the line, in the best one's octave. 1: no test.
+    check_rotation : bool
+        Drop pairs that do not share the common change of orientation.
+
+    Returns
+    -------
+    Matches
+        Rows of `a` (ascending in the order of `rows_a`), rows of `b`.
+    """
+    uv_a, uv_b = a.uv_rect_px[rows_a], b.uv_rect_px[rows_b]
+    first, second = _near_lines(uv_a, uv_b, a.sigma_px[rows_a], b.sigma_px[rows_b], F_b_a, pose_sigma_px)
+    usable = np.abs(a.octave[rows_a][first] - b.octave[rows_b][second]) <= octave_tolerance
+    usable &= _off_epipole(uv_a, F_b_a, epipole_px)[first] & _off_epipole(uv_b, F_b_a.T, epipole_px)[second]
+    if segments is not None:
+        slack_px = 2.0 * b.sigma_px[rows_b][second] + pose_sigma_px
+        usable &= _within_segments(uv_b[second], segments[first], slack_px)
+    first, second = first[usable], second[usable]
+    if len(first) == 0:
+        return NO_MATCHES
+    limit = frontend.max_distance if max_distance is None else max_distance
+    distance = frontend.distance(a.descriptors[rows_a[first]], b.descriptors[rows_b[second]])
+    octave_b = b.octave[rows_b[second]]
+    chosen = best_pairs(first, second, distance, octave_b, ratio, len(rows_a), len(rows_b))
+    # Best for b among all candidates, not only among those that are some feature's best.
+    chosen = np.intersect1d(chosen, best_per_group(second, distance, len(rows_b)), assume_unique=True)
+    chosen = chosen[distance[chosen] <= limit]
+    index = np.stack([rows_a[first[chosen]], rows_b[second[chosen]]], axis=1)
+    kept = np.ones(len(index), np.bool_)
+    if check_rotation:
+        kept = consistent_rotation(b.angle_rad[index[:, 1]] - a.angle_rad[index[:, 0]])
+    return Matches(index[kept], distance[chosen][kept])
+
+
+def ray_segments(
+    uv_a: FloatArray, K: FloatArray, T_b_a: FloatArray, inverse_depth: tuple[FloatArray | float, FloatArray | float]
+) -> FloatArray:
+    """Where in b the rays of a begin and end, for `match_epipolar`.
+
+    Parameters
+    ----------
+    uv_a : (A, 2) float64
+        Rectified pixels in a.
+    K : (3, 3) float64
+        Pinhole matrix of both rectified images.
+    T_b_a : (4, 4) float64
+        Takes coordinates in camera a to camera b.
+    inverse_depth : (nearest, farthest)
+        Greatest and least inverse depth along a's optical axis, scalars or (A,), in the inverse unit of `T_b_a`;
+        0 is infinity.
+
+    Returns
+    -------
+    (A, 2, 2) float64
+        Pixels in b of the nearest and the farthest point; NaN for a point behind b.
+    """
+    homogeneous = np.concatenate([uv_a, np.ones((len(uv_a), 1))], axis=1)
+    # K (R z K^-1 x + t) with z = 1 / rho is, up to scale, K R K^-1 x + rho K t: finite at infinity too.
+    at_infinity = homogeneous @ (K @ T_b_a[:3, :3] @ np.linalg.inv(K)).T
+    shift = K @ T_b_a[:3, 3]
+    points = np.stack([at_infinity + np.reshape(rho, (-1, 1)) * shift for rho in inverse_depth], axis=1)
+    depth = points[:, :, 2:]
+    in_front = depth > 1e-6
+    return np.where(in_front, points[:, :, :2] / np.where(in_front, depth, 1.0), np.nan)
+
+
+def _cells(uv_px: FloatArray, origin_px: FloatArray, cell_px: float, shape: tuple[int, int]) -> IntArray:
+    """Cell (column, row) of each position, those outside moved to the rim: (N, 2)."""
+    last = np.array([shape[1] - 1, shape[0] - 1], np.float64)
+    return np.clip((uv_px - origin_px) / cell_px, 0.0, last).astype(np.int64)
+
+
+def _ranges(begin: IntArray, end: IntArray) -> tuple[IntArray, IntArray]:
+    """All integers of the ranges [begin, end), one after the other, and the row of the range each belongs to."""
+    length = end - begin
+    row = np.repeat(np.arange(len(length)), length)
+    offset = np.cumsum(length) - length
+    return row, np.arange(len(row)) + (begin - offset)[row]
+
+
+def _near_lines(
+    uv_a: FloatArray, uv_b: FloatArray, sigma_a: FloatArray, sigma_b: FloatArray, F_b_a: FloatArray, extra_px: float
+) -> tuple[IntArray, IntArray]:
+    """Pairs whose point in b is within the 95 % gate of the line of the point in a, ascending in a."""
+    lines = np.concatenate([uv_a, np.ones((len(uv_a), 1))], axis=1) @ F_b_a.T
+    normal = np.hypot(lines[:, 0], lines[:, 1])
+    lines /= np.where(normal > 0, normal, np.nan)[:, None]
+    # Single precision: with unit normals the products stay below some thousands, so the error is about 1e-3 px.
+    points = np.concatenate([uv_b, np.ones((len(uv_b), 1))], axis=1).astype(np.float32)
+    off_line = lines.astype(np.float32) @ points.T
+    np.square(off_line, out=off_line)
+    # The noise of a's pixel moves the line by about as much as it moves the pixel.
+    gate_a = (CHI2_1DOF_95 * (sigma_a**2 + extra_px**2)).astype(np.float32)
+    gate_b = (CHI2_1DOF_95 * sigma_b**2).astype(np.float32)
+    off_line -= gate_b
+    flat = np.flatnonzero(off_line <= gate_a[:, None])
+    first, second = np.divmod(flat, max(len(uv_b), 1))
+    return first, second
+
+
+def _off_epipole(uv_px: FloatArray, F_other: FloatArray, radius_px: float) -> BoolArray:
+    """Which points of an image are not beside its epipole, the null vector of `F_other` (which maps its points)."""
+    epipole = np.linalg.svd(F_other)[2][-1]
+    if abs(epipole[2]) < 1e-9:
+        return np.ones(len(uv_px), np.bool_)
+    off: BoolArray = np.hypot(*(uv_px - epipole[:2] / epipole[2]).T) > radius_px
+    return off
+
+
+def _within_segments(uv_px: FloatArray, segments: FloatArray, slack_px: FloatArray) -> BoolArray:
+    """Whether each point (P, 2) lies between the ends of its segment (P, 2, 2), measured along the segment."""
+    along = segments[:, 1] - segments[:, 0]
+    length = np.hypot(along[:, 0], along[:, 1])
+    step = uv_px - segments[:, 0]
+    place = (step * along).sum(axis=1) / np.where(length > 0, length, 1.0)
+    # A segment shorter than the slack has no usable direction: the distance to its near end decides.
+    short = length <= 1e-6
+    place = np.where(short, np.hypot(step[:, 0], step[:, 1]), place)
+    return ~np.isfinite(length) | ((place >= -slack_px) & (place <= length + slack_px))

@@ -1,0 +1,158 @@
+"""Tracks of a front end that is not the live one, through frames whose poses in a submap are known.
+
+It holds no landmarks of the submap and none of its descriptors: pixels of its own features, matched by themselves, and
+for each frame where it stands relative to a keyframe of the submap, so that its points move with the submap's graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.triangulation import in_front, triangulate_n_view
+from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Matches
+from dualslam.frontends.gates import CHI2_2DOF_95
+from dualslam.map.submap import Submap
+
+NO_TRACK = -1
+MAX_DEPTH_SIGMA = 0.25
+"""Relative uncertainty of its depth up to which a point serves to find a pose (as for landmarks in the graph)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackViews:
+    """N tracks in V frames.
+
+    Attributes
+    ----------
+    T_cam_submap : (V, 4, 4)
+    uv_px : (N, V, 2)
+        Rectified; zero where not visible.
+    sigma_px : (N, V)
+    visible : (N, V) bool
+    """
+
+    T_cam_submap: FloatArray
+    uv_px: FloatArray
+    sigma_px: FloatArray
+    visible: BoolArray
+
+
+class AuxiliaryMap:
+    """Features of another front end in some frames, and which of them belong together.
+
+    Parameters
+    ----------
+    submap : Submap
+        Only the poses of its keyframes are read.
+    """
+
+    def __init__(self, submap: Submap) -> None:
+        self._submap = submap
+        self._features: dict[int, Features] = {}
+        self._track_of: dict[int, IntArray] = {}
+        self._place: dict[int, tuple[int, FloatArray]] = {}
+        self._n_tracks = 0
+
+    @property
+    def frames(self) -> list[int]:
+        """Frames with features and a pose, in the order in which they were posed."""
+        return [index for index in self._place if index in self._features]
+
+    def features(self, index: int) -> Features:
+        """Return the features of a frame."""
+        return self._features[index]
+
+    def T_cam_submap(self, index: int) -> FloatArray:
+        """Return where a frame stands by the submap's poses of now."""
+        return se3.inverse(self._submap.resolve_anchor(*self._place[index]))
+
+    def add(self, index: int, features: Features, matches: Mapping[int, Matches]) -> None:
+        """Take a frame's features in.
+
+        Parameters
+        ----------
+        index : int
+        features : Features
+        matches : mapping of int to Matches
+            Rows of an earlier frame's features, rows of `features`; where two earlier frames disagree, the first holds.
+        """
+        self._features[index] = features
+        self._track_of[index] = np.full(len(features), NO_TRACK, np.int64)
+        for other, found in matches.items():
+            self._extend(other, index, found.index)
+
+    def drop(self, index: int) -> None:
+        """Forget a frame that found no pose."""
+        del self._features[index], self._track_of[index]
+        self._place.pop(index, None)
+
+    def put(self, index: int, reference_id: int, T_cam_submap: FloatArray) -> None:
+        """Say where a frame stands, relative to a keyframe of the submap (which may be the frame itself)."""
+        T_submap_kf = self._submap.resolve_anchor(reference_id, np.eye(4))
+        self._place[index] = reference_id, se3.inverse(T_submap_kf) @ se3.inverse(T_cam_submap)
+
+    def rows_with_track(self, index: int) -> IntArray:
+        """Return the features of a frame that an earlier or later frame was found to see too."""
+        return np.flatnonzero(self._track_of[index] != NO_TRACK)
+
+    def views(self, tracks_of: int, rows: IntArray, frames: list[int]) -> TrackViews:
+        """Return the pixels, in `frames`, of the tracks of some features of frame `tracks_of`.
+
+        Parameters
+        ----------
+        tracks_of : int
+        rows : (N,) int64
+            Features that have a track.
+        frames : list of int
+            With a pose.
+        """
+        wanted = self._track_of[tracks_of][rows]
+        n, n_views = len(wanted), len(frames)
+        uv, sigma, visible = np.zeros((n, n_views, 2)), np.ones((n, n_views)), np.zeros((n, n_views), bool)
+        for v, index in enumerate(frames):
+            row_of = np.full(self._n_tracks, NO_TRACK)
+            has = self.rows_with_track(index)
+            row_of[self._track_of[index][has]] = has
+            row = row_of[wanted]
+            visible[:, v] = row >= 0
+            uv[visible[:, v], v] = self._features[index].uv_rect_px[row[row >= 0]]
+            sigma[visible[:, v], v] = self._features[index].sigma_px[row[row >= 0]]
+        T = np.array([self.T_cam_submap(index) for index in frames]).reshape(-1, 4, 4)
+        return TrackViews(T, uv, sigma, visible)
+
+    def _extend(self, other: int, index: int, pairs: IntArray) -> None:
+        """Let matched features share a track, at most one feature of each frame on a track."""
+        a, b = self._track_of[other], self._track_of[index]
+        rows_a, rows_b = pairs[:, 0], pairs[:, 1]
+        new = (a[rows_a] == NO_TRACK) & (b[rows_b] == NO_TRACK)
+        ids = self._n_tracks + np.arange(int(new.sum()))
+        a[rows_a[new]] = b[rows_b[new]] = ids
+        self._n_tracks += len(ids)
+        onwards = (a[rows_a] != NO_TRACK) & (b[rows_b] == NO_TRACK) & ~np.isin(a[rows_a], b)
+        b[rows_b[onwards]] = a[rows_a[onwards]]
+        back = (a[rows_a] == NO_TRACK) & (b[rows_b] != NO_TRACK) & ~np.isin(b[rows_b], a)
+        a[rows_a[back]] = b[rows_b[back]]
+
+
+def triangulate(views: TrackViews, K: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return points (N, 3) in the submap, and which are well enough known to find a pose by."""
+    n_seen = views.visible.sum(axis=1)
+    xyz = np.full((len(views.visible), 3), np.nan)
+    good = np.zeros(len(xyz), bool)
+    seen = np.flatnonzero(n_seen >= 2)
+    if len(seen) == 0:
+        return xyz, good
+    visible = views.visible[seen]
+    points = triangulate_n_view(views.uv_px[seen], K, views.T_cam_submap, visible)
+    xyz[seen] = points.xyz
+    sigma = views.sigma_px[seen]
+    fits = ((points.error2 < CHI2_2DOF_95 * sigma**2) | ~visible).all(axis=1)
+    # Depth is off by about its pixel's noise over the parallax.
+    parallax_rad = np.arccos(np.clip(points.min_cos_parallax, -1.0, 1.0))
+    certain = parallax_rad * K[0, 0] * MAX_DEPTH_SIGMA > np.where(visible, sigma, 0.0).max(axis=1)
+    good[seen] = fits & certain & in_front(points.depth) & np.isfinite(points.xyz).all(axis=1)
+    return xyz, good

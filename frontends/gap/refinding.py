@@ -1,0 +1,294 @@
+"""Landmarks of one side of a gap, found again on the other side in the images themselves.
+
+Beyond frames that could not be used (or after tracking has matched wide again) the map's scale hangs by the landmarks
+that are seen on both sides, and the detector finds few of the same points at half or twice the distance. With the pose
+now known about, each landmark's place and size there are too: the keyframes beyond the gap are searched for what the
+last keyframes before it saw, by its patch of the image, and what is found becomes a feature of theirs like any other.
+
+The pose of a gap relocalisation comes from few matches over a long way. There a landmark is looked for once its place is known to
+within what is searched, by the pose's covariance and its own: in a smaller search than that, what looks alike and
+confirms a wrong pose is all there is to find. Landmarks far away come first; what they tell of the pose makes way for
+those nearby (active search: Davison, ICCV 2003). The pose of a tracked frame is by the landmarks that it follows, and
+within the search.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dualslam.core.camera.models import Camera
+from dualslam.core.camera.rectification import rectified_sigma
+from dualslam.core.columns import concatenate
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.projection import projection_jacobians, refine_pose
+from dualslam.core.grey_image import GreyImage
+from dualslam.core.interfaces import Frontend
+from dualslam.core.types import BoolArray, Failure, Features, FloatArray, IntArray, Track, View
+from dualslam.frontends.gap.patches import HALF_PX, Pyramid, build_pyramid, match_patches
+from dualslam.frontends.gap.uncertainty import pose_uncertainty
+from dualslam.map.landmark_views import landmark_covariances
+from dualslam.map.submap import Submap
+
+RIM_KEYFRAMES = 6
+"""Keyframes before a gap whose landmarks are looked for beyond it."""
+FAR_KEYFRAMES = 8
+"""Keyframes beyond a gap in which they are: the wider these stand, the better they know the landmarks' depths."""
+KEPT_IMAGES = 12
+"""Those nearest in time to the latest keyframe: twice the rim, since not each keyframe is there to stay."""
+SEARCH_RAD = 0.022
+"""About the predicted place, in the coarser image, as an angle: a pose from few matches is off by as much."""
+SEARCH_SIGMAS = 3.0
+"""Standard deviations of the predicted place that the search must reach."""
+ROUNDS = 4
+"""Searches in one frame beyond a gap at most, each from the pose that the one before has left."""
+MAX_DEPTH_SIGMA = 0.1
+"""Relative, of a landmark that is looked for. There are more points far away than near, and of these the ones enter a
+map whose noise looks like parallax: on a rendered street, depths known to 5 % are right, to 12 % are 2 to 6 % too
+small, to 20 % 5 to 13 %. A hundred of them beyond a gap would not average that out, and pass it on as scale."""
+MAX_ZOOM = 4.0
+"""Beyond, a patch covers another part of the scene than its landmark stands for."""
+SIGMA_PX = 0.45
+"""Noise of a place, in pixels of the coarser image: half of what is found on a rendered street, at half the distance or
+twice, is nearer than 0.25 to 0.5 px of where it is in truth."""
+MAJORITY = 0.5
+"""Of the patches that are found must agree with one pose: below, it is chance that has found them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _PosePrior:
+    """What a gap relocalisation knows of a frame's pose, beside the landmarks that it sees: the pose and its information (6, 6)."""
+
+    T_cam_submap: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sought:
+    """N landmarks as one keyframe before the gap sees them."""
+
+    keyframe_id: int
+    landmark_ids: IntArray
+    features: Features
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """Rows of what was sought, and a feature for each."""
+
+    row: IntArray
+    features: Features
+
+
+class Refinder:
+    """Knows the images of a front end's latest keyframes, and whether a gap lies behind it.
+
+    Parameters
+    ----------
+    submap : Submap
+    frontend : Frontend
+        The live one.
+    camera : callable
+        The camera that rectifies the features now.
+    model_sigma_px : float
+        Error of its model, see `CameraConfig.model_sigma_px`.
+    """
+
+    def __init__(self, submap: Submap, frontend: Frontend, camera: Callable[[], Camera], model_sigma_px: float) -> None:
+        self._submap = submap
+        self._frontend = frontend
+        self._camera = camera
+        self._model_sigma_px = model_sigma_px
+        self._images: dict[int, GreyImage] = {}
+        self._rim: list[int] = []
+        self._levels: dict[int, Pyramid] = {}
+        self._n_left = 0
+
+    def remember(self, view: View) -> None:
+        """Keep the image of a keyframe; one that was straightened does not show its features where they are."""
+        if view.image is None or view.turn_rad is not None:
+            return
+        self._images[view.index] = view.image
+        for index in sorted(self._images, key=lambda i: abs(i - view.index))[KEPT_IMAGES:]:
+            del self._images[index]
+
+    def begin(self, index: int) -> None:
+        """Note that a gap lies between frame `index` and the keyframes so far."""
+        near = [k for k in self._submap.keyframes_near(index) if k in self._images and k != index]
+        self._rim, self._n_left = near[:RIM_KEYFRAMES], FAR_KEYFRAMES
+        self._levels = {k: levels for k, levels in self._levels.items() if k in self._rim}
+
+    def extend(self, track: Track, pose_is_given: bool = False) -> Track:
+        """Return a frame that is to become a keyframe with the landmarks from before the gap that its image shows.
+
+        Its features are those that it had, and behind them those that were found; its pose is refined with all.
+
+        Parameters
+        ----------
+        track : Track
+        pose_is_given : bool
+            Its pose and covariance are not by the landmarks that it sees, and count beside these.
+        """
+        view = track.view
+        if self._n_left == 0 or view.image is None or view.turn_rad is not None:
+            return track
+        self._n_left -= 1
+        levels = build_pyramid(view.image.pixels())
+        pose_prior = _PosePrior(track.T_cam_submap, _inverse(track.covariance)) if pose_is_given else None
+        looked_for = np.zeros(0, np.int64)
+        for _ in range(ROUNDS if pose_prior else 1):
+            sought = self._sought(track, looked_for, pose_prior)
+            if not sought:
+                break
+            found = [self._find(each, track, levels) for each in sought]
+            looked_for = np.concatenate([looked_for, *(each.landmark_ids for each in sought)])
+            ids = [each.landmark_ids[of.row] for each, of in zip(sought, found, strict=True)]
+            features = concatenate([track.view.features, *(of.features for of in found)])
+            track = self._posed(track, features, np.concatenate([track.landmark_ids, *ids]), pose_prior)
+        return track
+
+    def _sought(self, track: Track, looked_for: IntArray, pose_prior: _PosePrior | None) -> list[_Sought]:
+        """Return the landmarks of the rim that the frame lacks, each in the keyframe next to the gap that sees it.
+
+        Of these, the ones whose depths (and beyond a gap, whose places in the frame) are known; and none twice.
+        """
+        submap, taken = self._submap, np.concatenate([track.landmark_ids, looked_for])
+        pose_covariance = None if pose_prior is None else self._pose_covariance(track, pose_prior)
+        found = []
+        for k in self._rim:
+            if k not in submap.keyframes or k not in self._images:
+                continue
+            feature = np.flatnonzero(submap.landmark_of[k] >= 0)
+            feature = feature[~np.isin(submap.landmark_of[k][feature], taken)]
+            ids = submap.landmark_of[k][feature]
+            covariance = landmark_covariances(submap, ids)
+            known = self._depth_known(ids, k, covariance)
+            if pose_covariance is not None:
+                known[known] = self._place_known(ids[known], k, track, pose_covariance, covariance[known])
+            if known.any():
+                taken = np.concatenate([taken, ids[known]])
+                found.append(_Sought(k, ids[known], submap.keyframes[k].features.take(feature[known])))
+        return found
+
+    def _pose_covariance(self, track: Track, pose_prior: _PosePrior) -> FloatArray:
+        """Return how well the frame's pose is known (6, 6), by the gap relocalisation and by the landmarks that it sees."""
+        row = np.flatnonzero(track.landmark_ids >= 0)
+        sigma = track.view.features.sigma_px[row]
+        by_landmarks = pose_uncertainty(self._submap, track.T_cam_submap, track.landmark_ids[row], sigma)
+        if by_landmarks is None:
+            return _inverse(pose_prior.information)
+        return _inverse(_inverse(by_landmarks[0]) + pose_prior.information)
+
+    def _depth_known(self, landmark_ids: IntArray, k: int, covariance: FloatArray) -> BoolArray:
+        """Return which landmarks' (N,) depths in keyframe k are known, the poses taken as known."""
+        T_kf_submap = se3.inverse(self._submap.T_submap_kf[k])
+        along, depth = T_kf_submap[2, :3], self._submap.depths(landmark_ids, T_kf_submap)
+        sigma = np.sqrt(np.einsum("i,nij,j->n", along, covariance, along)) / np.maximum(depth, 1e-12)
+        return np.asarray(sigma < MAX_DEPTH_SIGMA, np.bool_)
+
+    def _place_known(
+        self, landmark_ids: IntArray, k: int, track: Track, pose_covariance: FloatArray, covariance: FloatArray
+    ) -> BoolArray:
+        """Return which landmarks' (N,) places in the frame are known to within the search."""
+        submap, T = self._submap, track.T_cam_submap
+        depth, depth_kf = (submap.depths(landmark_ids, T_) for T_ in (T, se3.inverse(submap.T_submap_kf[k])))
+        known = depth > 0
+        J_pose, J_point = projection_jacobians(submap.K, T, submap.landmarks["xyz_mu"][landmark_ids[known]])
+        place = J_pose @ pose_covariance @ J_pose.swapaxes(1, 2)
+        place += J_point @ covariance[known] @ J_point.swapaxes(1, 2)
+        coarser = np.maximum(depth_kf[known] / depth[known], 1.0)
+        sigma_rad = np.sqrt(np.linalg.eigvalsh(place)[:, -1]) / coarser / submap.K[0, 0]
+        known[known] = SEARCH_SIGMAS * sigma_rad < SEARCH_RAD
+        return np.asarray(known, np.bool_)
+
+    def _find(self, sought: _Sought, track: Track, levels: Pyramid) -> _Found:
+        """Search the image for one keyframe's landmarks."""
+        camera = self._camera()
+        T_kf_submap = se3.inverse(self._submap.T_submap_kf[sought.keyframe_id])
+        T_cam_kf = track.T_cam_submap @ self._submap.T_submap_kf[sought.keyframe_id]
+        uv_kf = sought.features.uv_px
+        depth = self._submap.depths(sought.landmark_ids, T_kf_submap)
+        uv, J = _predict(camera, uv_kf, depth, T_cam_kf)
+        zoom = _zoom(J)
+        margin = HALF_PX * np.maximum(zoom, 1.0)[:, None]
+        inside = ((uv > margin) & (uv < np.array([camera.width, camera.height]) - 1 - margin)).all(axis=1)
+        usable = np.flatnonzero(inside & (depth > 0) & (zoom > 1 / MAX_ZOOM) & (zoom < MAX_ZOOM))
+        matches = match_patches(
+            self._levels_of(sought.keyframe_id),
+            levels,
+            uv_kf[usable],
+            uv[usable],
+            J[usable],
+            SEARCH_RAD * camera.K[0, 0],
+        )
+        row = usable[matches.row]
+        uv_rect, magnification = camera.rectify(matches.uv_px)
+        held = np.isfinite(uv_rect).all(axis=1) & np.isfinite(magnification)
+        row, uv_px, uv_rect = row[held], matches.uv_px[held], uv_rect[held]
+        sigma = rectified_sigma(SIGMA_PX * matches.spacing_px[held], magnification[held], self._model_sigma_px)
+        of = sought.features.take(row)
+        scale = np.maximum(of.scale * zoom[row], 1.0)
+        octave = np.rint(np.log(scale) / np.log(self._frontend.scale_factor)).astype(np.int64)
+        octave = np.minimum(octave, self._frontend.n_octaves - 1)
+        turn = np.arctan2(J[row, 1, 0] - J[row, 0, 1], J[row, 0, 0] + J[row, 1, 1])
+        features = Features(uv_px, uv_rect, sigma, scale, octave, of.angle_rad + turn, of.descriptors)
+        return _Found(row, features)
+
+    def _levels_of(self, keyframe_id: int) -> Pyramid:
+        if keyframe_id not in self._levels:
+            self._levels[keyframe_id] = build_pyramid(self._images[keyframe_id].pixels())
+        return self._levels[keyframe_id]
+
+    def _posed(self, track: Track, features: Features, landmark_ids: IntArray, pose_prior: _PosePrior | None) -> Track:
+        """Pose the frame by all that was found, and leave out what does not agree."""
+        row = np.flatnonzero(landmark_ids >= 0)
+        T, sigma = track.T_cam_submap, features.sigma_px[row]
+        if pose_prior is not None:
+            T, sigma = (
+                pose_prior.T_cam_submap,
+                np.hypot(sigma, self._place_sigmas(landmark_ids[row], track.T_cam_submap)),
+            )
+        estimate = refine_pose(
+            self._submap.K,
+            T,
+            self._submap.landmarks["xyz_mu"][landmark_ids[row]],
+            features.uv_rect_px[row],
+            sigma,
+            prior_information=None if pose_prior is None else pose_prior.information,
+        )
+        is_new = row >= len(track.view.features)
+        if isinstance(estimate, Failure) or estimate.inliers[is_new].sum() <= MAJORITY * is_new.sum():
+            return track
+        landmark_ids = landmark_ids.copy()
+        landmark_ids[row[~estimate.inliers]] = -1
+        kept = np.ones(len(features), bool)
+        kept[row[is_new & ~estimate.inliers]] = False
+        view = replace(track.view, features=features.take(kept))
+        return replace(track, view=view, T_cam_submap=estimate.T_cam_w, landmark_ids=landmark_ids[kept])
+
+    def _place_sigmas(self, landmark_ids: IntArray, T_cam_submap: FloatArray) -> FloatArray:
+        """Return by how many pixels (N,) landmarks may be off for their own uncertainty, either coordinate."""
+        _, J = projection_jacobians(self._submap.K, T_cam_submap, self._submap.landmarks["xyz_mu"][landmark_ids])
+        place = J @ landmark_covariances(self._submap, landmark_ids) @ J.swapaxes(1, 2)
+        return np.asarray(np.sqrt(np.nan_to_num(np.trace(place, axis1=1, axis2=2) / 2, nan=0.0)), np.float64)
+
+
+def _inverse(symmetric: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.pinv(symmetric, hermitian=True), np.float64)
+
+
+def _predict(camera: Camera, uv_px: FloatArray, depth: FloatArray, T_b_a: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return where pixels (N, 2) of a, at a depth (N,), are in b, and by how much these move with those (N, 2, 2)."""
+    places = []
+    for step in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
+        rays = camera.unproject(uv_px + step)
+        p = rays * (depth / rays[:, 2])[:, None]
+        places.append(camera.project(p @ T_b_a[:3, :3].T + T_b_a[:3, 3]))
+    return places[0], np.stack([places[1] - places[0], places[2] - places[0]], axis=2)
+
+
+def _zoom(J: FloatArray) -> FloatArray:
+    """Return how much larger (N,) things are in the second image; NaN where they are not in it."""
+    return np.asarray(np.sqrt(np.abs(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0])))

@@ -1,0 +1,83 @@
+"""What a pose is worth that was found across a gap: its covariance, and how well it holds the scale.
+
+A frame beyond a gap sees points whose depths are known from the other side, to some extent. All that is mapped beyond
+the gap inherits the scale at which it sees them. What that is worth is not read from residuals, but from the Hessian:
+pose and points are unknown together, the points as well as what is known of them allows.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dualslam.core.geometry.projection import projection_jacobians
+from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.landmark_views import landmark_covariances
+from dualslam.map.submap import Submap
+
+HESSIAN_INFLATION = 1.5
+"""Of standard deviations: the poses that fix the points have errors too, and pixels of neighbours err alike."""
+MIN_POINTS = 4
+"""Landmarks that tell anything of a pose: three fix one."""
+SMALL_STEP = 0.1
+"""Of the median depth: a scale that is off by a quarter then moves what lies beyond by 2.5 %."""
+
+
+def gap_uncertainty(
+    K: FloatArray, T_cam_submap: FloatArray, xyz: FloatArray, sigma_px: FloatArray, information: FloatArray
+) -> tuple[FloatArray, float]:
+    """Return the covariance of a pose (6, 6), and the standard deviation of the points' mean log depth there.
+
+    Parameters
+    ----------
+    K : (3, 3)
+    T_cam_submap : (4, 4)
+    xyz : (N, 3)
+        Points that the camera sees.
+    sigma_px : (N,)
+        Noise of their pixels.
+    information : (N, 3, 3)
+        What is known of the points without this camera: inverse covariances, which need not be of full rank.
+    """
+    n = len(xyz)
+    J_pose, J_point = projection_jacobians(K, T_cam_submap, xyz)
+    weight = (1.0 / sigma_px**2)[:, None, None]
+    H_points = information + J_point.swapaxes(1, 2) @ (weight * J_point)
+    H_pose = (J_pose.swapaxes(1, 2) @ (weight * J_pose)).sum(axis=0)
+    H_cross = J_pose.swapaxes(1, 2) @ (weight * J_point)
+    inverse = np.linalg.pinv(H_points, hermitian=True)
+    p = xyz @ T_cam_submap[:3, :3].T + T_cam_submap[:3, 3]
+    g_pose = np.column_stack([p[:, 1], -p[:, 0], np.zeros((n, 3)), np.ones(n)]) / p[:, 2:]
+    g_point = T_cam_submap[2, :3] / p[:, 2:]
+    # A point counts by how well its own depth is known where the poses are.
+    share = 1.0 / np.maximum(np.einsum("ni,nij,nj->n", g_point, inverse, g_point), 1e-12)
+    share /= share.sum()
+    g_pose_mean, g_point = share @ g_pose, share[:, None] * g_point
+    reduced = H_pose - (H_cross @ inverse @ H_cross.swapaxes(1, 2)).sum(axis=0)
+    rest = g_pose_mean - np.einsum("nij,njk,nk->i", H_cross, inverse, g_point)
+    covariance = np.linalg.pinv(reduced, hermitian=True)
+    variance = np.einsum("ni,nij,nj->", g_point, inverse, g_point) + rest @ covariance @ rest
+    return HESSIAN_INFLATION**2 * covariance, HESSIAN_INFLATION * float(np.sqrt(max(variance, 0.0)))
+
+
+def pose_uncertainty(
+    submap: Submap, T_cam_submap: FloatArray, landmark_ids: IntArray, sigma_px: FloatArray
+) -> tuple[FloatArray, float] | None:
+    """Return the same of a pose that was found by a submap's landmarks; None where these are too few to tell.
+
+    Tracking takes landmarks for exact, which is good enough from one frame to the next.
+
+    Parameters
+    ----------
+    submap : Submap
+    T_cam_submap : (4, 4)
+    landmark_ids : (N,) int64
+        Those that agree with the pose, each once.
+    sigma_px : (N,)
+    """
+    covariances = landmark_covariances(submap, landmark_ids)
+    known = np.isfinite(covariances).all(axis=(1, 2)) & (submap.depths(landmark_ids, T_cam_submap) > 0)
+    if np.count_nonzero(known) < MIN_POINTS:
+        return None
+    xyz = submap.landmarks["xyz_mu"][landmark_ids[known]]
+    information = np.asarray(np.linalg.inv(covariances[known]), np.float64)
+    return gap_uncertainty(submap.K, T_cam_submap, xyz, sigma_px[known], information)

@@ -1,0 +1,304 @@
+"""How a submap starts: two views with parallax, a first bundle adjustment, and a check that refuses doubtful starts.
+
+A wrong start costs more than a late one: it is refused unless (1) the two views determine the direction of translation
+to within a stated sigma, (2) no other pose explains them nearly as well, and (3) the frames between them, which had no
+part in the estimate, agree with the points by their own pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.config.settings import InitialiserConfig
+from dualslam.core.bundle import BundleAdjuster, BundleProblem
+from dualslam.core.errors import SolverError
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.projection import projection_jacobians, refine_pose
+from dualslam.core.geometry.triangulation import triangulate_two_view
+from dualslam.core.interfaces import Frontend
+from dualslam.core.types import (
+    BoolArray,
+    Failure,
+    FailureReason,
+    Features,
+    FloatArray,
+    IntArray,
+    Matches,
+    Start,
+    View,
+)
+from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
+from dualslam.frontends.gates import CHI2_2DOF_95
+from dualslam.frontends.tracking.resection import resect
+from dualslam.frontends.tracking.two_view_hypotheses import propose_relative_poses
+
+LAGS = (2, 4, 8, 16, 32, 64)  # frames back that are tried as the first view
+N_WITNESSES = 3  # frames between the two views that must agree
+NEAR = 0.5  # share of the points that a start needs at least which must be near: on a road these fix the motion
+RUNNER_UP = 0.75  # another pose that explains this share of the winner's points makes the start ambiguous
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Two views, their matches, and one pose with the points that it gives."""
+
+    a: View
+    b: View
+    matches: Matches
+    T_b_a: FloatArray
+    xyz: FloatArray
+    good: BoolArray
+    parallax_deg: float  # median
+    n_near: int  # points with at least the parallax that is asked for
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Witness:
+    """A view between the two: its pose, its feature of each point (or -1), the share of its matches that agree."""
+
+    T_first_cam: FloatArray
+    feature: IntArray
+    support: float
+
+
+class Initialiser:
+    """Collects views until two of them start a map."""
+
+    def __init__(
+        self,
+        frontend: Frontend,
+        adjuster: BundleAdjuster,
+        config: InitialiserConfig,
+        K: FloatArray,
+        size_px: tuple[int, int],
+        seed: int,
+    ) -> None:
+        self._frontend = frontend
+        if config.matching == "gms":
+            nearest_search(frontend)  # a front end without it is told so before the first frame
+        self._adjuster = adjuster
+        self._config = config
+        self._K = K
+        self._size_px = size_px
+        self._seed = seed
+        self._views: list[View] = []
+
+    def collect(self, view: View) -> None:
+        """Keep a view as a possible first view, without trying to start from it."""
+        self._views = [*self._views[-self._config.max_views :], view]
+
+    def add(self, view: View) -> Start | Failure:
+        """Take a view in and try to start from it and an earlier one, the nearest first."""
+        self.collect(view)
+        best = Failure(FailureReason.TOO_FEW_MATCHES, "one view")
+        if len(view.features) < self._config.min_matches:
+            return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image")
+        for lag in LAGS:
+            if lag >= len(self._views):
+                break
+            start = self.try_pair(len(self._views) - 1 - lag, len(self._views) - 1)
+            if start:
+                return start
+            assert isinstance(start, Failure)
+            best = start
+            if start.reason in (FailureReason.TOO_FEW_MATCHES, FailureReason.NO_TEXTURE):
+                break
+        return best
+
+    def try_pair(self, first: int, last: int) -> Start | Failure:
+        """Try to start from two of the collected views (positions in the list)."""
+        a, b = self._views[first], self._views[last]
+        matches = self._match(a.features, b.features)
+        if len(matches) < self._config.min_matches:
+            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(matches)} matches, {self._config.min_matches} needed")
+        pair = self._best_pose(a, b, matches)
+        if isinstance(pair, Failure):
+            return pair
+        views = [a, *self._witnesses(first, last), b]
+        return self._verify(pair, views)
+
+    # --- two views
+
+    def _match(self, a: Features, b: Features) -> Matches:
+        """Match the two views; the frames between them have few points to find, too few for motion statistics."""
+        if self._config.matching == "gms":
+            return match_by_motion(self._frontend, a, b)
+        return self._frontend.match_wide(a, b)
+
+    def _best_pose(self, a: View, b: View, matches: Matches) -> _Pair | Failure:
+        fa, fb = matches.index[:, 0], matches.index[:, 1]
+        uv_a, uv_b = a.features.uv_rect_px[fa], b.features.uv_rect_px[fb]
+        sigma = np.maximum(a.features.sigma_px[fa], b.features.sigma_px[fb])
+        hypotheses = propose_relative_poses(
+            uv_a, uv_b, sigma, self._K, self._size_px, self._config.homography_ratio, self._seed
+        )
+        pairs = [self._evaluate(a, b, matches, T_b_a) for T_b_a in hypotheses.T_b_a]
+        pairs.sort(key=lambda p: -int(p.good.sum()))
+        best = pairs[0]
+        n_good = int(best.good.sum())
+        numbers = {
+            "n_matches": float(len(matches)),
+            "n_points": float(n_good),
+            "parallax_deg": best.parallax_deg,
+            "homography_share": hypotheses.homography_share,
+        }
+        if n_good < self._config.min_points:
+            return Failure(FailureReason.TOO_FEW_INLIERS, f"{n_good} points of {len(matches)} matches", numbers)
+        if best.n_near < NEAR * self._config.min_points:
+            detail = f"median parallax {best.parallax_deg:.2f} deg, {best.n_near} near points"
+            return Failure(FailureReason.LOW_PARALLAX, detail, numbers)
+        for other in pairs[1:]:
+            if int(other.good.sum()) > RUNNER_UP * n_good and _direction_angle_deg(best.T_b_a, other.T_b_a) > 10:
+                return Failure(FailureReason.AMBIGUOUS_MODEL, "two poses explain the views alike", numbers)
+        return best
+
+    def _evaluate(self, a: View, b: View, matches: Matches, T_b_a: FloatArray) -> _Pair:
+        fa, fb = matches.index[:, 0], matches.index[:, 1]
+        points = triangulate_two_view(
+            a.features.uv_rect_px[fa], b.features.uv_rect_px[fb], self._K, np.eye(4), se3.inverse(T_b_a)
+        )
+        good = (
+            (points.depth_a > 0)
+            & (points.depth_b > 0)
+            & (points.error2_a < CHI2_2DOF_95 * a.features.sigma_px[fa] ** 2)
+            & (points.error2_b < CHI2_2DOF_95 * b.features.sigma_px[fb] ** 2)
+        )
+        angle = np.degrees(np.arccos(np.clip(points.cos_parallax[good], -1, 1)))
+        # Points without parallax are no points of the map: their depth is anything.
+        good[good] = angle > 0.5 * self._config.min_parallax_deg
+        parallax = float(np.median(angle)) if len(angle) else 0.0
+        n_near = int((angle >= self._config.min_parallax_deg).sum())
+        return _Pair(a, b, matches, T_b_a, points.xyz, good, parallax, n_near)
+
+    # --- witnesses and bundle adjustment
+
+    def _witnesses(self, first: int, last: int) -> list[View]:
+        """Views spread evenly between the two."""
+        between = np.linspace(first, last, N_WITNESSES + 2)[1:-1]
+        positions = sorted({round(p) for p in between} - {first, last})
+        return [self._views[p] for p in positions if len(self._views[p].features) >= self._config.min_points]
+
+    def _verify(self, pair: _Pair, views: list[View]) -> Start | Failure:
+        config = self._config
+        good = np.flatnonzero(pair.good)
+        xyz = pair.xyz[good]
+        feature = np.full((len(views), len(good)), -1, np.int64)
+        feature[0], feature[-1] = pair.matches.index[good, 0], pair.matches.index[good, 1]
+        T_first_cam = np.tile(np.eye(4), (len(views), 1, 1))
+        T_first_cam[-1] = se3.inverse(pair.T_b_a)
+        support = []
+        for v in range(1, len(views) - 1):
+            witness = self._confirm(views[v], pair.a, feature[0], xyz)
+            if isinstance(witness, Failure):
+                support.append(0.0)
+                continue
+            T_first_cam[v], feature[v] = witness.T_first_cam, witness.feature
+            support.append(witness.support)
+        keep_views = (feature >= 0).any(axis=1)
+        numbers = {
+            "n_points": float(len(good)),
+            "parallax_deg": pair.parallax_deg,
+            "support": float(min(support)) if support else 0.0,
+        }
+        if not support or min(support) < config.min_support:
+            detail = f"the frames between confirm {numbers['support']:.0%} of the points"
+            return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers)
+        views = [views[v] for v in np.flatnonzero(keep_views)]
+        return self._adjust(views, T_first_cam[keep_views], xyz, feature[keep_views], numbers)
+
+    def _confirm(self, witness: View, first: View, feature: IntArray, xyz: FloatArray) -> _Witness | Failure:
+        """Pose a witness from the points alone, without a guess, and count how many of its matches agree."""
+        matches = self._frontend.match_wide(first.features.take(feature), witness.features)
+        if len(matches) < self._config.min_points // 2:
+            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(matches)} of {len(xyz)} points found")
+        point, seen = matches.index[:, 0], matches.index[:, 1]
+        uv_px, sigma_px = witness.features.uv_rect_px[seen], witness.features.sigma_px[seen]
+        T_guess = resect(self._K, self._size_px, uv_px, xyz[point], float(np.median(sigma_px)), self._seed)
+        estimate = refine_pose(self._K, T_guess, xyz[point], uv_px, sigma_px)
+        if isinstance(estimate, Failure):
+            return estimate
+        features = np.full(len(xyz), -1, np.int64)
+        features[point[estimate.inliers]] = seen[estimate.inliers]
+        return _Witness(se3.inverse(estimate.T_cam_w), features, estimate.n_inliers / len(matches))
+
+    def _adjust(
+        self, views: list[View], T_first_cam: FloatArray, xyz: FloatArray, feature: IntArray, numbers: dict[str, float]
+    ) -> Start | Failure:
+        view_of, point_of = np.nonzero(feature >= 0)
+        seen = [view.features.take(rows[rows >= 0]) for view, rows in zip(views, feature, strict=True)]
+        uv = np.concatenate([features.uv_rect_px for features in seen])
+        sigma = np.concatenate([features.sigma_px for features in seen])
+        fixed = np.zeros(len(views), bool)
+        fixed[0] = True
+        problem = BundleProblem(self._K, T_first_cam, fixed, xyz, view_of, point_of, uv, sigma)
+        try:
+            result = self._adjuster(problem)
+        except SolverError as error:
+            return Failure(FailureReason.SOLVER, str(error), numbers)
+        inlier = result.chi2 < CHI2_2DOF_95
+        n_bad = np.bincount(point_of[~inlier], minlength=len(xyz))
+        direction = direction_sigma_deg(problem, result.T_submap_kf, result.xyz_mu, inlier)
+        numbers = {**numbers, "chi2": float(np.median(result.chi2) / 1.386), "direction_sigma_deg": direction}
+        # A point must agree with both ends, and may miss at most one witness.
+        ends_ok = np.ones(len(xyz), bool)
+        ends_ok[point_of[~inlier & ((view_of == 0) | (view_of == len(views) - 1))]] = False
+        in_front = np.all(se3.act(se3.inverse(result.T_submap_kf), result.xyz_mu)[..., 2] > 0, axis=0)
+        keep = ends_ok & (n_bad <= 1) & in_front & result.adjusted
+        numbers["n_points"] = float(keep.sum())
+        if keep.sum() < self._config.min_points or keep.mean() < self._config.min_support:
+            return Failure(
+                FailureReason.DOUBTFUL_INITIALISATION, f"{keep.sum()} of {len(xyz)} points survive adjustment", numbers
+            )
+        if not numbers["chi2"] < self._config.max_chi2:
+            return Failure(FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {numbers['chi2']:.1f}", numbers)
+        if not direction < self._config.max_direction_sigma_deg:
+            return Failure(
+                FailureReason.LOW_PARALLAX, f"direction of translation known to {direction:.1f} deg only", numbers
+            )
+        feature = feature.copy()
+        feature[view_of[~inlier], point_of[~inlier]] = -1
+        depth = float(np.median(result.xyz_mu[keep, 2]))
+        T = result.T_submap_kf.copy()
+        T[:, :3, 3] /= depth
+        return Start(views, T, result.xyz_mu[keep] / depth, feature[:, keep], numbers)
+
+
+def direction_sigma_deg(problem: BundleProblem, T_w_cam: FloatArray, xyz: FloatArray, inlier: BoolArray) -> float:
+    """Standard deviation of the direction from the first to the last camera, by the two views' Hessian, degrees.
+
+    The points are eliminated by the Schur complement; the scale, which two views cannot tell, is held by its own prior.
+    """
+    last = len(T_w_cam) - 1
+    in_first = np.zeros(len(xyz), bool)
+    in_first[problem.point[(problem.kf == 0) & inlier]] = True
+    rows = np.flatnonzero((problem.kf == last) & inlier & in_first[problem.point])
+    points = xyz[problem.point[rows]]
+    sigma = problem.sigma_px[rows]
+    H_pp = np.zeros((len(rows), 3, 3))
+    for v in (0, last):
+        _, J_point = projection_jacobians(problem.K, se3.inverse(T_w_cam[v]), points)
+        H_pp += np.einsum("nki,nkj->nij", J_point, J_point) / sigma[:, None, None] ** 2
+    J_pose, J_point = projection_jacobians(problem.K, se3.inverse(T_w_cam[last]), points)
+    weight = 1 / sigma[:, None, None] ** 2
+    H_cp = np.einsum("nki,nkj->nij", J_pose, J_point) * weight
+    H_cc = (np.einsum("nki,nkj->nij", J_pose, J_pose) * weight).sum(0)
+    try:
+        S = H_cc - np.einsum("nij,njk,nlk->il", H_cp, np.linalg.inv(H_pp), H_cp)
+        t_cam = se3.inverse(T_w_cam[last])[:3, 3]
+        along = np.zeros(6)
+        along[3:] = t_cam / np.linalg.norm(t_cam)
+        S += np.outer(along, along) * np.trace(H_cc)
+        covariance = np.linalg.inv(S)[3:, 3:]
+    except np.linalg.LinAlgError:
+        return float("inf")
+    across = np.eye(3) - np.outer(along[3:], along[3:])
+    variance = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
+    return float(np.degrees(np.sqrt(max(variance, 0.0)) / np.linalg.norm(t_cam)))
+
+
+def _direction_angle_deg(T_1: FloatArray, T_2: FloatArray) -> float:
+    t1, t2 = T_1[:3, 3], T_2[:3, 3]
+    cosine = t1 @ t2 / max(float(np.linalg.norm(t1) * np.linalg.norm(t2)), 1e-12)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

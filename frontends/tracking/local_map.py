@@ -1,0 +1,117 @@
+"""The landmarks that tracking looks for: those of the keyframes that see what the camera sees now."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.submap import Submap
+
+VIEW_COSINE_MIN = 0.5  # a patch seen from more than 60 degrees off its mean direction does not look the same
+
+
+def covering_keyframes(submap: Submap, at_most: int, min_new: int) -> list[int]:
+    """Return few keyframes that together show most of the map.
+
+    Each shows the most landmarks that those before it do not (ties: lower id), and `min_new` of them at least.
+    """
+    seen = np.zeros(len(submap.landmarks), bool)
+    left = {k: submap.landmark_of[k][submap.landmark_of[k] >= 0] for k in sorted(submap.keyframes)}
+    chosen: list[int] = []
+    while left and len(chosen) < at_most:
+        n_new = {k: np.count_nonzero(~seen[ids]) for k, ids in left.items()}
+        best = max(n_new, key=lambda k: n_new[k])
+        if n_new[best] < min_new:
+            break
+        seen[left.pop(best)] = True
+        chosen.append(best)
+    return chosen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Where landmarks should be seen: rows of the local map, rectified pixels, and the octave of their patch."""
+
+    rows: IntArray
+    uv_px: FloatArray
+    octave: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalMap:
+    """A snapshot of landmarks, as contiguous arrays (N rows), that lives until the next keyframe.
+
+    Attributes
+    ----------
+    landmark_ids : (N,) int64
+    xyz_mu, normal : (N, 3) float64
+    reference_mu : (N,) float64
+        Distance times patch scale at the view that described the landmark: the distance at which its patch has scale 1.
+    descriptors : (N, D)
+    """
+
+    landmark_ids: IntArray
+    xyz_mu: FloatArray
+    normal: FloatArray
+    reference_mu: FloatArray
+    descriptors: NDArray[np.generic]
+
+    @classmethod
+    def of_landmarks(cls, submap: Submap, landmark_ids: IntArray) -> LocalMap:
+        """Take a snapshot of the given landmarks."""
+        lm = submap.landmarks
+        return cls(
+            landmark_ids,
+            lm["xyz_mu"][landmark_ids],
+            lm["normal"][landmark_ids],
+            lm["distance_mu"][landmark_ids] * lm["scale"][landmark_ids],
+            lm["descriptor"][landmark_ids],
+        )
+
+    def take(self, rows: NDArray[np.generic]) -> LocalMap:
+        """Return the rows given by index or mask."""
+        return LocalMap(
+            self.landmark_ids[rows],
+            self.xyz_mu[rows],
+            self.normal[rows],
+            self.reference_mu[rows],
+            self.descriptors[rows],
+        )
+
+    def __len__(self) -> int:
+        return len(self.landmark_ids)
+
+    def predict(
+        self, T_cam_submap: FloatArray, K: FloatArray, size_px: tuple[int, int], scale_factor: float, n_octaves: int
+    ) -> Prediction:
+        """Project into a camera and keep what it can see: in front, in the image, from a like side and distance.
+
+        Parameters
+        ----------
+        T_cam_submap : (4, 4) float64
+        K : (3, 3) float64
+        size_px : (width, height)
+        scale_factor, n_octaves
+            The front end's pyramid.
+        """
+        R, t = T_cam_submap[:3, :3], T_cam_submap[:3, 3]
+        p_cam = self.xyz_mu @ R.T + t
+        z = p_cam[:, 2]
+        in_front = z > 1e-6
+        uv = p_cam[:, :2] / np.where(in_front, z, 1.0)[:, None] * (K[0, 0], K[1, 1]) + (K[0, 2], K[1, 2])
+        width, height = size_px
+        rows = np.flatnonzero(
+            in_front & (uv[:, 0] >= 0) & (uv[:, 1] >= 0) & (uv[:, 0] <= width - 1) & (uv[:, 1] <= height - 1)
+        )
+        to_camera = -R.T @ t - self.xyz_mu[rows]
+        distance = np.sqrt(np.einsum("ij,ij->i", to_camera, to_camera))
+        cosine = np.einsum("ij,ij->i", to_camera, self.normal[rows]) / np.maximum(distance, 1e-12)
+        scale = self.reference_mu[rows] / np.maximum(distance, 1e-12)
+        coarsest = scale_factor ** (n_octaves - 1)
+        # One octave beyond the pyramid at either end.
+        ok = (cosine > VIEW_COSINE_MIN) & (scale > 1 / scale_factor) & (scale < coarsest * scale_factor)
+        octave = np.clip(np.rint(np.log(scale[ok]) / np.log(scale_factor)), 0, n_octaves - 1).astype(np.int64)
+        return Prediction(rows[ok], uv[rows[ok]], octave)

@@ -1,0 +1,232 @@
+"""Rolling shutter: rows are read one after the other, so that a turning camera sees each from another direction.
+
+Where every pixel would have been found at the time of the middle row follows from how the camera turns, which matches
+to the frame before tell, and from the readout time, which is the camera's own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import poselib
+
+from dualslam.config.settings import CameraConfig
+from dualslam.core.camera.models import Camera
+from dualslam.core.geometry import so3
+from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
+from dualslam.core.interfaces import Frontend
+from dualslam.core.types import Features, FloatArray, View
+from dualslam.frontends.gates import CHI2_1DOF_95
+from dualslam.frontends.tracking.resection import poselib_camera
+from dualslam.frontends.tracking.turning import turn_between
+
+STEP_S = 0.005
+READOUTS_S = STEP_S * np.arange(8)
+"""Readout times that are tried: up to all of the time between frames at 30 Hz."""
+TYPICAL = 4
+"""Place of the readout time, 0.02 s, that must be ruled out for a shutter to count as global."""
+MIN_SHIFT_PX = 3.0
+"""A view turns fast where so long a readout would shift its first and last rows by so much: several times what lens
+models get wrong. Only there can a readout be told from that, and only there does it matter."""
+LAG, SPACING = 3, 3
+"""Frames between the views of a pair, far enough for the turn to change; and between pairs, which do not overlap."""
+SUSPICION = 1 / 9
+"""Share of the evidence that makes a rolling shutter likely: one sigma of three."""
+MAX_PAIRS = 60
+"""Pairs after which the best readout time is taken, however unsure: waiting costs more then."""
+MIN_MATCHES = 60
+MAX_GAP = 2.5
+"""Of two times between frames, how much longer the later one may be for the turn to be carried on from one to the
+other."""
+
+
+def correct_shutter(features: Features, camera: Camera, turn_rad: FloatArray) -> Features:
+    """Move features to where they would be had all rows been read at the time of the middle one.
+
+    Parameters
+    ----------
+    features : Features
+        As found in an image that was read row by row.
+    camera : Camera
+    turn_rad : (3,)
+        Rotation vector by which the camera turns while an image is read, in its own axes.
+    """
+    K = camera.K
+    f, c = np.diag(K)[:2], K[:2, 2]
+    rays = np.column_stack([(features.uv_rect_px - c) / f, np.ones(len(features))])
+    late = features.uv_px[:, 1] / camera.height - 0.5
+    rays = np.einsum("nij,nj->ni", so3.exp(late[:, None] * turn_rad), rays)
+    uv_rect_px = f * rays[:, :2] / rays[:, 2:] + c
+    # The found pixels move alike, so that the same features can be rectified again by a better camera.
+    return replace(features, uv_px=features.uv_px + uv_rect_px - features.uv_rect_px, uv_rect_px=uv_rect_px)
+
+
+class TurnMeter:
+    """How the camera turns from frame to frame, by matches.
+
+    Attributes
+    ----------
+    between_rad_s : (3,) float64 or None
+        Between the two last views; None where it could not be told.
+    """
+
+    def __init__(self, frontend: Frontend) -> None:
+        self._frontend = frontend
+        self._last: View | None = None
+        self._gap_s = 0.0
+        self.between_rad_s: FloatArray | None = None
+
+    def rate_rad_s(self, view: View, K: FloatArray) -> FloatArray:
+        """Take the next view in; return its turn (3,), rad/s, in its own axes: zero where it cannot be told.
+
+        Matches tell the turn half-way between two frames; half a frame more is carried on from the two last turns.
+        """
+        last, before, gap_s = self._last, self.between_rad_s, self._gap_s
+        self._last, self.between_rad_s = view, None
+        if last is None:
+            return np.zeros(3)
+        matches = self._frontend.match_wide(last.features, view.features)
+        uv_a, uv_b = last.features.uv_rect_px[matches.index[:, 0]], view.features.uv_rect_px[matches.index[:, 1]]
+        turn = turn_between(K, uv_a, uv_b)
+        self._gap_s = view.timestamp_s - last.timestamp_s
+        if turn is None or self._gap_s == 0:
+            return np.zeros(3) if before is None else before
+        self.between_rad_s = rate = turn / self._gap_s
+        if before is None or abs(self._gap_s) > MAX_GAP * abs(gap_s):
+            return rate
+        return np.asarray(rate + 0.5 * (rate - before), np.float64)
+
+
+class ReadoutEstimator:
+    """The readout time by which matches of turning views fit the epipolar geometry best: from pixels alone.
+
+    Parameters
+    ----------
+    seed : int
+    min_evidence : float
+        See `CameraConfig.readout_evidence`.
+
+    Attributes
+    ----------
+    suspects : bool
+        Whether a rolling shutter is likely, though its time is not known yet.
+    """
+
+    def __init__(self, frontend: Frontend, seed: int, min_evidence: float) -> None:
+        self._frontend = frontend
+        self._seed = seed
+        self._min_evidence = min_evidence
+        self._recent: list[tuple[View, FloatArray | None]] = []
+        self._chi2 = np.zeros(len(READOUTS_S))
+        self._n_pairs = 0
+        self.suspects = False
+        self._n_frames = 0
+
+    def add(self, view: View, before_rad_s: FloatArray | None, camera: Camera) -> float | None:
+        """Take the next view in, with the turn since the one before; return the readout time, s, once it is known."""
+        self._recent = [*self._recent[-LAG - 2 :], (view, before_rad_s)]
+        self._n_frames += 1
+        if len(self._recent) < LAG + 3 or self._n_frames % SPACING:
+            return None
+        (a, to_a), (_, from_a), (b, to_b), (_, from_b) = (self._recent[n] for n in (1, 2, -2, -1))
+        if to_a is None or from_a is None or to_b is None or from_b is None:
+            return None
+        # A frame's own turn is that half-way between the turns to it and from it.
+        rate_a, rate_b = 0.5 * (to_a + from_a), 0.5 * (to_b + from_b)
+        if not (_is_fast(rate_a, camera) or _is_fast(rate_b, camera)):
+            return None
+        matches = self._frontend.match_wide(a.features, b.features)
+        if len(matches) < MIN_MATCHES:
+            return None
+        of_a, of_b = a.features.take(matches.index[:, 0]), b.features.take(matches.index[:, 1])
+        self._chi2 += self._misfits(of_a, rate_a, of_b, rate_b, camera)
+        self._n_pairs += 1
+        best = int(np.argmin(self._chi2))
+        evidence = self._chi2[0 if best else TYPICAL] - self._chi2[best]
+        self.suspects = best > 0 and evidence > SUSPICION * self._min_evidence
+        # A lowest value at the rim of what is tried is no minimum yet.
+        known = evidence > self._min_evidence and best < len(READOUTS_S) - 1
+        return _minimum(self._chi2, best) if known or self._n_pairs >= MAX_PAIRS else None
+
+    def _misfits(self, a: Features, rate_a: FloatArray, b: Features, rate_b: FloatArray, camera: Camera) -> FloatArray:
+        """Return the robust chi-square (T,) of the best relative pose of two views for each readout time.
+
+        Poses come from RANSAC with the shortest and with the longest time, and are refined with each: RANSAC's own
+        scatter would drown what the times differ by.
+        """
+        sigma_px = np.sqrt(0.5 * (a.sigma_px**2 + b.sigma_px**2))
+        lens = poselib_camera(camera.K, (camera.width, camera.height))
+        gate_px = CHI2_1DOF_95**0.5 * float(np.median(sigma_px))
+        straight = [
+            tuple(correct_shutter(x, camera, s * rate).uv_rect_px for x, rate in ((a, rate_a), (b, rate_b)))
+            for s in READOUTS_S
+        ]
+        ransac = {"max_epipolar_error": gate_px, "max_iterations": 500, "min_iterations": 100, "seed": self._seed}
+        first = [poselib.estimate_relative_pose(*straight[n], lens, lens, ransac, {})[0] for n in (0, -1)]
+        refine = {"loss_type": "CAUCHY", "loss_scale": gate_px, "max_iterations": 25}
+        misfits = []
+        for uv_a, uv_b in straight:
+            of_pose = []
+            for start in first:
+                pose, _ = poselib.refine_relative_pose(uv_a, uv_b, start, lens, lens, refine)
+                T_b_a = np.eye(4)
+                T_b_a[:3] = pose.Rt
+                error2 = sampson_error(fundamental_from_pose(camera.K, T_b_a), uv_a, uv_b) / sigma_px**2
+                of_pose.append(float((CHI2_1DOF_95 * np.log1p(error2 / CHI2_1DOF_95)).sum()))
+            misfits.append(min(of_pose))
+        return np.array(misfits)
+
+
+def _is_fast(rate_rad_s: FloatArray, camera: Camera) -> bool:
+    """Whether a typical readout would shift the first and last rows of such a view by more than lens errors."""
+    return bool(0.5 * READOUTS_S[TYPICAL] * camera.K[0, 0] * np.linalg.norm(rate_rad_s) > MIN_SHIFT_PX)
+
+
+def _minimum(chi2: FloatArray, best: int) -> float:
+    """Return the lowest point of the parabola through the best readout time and its neighbours."""
+    if not 0 < best < len(chi2) - 1:
+        return float(READOUTS_S[best])
+    left, middle, right = chi2[best - 1 : best + 2]
+    return float(READOUTS_S[best] + 0.5 * STEP_S * (left - right) / max(left - 2 * middle + right, 1e-9))
+
+
+class RollingShutter:
+    """The shutter of a run's camera: what is known of it, and the views as they would be without it.
+
+    Parameters
+    ----------
+    frontend : Frontend
+    config : CameraConfig
+    seed : int
+    """
+
+    def __init__(self, frontend: Frontend, config: CameraConfig, seed: int) -> None:
+        self._frontend = frontend
+        self.readout_s = config.readout_s or 0.0
+        asks = config.readout_s is None
+        self._estimator = ReadoutEstimator(frontend, seed, config.readout_evidence) if asks else None
+        self._meter = TurnMeter(frontend)
+
+    def shutter_corrected(self, view: View, camera: Camera) -> View:
+        """Take the frame's turn out of it. Frames come in the order of the sequence, each one once."""
+        if not self.readout_s:
+            return view
+        turn_rad = self.readout_s * self._meter.rate_rad_s(view, camera.K)
+        return replace(view, features=correct_shutter(view.features, camera, turn_rad), turn_rad=turn_rad)
+
+    def may_start(self, view: View, camera: Camera) -> bool:
+        """Whether a map may start from this view, found while there is none; what it tells of the shutter is taken in.
+
+        Of a camera that turns fast, with a shutter that is likely to roll, the rows' shifts would pass for parallax.
+        While a map lives nobody asks: it needs no other pixels than those that it is made of.
+        """
+        if self._estimator is None:
+            return True
+        self._meter.rate_rad_s(view, camera.K)
+        turn = self._meter.between_rad_s
+        readout_s = self._estimator.add(view, turn, camera)
+        if readout_s is None:
+            return not self._estimator.suspects or turn is None or not _is_fast(turn, camera)
+        self.readout_s, self._estimator, self._meter = readout_s, None, TurnMeter(self._frontend)
+        return True

@@ -1,0 +1,373 @@
+"""The pose of a frame against a submap: motion model, guided matching, robust pose; wide matching when that fails.
+
+The tracker does not know in which direction time runs: it predicts from the last two frames that it was given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dualslam.config.settings import TrackingConfig
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.geometry.projection import project_points, refine_pose
+from dualslam.core.interfaces import Frontend
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
+from dualslam.frontends.features.matching import FeatureGrid, match_projected
+from dualslam.frontends.gap.uncertainty import SMALL_STEP, pose_uncertainty
+from dualslam.frontends.gates import CHI2_2DOF_99, MIN_CONSENSUS
+from dualslam.frontends.tracking.local_map import LocalMap, Prediction, covering_keyframes
+from dualslam.frontends.tracking.resection import resect
+from dualslam.map.submap import NO_LANDMARK, Submap
+
+WIDER = 2.5  # second guided search: this many times the first radius
+MAX_EXTRAPOLATION = 3.0  # intervals for which the motion between the last two frames says something
+GIVEN_POSE_CHI2 = 4 * CHI2_2DOF_99  # 99 % with 2 degrees of freedom, and the pose off by as much as a pixel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GivenPose:
+    """A pose that the tracker did not find itself, with the evidence that it came with.
+
+    Attributes
+    ----------
+    T_cam_submap : (4, 4)
+    n_matches, n_inliers : int
+    chi2 : float
+        Mean squared whitened residual per degree of freedom of the inliers.
+    covariance : (6, 6)
+    wide : bool
+        Whether it is not the next frame's after the last one.
+    """
+
+    T_cam_submap: FloatArray
+    n_matches: int
+    n_inliers: int
+    chi2: float
+    covariance: FloatArray
+    wide: bool
+
+
+class Tracker:
+    """Tracks frames against one submap, one after the other, in whatever direction of time they come.
+
+    `n_covering`: beyond the keyframes nearest in time, wide matching tries so many that show the most of the map.
+    """
+
+    def __init__(
+        self,
+        frontend: Frontend,
+        config: TrackingConfig,
+        submap: Submap,
+        size_px: tuple[int, int],
+        seed: int,
+        n_covering: int = 0,
+    ) -> None:
+        self._frontend = frontend
+        self._config = config
+        self._submap = submap
+        self._size_px = size_px
+        self._seed = seed
+        self._n_covering = n_covering
+        self._last: Track | None = None
+        self._velocity: tuple[FloatArray, float] | None = None
+        self._local: LocalMap | None = None
+
+    @property
+    def last(self) -> Track | None:
+        """The last posed frame."""
+        return self._last
+
+    def start(self, track: Track) -> None:
+        """Begin at a frame whose pose is known, at rest."""
+        self._last, self._velocity = track, None
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Take the map's changes in (after a keyframe): local landmarks, merged ids, the last frame's refined pose."""
+        assert self._last is not None
+        submap, last = self._submap, self._last
+        ids = submap.current_ids(last.landmark_ids)
+        view, T_cam_submap = last.view, last.T_cam_submap
+        if view.index in submap.T_submap_kf:
+            T_cam_submap = se3.inverse(submap.T_submap_kf[view.index])
+            ids = submap.landmark_of[view.index].copy()
+            view = replace(view, features=submap.keyframes[view.index].features)  # it may have more than it came with
+        self._last = replace(last, view=view, landmark_ids=ids, T_cam_submap=T_cam_submap)
+        self._local = self._local_map(ids[ids >= 0])
+
+    def follow(self, S_now_then: FloatArray) -> None:
+        """Take in that the map has moved as a whole where the last frame is: its pose and the motion move along."""
+        assert self._last is not None
+        T_submap_cam = sim3.act_on_pose(S_now_then, se3.inverse(self._last.T_cam_submap))
+        self._last = replace(self._last, T_cam_submap=se3.inverse(T_submap_cam))
+        if self._velocity is not None:  # a motion in the camera's frame: a change of frame shows in its unit only
+            xi, dt = self._velocity
+            self._velocity = (np.concatenate([xi[:3], float(sim3.scale(S_now_then)) * xi[3:]]), dt)
+        self.refresh()
+
+    def track(self, view: View, may_relocalise: bool = True) -> Track | Failure:
+        """Pose a frame. A failure leaves the tracker as it was, so that the next frame may succeed.
+
+        `may_relocalise`: match it with whole keyframes where guided matching fails.
+        """
+        assert self._last is not None, "start() comes first"
+        features = view.features
+        if len(features) < self._config.min_inliers:
+            return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features in the image")
+        grid = FeatureGrid.build(features.uv_rect_px)
+        T_predicted = self._predict(view.timestamp_s)
+        found: tuple[FloatArray, IntArray] | Failure = Failure(FailureReason.TOO_FEW_MATCHES)
+        for radius_px in (self._config.search_radius_px, self._config.search_radius_px * WIDER):
+            found = self._pose_from_last(view, grid, T_predicted, radius_px)
+            if found:
+                break
+        wide = not found or self.lies_beyond_gap(view)
+        if isinstance(found, Failure):
+            found = self._pose_from_wide_matches(view) if may_relocalise else found
+            if isinstance(found, Failure):
+                return found
+            self._local = self._local_map(found[1][found[1] >= 0])
+        track = self._pose_from_local_map(view, grid, *found, T_predicted, wide)
+        if isinstance(track, Failure):
+            return track
+        verdict = self._judge_relocalised(track) if wide else track
+        if not isinstance(verdict, Failure):
+            self._accept(track)
+        return verdict
+
+    def lies_beyond_gap(self, view: View) -> bool:
+        """Whether so much time has passed since the last posed frame that its motion does not lead to this one."""
+        return self._velocity is not None and self._n_intervals(view.timestamp_s) > MAX_EXTRAPOLATION
+
+    def track_at(self, view: View, pose: GivenPose) -> Track:
+        """Take a pose as it is, and look for the landmarks of the keyframes nearest in time under it."""
+        keyframe_ids = self._submap.keyframes_near(view.index)[: self._config.local_keyframes]
+        self._local = LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(keyframe_ids))
+        landmark_ids = np.full(len(view.features), NO_LANDMARK, np.int64)
+        grid = FeatureGrid.build(view.features.uv_rect_px)
+        landmark_ids, visible = self._search_local_map(view, grid, pose.T_cam_submap, landmark_ids)
+        feature = np.flatnonzero(landmark_ids >= 0)
+        uv, _ = project_points(
+            self._submap.K, pose.T_cam_submap, self._submap.landmarks["xyz_mu"][landmark_ids[feature]]
+        )
+        error2 = ((uv - view.features.uv_rect_px[feature]) ** 2).sum(axis=1)
+        fits = error2 < GIVEN_POSE_CHI2 * view.features.sigma_px[feature] ** 2
+        landmark_ids[feature[~fits]] = NO_LANDMARK
+        T = pose.T_cam_submap
+        track = Track(
+            view,
+            T,
+            T,
+            landmark_ids,
+            len(visible),
+            pose.n_matches,
+            pose.n_inliers,
+            pose.chi2,
+            pose.wide,
+            pose.covariance,
+        )
+        self._accept(track)
+        return track
+
+    def track_near(self, view: View, T_cam_submap: FloatArray) -> Track | Failure:
+        """Pose a frame by the landmarks of the keyframes nearest in time, from a pose that is near its own.
+
+        The tracker goes on from there only if it is told to `take` the track.
+        """
+        keyframe_ids = self._submap.keyframes_near(view.index)[: self._config.local_keyframes]
+        self._local = LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(keyframe_ids))
+        grid = FeatureGrid.build(view.features.uv_rect_px)
+        nothing = np.full(len(view.features), NO_LANDMARK, np.int64)
+        return self._pose_from_local_map(view, grid, T_cam_submap, nothing, T_cam_submap, wide=True)
+
+    def take(self, track: Track) -> None:
+        """Go on from a track."""
+        self._accept(track)
+
+    # --- steps
+
+    def _predict(self, timestamp_s: float) -> FloatArray:
+        """Constant velocity: the last frame-to-frame motion, scaled to the time that has passed."""
+        assert self._last is not None
+        if self._velocity is None:
+            return self._last.T_cam_submap
+        # Far beyond the measured interval (frames were lost) the velocity says little.
+        n_intervals = np.clip(self._n_intervals(timestamp_s), 0.0, MAX_EXTRAPOLATION)
+        return se3.exp(self._velocity[0] * n_intervals) @ self._last.T_cam_submap
+
+    def _n_intervals(self, timestamp_s: float) -> float:
+        """Return the time since the last frame, over that in which its velocity was measured."""
+        assert self._last is not None
+        assert self._velocity is not None
+        dt = self._velocity[1]
+        return (timestamp_s - self._last.view.timestamp_s) / dt if dt != 0 else 1.0
+
+    def _pose_from_last(
+        self, view: View, grid: FeatureGrid, T_predicted: FloatArray, radius_px: float
+    ) -> tuple[FloatArray, IntArray] | Failure:
+        """Search the last frame's landmarks about their predicted pixels."""
+        assert self._last is not None
+        last_rows = np.flatnonzero(self._last.landmark_ids >= 0)
+        ids = self._last.landmark_ids[last_rows]
+        local = LocalMap.of_landmarks(self._submap, ids)
+        prediction = self._predict_local(local, T_predicted)
+        # The last frame's own descriptor is the freshest view of the landmark.
+        descriptors = self._last.view.features.descriptors[last_rows][prediction.rows]
+        matches = match_projected(
+            self._frontend,
+            grid,
+            view.features,
+            prediction.uv_px,
+            radius_px * self._frontend.scale_factor**prediction.octave,
+            descriptors,
+            octave=prediction.octave,
+            angle_rad=self._last.view.features.angle_rad[last_rows][prediction.rows],
+        )
+        rows, feature = prediction.rows[matches.index[:, 0]], matches.index[:, 1]
+        return self._refine(view, T_predicted, ids[rows], local.xyz_mu[rows], feature)
+
+    def _pose_from_wide_matches(self, view: View) -> tuple[FloatArray, IntArray] | Failure:
+        """Match the whole image against one keyframe after the other, pose by PnP."""
+        submap, best = self._submap, Failure(FailureReason.TOO_FEW_MATCHES, "no keyframe matched")
+        for k in self._wide_keyframes(view.index):
+            has_landmark = np.flatnonzero(submap.landmark_of[k] >= 0)
+            matches = self._frontend.match_wide(submap.keyframes[k].features.take(has_landmark), view.features)
+            if len(matches) < MIN_CONSENSUS:
+                continue
+            ids = submap.landmark_of[k][has_landmark[matches.index[:, 0]]]
+            feature = matches.index[:, 1]
+            xyz, uv = submap.landmarks["xyz_mu"][ids], view.features.uv_rect_px[feature]
+            sigma_px = float(np.median(view.features.sigma_px[feature]))
+            T_cam_submap = resect(submap.K, self._size_px, uv, xyz, sigma_px, self._seed)
+            found = self._refine(view, T_cam_submap, ids, xyz, feature)
+            if found:
+                return found
+            assert isinstance(found, Failure)
+            best = found
+        return best
+
+    def _wide_keyframes(self, index: int) -> list[int]:
+        near = self._submap.keyframes_near(index)[: self._config.wide_keyframes]
+        if self._n_covering == 0:
+            return near
+        covering = covering_keyframes(self._submap, self._n_covering, self._config.min_inliers)
+        return [*near, *(k for k in covering if k not in near)]
+
+    def _judge_relocalised(self, track: Track) -> Track | Failure:
+        """Return a track across a gap if it holds the scale: all that is mapped beyond the gap will inherit it.
+
+        A step that is small against the depth of what is seen leaves the scale where it is.
+        """
+        assert self._last is not None
+        row = np.flatnonzero(track.landmark_ids >= 0)
+        ids = track.landmark_ids[row]
+        step = se3.inverse(track.T_cam_submap)[:3, 3] - se3.inverse(self._last.T_cam_submap)[:3, 3]
+        if np.linalg.norm(step) < SMALL_STEP * np.median(self._submap.depths(ids, track.T_cam_submap)):
+            return track
+        known = pose_uncertainty(self._submap, track.T_cam_submap, ids, track.view.features.sigma_px[row])
+        scale_sigma = np.inf if known is None else known[1]
+        if scale_sigma <= self._config.max_gap_scale_sigma:
+            return track
+        detail = f"the scale beyond the gap is known to {scale_sigma:.1%}"
+        return Failure(FailureReason.SCALE, detail, {"gap_scale_sigma": scale_sigma})
+
+    def _refine(
+        self, view: View, T_start: FloatArray, ids: IntArray, xyz_mu: FloatArray, feature: IntArray
+    ) -> tuple[FloatArray, IntArray] | Failure:
+        minimum = self._config.min_inliers
+        if len(ids) < minimum:
+            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(ids)} matches, {minimum} needed")
+        features = view.features
+        estimate = refine_pose(
+            self._submap.K, T_start, xyz_mu, features.uv_rect_px[feature], features.sigma_px[feature]
+        )
+        if isinstance(estimate, Failure):
+            return estimate
+        if estimate.n_inliers < minimum:
+            return Failure(FailureReason.TOO_FEW_INLIERS, f"{estimate.n_inliers} inliers of {len(ids)} matches")
+        landmark_ids = np.full(len(features), NO_LANDMARK, np.int64)
+        landmark_ids[feature[estimate.inliers]] = ids[estimate.inliers]
+        return estimate.T_cam_w, landmark_ids
+
+    def _pose_from_local_map(
+        self,
+        view: View,
+        grid: FeatureGrid,
+        T_cam_submap: FloatArray,
+        landmark_ids: IntArray,
+        T_predicted: FloatArray,
+        wide: bool,
+    ) -> Track | Failure:
+        """Add the local map's other landmarks about their pixels under the first pose, and refine with all of them."""
+        features, submap = view.features, self._submap
+        landmark_ids, visible = self._search_local_map(view, grid, T_cam_submap, landmark_ids)
+        feature = np.flatnonzero(landmark_ids >= 0)
+        ids = landmark_ids[feature]
+        estimate = refine_pose(
+            submap.K,
+            T_cam_submap,
+            submap.landmarks["xyz_mu"][ids],
+            features.uv_rect_px[feature],
+            features.sigma_px[feature],
+        )
+        if isinstance(estimate, Failure):
+            return estimate
+        if estimate.n_inliers < self._config.min_inliers:
+            return Failure(FailureReason.TOO_FEW_INLIERS, f"{estimate.n_inliers} inliers of {len(ids)} matches")
+        landmark_ids[feature[~estimate.inliers]] = NO_LANDMARK
+        submap.landmarks["n_visible"][visible] += 1
+        submap.landmarks["n_found"][ids[estimate.inliers]] += 1
+        return Track(
+            view,
+            estimate.T_cam_w,
+            T_predicted,
+            landmark_ids,
+            n_visible=len(visible),
+            n_matches=len(ids),
+            n_inliers=estimate.n_inliers,
+            chi2=float(estimate.chi2[estimate.inliers].mean() / 2),
+            wide=wide,
+            covariance=estimate.covariance,
+        )
+
+    def _search_local_map(
+        self, view: View, grid: FeatureGrid, T_cam_submap: FloatArray, landmark_ids: IntArray
+    ) -> tuple[IntArray, IntArray]:
+        """Return the features' landmarks, those of the local map added that were not among them, and all in view."""
+        assert self._local is not None
+        features, local = view.features, self._local
+        prediction = self._predict_local(local, T_cam_submap)
+        new = ~np.isin(local.landmark_ids[prediction.rows], landmark_ids)
+        matches = match_projected(
+            self._frontend,
+            grid,
+            features,
+            prediction.uv_px[new],
+            self._config.local_radius_px * self._frontend.scale_factor ** prediction.octave[new],
+            local.descriptors[prediction.rows[new]],
+            octave=prediction.octave[new],
+            taken=landmark_ids >= 0,
+        )
+        landmark_ids = landmark_ids.copy()
+        landmark_ids[matches.index[:, 1]] = local.landmark_ids[prediction.rows[new][matches.index[:, 0]]]
+        return landmark_ids, local.landmark_ids[prediction.rows]
+
+    def _accept(self, track: Track) -> None:
+        assert self._last is not None
+        last = self._last
+        dt = track.view.timestamp_s - last.view.timestamp_s
+        self._velocity = (se3.log(track.T_cam_submap @ se3.inverse(last.T_cam_submap)), dt)
+        self._last = track
+
+    # --- the local map
+
+    def _predict_local(self, local: LocalMap, T_cam_submap: FloatArray) -> Prediction:
+        frontend = self._frontend
+        return local.predict(T_cam_submap, self._submap.K, self._size_px, frontend.scale_factor, frontend.n_octaves)
+
+    def _local_map(self, landmark_ids: IntArray) -> LocalMap:
+        keyframe_ids, _ = self._submap.covisible(landmark_ids)
+        nearest = keyframe_ids[: self._config.local_keyframes]
+        return LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(nearest))

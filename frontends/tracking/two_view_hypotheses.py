@@ -1,0 +1,76 @@
+"""Relative poses that two matched views allow: from an essential matrix and, for planes, from a homography."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+
+from dualslam.core.geometry.two_view import (
+    decompose_homography,
+    fundamental_from_pose,
+    homography_transfer_error,
+    sampson_error,
+)
+from dualslam.core.types import FloatArray
+from dualslam.frontends.gates import CHI2_1DOF_95, CHI2_2DOF_95
+from dualslam.frontends.tracking.resection import poselib_camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypotheses:
+    """What two views allow.
+
+    Attributes
+    ----------
+    T_b_a : list of (4, 4) float64
+        Candidate poses, translation of length 1.
+    homography_share : float
+        Score of the homography in the sum of both scores: high for a plane or a pure turn.
+    """
+
+    T_b_a: list[FloatArray]
+    homography_share: float
+
+
+def propose_relative_poses(
+    uv_a_px: FloatArray,
+    uv_b_px: FloatArray,
+    sigma_px: FloatArray,
+    K: FloatArray,
+    size_px: tuple[int, int],
+    homography_ratio: float,
+    seed: int,
+) -> Hypotheses:
+    """Estimate essential matrix and homography, and return the relative poses that deserve a closer look.
+
+    The scores are truncated sums of squared whitened residuals, as in ORB-SLAM (Mur-Artal et al. 2015, Sec. IV): with
+    both counted up to the same bound, the model with the larger sum explains more of the matches.
+    """
+    camera = poselib_camera(K, size_px)
+    sigma = float(np.median(sigma_px))
+    options = {"max_epipolar_error": 2.0 * sigma, "max_iterations": 1000, "min_iterations": 100, "seed": seed}
+    pose, _ = poselib.estimate_relative_pose(uv_a_px, uv_b_px, camera, camera, options, {})
+    T_b_a = np.eye(4)
+    T_b_a[:3] = pose.Rt
+    options = {"max_reproj_error": 3.0 * sigma, "max_iterations": 1000, "min_iterations": 100, "seed": seed}
+    H_b_a, _ = poselib.estimate_homography(uv_a_px, uv_b_px, options, {})
+    variance = sigma_px**2
+    score_e = _score(sampson_error(fundamental_from_pose(K, T_b_a), uv_a_px, uv_b_px) / variance, CHI2_1DOF_95)
+    score_h = _score(homography_transfer_error(H_b_a, uv_a_px, uv_b_px).mean(axis=1) / variance, CHI2_2DOF_95)
+    share = score_h / max(score_e + score_h, 1e-12)
+    candidates = [_unit_baseline(T_b_a)]
+    if share > homography_ratio:
+        candidates += [_unit_baseline(T) for T in decompose_homography(H_b_a, K).T_b_a]
+    return Hypotheses(candidates, share)
+
+
+def _unit_baseline(T_b_a: FloatArray) -> FloatArray:
+    T = T_b_a.copy()
+    T[:3, 3] /= max(float(np.linalg.norm(T[:3, 3])), 1e-12)
+    return T
+
+
+def _score(squared: FloatArray, gate: float) -> float:
+    return float(np.sum(np.where(squared < gate, CHI2_2DOF_95 - squared, 0.0)))

@@ -1,0 +1,230 @@
+"""The visual front end: frames in, keyframes of one submap out, in either direction of time.
+
+The same object tracks live frames, walks back from a new submap's first keyframe to frames before it, and walks back
+through a buffer to an older submap: the only difference is the order in which it is given the frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Set
+
+import numpy as np
+
+from dualslam.config.settings import Config
+from dualslam.core.geometry import se3
+from dualslam.core.interfaces import Frontend, GraphEstimate, KeyframeReport, SubmapGraph
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
+from dualslam.frontends.gap.refinding import Refinder
+from dualslam.frontends.tracking.keyframing import keyframe_due
+from dualslam.frontends.tracking.mapper import Mapper
+from dualslam.frontends.tracking.tracker import GivenPose, Tracker
+from dualslam.map.submap import RelativePose, Submap
+from dualslam.map.submap_change import change_of_frame
+
+CULL_BEHIND = 2  # the newest keyframes are not judged redundant: the next ones may need them
+N_CULL_CANDIDATES = 10  # of the covisible keyframes, the nearest in what they see
+
+
+class VisualFrontEnd:
+    """Tracks frames against a submap and extends it by keyframes.
+
+    `refinder`: finds landmarks across gaps in the images themselves; without it features alone tie the keyframes there.
+    `n_covering`: see `Tracker`.
+    """
+
+    def __init__(
+        self,
+        frontend: Frontend,
+        config: Config,
+        submap: Submap,
+        graph: SubmapGraph,
+        size_px: tuple[int, int],
+        refinder: Refinder | None = None,
+        n_covering: int = 0,
+    ) -> None:
+        self.submap = submap
+        self.graph = graph
+        self._config = config
+        self._tracker = Tracker(frontend, config.tracking, submap, size_px, config.seed, n_covering)
+        self._mapper = Mapper(frontend, config.mapping, submap, size_px)
+        self._refinder = refinder
+        self._after_gap = False
+        self._apart: frozenset[int] = frozenset()  # keyframes across the last gap, where few landmarks bridge it
+        self._reference_id = -1
+        self._since_rebuild = 0
+        self._kept: frozenset[int] = frozenset()
+        self._path: list[int] = []  # keyframes in the order in which this front end met them
+
+    @property
+    def reference_id(self) -> int:
+        """The keyframe that frames are posed against."""
+        return self._reference_id
+
+    def start_at(self, keyframe_id: int) -> None:
+        """Begin at a keyframe of the submap, at rest."""
+        keyframe = self.submap.keyframes[keyframe_id]
+        view = View(keyframe.id, keyframe.timestamp_s, keyframe.features)
+        T_cam_submap = se3.inverse(self.submap.T_submap_kf[keyframe_id])
+        landmark_ids = self.submap.landmark_of[keyframe_id].copy()
+        n = int((landmark_ids >= 0).sum())
+        track = Track(view, T_cam_submap, T_cam_submap, landmark_ids, n, n, n, 1.0, False, np.zeros((6, 6)))
+        self._tracker.start(track)
+        self._reference_id = keyframe_id
+        self._path = [keyframe_id]
+
+    def keep(self, keyframe_ids: Set[int]) -> None:
+        """Never cull these keyframes, however redundant they become."""
+        self._kept = frozenset(keyframe_ids)
+
+    def adopt(self, graph: SubmapGraph, before: Submap) -> None:
+        """Go on with another graph of the same submap, whose poses and points have moved since it was `before`."""
+        self.graph = graph
+        self._tracker.follow(change_of_frame(before, self.submap, [self._reference_id]))
+
+    def track(self, view: View) -> Track | Failure:
+        """Pose a frame against the submap."""
+        return self._noted(view, self._tracker.track(view))
+
+    def follow(self, view: View) -> Track | Failure:
+        """Pose the frame next to the last one, by guided matching alone."""
+        return self._noted(view, self._tracker.track(view, may_relocalise=False))
+
+    def lies_beyond_gap(self, view: View) -> bool:
+        """Whether the motion of the last frames does not lead to this one: others between them are missing."""
+        return self._tracker.lies_beyond_gap(view)
+
+    def _noted(self, view: View, track: Track | Failure) -> Track | Failure:
+        self._note_gap(track)
+        if track and view.index in self.submap.keyframes:
+            self._meet(view.index)
+        return track
+
+    def track_at(self, view: View, pose: GivenPose) -> Track:
+        """Take a frame's pose from elsewhere, and find the submap's landmarks in it."""
+        track = self._tracker.track_at(view, pose)
+        self._note_gap(track)
+        if view.index in self.submap.keyframes:
+            self._meet(view.index)
+        return track
+
+    def track_near(self, view: View, T_cam_submap: FloatArray) -> Track | Failure:
+        """Pose a frame by the submap's landmarks, from a pose that is near its own; `take` goes on from there."""
+        return self._tracker.track_near(view, T_cam_submap)
+
+    def take(self, track: Track) -> None:
+        """Go on from a track."""
+        self._tracker.take(track)
+        self._note_gap(track)
+
+    def confirmed(self) -> Track | None:
+        """Return None: a frame has its pose at once, or none."""
+        return None
+
+    def relative_pose(self, track: Track) -> FloatArray:
+        """Return ``T_kf_cam``, the track's pose relative to the reference keyframe.
+
+        The reference keyframe itself stands where the graph has put it, not where its frame was tracked.
+        """
+        if track.view.index == self._reference_id:
+            return np.eye(4)
+        return se3.inverse(self.submap.T_submap_kf[self._reference_id]) @ se3.inverse(track.T_cam_submap)
+
+    def keyframe_due(self, track: Track) -> bool:
+        """Whether the frame should become a keyframe."""
+        return keyframe_due(track, self.submap, self._reference_id, self._config.keyframes)
+
+    def insert_keyframe(self, track: Track, pose_is_given: bool = False) -> KeyframeReport | Failure:
+        """Make the frame a keyframe: pose it by the graph, extend the map from there, solve again.
+
+        `pose_is_given`: its pose and covariance come from elsewhere, and count beside the landmarks that it sees.
+
+        What a pose places, it places to its own liking: new landmarks of a wrong one confirm it, and outvote the old
+        ones in the next frames. The graph therefore poses the keyframe by its matches before any is made. Where it
+        refuses most of the matches, the frame's pose is wrong: the map is left without it.
+        """
+        if pose_is_given:
+            known = RelativePose(self._reference_id, self.relative_pose(track), track.covariance)
+            self.submap.relative_poses[track.view.index] = known
+        track = self._refound(track, pose_is_given)
+        self._mapper.observe(track)
+        matched = self._rows_of(track.view.index)
+        rebuild = self._rebuild_due(track)
+        posed = self._solve()
+        n_refused = int(np.isin(matched, posed.outlier_rows).sum())
+        if n_refused > self._config.health.max_refused * len(matched):
+            self._withdraw(track.view.index)
+            detail = f"the map contradicts {n_refused} of {len(matched)} matches of keyframe {track.view.index}"
+            return Failure(FailureReason.CHI_SQUARE, detail, {"n_refused": float(n_refused)})
+        mapping = self._mapper.grow(track, self._apart, posed.noise2)
+        grown = self._solve(rebuild)
+        self._meet(track.view.index)
+        culled = self._cull_keyframe()
+        self._tracker.refresh()
+        return KeyframeReport(mapping, posed, grown, culled, posed.rebuilt or (grown.rebuilt and not rebuild))
+
+    def _note_gap(self, track: Track | Failure) -> None:
+        """Keyframes beyond frames that found no pose, or one by wide matching alone, are to be tied to those before."""
+        if isinstance(track, Failure):
+            self._after_gap = True
+            return
+        if track.wide:
+            bridged = np.count_nonzero(track.landmark_ids >= 0) >= self._config.keyframes.weak_landmarks
+            self._apart = frozenset() if bridged else frozenset(self.submap.keyframes)
+        if self._refinder is not None and (track.wide or self._after_gap):
+            self._refinder.begin(track.view.index)
+        self._after_gap = False
+
+    def _refound(self, track: Track, pose_is_given: bool) -> Track:
+        """Look for landmarks in the image itself where hardly any tie the new keyframe to those before it."""
+        if self._refinder is None:
+            return track
+        if np.count_nonzero(track.landmark_ids >= 0) < self._config.keyframes.weak_landmarks:
+            self._refinder.begin(track.view.index)
+        track = self._refinder.extend(track, pose_is_given)
+        self._refinder.remember(track.view)
+        return track
+
+    def _rows_of(self, keyframe_id: int) -> IntArray:
+        obs = self.submap.observations
+        return np.flatnonzero((obs["kf"] == keyframe_id) & obs["alive"])
+
+    def _solve(self, rebuild: bool = False) -> GraphEstimate:
+        """Bring the graph up to date with the submap, and the submap with its estimate."""
+        estimate = self.graph.rebuild(self.submap) if rebuild else self.graph.update(self.submap)
+        self.submap.apply_estimate(*estimate.values)
+        self.submap.remove_outliers(estimate.outlier_rows)
+        return estimate
+
+    def _withdraw(self, keyframe_id: int) -> None:
+        """Take a keyframe that the map contradicts out again."""
+        self.submap.remove_keyframe(keyframe_id, self._reference_id)
+        self.submap.apply_estimate(*self.graph.update(self.submap).values)
+        self._tracker.refresh()
+
+    def _rebuild_due(self, track: Track) -> bool:
+        """Whether the frame contradicts the map so much that the incremental estimate is to be made anew in batch."""
+        self._since_rebuild += 1
+        doubtful = track.n_inliers < self._config.graph.rebuild_inlier_ratio * track.n_matches
+        if not doubtful or self._since_rebuild < self._config.graph.rebuild_spacing:
+            return False
+        self._since_rebuild = 0
+        return True
+
+    def _meet(self, keyframe_id: int) -> None:
+        if keyframe_id != self._reference_id:
+            self._reference_id = keyframe_id
+            self._path.append(keyframe_id)
+
+    def _cull_keyframe(self) -> int | None:
+        """Cull at most one keyframe that has become redundant; those of the gauge stay."""
+        submap = self.submap
+        ids = submap.landmark_of[self._reference_id]
+        covisible, _ = submap.covisible(ids[ids >= 0])
+        kept = {*submap.gauge, *self._path[-CULL_BEHIND:], *self._kept}
+        candidates = [k for k in covisible.tolist() if k not in kept][:N_CULL_CANDIDATES]
+        culled = self._mapper.redundant_keyframe(candidates)
+        if culled is not None:
+            if culled in self._path:
+                self._path.remove(culled)
+            submap.remove_keyframe(culled, self._reference_id)
+        return culled

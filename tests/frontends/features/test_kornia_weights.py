@@ -1,0 +1,280 @@
+"""The learned parts of the kornia front end, with random weights in real checkpoint files, and what is said without."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import kornia.feature as kf
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from dualslam.config.settings import FrontendConfig
+from dualslam.core.errors import ConfigError
+from dualslam.core.interfaces import Frontend
+from dualslam.frontends.features.kornia import checkpoints as table
+from dualslam.frontends.features.kornia.checkpoints import Checkpoint
+from dualslam.frontends.features.kornia.networks import Network
+from dualslam.frontends.features.kornia.weights import WeightSource
+from dualslam.frontends.registry import create_frontend
+from tests.frontends.conftest import textured
+from tests.frontends.features.test_orb import same
+
+Image = NDArray[np.uint8]
+PARTS: dict[str, list[Checkpoint]] = {
+    "xfeat": [table.XFEAT],
+    "aliked": [table.ALIKED],
+    "disk": [table.DISK],
+    "dedode": [table.DEDODE_DETECTOR, table.DEDODE_DESCRIPTOR],
+    "keynet": [table.KEYNET, table.AFFNET, table.ORINET, table.HARDNET],
+}
+
+
+def write(folder: Path, checkpoint: Checkpoint, state: dict[str, torch.Tensor]) -> Path:
+    """A file like the published one."""
+    path = folder / checkpoint.file
+    torch.save({checkpoint.key: state} if checkpoint.key else state, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder with a random checkpoint of every part, lively enough that its network finds something."""
+    folder = tmp_path_factory.mktemp("checkpoints")
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        xfeat = kf.XFeat().net.state_dict()
+        xfeat["keypoint_head.3.weight"] *= 100.0
+        write(folder, table.XFEAT, xfeat)
+        write(folder, table.ALIKED, kf.ALIKED("aliked-n16").state_dict())
+        write(folder, table.DISK, kf.DISK().state_dict())
+        dedode = kf.DeDoDe("L", "B")
+        write(folder, table.DEDODE_DETECTOR, dedode.detector.state_dict())
+        write(folder, table.DEDODE_DESCRIPTOR, dedode.descriptor.state_dict())
+        keynet = kf.KeyNet(pretrained=False).state_dict()
+        keynet["last_conv.0.bias"] += 1.0
+        write(folder, table.KEYNET, keynet)
+        write(folder, table.AFFNET, kf.LAFAffNetShapeEstimator(pretrained=False).state_dict())
+        write(folder, table.ORINET, kf.OriNet(pretrained=False).state_dict())
+        write(folder, table.HARDNET, kf.HardNet(pretrained=False).state_dict())
+        for name, checkpoint in table.LIGHTGLUE.items():
+            write(folder, checkpoint, lightglue_state(name))
+    yield folder
+    for path in folder.iterdir():  # 250 MB
+        path.unlink()
+
+
+def lightglue_state(name: str) -> dict[str, torch.Tensor]:
+    """Random weights under the publishers' older names, without what the model derives from its settings."""
+    model = kf.LightGlue(None, **{**kf.LightGlue.features[name], "weights": None})
+    state = {key: value for key, value in model.state_dict().items() if key != "confidence_thresholds"}
+    for layer in range(model.conf.n_layers):
+        for block in ("self_attn", "cross_attn"):
+            old, new = f"transformers.{layer}.{block}.", f"{block}.{layer}."
+            state = {new + key[len(old) :] if key.startswith(old) else key: value for key, value in state.items()}
+    return {f"matcher.{key}": value for key, value in state.items()} if name == "xfeat" else state
+
+
+def build(n_features: int = 150, **options: Any) -> Frontend:
+    return create_frontend(FrontendConfig(name="kornia", n_features=n_features, options={"device": "cpu", **options}))
+
+
+@pytest.fixture(scope="module")
+def small() -> Image:
+    return textured(150, 211, seed=3)
+
+
+@pytest.mark.parametrize("detector", list(PARTS))
+def test_each_learned_detector_through_its_checkpoint(published: Path, small: Image, detector: str) -> None:
+    frontend = build(detector=detector, weights=str(published))
+    features = frontend.extract(small)
+    assert 20 <= len(features) <= 150
+    length = {"xfeat": 64, "dedode": 256}.get(detector, 128)
+    assert features.descriptors.shape == (len(features), length)
+    assert features.descriptors.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1.0, atol=1e-4)
+    assert ((features.uv_px >= -0.5) & (features.uv_px <= (210.5, 149.5))).all()
+    assert (features.octave < frontend.n_octaves).all()
+    assert (features.sigma_px > 0).all()
+    np.testing.assert_allclose(features.scale, frontend.scale_factor**features.octave)
+    again = build(detector=detector, weights=str(published))
+    assert same(features, again.extract(np.repeat(small[:, :, None], 3, axis=2)))
+    # Even at random, the same image matches itself row by row.
+    matches = frontend.match_wide(features, features)
+    assert (matches.index[:, 0] == matches.index[:, 1]).all()
+
+
+@pytest.mark.parametrize("detector", ["xfeat", "aliked", "disk", "dedode"])
+def test_networks_bear_flat_and_tiny_images(published: Path, detector: str) -> None:
+    frontend = build(detector=detector, weights=str(published))
+    rng = np.random.default_rng(0)
+    for shape in ((1, 1), (32, 400)):
+        assert len(frontend.extract(rng.integers(0, 256, shape, dtype=np.uint8))) == 0
+    assert len(frontend.extract(np.full((100, 120), 9, np.uint8))) == 0
+    nearly_flat = np.full((100, 120), 9, np.uint8)
+    nearly_flat[50, 60] = 10
+    for image in (rng.integers(0, 256, (33, 34), dtype=np.uint8), nearly_flat):
+        features = frontend.extract(image)
+        assert len(features.descriptors) == len(features)
+        assert len(frontend.match_wide(features, features)) <= len(features)
+
+
+def test_positions_of_xfeat_and_dedode_follow_our_pixels(published: Path) -> None:
+    class Fixed:
+        """Stands for the model and answers in its manner: the network's own pixels are known."""
+
+        def detectAndCompute(self, images: torch.Tensor) -> list[dict[str, torch.Tensor]]:
+            # Pixel (10, 20) of the 192 x 128 image that XFeat makes of 211 x 150, as kornia scales it back.
+            uv = torch.tensor([[10.0 * 211 / 192, 20.0 * 150 / 128]])
+            return [{"keypoints": uv, "scores": torch.ones(1), "descriptors": torch.ones(1, 64)}]
+
+        def __call__(self, images: torch.Tensor, n: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+            return torch.tensor([[[7.5, 9.5]]]), torch.ones(1, 1), torch.ones(1, 1, 256)
+
+    source = WeightSource("frontend.options.weights", published, is_single=False)
+    expected = {"xfeat": (10.5 * 211 / 192 - 0.5, 20.5 * 150 / 128 - 0.5), "dedode": (7.0, 9.0)}
+    for name, uv in expected.items():
+        network = Network(name, 10, torch.device("cpu"), half=False, source=source)
+        network._model = Fixed()
+        np.testing.assert_allclose(network(torch.zeros(1, 3, 150, 211))[0].uv_px, [uv], atol=1e-4)
+
+
+@pytest.mark.parametrize("detector", ["xfeat", "aliked", "disk"])
+def test_lightglue_through_its_checkpoint(published: Path, small: Image, detector: str) -> None:
+    weights = {"weights": str(published), "matcher_weights": str(published)}
+    frontend = build(detector=detector, matcher="lightglue", max_distance_strict=2.0, **weights)
+    a, b = frontend.extract(small), frontend.extract(np.roll(small, 3, axis=1))
+    matches = frontend.match_wide(a, b)
+    assert matches.index.shape == (len(matches), 2)
+    assert len(set(matches.index[:, 0].tolist())) == len(set(matches.index[:, 1].tolist())) == len(matches)
+    distance = frontend.distance(a.descriptors[matches.index[:, 0]], b.descriptors[matches.index[:, 1]])
+    np.testing.assert_array_equal(matches.distance, distance)
+    np.testing.assert_array_equal(matches.index, frontend.match_wide(a, b).index)
+    assert len(frontend.match_wide(a.take(np.arange(1)), b)) == 0
+
+
+def test_hardnet_on_corners_takes_the_one_file_that_it_needs(published: Path, small: Image) -> None:
+    file = published / table.HARDNET.file
+    features = build(detector="harris", descriptor="hardnet", weights=str(file)).extract(small)
+    assert features.descriptors.shape == (len(features), 128)
+    assert len(features) >= 50
+
+
+def test_torchs_cache_is_searched(
+    published: Path, small: Image, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    (tmp_path / "hub").mkdir()
+    (tmp_path / "hub" / "checkpoints").symlink_to(published)
+    assert same(build(detector="disk").extract(small), build(detector="disk", weights=str(published)).extract(small))
+
+
+@pytest.mark.parametrize(("detector", "first"), [(name, parts[0]) for name, parts in PARTS.items()])
+def test_without_weights_the_error_says_what_is_missing_and_nothing_is_fetched(
+    detector: str, first: Checkpoint, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("a download was tried")
+
+    monkeypatch.setattr("urllib.request.urlopen", refuse)
+    monkeypatch.setattr("kornia.core.download.urlopen", refuse)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    with pytest.raises(ConfigError) as caught:
+        build(detector=detector)
+    text = str(caught.value)
+    assert text.startswith("frontend.options.weights: ")
+    assert str(tmp_path / "hub" / "checkpoints" / first.file) in text
+    assert first.url in text
+    assert list(tmp_path.rglob("*.p*")) == []
+
+
+def test_lightglue_without_weights_names_its_own_option(published: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(published / "nowhere"))
+    with pytest.raises(ConfigError, match=r"^frontend\.options\.matcher_weights: .*disk_lightglue.* is published at"):
+        build(detector="disk", matcher="lightglue", weights=str(published))
+
+
+def test_wrong_places(published: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"nothing\.pt is not there .*XFeat is published at https"):
+        build(detector="xfeat", weights=str(tmp_path / "nothing.pt"))
+    with pytest.raises(ConfigError, match=r"xfeat\.pt is not there"):
+        build(detector="xfeat", weights=str(tmp_path))
+    with pytest.raises(ConfigError, match="more than one checkpoint is needed: name the folder"):
+        build(detector="dedode", weights=str(published / table.DEDODE_DETECTOR.file))
+
+
+def test_checkpoints_that_do_not_fit(published: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"xfeat\.pt does not fit DISK: .* tensors are missing, first unet"):
+        build(detector="disk", weights=str(published / table.XFEAT.file))
+    state = kf.DISK(desc_dim=64).state_dict()
+    with pytest.raises(ConfigError, match=r"does not fit DISK: size mismatch for unet\."):
+        build(detector="disk", weights=str(write(tmp_path, table.DISK, state)))
+    for content in (b"", b"no checkpoint at all", (published / table.XFEAT.file).read_bytes()[:5000]):
+        (tmp_path / "broken.pt").write_bytes(content)
+        with pytest.raises(ConfigError, match=r"broken\.pt cannot be read as a checkpoint"):
+            build(detector="xfeat", weights=str(tmp_path / "broken.pt"))
+    torch.save([torch.ones(3)], tmp_path / "list.pt")
+    with pytest.raises(ConfigError, match=r"list\.pt holds no named tensors, so it is no checkpoint of XFeat"):
+        build(detector="xfeat", weights=str(tmp_path / "list.pt"))
+
+
+def test_building_leaves_torchs_random_numbers_alone(published: Path) -> None:
+    before = torch.get_rng_state()
+    build(detector="xfeat", weights=str(published))
+    assert torch.equal(before, torch.get_rng_state())
+
+
+class Trap:
+    """Leaves a mark when it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.mark,)
+
+
+def test_a_checkpoint_runs_no_code(tmp_path: Path) -> None:
+    torch.save({"state_dict": Trap(tmp_path / "sprung")}, tmp_path / "trap.pt")
+    with pytest.raises(ConfigError, match=r"trap\.pt cannot be read as a checkpoint"):
+        build(detector="xfeat", weights=str(tmp_path / "trap.pt"))
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_files_and_addresses_are_those_of_kornia() -> None:
+    # The functions of the same names hide these modules.
+    hardnet, affine, orientation, keynet, disk, dedode, xfeat, aliked = (
+        importlib.import_module(f"kornia.feature.{name}")
+        for name in (
+            "hardnet", "affine_shape", "orientation", "keynet", "disk.disk", "dedode.dedode", "xfeat", "aliked.aliked"
+        )
+    )  # fmt: skip
+    assert table.HARDNET.url in hardnet.urls["liberty_aug"]
+    assert table.AFFNET.url in affine.urls["affnet"]
+    assert table.ORINET.url in orientation.urls["orinet"]
+    assert table.KEYNET.url in keynet.KeyNet_URL
+    assert table.DISK.url in disk.urls["depth"]
+    assert table.DEDODE_DETECTOR.url in dedode.urls["detector"]["L-C4-v2"]
+    assert table.DEDODE_DESCRIPTOR.url in dedode.urls["descriptor"]["B-upright"]
+    assert table.XFEAT.url == xfeat.XFeat.weights_url
+    assert table.ALIKED.url in [url.format("aliked-n16") for url in aliked._CHECKPOINT_URLS]
+    for parts in PARTS.values():
+        assert all(part.url.endswith(f"/{part.file}") for part in parts)
+
+
+@pytest.mark.parametrize("name", list(table.LIGHTGLUE))
+def test_lightglues_file_is_the_one_that_kornia_would_fetch(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, Any] = {}
+
+    def note(url: list[str], file_name: str) -> dict[str, torch.Tensor]:
+        asked.update(url=url, file_name=file_name)
+        return {}
+
+    monkeypatch.setattr("kornia.feature.lightglue.load_state_dict_from_url", note)
+    kf.LightGlue(name)
+    assert asked["file_name"] == table.LIGHTGLUE[name].file
+    assert table.LIGHTGLUE[name].url in asked["url"]

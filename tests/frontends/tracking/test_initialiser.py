@@ -1,0 +1,170 @@
+"""Starts of a map: right where the views allow one, refused where they do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dualslam.backend.local_ba import bundle_adjust_arrays
+from dualslam.config.settings import InitialiserConfig
+from dualslam.core.types import Failure, FailureReason, FloatArray, Start, View
+from dualslam.frontends.features.orb import OrbFrontend
+from dualslam.frontends.tracking.initialiser import Initialiser
+from dualslam.testing.point_world import CAMERA, SIZE_PX, PointWorld, cloud, path, pose_errors, random_features
+
+ROTATION_RAD = 0.01
+TRANSLATION = 3 * np.radians(InitialiserConfig().max_direction_sigma_deg)
+"""Of the baseline: three of the standard deviations that the direction may have."""
+
+
+def initialiser(**settings: float) -> Initialiser:
+    config = InitialiserConfig(**settings)
+    return Initialiser(OrbFrontend(), bundle_adjust_arrays, config, CAMERA.K, SIZE_PX, 0)
+
+
+def feed(views: list[View]) -> tuple[Start | None, list[Failure]]:
+    starter, refusals = initialiser(), []
+    for view in views:
+        start = starter.add(view)
+        if start:
+            return start, refusals
+        refusals.append(start)
+    return None, refusals
+
+
+@pytest.mark.parametrize(
+    ("step_m", "turn_rad"),
+    [
+        ([0.1, 0, 0], [0, 0, 0]),
+        ([0.1, 0, 0], [0, -0.01, 0]),
+        ([0.0, 0.03, 0.25], [0, 0.005, 0]),
+        ([0.0, 0.0, 0.25], [0, 0, 0]),
+        ([0.05, 0.05, 0.05], [0.005, 0.005, 0.02]),
+    ],
+    ids=["sideways", "around", "drive and turn", "ahead", "screw"],
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_start_is_right(step_m: FloatArray, turn_rad: FloatArray, seed: int) -> None:
+    world = PointWorld(cloud(seed=seed), path(30, step_m, turn_rad), seed=seed)
+    start, _ = feed(world.views())
+    assert start is not None
+    T_true = world.T_world_cam[[view.index for view in start.views]]
+    translation, rotation = pose_errors(start.T_first_cam, T_true)
+    baseline_m = np.linalg.norm(T_true[-1, :3, 3] - T_true[0, :3, 3])
+    assert rotation.max() < ROTATION_RAD
+    assert translation.max() < TRANSLATION * baseline_m
+    assert np.median(start.xyz[:, 2]) == pytest.approx(1.0)
+    assert (start.feature[[0, -1]] >= 0).all()
+
+
+def test_near_points_start_a_map_however_many_are_far() -> None:
+    """As on a road: most of what is seen has no parallax, and the rest fixes the motion."""
+    xyz = np.concatenate([15 * cloud(900, 1), cloud(300)])
+    world = PointWorld(xyz, path(8, np.array([0, 0.03, 0.25]), np.array([0, 0.005, 0])))
+    start, refusals = feed(world.views())
+    assert start is not None
+    assert len(refusals) <= 4
+    assert start.numbers["parallax_deg"] < 0.5 * InitialiserConfig().min_parallax_deg
+    T_true = world.T_world_cam[[view.index for view in start.views]]
+    translation, rotation = pose_errors(start.T_first_cam, T_true)
+    assert rotation.max() < ROTATION_RAD
+    assert translation.max() < TRANSLATION * np.linalg.norm(T_true[-1, :3, 3] - T_true[0, :3, 3])
+
+
+@pytest.mark.parametrize("turn_rad", [[0, 0, 0], [0, 0.02, 0], [0.01, 0.01, 0.01]], ids=["still", "pan", "all axes"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_start_without_a_baseline(turn_rad: FloatArray, seed: int) -> None:
+    world = PointWorld(cloud(1200, seed), path(20, np.zeros(3), turn_rad), seed=seed)
+    start, refusals = feed(world.views())
+    assert start is None
+    assert {refusal.reason for refusal in refusals[1:]} <= {
+        FailureReason.LOW_PARALLAX,
+        FailureReason.TOO_FEW_INLIERS,
+        FailureReason.TOO_FEW_MATCHES,
+        FailureReason.AMBIGUOUS_MODEL,
+        FailureReason.DOUBTFUL_INITIALISATION,
+        FailureReason.CHI_SQUARE,
+    }
+
+
+def test_a_plane_gives_the_right_start_or_none() -> None:
+    xyz = cloud(1200)
+    xyz[:, 2] = 6 + 0.2 * xyz[:, 0]
+    world = PointWorld(xyz, path(30, np.array([0.1, 0.02, 0.03]), np.array([0, -0.005, 0])))
+    start, _ = feed(world.views())
+    if start is not None:
+        translation, rotation = pose_errors(start.T_first_cam, world.T_world_cam[[v.index for v in start.views]])
+        assert rotation.max() < 2 * ROTATION_RAD
+        assert translation.max() < 0.1
+
+
+def test_no_start_from_noise() -> None:
+    orb, rng = OrbFrontend(), np.random.default_rng(0)
+    dark = [np.clip(rng.normal(0, 1.8, (240, 320)), 0, 255).astype(np.uint8) for _ in range(10)]
+    bright = [np.clip(rng.normal(128, 30, (240, 320)), 0, 255).astype(np.uint8) for _ in range(10)]
+    start, _ = feed([View(i, i / 10, orb.extract(image)) for i, image in enumerate(dark + bright)])
+    assert start is None
+    start, refusals = feed([View(i, i / 10, random_features(rng, 1000)) for i in range(10)])
+    assert start is None
+    assert refusals[-1].reason is FailureReason.TOO_FEW_MATCHES
+
+
+def test_too_little_to_see_is_said() -> None:
+    _, refusals = feed([View(i, i / 10, random_features(np.random.default_rng(i), 30)) for i in range(3)])
+    assert [r.reason for r in refusals] == [FailureReason.NO_TEXTURE] * 3
+
+
+def test_witnesses_that_disagree_refuse_the_start() -> None:
+    """The frames between the two views show something else: the pair alone must not start a map."""
+    world = PointWorld(cloud(), path(4, np.array([0.3, 0, 0]), np.zeros(3)))
+    other = PointWorld(cloud(seed=9), path(4, np.array([0.3, 0, 0]), np.zeros(3)), seed=9)
+    starter = initialiser()
+    for view in (world.view(0), other.view(1), world.view(2)):
+        starter.collect(view)
+    refusal = starter.try_pair(0, 2)
+    assert isinstance(refusal, Failure)
+    assert refusal.reason is FailureReason.DOUBTFUL_INITIALISATION
+    assert refusal.numbers["support"] == 0
+
+
+def test_direction_is_known_as_well_as_is_said() -> None:
+    errors, sigmas = [], []
+    for seed in range(8):
+        world = PointWorld(cloud(seed=seed), path(9, np.array([0.06, 0, 0.02]), np.zeros(3)), noise_px=1.0, seed=seed)
+        starter = initialiser()
+        for view in world.views():
+            starter.collect(view)
+        start = starter.try_pair(0, 8)
+        assert isinstance(start, Start)
+        t, t_true = start.T_first_cam[-1, :3, 3], world.T_world_cam[8, :3, 3]
+        cosine = t @ t_true / np.linalg.norm(t) / np.linalg.norm(t_true)
+        errors.append(np.degrees(np.arccos(min(cosine, 1.0))))
+        sigmas.append(start.numbers["direction_sigma_deg"])
+    # The sigma is that of the worse of two axes.
+    assert 0.3 < np.sqrt(np.mean(np.square(errors))) / np.mean(sigmas) < 1.6
+    strict = initialiser(max_direction_sigma_deg=0.5 * min(sigmas))
+    for view in world.views():
+        strict.collect(view)
+    refusal = strict.try_pair(0, 8)
+    assert isinstance(refusal, Failure)
+    assert "direction of translation" in refusal.detail
+
+
+def test_collected_views_can_be_first_views() -> None:
+    """What a lost track collected starts the next map as soon as one more frame comes."""
+    world = PointWorld(cloud(), path(12, np.array([0.12, 0, 0]), np.zeros(3)))
+    starter = initialiser()
+    for view in world.views()[:-1]:
+        starter.collect(view)
+    start = starter.add(world.view(11))
+    assert isinstance(start, Start)
+    assert start.views[-1].index == 11
+
+
+def test_the_same_views_give_the_same_start() -> None:
+    world = PointWorld(cloud(), path(20, np.array([0.1, 0, 0.02]), np.array([0, 0.004, 0])))
+    (a, _), (b, _) = feed(world.views()), feed(world.views())
+    assert a is not None
+    assert b is not None
+    assert np.array_equal(a.T_first_cam, b.T_first_cam)
+    assert np.array_equal(a.xyz, b.xyz)

@@ -1,0 +1,194 @@
+"""A camera that reads row by row while it turns: found out from pixels alone, and taken out of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dualslam.config.settings import CameraConfig
+from dualslam.core.events import Event, EventKind
+from dualslam.core.geometry import se3, so3
+from dualslam.core.types import FloatArray, Frame, View
+from dualslam.frontends.features.orb import OrbFrontend
+from dualslam.frontends.tracking.rolling_shutter import RollingShutter, TurnMeter, correct_shutter
+from dualslam.frontends.tracking.turning import turn_between
+from dualslam.system import System
+from dualslam.testing.point_world import (
+    CAMERA,
+    RATE_HZ,
+    SIZE_PX,
+    PointWorld,
+    cloud,
+    make_features,
+    path,
+    pose_errors,
+    system_in,
+)
+
+READOUT_S = 0.025
+
+
+def shaken(n: int) -> FloatArray:
+    """A hand that looks about fast, 60 degrees a second and more, and hardly moves."""
+    s = np.arange(n) / RATE_HZ
+    R = so3.exp(np.column_stack([0.2 * np.sin(5 * s), 0.3 * np.sin(4 * s + 1), 0.15 * np.sin(6 * s + 2)]))
+    return se3.from_parts(R, 0.05 * np.column_stack([np.sin(3 * s), np.sin(2.5 * s), np.sin(2 * s)]))
+
+
+def turn_rate(T_world_cam: FloatArray, i: int) -> FloatArray:
+    """True turn about frame i, rad/s."""
+    R = T_world_cam[:, :3, :3]
+    return 0.5 * RATE_HZ * so3.log(R[i - 1].T @ R[i + 1])
+
+
+def read_row_by_row(world: PointWorld, i: int, readout_s: float) -> View:
+    """What a rolling shutter finds: each point where its own row sees it."""
+    view = world.view(i)
+    if not 0 < i < len(world.T_world_cam) - 1 or not readout_s:
+        return view
+    turn_rad = readout_s * turn_rate(world.T_world_cam, i)
+    features, uv = view.features, view.features.uv_px
+    rays = np.column_stack([(uv - CAMERA.K[:2, 2]) / np.diag(CAMERA.K)[:2], np.ones(len(uv))])
+    bent = uv
+    for _ in range(5):  # the row in which a point is found depends on where it is found
+        late = bent[:, 1] / CAMERA.height - 0.5
+        bent = CAMERA.project(np.einsum("nji,nj->ni", so3.exp(late[:, None] * turn_rad), rays))
+    inside = ((bent > 0) & (bent < SIZE_PX)).all(axis=1)
+    return replace(view, features=replace(features, uv_px=bent, uv_rect_px=bent).take(inside))
+
+
+def asked(world: PointWorld, readout_s: float) -> tuple[RollingShutter, list[bool]]:
+    """The shutter after all frames, and from which of them a map might have started."""
+    shutter = RollingShutter(OrbFrontend(), CameraConfig(), 0)
+    started: list[bool] = []
+    for i in range(len(world.T_world_cam)):
+        view = read_row_by_row(world, i, readout_s)
+        started.append(shutter.may_start(view, CAMERA))
+    return shutter, started
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_readout_is_found_from_pixels(seed: int) -> None:
+    world = PointWorld(cloud(seed=seed), shaken(120), seed=seed)
+    shutter, started = asked(world, READOUT_S)
+    assert shutter.readout_s == pytest.approx(READOUT_S, abs=0.005)
+    assert not all(started[:20])
+    assert all(started[-20:])
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_global_shutter_is_left_alone(seed: int) -> None:
+    world = PointWorld(cloud(seed=seed), shaken(120), seed=seed)
+    shutter, started = asked(world, 0.0)
+    assert shutter.readout_s == 0
+    assert all(started[-20:])
+
+
+def test_a_slow_camera_is_not_kept_waiting() -> None:
+    world = PointWorld(cloud(), path(30, np.array([0.1, 0, 0]), np.array([0, 0.01, 0])))
+    _, started = asked(world, READOUT_S)
+    assert all(started)
+
+
+def test_straightened_pixels_are_those_of_a_global_shutter() -> None:
+    world = PointWorld(cloud(), shaken(12), noise_px=0.0)
+    for i in (3, 7):
+        found = read_row_by_row(world, i, READOUT_S).features
+        exact = world.view(i).features
+        row = {word.tobytes(): n for n, word in enumerate(exact.descriptors)}
+        same = [row[word.tobytes()] for word in found.descriptors]
+        straight = correct_shutter(found, CAMERA, READOUT_S * turn_rate(world.T_world_cam, i))
+        off_before = np.linalg.norm(found.uv_px - exact.uv_px[same], axis=1)
+        off = np.linalg.norm(straight.uv_rect_px - exact.uv_px[same], axis=1)
+        assert off_before.max() > 5
+        assert off.max() < 1e-3
+        assert np.allclose(straight.uv_px, straight.uv_rect_px)
+
+
+def test_the_turn_is_that_of_the_frame() -> None:
+    world = PointWorld(cloud(), shaken(40))
+    meter = TurnMeter(OrbFrontend())
+    off = []
+    for i, view in enumerate(world.views()[:-1]):
+        rate = meter.rate_rad_s(view, CAMERA.K)
+        if i >= 2:
+            off.append(np.linalg.norm(rate - turn_rate(world.T_world_cam, i)))
+    fastest = max(np.linalg.norm(turn_rate(world.T_world_cam, i)) for i in range(1, 39))
+    assert fastest > 1.0
+    assert np.median(off) < 0.1 * fastest
+
+
+def test_a_view_knows_what_was_taken_out_of_it() -> None:
+    world = PointWorld(cloud(), shaken(6))
+    still = RollingShutter(OrbFrontend(), CameraConfig(readout_s=0.0), 0)
+    assert still.shutter_corrected(world.view(0), CAMERA) is not None
+    assert still.shutter_corrected(world.view(1), CAMERA).turn_rad is None
+    assert still.may_start(world.view(2), CAMERA)
+    rolling = RollingShutter(OrbFrontend(), CameraConfig(readout_s=READOUT_S), 0)
+    views = [rolling.shutter_corrected(world.view(i), CAMERA) for i in range(5)]
+    turn_rad = views[-1].turn_rad
+    assert turn_rad is not None
+    again = correct_shutter(world.view(4).features, CAMERA, turn_rad)
+    assert np.array_equal(again.uv_rect_px, views[-1].features.uv_rect_px)
+
+
+def test_turn_between_frames_survives_wrong_matches() -> None:
+    rng = np.random.default_rng(0)
+    turn = np.array([0.05, -0.2, 0.1])
+    uv_a = rng.uniform([150, 120], [490, 360], (200, 2))
+    rays = np.column_stack([(uv_a - CAMERA.K[:2, 2]) / np.diag(CAMERA.K)[:2], np.ones(200)])
+    uv_b = CAMERA.project(rays @ so3.exp(turn)) + rng.normal(0, 0.5, (200, 2))
+    uv_b[:60] = rng.uniform([0, 0], SIZE_PX, (60, 2))
+    found = turn_between(CAMERA.K, uv_a, uv_b)
+    assert found is not None
+    assert np.linalg.norm(found - turn) < 0.002
+    assert turn_between(CAMERA.K, uv_a[:10], uv_b[:10]) is None
+
+
+def test_no_pixels_no_turn() -> None:
+    empty = make_features(np.empty((0, 2)), np.empty(0), np.empty(0, np.int64), np.empty((0, 32), np.uint8))
+    meter = TurnMeter(OrbFrontend())
+    for i in range(3):
+        assert np.array_equal(meter.rate_rad_s(View(i, i / RATE_HZ, empty), CAMERA.K), np.zeros(3))
+
+
+N_TURNING = 100
+
+
+def run_over_a_turn(**camera: object) -> tuple[System, FloatArray]:
+    """A rolling shutter that only turns for a hundred frames, and then moves."""
+    turning, moving = shaken(N_TURNING), path(25, np.array([0.12, 0, 0]), np.array([0, 0.004, 0]))
+    turning[:, :3, 3] = 0
+    world = PointWorld(cloud(), np.concatenate([turning, turning[-1] @ moving]))
+    system = system_in(world, camera={"model_sigma_px": 0.0, **camera})
+    shutter = system._parts.shutter
+
+    def view_of(frame: Frame) -> View:
+        return shutter.shutter_corrected(read_row_by_row(world, frame.index, READOUT_S), CAMERA)
+
+    system._parts = replace(system._parts, view_of=view_of)
+    for frame in world.frames():
+        system.step(frame)
+    return system, world.T_world_cam
+
+
+def first(system: System, kind: EventKind) -> Event:
+    return next(event for event in system.events if event.event is kind)
+
+
+def test_a_turn_alone_starts_no_map() -> None:
+    """With a shutter that is taken for a global one the shifts of the rows pass for parallax."""
+    system, T_true = run_over_a_turn()
+    found, started = first(system, EventKind.SHUTTER_FOUND), first(system, EventKind.INITIALISED)
+    assert found.data["readout_s"] == pytest.approx(READOUT_S, abs=0.005)
+    assert found.frame < N_TURNING <= started.frame
+    assert all(view.turn_rad is not None for view in system.buffer)
+    submap = system.atlas.submaps[0]
+    posed = sorted(submap.keyframes)
+    _, rotation = pose_errors(submap.keyframe_poses(posed), T_true[posed])
+    row_shift = READOUT_S * max(np.linalg.norm(turn_rate(T_true, i)) for i in range(1, N_TURNING - 1))
+    assert rotation.max() < 0.5 * row_shift
+    taken_for_global, _ = run_over_a_turn(readout_s=0.0)
+    assert first(taken_for_global, EventKind.INITIALISED).frame < N_TURNING

@@ -1,0 +1,372 @@
+"""Tracking and mapping against exact scenes: poses, wide relocalisation, keyframes, culling."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dualslam.backend.submap_graph import ISam2SubmapGraph
+from dualslam.config.settings import Config, KeyframeConfig, MappingConfig
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.interfaces import KeyframeReport
+from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe, Track, View
+from dualslam.frontends.features.orb import OrbFrontend
+from dualslam.frontends.tracking.keyframing import keyframe_due, parallax_deg
+from dualslam.frontends.tracking.local_map import LocalMap
+from dualslam.frontends.tracking.mapper import Mapper, spread_choice
+from dualslam.frontends.tracking.resection import resect
+from dualslam.frontends.tracking.visual import VisualFrontEnd
+from dualslam.map.submap import NO_LANDMARK, Submap
+from dualslam.testing.point_world import (
+    CAMERA,
+    SIZE_PX,
+    PointWorld,
+    cloud,
+    hand_held,
+    path,
+    pose_errors,
+    random_features,
+)
+
+POSITION_M, ROTATION_RAD = 0.03, 0.005
+
+
+def true_map(world: PointWorld, keyframes: list[int], every: int = 1) -> Submap:
+    """Return a submap in world coordinates: true poses, every n-th point that two keyframes see at its truth."""
+    views = {k: world.view(k) for k in keyframes}
+    point_of = {
+        k: [int(np.bitwise_count(world.descriptors ^ d).sum(1).argmin()) for d in view.features.descriptors]
+        for k, view in views.items()
+    }
+    submap = Submap(0, CAMERA.K, np.zeros(32, np.uint8))
+    for k in keyframes:
+        submap.add_keyframe(Keyframe(k, views[k].timestamp_s, views[k].features), world.T_world_cam[k])
+    n_seen = np.bincount(np.concatenate(list(point_of.values())), minlength=len(world.xyz))
+    ids = np.full(len(world.xyz), NO_LANDMARK)
+    for k in keyframes:
+        points, features = np.array(point_of[k]), views[k].features
+        new = (n_seen[points] > 1) & (ids[points] < 0) & (points % every == 0)
+        ids[points[new]] = submap.add_landmarks(
+            world.xyz[points[new]], features.descriptors[new], features.scale[new], k
+        )
+        known = ids[points] >= 0
+        submap.add_observations(k, np.flatnonzero(known), ids[points[known]])
+    submap.gauge = (keyframes[0], keyframes[-1])
+    return submap
+
+
+def front_end(world: PointWorld, keyframes: list[int], start_at: int, every: int = 1) -> VisualFrontEnd:
+    config = Config()
+    submap = true_map(world, keyframes, every)
+    graph = ISam2SubmapGraph(config.graph)
+    graph.update(submap)
+    live = VisualFrontEnd(OrbFrontend(), config, submap, graph, SIZE_PX)
+    live.start_at(start_at)
+    return live
+
+
+@pytest.fixture
+def world() -> PointWorld:
+    return PointWorld(cloud(), hand_held(80))
+
+
+def tracked(live: VisualFrontEnd, view: View) -> Track:
+    track = live.track(view)
+    assert isinstance(track, Track), track
+    return track
+
+
+class TestTracker:
+    @pytest.mark.parametrize("order", [range(9, 26), range(15, 0, -1)], ids=["forwards", "backwards"])
+    def test_poses_are_right(self, world: PointWorld, order: range) -> None:
+        live = front_end(world, [0, 4, 8, 12, 16], start_at=8 if order.step > 0 else 16)
+        tracks = [tracked(live, world.view(i)) for i in order]
+        assert not any(track.wide for track in tracks)
+        np.testing.assert_allclose(
+            se3.inverse(tracks[0].T_predicted), world.T_world_cam[order.start - order.step], atol=1e-9
+        )
+        T = np.stack([se3.inverse(track.T_cam_submap) for track in tracks])
+        error = se3.log(se3.inverse(T) @ world.T_world_cam[list(order)])
+        assert np.linalg.norm(error[:, 3:], axis=1).max() < POSITION_M
+        assert np.linalg.norm(error[:, :3], axis=1).max() < ROTATION_RAD
+
+    def test_covariance_is_that_of_the_errors(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8, 12, 16], start_at=8)
+        distances2 = []
+        for i in range(9, 16):
+            track = tracked(live, world.view(i))
+            error = se3.log(track.T_cam_submap @ world.T_world_cam[i])
+            distances2.append(error @ np.linalg.solve(track.covariance, error))
+        # Six degrees of freedom; the points are exact.
+        assert 1 < np.mean(distances2) < 16
+
+    def test_dropped_frames_are_found_again_by_wide_matching(self, world: PointWorld) -> None:
+        far = PointWorld(world.xyz, path(40, np.array([0.0, 0, 0]), np.array([0, 0.02, 0])))
+        live = front_end(far, [0, 3, 6, 9], start_at=9)
+        tracked(live, far.view(9))
+        # 0.3 rad further at once: 135 px, beyond the guided search.
+        track = tracked(live, far.view(24))
+        assert track.wide
+        error = se3.log(track.T_cam_submap @ far.T_world_cam[24])
+        assert np.linalg.norm(error[:3]) < ROTATION_RAD
+        assert not tracked(live, far.view(24)).wide
+
+    def test_frames_that_are_missing_are_a_gap_also_where_guided_matching_finds_its_way(
+        self, world: PointWorld
+    ) -> None:
+        live = front_end(world, [0, 4, 8, 12, 16], start_at=8)
+        assert not any(tracked(live, world.view(i)).wide for i in (9, 10, 11, 14))
+        assert not live.lies_beyond_gap(world.view(22))  # its motion was measured over three intervals
+        assert not tracked(live, world.view(15)).wide
+        assert live.lies_beyond_gap(world.view(19))
+        track = tracked(live, world.view(19))
+        assert track.wide
+        assert np.linalg.norm(se3.log(track.T_cam_submap @ world.T_world_cam[19])[3:]) < POSITION_M
+
+    @pytest.mark.parametrize(("keyframes", "holds"), [([0, 1], False), ([0, 4, 8, 12], True)])
+    def test_a_leap_that_loses_the_scale_is_refused(self, keyframes: list[int], holds: bool) -> None:
+        """Two keyframes side by side hardly know depths; the same leap from a wide map holds the scale."""
+        drive = PointWorld(cloud(1200, seed=1) * (1.5, 1.0, 2.5), path(60, np.array([0.05, 0, 0.2]), np.zeros(3)))
+        live = front_end(drive, keyframes, start_at=keyframes[-1], every=8)
+        last = keyframes[-1] + 1
+        before = tracked(live, drive.view(last))
+        far = live.track(drive.view(last + 12))
+        if holds:
+            assert isinstance(far, Track)
+            assert far.wide
+            return
+        assert isinstance(far, Failure)
+        assert far.reason is FailureReason.SCALE
+        again = tracked(live, drive.view(last))  # it stands where it stood
+        np.testing.assert_allclose(again.T_cam_submap, before.T_cam_submap, atol=1e-3)
+
+    def test_it_follows_a_map_that_has_moved(self, world: PointWorld) -> None:
+        """Another unit and another frame, between two keyframes: the motion model goes on as if nothing were."""
+        live, untouched = (front_end(world, [0, 4, 8, 12, 16], start_at=8) for _ in range(2))
+        for i in (9, 10, 11):
+            tracked(live, world.view(i))
+            tracked(untouched, world.view(i))
+        before = live.submap.copy()
+        T_new_old = se3.exp(np.array([0.3, -0.2, 0.1, 1.0, 2.0, -1.0]))
+        live.submap.transform(2.5, T_new_old)
+        graph = ISam2SubmapGraph(Config().graph)
+        graph.update(live.submap)
+        live.adopt(graph, before)
+        a, b = tracked(live, world.view(13)), tracked(untouched, world.view(13))
+        S_new_old = sim3.from_parts(2.5, T_new_old[:3, :3], T_new_old[:3, 3])
+        for moved, still in ((a.T_predicted, b.T_predicted), (a.T_cam_submap, b.T_cam_submap)):
+            np.testing.assert_allclose(
+                se3.inverse(moved), sim3.act_on_pose(S_new_old, se3.inverse(still)), rtol=0, atol=1e-6
+            )
+        assert a.n_inliers == b.n_inliers
+
+    def test_a_failure_leaves_the_tracker_as_it_was(self, world: PointWorld) -> None:
+        live, untouched = (front_end(world, [0, 4, 8], start_at=8) for _ in range(2))
+        nothing = random_features(np.random.default_rng(0), 10)
+        for i, features in ((9, random_features(np.random.default_rng(1))), (10, nothing)):
+            assert isinstance(live.track(View(i, i / 20, features)), Failure)
+        a, b = tracked(live, world.view(11)), tracked(untouched, world.view(11))
+        assert np.array_equal(a.T_cam_submap, b.T_cam_submap)
+
+    def test_no_texture_is_said(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8], start_at=8)
+        failure = live.track(View(9, 0.45, random_features(np.random.default_rng(0), 3)))
+        assert isinstance(failure, Failure)
+        assert failure.reason is FailureReason.NO_TEXTURE
+
+    def test_wrong_matches_are_left_out(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8], start_at=8)
+        view = world.view(9)
+        wrong = np.random.default_rng(0).permutation(len(view.features))[: len(view.features) // 5]
+        view.features.uv_rect_px[wrong] += 8.0
+        track = tracked(live, view)
+        assert np.linalg.norm(se3.log(track.T_cam_submap @ world.T_world_cam[9])[3:]) < POSITION_M
+        assert (track.landmark_ids[wrong] == NO_LANDMARK).mean() > 0.95
+
+
+class TestMapping:
+    def test_new_landmarks_lie_where_the_points_are(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8], start_at=8, every=2)
+        n_before = len(live.submap.landmarks)
+        for i in range(9, 40):
+            track = tracked(live, world.view(i))
+            if i % 5 == 0:
+                live.insert_keyframe(track)
+        submap = live.submap
+        new = np.flatnonzero(submap.landmarks["alive"][n_before:]) + n_before
+        new = new[submap.n_observations(new) >= 3]
+        assert len(new) > 50
+        nearest = np.linalg.norm(submap.landmarks["xyz_mu"][new, None] - world.xyz[None], axis=2).min(axis=1)
+        depth = submap.landmarks["distance_mu"][new]
+        assert np.median(nearest / depth) < 0.01
+        # Each point once: descriptors tell them apart.
+        seen = np.bitwise_count(submap.landmarks["descriptor"][new, None] ^ world.descriptors[None]).sum(-1).argmin(1)
+        assert len(np.unique(seen)) > 0.97 * len(seen)
+
+    def test_a_keyframe_is_posed_by_the_map_before_it_places_anything(self, world: PointWorld) -> None:
+        """Tracked a degree off, it maps as much as one that was tracked right, and as truly."""
+        found = []
+        for off in (np.zeros(6), np.array([0.0, 0.0175, 0.0, -0.05, 0.0, 0.0])):
+            live = front_end(world, [0, 4, 8], start_at=8, every=2)
+            for i in range(9, 16):
+                track = tracked(live, world.view(i))
+            n_before = len(live.submap.landmarks)
+            report = live.insert_keyframe(replace(track, T_cam_submap=se3.exp(off) @ track.T_cam_submap))
+            assert isinstance(report, KeyframeReport)
+            new = np.flatnonzero(live.submap.landmarks["alive"][n_before:]) + n_before
+            nearest = np.linalg.norm(live.submap.landmarks["xyz_mu"][new, None] - world.xyz[None], axis=2).min(axis=1)
+            found.append((len(new), np.quantile(nearest / live.submap.landmarks["distance_mu"][new], 0.9)))
+        (n_right, error_right), (n_off, error_off) = found
+        assert n_off > 0.95 * n_right
+        assert error_off < 1.2 * error_right
+
+    def test_no_landmark_is_let_in_that_fits_worse_than_the_map_does(self, world: PointWorld) -> None:
+        """Its gate follows residuals that are smaller than their sigmas, and opens for none that are larger."""
+        worst, n_new = {}, {}
+        for noise2 in (0.25, 1.0, 4.0):
+            live = front_end(world, [0, 4, 8], start_at=8, every=2)
+            track, submap = tracked(live, world.view(12)), live.submap
+            mapper = Mapper(OrbFrontend(), Config().mapping, submap, SIZE_PX)
+            mapper.observe(track)
+            n_before = len(submap.observations)
+            n_new[noise2] = mapper.grow(track, noise2=noise2).n_new
+            rows = np.arange(n_before, len(submap.observations))
+            uv_px, sigma_px = submap.observed_pixels(rows)
+            chi2 = []
+            for i, row in enumerate(rows):
+                T_cam_submap = se3.inverse(submap.T_submap_kf[int(submap.observations["kf"][row])])
+                xyz_mu = submap.landmarks["xyz_mu"][submap.observations["landmark"][row]]
+                error = (CAMERA.project(se3.act(T_cam_submap, xyz_mu[None]))[0] - uv_px[i]) / sigma_px[i]
+                chi2.append(error @ error)
+            worst[noise2] = max(chi2)
+        gate = MappingConfig().reprojection_chi2
+        assert worst[0.25] < 0.25 * gate < worst[1.0] < gate
+        assert 0 < n_new[0.25] < n_new[1.0] == n_new[4.0]
+
+    def test_nothing_is_triangulated_across_a_gap_that_few_landmarks_bridge(self) -> None:
+        world = PointWorld(cloud(), path(60, np.array([0.02, 0, 0]), np.array([0, 0.02, 0])))
+        before = [0, 3, 6, 9]
+        live = front_end(world, before, start_at=9, every=12)
+        tracked(live, world.view(9))
+        n_before = len(live.submap.landmarks)
+        leapt = tracked(live, world.view(24))
+        assert leapt.wide
+        assert np.count_nonzero(leapt.landmark_ids >= 0) < Config().keyframes.weak_landmarks
+        live.insert_keyframe(leapt)
+        assert len(live.submap.landmarks) == n_before  # it stands alone on its side
+        for i in (27, 30, 33):
+            live.insert_keyframe(tracked(live, world.view(i)))
+        new = np.flatnonzero(live.submap.landmarks["alive"][n_before:]) + n_before
+        assert len(new) > 30
+        # Placed by this side alone; then they may be found on the other one, too.
+        obs = live.submap.observations
+        here = obs["alive"] & np.isin(obs["kf"], [24, 27, 30, 33])
+        assert (np.bincount(obs["landmark"][here], minlength=len(live.submap.landmarks))[new] >= 2).all()
+
+    def test_keyframe_poses_and_the_frames_between_stay_right(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8], start_at=8)
+        relative = {}
+        for i in range(9, 60):
+            track = tracked(live, world.view(i))
+            if live.keyframe_due(track):
+                live.insert_keyframe(track)
+            relative[i] = (live.reference_id, live.relative_pose(track))
+            # A keyframe stands where the graph has put it, not where it was tracked.
+            assert (live.reference_id == i) == np.array_equal(relative[i][1], np.eye(4))
+        T = np.stack([live.submap.resolve_anchor(k, T_kf_cam) for k, T_kf_cam in relative.values()])
+        translation, rotation = pose_errors(T, world.T_world_cam[list(relative)])
+        assert translation.max() < POSITION_M
+        assert rotation.max() < 2 * ROTATION_RAD
+
+    def test_redundant_keyframes_go_and_their_frames_stay_posed(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8], start_at=8)
+        culled = []
+        for i in range(9, 30):
+            report = live.insert_keyframe(tracked(live, world.view(i)))
+            culled += [report.culled_keyframe] if report.culled_keyframe is not None else []
+        submap = live.submap
+        assert len(culled) > 3
+        assert set(culled) == set(submap.anchors)
+        assert set(submap.gauge) <= set(submap.keyframes)
+        assert not set(culled) & set(submap.observations["kf"][submap.observations["alive"]].tolist())
+        for k in culled:
+            error = se3.log(se3.inverse(submap.resolve_anchor(k, np.eye(4))) @ world.T_world_cam[k])
+            assert np.linalg.norm(error[3:]) < POSITION_M
+
+    def test_observations_are_capped_and_spread(self) -> None:
+        rng = np.random.default_rng(0)
+        crowd, rest = rng.uniform([0, 0], [40, 40], (300, 2)), rng.uniform([40, 40], SIZE_PX, (100, 2))
+        uv = np.concatenate([crowd, rest])
+        chosen = spread_choice(uv, np.arange(len(uv)), 120, SIZE_PX)
+        assert chosen.sum() == 120
+        assert chosen[300:].sum() > 60
+        # The highest priority of the crowded cell stays.
+        assert chosen[299]
+        assert spread_choice(uv, np.arange(len(uv)), 400, SIZE_PX).all()
+
+
+class TestKeyframing:
+    def test_standing_still_makes_no_keyframes(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8], start_at=8)
+        track = tracked(live, View(9, 0.45, world.view(8).features))
+        assert not live.keyframe_due(track)
+
+    def test_moving_on_makes_them(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8], start_at=8)
+        due = [i for i in range(9, 40) if live.keyframe_due(tracked(live, world.view(i)))]
+        assert due
+        assert due[0] > 9
+
+    def test_parallax_is_the_angle_of_the_baseline(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8], start_at=8)
+        track = tracked(live, world.view(12))
+        ids = track.landmark_ids[track.landmark_ids >= 0]
+        depth = (live.submap.landmarks["xyz_mu"][ids] @ track.T_cam_submap[2, :3]) + track.T_cam_submap[2, 3]
+        baseline = np.linalg.norm(world.T_world_cam[12, :3, 3] - world.T_world_cam[8, :3, 3])
+        expected = np.degrees(np.arctan(baseline / np.median(depth)))
+        assert parallax_deg(track, live.submap, 8) == pytest.approx(expected, rel=0.1)
+
+    def test_few_landmarks_make_one_at_once(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8], start_at=8)
+        track = tracked(live, world.view(9))
+        assert keyframe_due(track, live.submap, 8, KeyframeConfig(weak_landmarks=5000))
+        assert not keyframe_due(tracked(live, world.view(8)), live.submap, 8, KeyframeConfig(weak_landmarks=5000))
+
+    @pytest.mark.filterwarnings("error")
+    def test_a_pose_from_elsewhere_without_a_landmark_is_due(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8], start_at=8)
+        track = tracked(live, world.view(9))
+        unseen = replace(track, landmark_ids=np.full_like(track.landmark_ids, NO_LANDMARK))
+        assert parallax_deg(unseen, live.submap, 8) == 0.0
+        assert keyframe_due(unseen, live.submap, 8, KeyframeConfig())
+
+
+def test_local_map_predicts_what_the_camera_sees(world: PointWorld) -> None:
+    submap = true_map(world, [0, 4, 8])
+    local = LocalMap.of_landmarks(submap, submap.landmarks_of_keyframes([0, 4, 8]))
+    T_cam_w = se3.inverse(world.T_world_cam[6])
+    prediction = local.predict(T_cam_w, CAMERA.K, SIZE_PX, 1.2, 8)
+    assert len(prediction.rows) > 100
+    p = se3.act(T_cam_w, local.xyz_mu[prediction.rows])
+    np.testing.assert_allclose(prediction.uv_px, CAMERA.project(p), atol=1e-9)
+    behind = se3.inverse(se3.from_parts(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)))
+    assert len(local.predict(behind, CAMERA.K, SIZE_PX, 1.2, 8).rows) == 0
+    assert len(local.take(prediction.rows)) == len(prediction.rows)
+
+
+@pytest.mark.parametrize("share_wrong", [0.0, 0.5])
+def test_resection_needs_no_guess(share_wrong: float) -> None:
+    rng = np.random.default_rng(0)
+    xyz = cloud(300)
+    T_w_cam: FloatArray = path(2, np.array([0.5, 0.2, 0.3]), np.array([0.1, 0.2, 0.3]))[1]
+    p = se3.act(se3.inverse(T_w_cam), xyz)
+    uv = CAMERA.project(p) + 0.5 * rng.normal(size=(len(xyz), 2))
+    wrong = rng.random(len(xyz)) < share_wrong
+    uv[wrong] = rng.uniform([0, 0], SIZE_PX, (int(wrong.sum()), 2))
+    T_cam_w = resect(CAMERA.K, SIZE_PX, uv, xyz, 0.5, 0)
+    error = se3.log(T_cam_w @ T_w_cam)
+    assert np.linalg.norm(error[3:]) < POSITION_M
+    assert np.linalg.norm(error[:3]) < ROTATION_RAD
+    assert np.array_equal(T_cam_w, resect(CAMERA.K, SIZE_PX, uv, xyz, 0.5, 0))

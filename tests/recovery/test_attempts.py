@@ -1,0 +1,245 @@
+"""Attempts at a recovery: their order, what they say, and a gap relocalisation over a black-out on rendered images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dualslam.build import build_system, recovery_parts
+from dualslam.config.settings import AttemptConfig, Config, RecoveryConfig
+from dualslam.core.camera.models import PinholeCamera
+from dualslam.core.errors import ConfigError
+from dualslam.core.events import Event, EventKind
+from dualslam.core.geometry import se3, sim3
+from dualslam.lab.audits.link_audit import LinkAudit, audit_links
+from dualslam.lab.synthetic import ScriptedEvent as Spoil
+from dualslam.lab.synthetic import make_sequence
+from dualslam.lab.synthetic.events import ScriptedEventKind as SpoilKind
+from dualslam.recovery.executor import InlineExecutor, Outcome
+from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryResult, run_recovery
+from dualslam.run.results import trajectories_of
+from dualslam.system import System
+from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
+from tests.recovery.test_worker import assert_same
+
+COVERED = frozenset(range(35, 50))
+CAMERA = PinholeCamera(640, 480, 450.0, 450.0, 319.5, 239.5)
+
+
+def config(**recovery: object) -> RecoveryConfig:
+    return Config.model_validate({"recovery": recovery}).recovery
+
+
+class TestConfig:
+    def test_a_list_of_words_is_a_list_of_front_ends(self) -> None:
+        attempts = config(attempts=["live", "sift", {"frontend": "orb", "n_features": 4000}]).attempts
+        assert [attempt.frontend for attempt in attempts] == ["live", "sift", "orb"]
+        assert attempts[0].is_live
+        assert attempts[2] == AttemptConfig(frontend="orb", n_features=4000)
+        (leap,) = config(attempts=["gap"]).attempts
+        assert (leap.frontend, leap.tracking, leap.name) == ("sift", "live", "gap (sift)")
+
+    @pytest.mark.parametrize(
+        ("attempts", "told"),
+        [
+            ([], "at least 1"),
+            ([{"frontend": "live", "n_features": 500}], "no settings of its own"),
+            ([{"frontent": "sift"}], "frontent"),
+            ([3], "attempts.0"),
+        ],
+    )
+    def test_mistakes_are_told(self, attempts: list[object], told: str) -> None:
+        with pytest.raises(ValueError, match=told):
+            config(attempts=attempts)
+
+    def test_an_unknown_front_end_is_told_with_its_place(self) -> None:
+        with pytest.raises(ConfigError, match=r"recovery.attempts\[1\].*'surf'.*known: .*sift"):
+            build_system(Config.model_validate({"recovery": {"attempts": ["live", "surf"]}}), CAMERA)
+        options = [{"frontend": "sift", "options": {"ratios": 0.7}}]
+        with pytest.raises(ConfigError, match=r"recovery.attempts\[0\].*ratios"):
+            build_system(Config.model_validate({"recovery": {"attempts": options}}), CAMERA)
+
+
+def events_of(attempts: list[str], **settings: object) -> list[Event]:
+    """Attempts of a run in a world of points, where there are no images."""
+    system = system_in(PointWorld(cloud(), hand_held(60), covered=COVERED), recovery={"attempts": attempts, **settings})
+    for frame in PointWorld(cloud(), hand_held(60), covered=COVERED).frames():
+        system.step(frame)
+    return system.events.of_kind(EventKind.RECOVERY_ATTEMPT, EventKind.LINKED, EventKind.RECOVERY_ENDED)
+
+
+class TestOrder:
+    def test_the_first_that_links_is_the_last_that_is_made(self) -> None:
+        attempt, ended, linked = events_of(["live", "sift"])
+        assert attempt.data["attempt"] == linked.data["attempt"] == "live"
+        assert attempt.data["verdict"] == "linked"
+        assert attempt.data["frames"] >= attempt.data["new_keyframes"] >= 4
+        assert attempt.data["inliers"] <= attempt.data["matches"]
+        assert attempt.data["skipped_frames"] >= len(COVERED)
+        assert ended.data["linked"]
+
+    def test_one_that_fails_is_followed_by_the_next(self) -> None:
+        first, second, _, linked = events_of(["sift", "live"])
+        assert [first.data["attempt"], second.data["attempt"]] == ["sift", "live"]
+        assert first.data["verdict"] == "its image is no longer buffered"
+        assert linked.data["attempt"] == "live"
+
+    def test_the_next_starts_where_the_first_did(self) -> None:
+        alone = events_of(["live"])[-1].data
+        second = events_of(["sift", "live"])[-1].data
+        assert {k: v for k, v in alone.items() if k != "seconds"} == {k: v for k, v in second.items() if k != "seconds"}
+
+    def test_all_may_fail(self) -> None:
+        events = events_of(["live", "sift"], max_gap_frames=3)
+        assert [event.event for event in events[:2]] == [EventKind.RECOVERY_ATTEMPT] * 2
+        assert not events[-1].data["linked"]
+        assert events[0].data["unusable_at_end"] == 4
+
+
+def test_frames_before_a_start_are_posed_by_live_features_whatever_the_attempts() -> None:
+    world = PointWorld(cloud(), hand_held(30))  # without images, so that no other front end sees anything
+    system = system_in(world, recovery={"attempts": ["sift"]})
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    (start,) = system.events.of_kind(EventKind.INITIALISED)
+    assert start.data["first_view"] + 1 < start.frame  # there are some
+    assert sorted(system.poses) == list(range(30))
+
+
+class OutOfTimeAtFirst:
+    """Gives the first jobs that have a lost map to look for no time at all."""
+
+    def __init__(self, system: System, n_failing: int) -> None:
+        self._inline = system._recoveries._executor
+        assert isinstance(self._inline, InlineExecutor)
+        self._parts, self._n_failing = self._inline._parts, n_failing
+
+    def submit(self, job: RecoveryJob) -> None:
+        if job.lost:
+            self._inline._parts = replace(self._parts, budget_s=0.0 if self._n_failing > 0 else None)
+            self._n_failing -= 1
+        self._inline.submit(job)
+
+    def poll(self) -> list[Outcome]:
+        return self._inline.poll()
+
+    finish = poll
+
+
+class TestRetry:
+    @staticmethod
+    def run(n_failing: int, **recovery: object) -> System:
+        world = PointWorld(cloud(), hand_held(90), covered=COVERED)
+        system = system_in(world, recovery={"attempts": ["live"], "retry_keyframes": [4], **recovery})
+        system._recoveries._executor = OutOfTimeAtFirst(system, n_failing)
+        for frame in world.frames():
+            system.step(frame)
+        system.finish()
+        return system
+
+    def test_a_recovery_without_link_is_made_again_when_the_map_has_grown(self) -> None:
+        system = self.run(n_failing=1)
+        started = system.events.of_kind(EventKind.RECOVERY_STARTED)
+        assert [event.data["again"] for event in started] == [False, True]
+        ended = system.events.of_kind(EventKind.RECOVERY_ENDED)
+        assert [event.data["linked"] for event in ended] == [False, True]
+        (link,) = system.atlas.links
+        assert link.keyframes
+        main = trajectories_of(system).main
+        assert set(main.index.tolist()) == set(range(90)) - COVERED
+
+    def test_it_ends_with_the_last_of_the_sizes_and_once_more_with_the_run(self) -> None:
+        system = self.run(n_failing=9)
+        started = system.events.of_kind(EventKind.RECOVERY_STARTED)
+        assert [event.frame for event in started[2:]] == [89]
+        assert not system.atlas.links
+
+    def test_what_is_linked_is_not_looked_for_again(self) -> None:
+        system = self.run(n_failing=0)
+        assert len(system.events.of_kind(EventKind.RECOVERY_STARTED)) == 1
+
+    def test_nothing_is_looked_for_that_the_buffer_does_not_hold(self) -> None:
+        world = PointWorld(cloud(), hand_held(90), covered=COVERED)
+        system = system_in(world, recovery={"attempts": ["live"], "retry_keyframes": [4]}, buffer={"duration_s": 0.2})
+        system._recoveries._executor = OutOfTimeAtFirst(system, 9)
+        for frame in world.frames():
+            system.step(frame)
+        assert len(system.events.of_kind(EventKind.RECOVERY_STARTED)) == 1
+
+
+def drive(attempts: list[str]) -> tuple[System, np.ndarray]:
+    """A street with a black-out of a second, at ten frames a second and half a metre a frame."""
+    sequence = make_sequence("street", 52, seed=2, events=[Spoil(SpoilKind.BLACKOUT, 26, 10)])
+    settings = {"recovery": {"attempts": attempts}, "calibration": {"refine": False}, "buffer": {"duration_s": 5.0}}
+    system = build_system(Config.model_validate(settings), sequence.camera)
+    for i in range(6, 52):
+        system.step(sequence.frame(i))
+    system.finish()
+    return system, sequence.ground_truth_T_world_cam
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("attempt", ["sift", "gap"])
+def test_a_black_out_on_the_road_is_leapt(attempt: str) -> None:
+    system, truth = drive([attempt])
+    # Just begun, the new map may hold its scale too loosely across the gap: then it is tried again two frames later.
+    made = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)[-1]
+    assert made.data["gaps"] == 1
+    (link,) = system.atlas.links
+    scales = []
+    for m in (link.a, link.b):
+        submap = system.atlas.submaps[m]
+        ids = [k for k in submap.keyframes if (k > 35) == (m == link.b)]
+        est, true = submap.keyframe_poses(ids)[:, :3, 3], truth[ids][:, :3, 3]
+        scales.append(np.linalg.norm(true - true.mean(0)) / np.linalg.norm(est - est.mean(0)))
+    # What the gap relocalisation knew is still known once the walk's result is in the map, whatever frame the map has by then.
+    new = system.atlas.submaps[link.b]
+    (k, known), *_ = new.relative_poses.items()
+    assert k < 35 < known.keyframe_id
+    off = se3.log(se3.inverse(known.T_ref_kf) @ se3.inverse(new.T_submap_kf[known.keyframe_id]) @ new.T_submap_kf[k])
+    assert off @ np.linalg.solve(known.covariance, off) < 22.5  # 99.9 % for six degrees of freedom
+    # The whole new map, not only its end on this side of the gap, has its place and size.
+    assert abs(float(sim3.scale(link.S_a_b)) / (scales[1] / scales[0]) - 1) < 0.05
+    main = trajectories_of(system).main
+    translation, rotation = pose_errors(main.T_world_cam, truth[main.index])
+    length = np.linalg.norm(np.diff(truth[6:, :3, 3], axis=0), axis=1).sum()
+    assert translation.max() < 0.03 * length
+    assert rotation.max() < np.radians(1.0)  # a third of what makes a link wrong
+
+
+@pytest.mark.slow
+def test_the_result_is_the_same_whatever_the_threads() -> None:
+    world = make_sequence("street", 52, seed=2, events=[Spoil(SpoilKind.BLACKOUT, 26, 10)])
+    config = Config.model_validate({"recovery": {"attempts": ["gap"]}, "calibration": {"refine": False}})
+    system = build_system(config, world.camera)
+    jobs: list[RecoveryJob] = []
+    system._recoveries._executor.submit = jobs.append  # type: ignore[method-assign]
+    for i in range(6, 52):
+        system.step(world.frame(i))
+    job = next(job for job in jobs if job.lost)
+    size_px = (world.camera.width, world.camera.height)
+    alone, beside = (run_recovery(job, recovery_parts(config, size_px, n_threads=n)) for n in (0, 2))
+    assert isinstance(beside, RecoveryResult)
+    assert beside.events[-1].data["gaps"] == 1
+    assert_same(alone, beside)
+
+
+@pytest.mark.slow
+def test_missing_frames_lead_to_no_wrong_link() -> None:
+    """Ten metres of road without a frame: guided matching goes over them to a place 5.6 m off, and does not notice."""
+    world = make_sequence("street", 90, 8, 320, 240, events=[Spoil(SpoilKind.DROP, 53, 10)])
+    config = Config.model_validate({"seed": 8, "frontend": {"n_features": 600}})
+    system = build_system(config, world.camera)
+    for frame in world:
+        system.step(frame)
+    system.finish()
+    assert system.events.of_kind(EventKind.FAILED)
+    truth = dict(enumerate(world.ground_truth_T_world_cam))
+    links = audit_links(system.atlas, system.poses.values(), truth)
+    assert all(isinstance(link, LinkAudit) and not link.wrong for link in links)
+    leapt = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)[-1]
+    assert (leapt.data["verdict"] == "linked") == bool(links)
+    assert leapt.data["gaps"] == bool(links)  # over the gap no walk goes but by a gap relocalisation

@@ -1,0 +1,27 @@
+"""Base is Dual with recovery off, and nothing else is different."""
+
+from __future__ import annotations
+
+from dualslam.build import build_system
+from dualslam.config.files import config_from_dict
+from dualslam.core.events import EventKind
+from dualslam.lab.synthetic import make_sequence
+
+N = 50
+DARK = {"kind": "blackout", "start": 30, "length": 5}
+
+
+def test_while_no_map_is_lost_both_are_the_same() -> None:
+    """Also where landmarks are found again in the images, beyond frames that tracking gets over by itself."""
+    world = make_sequence("street", N, 3, 320, 240, events=[DARK])
+    runs = []
+    for enabled in (True, False):
+        system = build_system(config_from_dict({"recovery": {"enabled": enabled}}), world.camera)
+        for frame in world:
+            system.step(frame)
+        assert not system.events.of_kind(EventKind.FAILED)
+        runs.append(dict(system.poses))
+    dual, base = runs
+    assert dual.keys() == base.keys()
+    assert max(dual) == N - 1
+    assert min(dual[i].T_kf_cam.tobytes() == base[i].T_kf_cam.tobytes() for i in dual)

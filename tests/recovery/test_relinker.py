@@ -1,0 +1,65 @@
+"""When a walk back tries to link, and when it has tried enough."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+from dualslam.config.settings import RecoveryConfig
+from dualslam.core.types import Failure, FailureReason
+from dualslam.map.submap import Submap
+from dualslam.recovery.relinker import Relinker
+
+ONSET = 190
+
+
+def holding(submap_id: int, keyframes: range) -> Submap:
+    return cast(Submap, SimpleNamespace(id=submap_id, keyframes=dict.fromkeys(keyframes)))
+
+
+def tries_of_a_walk(n: int, **settings: Any) -> tuple[list[int], int | None]:
+    """Walk back from keyframe 199 over n more; return the numbers shared at each try, and at which it was enough."""
+    old, new = holding(0, range(200)), holding(1, range(200, 210))
+    asked: list[int] = []
+
+    def refuse(old: Submap, new: Submap, onset: int | None) -> Failure:
+        asked.append(len(new.keyframes) - 10)
+        return Failure(FailureReason.AGREEMENT, "no")
+
+    relinker = Relinker(new, {0: old}, {0: ONSET}, refuse, RecoveryConfig.model_validate(settings))
+    for shared in range(1, n + 1):
+        k = 200 - shared
+        new.keyframes[k] = None  # type: ignore[assignment]
+        assert [t.n_shared for t in relinker.attempts(k)] == asked[-1:] * (asked[-1:] == [shared])
+        if relinker.has_seen_enough:
+            return asked, shared
+    return asked, None
+
+
+def test_it_tries_at_each_of_the_first_shared_keyframes() -> None:
+    asked, _ = tries_of_a_walk(12)
+    assert asked == list(range(4, 13))
+
+
+def test_later_on_it_tries_at_each_tenth_part_more() -> None:
+    asked, _ = tries_of_a_walk(100, max_shared_keyframes=200)
+    late = [n for n in asked if n > 12]
+    assert all(b >= 1.1 * a for a, b in zip([12, *late], late, strict=False))
+    assert all(b <= 1.1 * a + 1 for a, b in zip([12, *late], late, strict=False))
+
+
+def test_it_has_seen_enough_once_it_has_tried_with_so_many_healthy_keyframes() -> None:
+    asked, ended = tries_of_a_walk(150, max_shared_keyframes=30)
+    suspected = 200 - ONSET
+    assert ended is not None
+    assert ended == asked[-1]
+    assert 30 <= ended - suspected <= 1.1 * (30 + suspected) + 1 - suspected
+
+
+def test_a_keyframe_that_the_lost_map_does_not_hold_is_no_reason_to_try() -> None:
+    old, new = holding(0, range(0, 50, 2)), holding(1, range(50))
+
+    def never(old: Submap, new: Submap, onset: int | None) -> Failure:
+        raise AssertionError
+
+    assert not list(Relinker(new, {0: old}, {0: ONSET}, never, RecoveryConfig()).attempts(11))

@@ -1,0 +1,187 @@
+"""Recovery in a process of its own: the same result as inline, and no way in which a worker can take the run down."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import time
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+import pytest
+
+from dualslam.build import recovery_parts
+from dualslam.config.settings import Config
+from dualslam.core.events import EventKind
+from dualslam.core.types import Failure, FailureReason
+from dualslam.recovery.executor import Outcome
+from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryResult, run_recovery
+from dualslam.recovery.worker import WorkerExecutor
+from dualslam.run.results import trajectories_of
+from dualslam.testing.point_world import SIZE_PX, PointWorld, cloud, hand_held, pose_errors, system_in
+
+COVERED = frozenset(range(35, 50))
+MAKE_PARTS = partial(recovery_parts, Config(), SIZE_PX)
+PATIENCE_S = 120.0  # of the test, on a busy machine
+
+
+class Catcher:
+    """Notes the jobs that a system submits; nothing comes of them."""
+
+    def __init__(self) -> None:
+        self.jobs: list[RecoveryJob] = []
+
+    def submit(self, job: RecoveryJob) -> None:
+        self.jobs.append(job)
+
+    def poll(self) -> list[Outcome]:
+        return []
+
+    finish = poll
+
+
+@pytest.fixture(scope="module")
+def job() -> RecoveryJob:
+    """A walk back that ends with a link."""
+    world = PointWorld(cloud(), hand_held(60), covered=COVERED)
+    system, catcher = system_in(world, recovery={"enabled": True}), Catcher()
+    system._recoveries._executor = catcher
+    for frame in world.frames():
+        system.step(frame)
+    _, job = catcher.jobs
+    return job
+
+
+@pytest.fixture
+def executor() -> Iterator[WorkerExecutor]:
+    executor = WorkerExecutor(MAKE_PARTS, 1, time_limit_s=PATIENCE_S, finish_wait_s=0.0)
+    yield executor
+    executor.finish()
+
+
+def wait_for(executor: WorkerExecutor) -> RecoveryResult | Failure:
+    began_s = time.monotonic()
+    while time.monotonic() - began_s < PATIENCE_S:
+        for _, result in executor.poll():
+            return result
+        time.sleep(0.02)
+    raise AssertionError("the worker gave no result")
+
+
+def gone(pid: int | None) -> bool:
+    try:
+        os.kill(pid or 0, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+def assert_same(a: RecoveryResult | Failure, b: RecoveryResult | Failure) -> None:
+    assert isinstance(a, RecoveryResult)
+    assert isinstance(b, RecoveryResult)
+    assert list(a.submap.keyframes) == list(b.submap.keyframes)
+    for name, column in a.submap.landmarks.columns().items():
+        assert np.array_equal(column, b.submap.landmarks[name])
+    for x, y in zip(a.frames, b.frames, strict=True):
+        assert x.pose.keyframe_id == y.pose.keyframe_id
+        assert np.array_equal(x.pose.T_kf_cam, y.pose.T_kf_cam)
+    told = [[event.as_dict() | {"seconds": None} for event in result.events] for result in (a, b)]
+    assert told[0] == told[1]
+    assert a.link is not None
+    assert b.link is not None
+    assert np.array_equal(a.link.estimate.S_old_new, b.link.estimate.S_old_new)
+
+
+def test_a_recovery_out_of_time_gives_what_it_has(job: RecoveryJob) -> None:
+    result = run_recovery(job, recovery_parts(Config(), SIZE_PX, budget_s=0.0))
+    assert isinstance(result, RecoveryResult)
+    assert result.link is None
+    (attempt,) = result.events
+    assert attempt.data["verdict"] == "out of time"
+
+
+def test_a_job_can_be_pickled_and_is_left_as_it_was(job: RecoveryJob) -> None:
+    before = job.submap.copy()
+    here = run_recovery(job, MAKE_PARTS())
+    assert_same(here, run_recovery(pickle.loads(pickle.dumps(job)), MAKE_PARTS()))
+    assert isinstance(here, RecoveryResult)
+    assert len(here.submap.keyframes) > len(before.keyframes)
+    assert list(job.submap.keyframes) == list(before.keyframes)
+    for name, column in before.landmarks.columns().items():
+        assert np.array_equal(column, job.submap.landmarks[name])
+
+
+def test_a_worker_finds_what_would_be_found_inline_and_stays_warm(executor: WorkerExecutor, job: RecoveryJob) -> None:
+    pids = executor.pids
+    for _ in range(2):
+        executor.submit(job)
+        assert_same(wait_for(executor), run_recovery(job, MAKE_PARTS()))
+    assert executor.pids == pids
+    assert executor.finish() == []
+    assert gone(pids[0])
+
+
+def test_a_worker_that_is_killed_costs_its_job_only(executor: WorkerExecutor, job: RecoveryJob) -> None:
+    (pid,) = executor.pids
+    executor.submit(job)
+    executor.submit(job)  # waits for its turn
+    assert pid is not None
+    os.kill(pid, signal.SIGKILL)
+    lost = wait_for(executor)
+    assert isinstance(lost, Failure)
+    assert lost.reason is FailureReason.WORKER
+    assert "-9" in lost.detail
+    assert isinstance(wait_for(executor), RecoveryResult)
+
+
+def test_a_worker_that_died_while_idle_is_replaced(executor: WorkerExecutor, job: RecoveryJob) -> None:
+    (pid,) = executor.pids
+    assert pid is not None
+    os.kill(pid, signal.SIGKILL)
+    while executor._idle[0].alive:
+        time.sleep(0.01)
+    executor.submit(job)
+    assert isinstance(wait_for(executor), RecoveryResult)
+
+
+def test_a_worker_that_hangs_is_ended_after_its_time(job: RecoveryJob) -> None:
+    executor = WorkerExecutor(MAKE_PARTS, 1, time_limit_s=0.3, finish_wait_s=0.0)
+    (pid,) = executor.pids
+    assert pid is not None
+    os.kill(pid, signal.SIGSTOP)
+    executor.submit(job)
+    lost = wait_for(executor)
+    assert isinstance(lost, Failure)
+    assert lost.reason is FailureReason.TIMEOUT
+    assert gone(pid)
+    assert executor.pids != [pid]
+    executor.finish()
+
+
+def test_the_end_of_a_run_waits_so_long_and_no_longer(job: RecoveryJob) -> None:
+    executor = WorkerExecutor(MAKE_PARTS, 1, time_limit_s=PATIENCE_S, finish_wait_s=0.2)
+    (pid,) = executor.pids
+    assert pid is not None
+    os.kill(pid, signal.SIGSTOP)
+    executor.submit(job)
+    executor.submit(job)
+    outcomes = executor.finish()
+    assert [isinstance(r, Failure) and r.reason is FailureReason.TIMEOUT for _, r in outcomes] == [True, True]
+    assert gone(pid)
+
+
+def test_a_system_with_a_worker_ends_in_one_map() -> None:
+    world = PointWorld(cloud(), hand_held(70), covered=COVERED)
+    settings = {"enabled": True, "workers": 1, "finish_wait_s": PATIENCE_S}
+    system = system_in(world, recovery=settings)
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    assert not system.events.of_kind(EventKind.RECOVERY_FAILED)
+    main = trajectories_of(system).main
+    assert set(main.index.tolist()) == set(range(70)) - COVERED
+    translation, rotation = pose_errors(main.T_world_cam, world.T_world_cam[main.index])
+    assert translation.max() < 0.08
+    assert rotation.max() < 0.01

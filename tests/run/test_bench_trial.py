@@ -1,0 +1,126 @@
+"""Trials with the real system, and the command."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dualslam.cli import main
+from dualslam.lab.bench.plan import Trial, plan_trials
+from dualslam.lab.bench.record import FailureKind, TrialOutcome, judge
+from dualslam.lab.bench.spec import BenchSpec, load_spec
+from dualslam.lab.bench.trial_log import TrialLog
+from dualslam.run.bench_trial import describe_source, run_trial
+from tests.cli.conftest import _own_environment  # noqa: F401 (used by every test)
+from tests.lab.bench.dask_cluster import dask_cluster
+
+SPEC = """
+name: tiny
+sequences: [{name: room, source: "synthetic:room,frames=50,seed=2", frames: 40, returns_to_start: true}]
+variants: [{name: base, set: {recovery.enabled: false}}]
+conditions: [{name: gap, corruptions: [{kind: drop, frames: 3}]}]
+trials: 1
+"""
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory: pytest.TempPathFactory) -> BenchSpec:
+    path = tmp_path_factory.mktemp("spec") / "tiny.yaml"
+    path.write_text(SPEC)
+    return load_spec(path)
+
+
+@pytest.fixture(scope="module")
+def trial(spec: BenchSpec) -> Trial:
+    (trial,) = plan_trials(spec, lambda sequence: describe_source(sequence, None))
+    return trial
+
+
+def test_a_trial_is_a_run_folder_and_a_line(spec: BenchSpec, trial: Trial, tmp_path: Path) -> None:
+    record = run_trial(trial, str(tmp_path))
+    assert record.outcome is TrialOutcome.DONE, record.error
+    assert len(record.status) == 37
+    assert record.initialised_at is not None
+    assert record.coverage > 0.95
+    assert record.ate_m is not None
+    assert record.path_m is not None
+    assert record.end_point_error_m is not None
+    assert judge(record, spec.thresholds) is None
+    run = tmp_path / "trials" / "room" / "gap" / "base" / "00"
+    assert json.loads((run / "summary.json").read_text())["ate_rmse_m"] == pytest.approx(record.ate_m)
+    assert json.loads((run / "trial.json").read_text())["start"] == trial.start
+    # The same trial again takes the place of the first, with the same result but for its times.
+    again = run_trial(trial, str(tmp_path))
+    assert replace(again, wall_s=record.wall_s, cpu_s=record.cpu_s) == record
+
+
+def test_what_goes_wrong_is_in_the_line(trial: Trial, tmp_path: Path) -> None:
+    missing = run_trial(replace(trial, source=str(tmp_path / "nowhere")), str(tmp_path))
+    assert missing.outcome is TrialOutcome.CRASHED
+    assert "does not exist" in missing.error
+    late = run_trial(replace(trial, timeout_s=1e-3), str(tmp_path))
+    assert late.outcome is TrialOutcome.TIMED_OUT
+    assert judge(late, BenchSpec.model_fields["thresholds"].default) is FailureKind.TIMED_OUT
+
+
+def test_a_bug_leaves_its_traceback_in_the_folder(
+    trial: Trial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("by zero")
+
+    monkeypatch.setattr("dualslam.run.bench_trial.run_to_folder", broken)
+    record = run_trial(trial, str(tmp_path))
+    assert (record.outcome, record.error) == (TrialOutcome.CRASHED, "ZeroDivisionError: by zero")
+    assert "ZeroDivisionError" in (tmp_path / "trials" / trial.key / "error.log").read_text()
+
+
+def test_the_command_writes_tables_and_runs_nothing_twice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, out = tmp_path / "tiny.yaml", tmp_path / "out"
+    path.write_text(SPEC)
+    command = ["bench", str(path), "--out", str(out), "--jobs", "1"]
+    assert main(command) == 0
+    captured = capsys.readouterr()
+    assert "### Table II: failures" in captured.out
+    assert "1/1 room/gap/base/00: good" in captured.err
+    lines, page = (out / "trials.jsonl").read_text(), (out / "tables.md").read_text()
+    assert main(command) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    assert ((out / "trials.jsonl").read_text(), (out / "tables.md").read_text()) == (lines, page)
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_line_that_this_machine_gives(trial: Trial, tmp_path: Path) -> None:
+    (tmp_path / "tiny.yaml").write_text(SPEC)
+    out = tmp_path / "out"
+    with dask_cluster(tmp_path) as cluster:
+        command = ["bench", str(tmp_path / "tiny.yaml"), "--out", str(out), "--scheduler", cluster.address]
+        assert main([*command, "--quiet"]) == 0
+    (line,) = TrialLog(out / "trials.jsonl").records
+    here = run_trial(trial, str(tmp_path / "here"))
+    assert here.outcome is TrialOutcome.DONE
+    assert replace(here, wall_s=line.wall_s, cpu_s=line.cpu_s) == line
+    runs = [folder / "trials" / trial.key / "trajectory.txt" for folder in (out, tmp_path / "here")]
+    assert runs[0].read_bytes() == runs[1].read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--data", "/nowhere"], "--data /nowhere is no folder"),
+        (["--only", "road"], "has no sequence road; it has room"),
+        (["--jobs", "0"], "must be a whole number of at least 1"),
+    ],
+)
+def test_bad_usage_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str
+) -> None:
+    (tmp_path / "tiny.yaml").write_text(SPEC)
+    assert main(["bench", str(tmp_path / "tiny.yaml"), "--out", str(tmp_path / "out"), *options]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert "Traceback" not in error

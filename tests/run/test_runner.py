@@ -1,0 +1,155 @@
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from dualslam.core.errors import InputError
+from dualslam.core.types import Frame
+from dualslam.map.frame_records import FrameResult
+from dualslam.run.results import frame_rows
+from dualslam.run.runner import run_sequence
+from tests.cli.fakes import FakeSystem
+
+EVERYWHERE = {i: np.eye(4) for i in range(100)}
+
+
+@dataclass
+class Clock:
+    """Time that passes only when someone works or sleeps."""
+
+    now_s: float = 100.0
+    slept_s: list[float] = field(default_factory=list)
+
+    def __call__(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.slept_s.append(seconds)
+        self.now_s += seconds
+
+
+class Frames:
+    """Frames at 10 Hz, of which the source may break."""
+
+    name = "frames"
+    rate_hz = 10.0
+
+    def __init__(self, indices: list[int], break_after: int | None = None) -> None:
+        self.indices, self.break_after, self.closed = indices, break_after, False
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __iter__(self) -> Iterator[Frame]:
+        try:
+            for n, i in enumerate(self.indices):
+                if n == self.break_after:
+                    raise InputError("the cable came off.")
+                yield Frame(i, 0.1 * i, np.zeros((4, 4), np.uint8))
+        finally:
+            self.closed = True
+
+
+def in_real_time(indices: list[int], work_s: dict[int, float]) -> tuple[list[int], list[int], Clock]:
+    clock = Clock()
+
+    def work(frame: Frame) -> None:
+        clock.now_s += work_s.get(frame.index, 0.01)
+
+    system = FakeSystem(EVERYWHERE, before_step=work)
+    report = run_sequence(system, Frames(indices), realtime=True, clock=clock, sleep=clock.sleep)  # type: ignore[arg-type]
+    assert report.n_frames == len(indices)
+    assert [row.index for row in frame_rows(system, _no_poses(), report.dropped)] == indices  # type: ignore[arg-type]
+    return list(system.rows), [i for i, _ in report.dropped], clock
+
+
+def _no_poses() -> object:
+    from dualslam.io.run_folder import PosedFrames
+
+    return PosedFrames(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 4, 4)))
+
+
+def test_in_real_time_a_quick_system_waits_for_its_frames() -> None:
+    seen, dropped, clock = in_real_time([0, 1, 2, 3], {})
+    assert (seen, dropped) == ([0, 1, 2, 3], [])
+    assert clock.slept_s == pytest.approx([0.09] * 3)
+
+
+def test_in_real_time_a_slow_step_costs_the_frames_that_came_meanwhile() -> None:
+    # Frame 1 is ready at 0.1 + 0.25 s: frame 2 (0.2 s) has been overtaken by frame 3 (0.3 s), which is taken late.
+    seen, dropped, _ = in_real_time([0, 1, 2, 3, 4, 5], {1: 0.25})
+    assert (seen, dropped) == ([0, 1, 3, 4, 5], [2])
+
+
+def test_in_real_time_backwards() -> None:
+    seen, dropped, _ = in_real_time([5, 4, 3, 2, 1], {4: 0.25})
+    assert (seen, dropped) == ([5, 4, 2, 1], [3])
+
+
+def test_latency_and_speed_are_measured() -> None:
+    clock = Clock()
+
+    def work(frame: Frame) -> None:
+        clock.now_s += 0.02
+
+    report = run_sequence(FakeSystem(EVERYWHERE, before_step=work), Frames([0, 1]), clock=clock)  # type: ignore[arg-type]
+    assert report.latencies_ms == pytest.approx((20, 20))
+    assert report.fps == pytest.approx(50)
+    assert report.peak_rss_mb > 1
+    assert report.cpu_s >= 0
+
+
+def test_a_source_that_breaks_ends_the_run_and_keeps_its_frames() -> None:
+    system, frames = FakeSystem(EVERYWHERE), Frames([0, 1, 2], break_after=2)
+    report = run_sequence(system, frames)  # type: ignore[arg-type]
+    assert str(report.error) == "the cable came off."
+    assert list(system.rows) == [0, 1]
+    assert system.n_finished == 1
+    assert frames.closed
+
+
+def test_a_system_that_breaks_is_finished_and_what_it_raised_first_is_reported() -> None:
+    class Broken(FakeSystem):
+        def step(self, frame: Frame) -> FrameResult:
+            if frame.index == 2:
+                raise ZeroDivisionError("in a step")
+            return super().step(frame)
+
+        def finish(self, interrupted: bool = False) -> None:
+            super().finish()
+            raise ValueError("at the end")
+
+    system, frames = Broken(EVERYWHERE), Frames([0, 1, 2, 3])
+    report = run_sequence(system, frames)  # type: ignore[arg-type]
+    assert isinstance(report.bug, ZeroDivisionError)
+    assert (report.n_frames, list(system.rows), system.n_finished) == (3, [0, 1], 1)
+    assert frames.closed
+    assert isinstance(run_sequence(Broken(EVERYWHERE), Frames([0])).bug, ValueError)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("stops", [False, True])
+def test_who_interrupts_a_run_does_not_wait_for_a_last_walk(stops: bool) -> None:
+    def interrupt(frame: Frame) -> None:
+        if stops and frame.index == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    system = FakeSystem(EVERYWHERE, before_step=interrupt)
+    report = run_sequence(system, Frames([0, 1, 2]))  # type: ignore[arg-type]
+    assert (report.interrupted, system.was_interrupted, system.n_finished) == (stops, stops, 1)
+
+
+def test_a_source_without_frames_is_bad_input() -> None:
+    with pytest.raises(InputError, match="gave no frame"):
+        run_sequence(FakeSystem(EVERYWHERE), Frames([]))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="cable"):
+        run_sequence(FakeSystem(EVERYWHERE), Frames([0], break_after=0))  # type: ignore[arg-type]
+
+
+def test_on_frame_is_told_every_result() -> None:
+    seen = []
+    run_sequence(FakeSystem(EVERYWHERE), Frames([4, 2]), on_frame=seen.append)  # type: ignore[arg-type]
+    assert [result.index for result in seen] == [4, 2]
