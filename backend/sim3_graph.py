@@ -18,6 +18,7 @@ from dualslam.backend.noise import GAUGE_SIGMA, gaussian
 from dualslam.backend.observability import find_components
 from dualslam.backend.solver import GTSAM_ERRORS, SolverFailure
 from dualslam.core.errors import SolverError
+from dualslam.core.geometry import sim3
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 GNC_INLIER_PROBABILITY = 0.99
@@ -89,6 +90,33 @@ class Sim3Solution:
         except GTSAM_ERRORS as error:
             raise SolverError(f"no covariances of Sim(3) nodes {list(nodes)[:5]}: {SolverFailure.of(error)}") from error
         return np.array(found).reshape(-1, 7, 7)
+
+    def relative_covariances(self, pairs: Sequence[tuple[int, int]]) -> FloatArray:
+        """Return (P, 7, 7) covariances of ``inv(S_world_first) @ S_world_second``: right perturbation, second's frame.
+
+        Raises
+        ------
+        SolverError
+            If the solver cannot tell.
+        """
+        found = np.empty((len(pairs), 7, 7))
+        try:
+            marginals = gtsam.Marginals(self._graph, self._values)
+            for i, (first, second) in enumerate(pairs):
+                joint = marginals.jointMarginalCovariance([int(first), int(second)])
+                C = np.block([[np.asarray(joint.at(a, b)) for b in (first, second)] for a in (first, second)])
+                S_second_first = sim3.inverse(self.S_world_node[second]) @ self.S_world_node[first]
+                J = np.concatenate((-sim3.adjoint(S_second_first), np.eye(7)), axis=1)
+                found[i] = J @ C @ J.T
+        except GTSAM_ERRORS as error:
+            raise SolverError(f"no covariances between {len(pairs)} pairs of Sim(3) nodes: {error}") from error
+        return 0.5 * (found + found.transpose(0, 2, 1))
+
+    def residuals(self, edges: Sequence[Sim3Edge]) -> FloatArray:
+        """Return (E, 7): how far the nodes stand off each edge, in the edge's own tangent space."""
+        S = [sim3.inverse(self.S_world_node[e.first]) @ self.S_world_node[e.second] for e in edges]
+        measured = np.array([e.S_first_second for e in edges]).reshape(-1, 4, 4)
+        return sim3.log(sim3.inverse(measured) @ np.array(S).reshape(-1, 4, 4))
 
 
 def optimise_sim3(

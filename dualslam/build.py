@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from dualslam.backend.atlas_solver import GtsamAtlasSolver
 from dualslam.backend.local_ba import bundle_adjust, bundle_adjust_arrays
 from dualslam.backend.self_calibration import estimate_calibration, find_preferred_camera
 from dualslam.backend.submap_graph import ISam2SubmapGraph
@@ -123,9 +124,15 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
             calibration=calibration,
             shutter=shutter,
             recovery=recovery or recovery_executor(config, size_px, faults, frontend),
+            atlas_solver=atlas_solver(config),
         ),
         config,
     )
+
+
+def atlas_solver(config: Config) -> GtsamAtlasSolver:
+    """Build what solves the graph over all submaps."""
+    return GtsamAtlasSolver(config.atlas.robust, config.graph.robust_k)
 
 
 def self_calibrator(config: Config) -> SelfCalibrator:

@@ -11,15 +11,16 @@ import numpy as np
 
 from dualslam.calibration.lens import Calibration
 from dualslam.config.settings import Config
+from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import MapStarter, Shutter, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, Start, Track, View
 from dualslam.health import HealthMonitor, count_signs
-from dualslam.map.atlas import Link, LinkKind
+from dualslam.map.atlas import Link
+from dualslam.map.connections import Connections
 from dualslam.map.frame_records import FrameRecord, FrameResult
-from dualslam.map.propagation import propagate_anchors, propagate_poses
 from dualslam.map.record import Record
 from dualslam.map.split import next_submap
 from dualslam.map.submap import Submap
@@ -27,7 +28,6 @@ from dualslam.map.trajectory import FramePose
 from dualslam.recovery.executor import RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.manager import Recoveries
-from dualslam.recovery.merge import propagate_links
 from dualslam.recovery.relocaliser import Relocaliser
 
 log = logging.getLogger(__name__)
@@ -48,6 +48,7 @@ class Components:
     calibration: Calibration
     shutter: Shutter
     recovery: RecoveryExecutor
+    atlas_solver: AtlasSolver
 
     @property
     def K(self) -> FloatArray:
@@ -83,14 +84,25 @@ class System:
         self._starter = components.new_starter()
         self._lost: list[View] = []
         self._health = HealthMonitor(config.health)
+        self._connections = Connections(record, components.atlas_solver, components.new_graph, self._front_ends)
         self._recoveries = Recoveries(
-            record, self.buffer, components.recovery, components.new_graph, components.calibration, config.recovery
+            record,
+            self.buffer,
+            components.recovery,
+            components.new_graph,
+            components.calibration,
+            self._connections,
+            config.recovery,
         )
 
     @property
     def live(self) -> VisualOdometry | None:
         """The front end of the live submap; None while there is no map."""
         return self._live
+
+    def _front_ends(self) -> list[VisualOdometry]:
+        """Those that go on in a submap, or may: what moves under them they must hear of."""
+        return [front_end for front_end in (self._live, self._relocaliser.relocaliser) if front_end is not None]
 
     def step(self, frame: Frame) -> FrameResult:
         """Take one frame through the system.
@@ -275,25 +287,18 @@ class System:
                 return
             live.adopt(refined.graph, refined.before)
             self.buffer.map(calibration.rectified)
-            self._propagate(refined.before, live.submap)
-            changed = [m for m in self._recoveries.waiting if self._update_camera(self.atlas.submaps[m])]
+            self._connections.follow(refined.before, live.submap, view)
+            changed = [m for m in self._recoveries.waiting if self._update_camera(self.atlas.submaps[m], view)]
         self._record.event(EventKind.CALIBRATED, view, live.submap.id, lost=changed, **refined.numbers)
 
-    def _update_camera(self, lost: Submap) -> bool:
+    def _update_camera(self, lost: Submap, view: View) -> bool:
         """Change a lost submap to the present camera, if it can be."""
         before = self._parts.calibration.update(lost, self._parts.new_graph())
         if isinstance(before, Failure):
             log.warning("submap %d keeps its camera: %s", lost.id, before.detail)
             return False
-        self._propagate(before, lost)
+        self._connections.follow(before, lost, view)
         return True
-
-    def _propagate(self, before: Submap, submap: Submap) -> None:
-        """Let all that is known against a submap follow it where a calibration has bent it."""
-        for pose in propagate_poses(self.poses.values(), before, submap):
-            self.poses[pose.index] = pose
-        propagate_anchors(before, submap)
-        propagate_links(self.atlas, before, submap)
 
     # --- failure
 
@@ -352,7 +357,7 @@ class System:
     # --- a submap that is full
 
     def _roll_over(self, live: VisualOdometry, view: View) -> None:
-        """Go on in a new submap that shares its first keyframes with the full one: exact link, no failure."""
+        """Go on in a new submap that shares its first keyframes with the full one: no failure, and a stiff link."""
         submap = next_submap(live.submap, len(self.atlas.submaps), self._config.graph.rollover_keyframes)
         graph = self._parts.new_graph()
         try:
@@ -361,11 +366,12 @@ class System:
             log.warning("submap %d stays open beyond its cap: %s", live.submap.id, error)
             return
         self.atlas.add(submap)
-        self.atlas.link(Link(live.submap.id, submap.id, np.eye(4), np.zeros((7, 7)), LinkKind.ROLLOVER))
         self._record.event(EventKind.ROLLED_OVER, view, submap.id, from_submap=live.submap.id)
         self._archive(live, "full")
+        link = Link.of_rollover(live.submap, submap)
         self._live = self._parts.new_odometry(submap, graph)
         self._live.start_at(list(submap.keyframes)[-1])
+        self._connections.connect([link], view)
 
     # --- records
 

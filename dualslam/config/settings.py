@@ -375,6 +375,13 @@ class FusionConfig(StrictModel):
     neither is believed: chi-square, 7 degrees of freedom, 99.9 %."""
 
 
+class AtlasConfig(StrictModel):
+    """The graph over all submaps."""
+
+    robust: bool = True
+    """Whether a connection that the others contradict is rejected; else all of them are obeyed."""
+
+
 class Config(StrictModel):
     """The root of the configuration."""
 
@@ -392,6 +399,7 @@ class Config(StrictModel):
     graph: GraphConfig = GraphConfig()
     linking: LinkingConfig = LinkingConfig()
     fusion: FusionConfig = FusionConfig()
+    atlas: AtlasConfig = AtlasConfig()
     calibration: CalibrationConfig = CalibrationConfig()
     corruptions: tuple[Corruption, ...] = ()
     """What the failure lab does to the run on purpose, for example [{kind: blackout, start: 100, length: 10}]."""

@@ -33,6 +33,9 @@ class EventKind(StrEnum):
     FUSED = "fused"
     ABSORBED = "absorbed"
     LOOP_CLOSED = "loop_closed"
+    ATLAS_SOLVED = "atlas_solved"
+    CONNECTION_REJECTED = "connection_rejected"
+    CONNECTION_READMITTED = "connection_readmitted"
     INTERRUPTED = "interrupted"
 
 

@@ -1,7 +1,8 @@
-"""The submaps of a run and the Sim(3) links between them."""
+"""The submaps of a run, the Sim(3) connections between them, and where the solution has put them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -10,6 +11,11 @@ import numpy as np
 from dualslam.core.geometry import sim3
 from dualslam.core.types import FloatArray
 from dualslam.map.submap import Submap
+from dualslam.map.warp import Warp
+
+ROLLOVER_SIGMAS = np.array([1e-3] * 3 + [2e-3] * 3 + [2e-3])
+"""How far a submap that has rolled over and its full predecessor may come apart where they share keyframes (rad, unit
+of the submap, log-scale): stiffer than ten keyframes of either, and yet to be bent by a loop."""
 
 
 class LinkKind(StrEnum):
@@ -18,23 +24,30 @@ class LinkKind(StrEnum):
     ROLLOVER = "rollover"
     RECOVERY = "recovery"
     LOOP = "loop"
+    MERGE = "merge"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Link:
-    """A Sim(3) between two submaps: ``p_a = S_a_b @ p_b``.
+    """A connection: a Sim(3) between two submaps, or two places of one, measured about two keyframes.
 
     Attributes
     ----------
     a, b : int
-        Submap ids.
+        Submap ids; equal for a loop within a submap.
     S_a_b : (4, 4) float64
-        ``[[s R, t], [0, 1]]``.
+        ``[[s R, t], [0, 1]]``: ``p_a = S_a_b @ p_b``, in the submaps' frames as they are now.
     covariance : (7, 7) float64
-        Tangent order rotation, translation, log-scale; zero for a link that is exact by construction.
+        Of the right perturbation ``S_a_b @ exp(xi)``: rotation, translation, log-scale, in the frame and unit of b.
     kind : LinkKind
     keyframes : tuple of int
-        Shared keyframes that it stands on, ascending; none for an exact link.
+        Shared keyframes that it stands on, ascending; none where the submaps share no frames.
+    keyframe_a, keyframe_b : int
+        The keyframes between which its factor stands; -1: the newest of `keyframes` that is there.
+    doubtful : bool
+        Whether it may be rejected where others contradict it.
+    rejected : bool
+        The atlas does not believe it: it joins nothing, but is asked again at each solution.
     """
 
     a: int
@@ -43,14 +56,80 @@ class Link:
     covariance: FloatArray
     kind: LinkKind
     keyframes: tuple[int, ...] = ()
+    keyframe_a: int = -1
+    keyframe_b: int = -1
+    doubtful: bool = True
+    rejected: bool = False
+
+    @classmethod
+    def of_rollover(cls, full: Submap, following: Submap) -> Link:
+        """Join a full submap and the next, which starts in its frame: stiff, but not rigid."""
+        shared = tuple(sorted(full.keyframes.keys() & following.keyframes.keys()))
+        middle = shared[len(shared) // 2]
+        covariance = np.diag(ROLLOVER_SIGMAS**2)
+        return cls(
+            full.id, following.id, np.eye(4), covariance, LinkKind.ROLLOVER, shared, middle, middle, doubtful=False
+        )
+
+    @classmethod
+    def of_keyframes(
+        cls,
+        atlas: Atlas,
+        a: tuple[int, int],
+        b: tuple[int, int],
+        S_ka_kb: FloatArray,
+        covariance: FloatArray,
+        kind: LinkKind,
+        doubtful: bool = True,
+    ) -> Link:
+        """Make the link of a similarity that was measured between two keyframes.
+
+        Parameters
+        ----------
+        atlas : Atlas
+        a, b : (int, int)
+            Submap and keyframe.
+        S_ka_kb : (4, 4)
+            From the second keyframe's frame to the first one's, in the units of their submaps.
+        covariance : (7, 7)
+            Of ``S_ka_kb @ exp(xi)``: in the second keyframe's frame.
+        kind : LinkKind
+        doubtful : bool
+        """
+        T_a, T_b = atlas.submaps[a[0]].T_submap_kf[a[1]], atlas.submaps[b[0]].T_submap_kf[b[1]]
+        Ad = sim3.adjoint(T_b)
+        S_a_b = T_a @ S_ka_kb @ sim3.inverse(T_b)
+        return cls(a[0], b[0], S_a_b, Ad @ covariance @ Ad.T, kind, (), a[1], b[1], doubtful)
+
+    def attached(self, atlas: Atlas) -> tuple[int, int]:
+        """Return the keyframes of a and b that its factor stands between, as they are there now."""
+        a, b = atlas.submaps[self.a], atlas.submaps[self.b]
+        return _present(a, self.keyframe_a, self.keyframes), _present(b, self.keyframe_b, self.keyframes)
 
 
 class Atlas:
-    """A graph whose nodes are submaps and whose edges are links. Nothing is ever deleted."""
+    """Submaps and the links between them. Nothing is ever deleted.
+
+    Attributes
+    ----------
+    submaps : dict of int to Submap
+    links : list of Link
+        In the order in which they came.
+    placement : dict of int to (4, 4)
+        Where the last solution has put the submaps of linked sets with cycles: into the frame of the set's first.
+        Sets without one need no solution: links are composed.
+    warps : dict of int to Warp
+        How solutions have bent submaps so far: from what their own graphs say to where their keyframes stand.
+    held : dict of int to frozenset of int
+        Keyframes whose `Submap.relative_poses` hold a bend: they are no evidence of their own.
+    """
 
     def __init__(self) -> None:
         self.submaps: dict[int, Submap] = {}
         self.links: list[Link] = []
+        self.placement: dict[int, FloatArray] = {}
+        self.warps: dict[int, Warp] = {}
+        self.held: dict[int, frozenset[int]] = {}
 
     def add(self, submap: Submap) -> None:
         """Take a submap in."""
@@ -62,14 +141,14 @@ class Atlas:
         """Join two submaps."""
         self.links.append(link)
 
+    @property
+    def believed(self) -> list[Link]:
+        """The links that join something."""
+        return [link for link in self.links if not link.rejected]
+
     def components(self) -> list[list[int]]:
         """Return the linked sets of submaps, each ascending, in order of their first submap."""
-        component = {m: m for m in self.submaps}
-        for link in self.links:
-            old, new = sorted((component[link.a], component[link.b]), reverse=True)
-            component = {m: new if c == old else c for m, c in component.items()}
-        roots = sorted(set(component.values()))
-        return [[m for m in sorted(self.submaps) if component[m] == root] for root in roots]
+        return joined(self.submaps, self.believed)
 
     def S_world_submap(self, component: list[int]) -> dict[int, FloatArray]:
         """Return the transform of each submap of a linked set into the frame of its first one.
@@ -80,10 +159,14 @@ class Atlas:
             Submap ids; links that lead out of it are not followed.
         """
         found: dict[int, FloatArray] = {component[0]: np.eye(4)}
+        if component[0] in self.placement:
+            S_first_world = sim3.inverse(self.placement[component[0]])
+            own = next(c for c in self.components() if component[0] in c)
+            found |= {m: S_first_world @ self.placement[m] for m in component[1:] if m in own and m in self.placement}
         grown = True
         while grown:
             grown = False
-            for link in self.links:
+            for link in self.believed:
                 if link.a not in component or link.b not in component:
                     continue
                 if link.a in found and link.b not in found:
@@ -93,3 +176,28 @@ class Atlas:
                     found[link.a] = found[link.b] @ sim3.inverse(link.S_a_b)
                     grown = True
         return found
+
+
+def joined(submap_ids: Iterable[int], links: Iterable[Link]) -> list[list[int]]:
+    """Return the sets of submaps that links join, each ascending, in order of their first submap."""
+    ids = sorted(submap_ids)
+    component = {m: m for m in ids}
+    for link in links:
+        old, new = sorted((component[link.a], component[link.b]), reverse=True)
+        component = {m: new if c == old else c for m, c in component.items()}
+    roots = sorted(set(component.values()))
+    return [[m for m in ids if component[m] == root] for root in roots]
+
+
+def _present(submap: Submap, keyframe_id: int, shared: tuple[int, ...]) -> int:
+    """Return the keyframe of a submap at which a link is attached; where that was culled, the one in its place.
+
+    Where nothing is said of it, the submap's newest.
+    """
+    wanted = [keyframe_id] if keyframe_id >= 0 else sorted(shared, reverse=True)
+    for k in wanted:
+        while k in submap.anchors and k not in submap.keyframes:
+            k = submap.anchors[k].keyframe_id
+        if k in submap.keyframes:
+            return k
+    return max(submap.keyframes)

@@ -46,9 +46,10 @@ def propagate_poses(poses: Iterable[FramePose], before: Submap, after: Submap) -
 def propagate_anchors(before: Submap, after: Submap) -> None:
     """Move the culled keyframes of `after` in the same way."""
     keyframe_ids = _in_both(before, after)
-    for k, anchor in list(after.anchors.items()):
-        T_submap_cam = before.resolve_anchor(anchor.keyframe_id, anchor.T_kf_cam)
-        after.anchors[k] = Anchor(*_propagate(k, T_submap_cam, keyframe_ids, before, after))
+    for k in list(after.anchors):
+        if k not in before.anchors and k not in before.keyframes:
+            continue  # it came with the change
+        after.anchors[k] = Anchor(*_propagate(k, before.resolve_anchor(k, np.eye(4)), keyframe_ids, before, after))
 
 
 def _in_both(before: Submap, after: Submap) -> IntArray:

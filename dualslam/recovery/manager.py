@@ -16,6 +16,7 @@ from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus, Keyframe, View
 from dualslam.map.atlas import Link, LinkKind
+from dualslam.map.connections import AtlasReport, Connections
 from dualslam.map.propagation import propagate_poses
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.solving import solve
@@ -25,7 +26,7 @@ from dualslam.recovery.bypass import absorb, bypass, drop_corrupted
 from dualslam.recovery.direction import reads_backwards
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
-from dualslam.recovery.merge import Merged, merge_recovery, propagate_links
+from dualslam.recovery.merge import Merged, merge_recovery
 from dualslam.recovery.overlap_refinement import gauge_at_overlap
 from dualslam.recovery.reverse_tracking import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult
 from dualslam.recovery.schedule import RetrySchedule, way_to_gaps
@@ -59,6 +60,7 @@ class Recoveries:
     executor : RecoveryExecutor
     new_graph : callable
     calibration : Calibration
+    connections : Connections
     config : RecoveryConfig
     """
 
@@ -69,6 +71,7 @@ class Recoveries:
         executor: RecoveryExecutor,
         new_graph: Callable[[], SubmapGraph],
         calibration: Calibration,
+        connections: Connections,
         config: RecoveryConfig,
     ) -> None:
         self._record = record
@@ -76,6 +79,7 @@ class Recoveries:
         self._executor = executor
         self._new_graph = new_graph
         self._calibration = calibration
+        self._connections = connections
         self._config = config
         self._lost: dict[int, Loss] = {}  # submaps that are not linked yet
         self._under_way: dict[int, _UnderWay] = {}  # by the new submap's id
@@ -256,9 +260,9 @@ class Recoveries:
             return
         before = submap.copy()
         submap.take_over(merged.submap)
-        propagate_links(self._record.atlas, before, submap)
         if live is not None and live.submap is submap:
             live.adopt(graph, before)
+        self._connections.follow(before, submap, now)
         told = self._circumstances.get(submap.id, {})
         for event in result.events:
             data = event.data | (told if event.event is EventKind.RECOVERY_ATTEMPT else {})
@@ -327,7 +331,11 @@ class Recoveries:
         S_old_new = S_old_now_then @ link.S_old_new @ sim3.inverse(S_now_then)
         Ad = sim3.adjoint(S_now_then)
         covariance = Ad @ link.covariance @ Ad.T
-        record.atlas.link(Link(found.old_id, new_id, S_old_new, covariance, LinkKind.RECOVERY, tuple(agreeing)))
+        joined = Link(found.old_id, new_id, S_old_new, covariance, LinkKind.RECOVERY, tuple(agreeing))
+        report = self._connections.connect([joined], now)
+        if not report or report.newly_rejected:
+            self._refused(found, new_id, report, now)
+            return
         record.event(
             EventKind.LINKED,
             now,
@@ -360,6 +368,19 @@ class Recoveries:
         )
         record.event(
             EventKind.FUSED, now, new_id, old_submap=found.old_id, bypassed=n_bypassed, dropped=n_dropped, **numbers
+        )
+
+    def _refused(self, found: FoundLink, new_id: int, report: AtlasReport, now: FrameStamp) -> None:
+        """Say that the atlas could not take a link in, or did not believe it."""
+        why = report.failure or Failure(FailureReason.CONTRADICTION, "the rest of the atlas contradicts the link")
+        self._record.event(
+            EventKind.LINK_REFUSED,
+            now,
+            new_id,
+            attempt=found.attempt,
+            old_submap=found.old_id,
+            verdict=why.detail,
+            reason=str(why.reason),
         )
 
     def _settle(self, old_id: int, live: VisualOdometry | None) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe
-from dualslam.map.atlas import Atlas
+from dualslam.map.atlas import Atlas, Link
 from dualslam.map.submap import NO_LANDMARK, Anchor, Submap
 from dualslam.map.submap_change import change_of_frame
 
@@ -68,20 +68,23 @@ def merge_recovery(live: Submap, base: Submap, grown: Submap, rectify: Rectify) 
 
 
 def propagate_links(atlas: Atlas, before: Submap, after: Submap) -> None:
-    """Let the links of a submap follow a change of it: each stands on keyframes that both its submaps hold."""
+    """Let the links of a submap follow a change of it, each as the keyframes moved that it stands on there."""
     for i, link in enumerate(atlas.links):
-        if after.id not in (link.a, link.b):
-            continue
-        other = atlas.submaps[link.a if link.b == after.id else link.b]
-        stands_on = link.keyframes or other.keyframes
-        shared = [k for k in stands_on if k in before.keyframes and k in after.keyframes]
-        S_after_before = change_of_frame(before, after, shared or before.keyframes)
+        S_a_b, covariance = link.S_a_b, link.covariance
         if link.a == after.id:
-            atlas.links[i] = replace(link, S_a_b=S_after_before @ link.S_a_b)
-        else:
+            S_a_b = _change_at(before, after, link, link.keyframe_a) @ S_a_b
+        if link.b == after.id:
+            S_after_before = _change_at(before, after, link, link.keyframe_b)
             Ad = sim3.adjoint(S_after_before)
-            S_a_b = link.S_a_b @ sim3.inverse(S_after_before)
-            atlas.links[i] = replace(link, S_a_b=S_a_b, covariance=Ad @ link.covariance @ Ad.T)
+            S_a_b = S_a_b @ sim3.inverse(S_after_before)
+            covariance = Ad @ covariance @ Ad.T
+        atlas.links[i] = replace(link, S_a_b=S_a_b, covariance=covariance)
+
+
+def _change_at(before: Submap, after: Submap, link: Link, attached: int) -> FloatArray:
+    """Return how a submap has changed about the keyframes that a link stands on there."""
+    stands_on = [k for k in (*link.keyframes, attached) if k in before.keyframes and k in after.keyframes]
+    return change_of_frame(before, after, stands_on or before.keyframes)
 
 
 def _add_keyframes(merged: Submap, base: Submap, moved: Submap, rectify: Rectify) -> None:

@@ -29,6 +29,11 @@ class Relocaliser:
         self._n_unseen = 0  # frames since the loss that show something, without a start
         self._sighted = False  # whether the last one has shown the map
 
+    @property
+    def relocaliser(self) -> VisualOdometry | None:
+        """The front end that is shown the frames; none where no map is looked for."""
+        return self._frontend
+
     def begin(self, lost: VisualOdometry) -> None:
         """Look for the map of a front end that has lost it, from now on; no longer for any other."""
         self.end()

@@ -1,0 +1,224 @@
+"""The atlas graph: which connections to believe, and the similarities that agree best with those.
+
+Graduated non-convexity (`gtsam.GncLMOptimizer`) starts from the least-squares solution. A false connection with a tiny
+sigma has bent that to itself, so that its own residual is small and those of the true ones are large: taken at its
+word, it wins. What a connection is asked for the decision is therefore how far it lies from what *all others* say,
+against its own covariance and theirs together (its innovation): a tiny sigma of its own then counts for nothing, and a
+true loop after much drift is not refused for being far from a chain that knows itself to have drifted. The solution
+itself uses each connection's own covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dualslam.backend.edge_covariance import edge_covariances
+from dualslam.backend.sim3_graph import Sim3Edge, Sim3Prior, Sim3Solution, optimise_sim3
+from dualslam.core.atlas_problem import AtlasProblem, AtlasSolution
+from dualslam.core.errors import SolverError
+from dualslam.core.geometry import sim3
+from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.map.submap import Submap
+
+LEAST_SIGMAS = np.array([1e-4, 1e-4, 1e-4, 5e-4, 5e-4, 5e-4, 5e-4])
+"""No connection is taken as surer than this (rad, the second submap's unit, log-scale): pixels of half a pixel at a
+focal length of 700 and a few hundred matches. Below, the factor would also be beyond what a double resolves."""
+SETTLED_COST = 1e-9
+"""A graph with no more than this to gain stands already: a tree, whose nodes were composed along its edges."""
+MAX_PASSES = 4
+"""What is believed decides what the others are asked; it settled in two rounds in every trial."""
+MAX_ITERATIONS = 100
+LEAST_REDUNDANCY = 1e-6
+"""Share of an edge's variance below which the rest of the graph has no say in it."""
+
+
+class GtsamAtlasSolver:
+    """The `dualslam.core.atlas_problem.AtlasSolver` made with GTSAM.
+
+    Parameters
+    ----------
+    robust : bool
+        Let graduated non-convexity choose among doubtful connections; else all are obeyed.
+    robust_k : float
+        Huber threshold of the submaps' projections, in sigmas.
+    """
+
+    def __init__(self, robust: bool, robust_k: float) -> None:
+        self._robust = robust
+        self._robust_k = robust_k
+
+    def solve(self, problem: AtlasProblem) -> AtlasSolution:
+        """Find the similarities that agree best with the edges, without those that are wrong.
+
+        Raises
+        ------
+        SolverError
+        """
+        graph = _Graph(problem)
+        all_edges = np.ones(len(problem.edges), bool)
+        doubtful = np.array([e.doubtful for e in problem.edges], bool)
+        believed, chi2 = all_edges, np.full(len(problem.edges), np.nan)
+        if self._robust and doubtful.any():
+            believed, chi2 = graph.choose(doubtful)
+        solution = graph.optimise(believed)
+        found = np.array([solution.S_world_node[i] for i in range(len(problem.S_world_node))])
+        return AtlasSolution(found, believed, chi2, solution.cost_before, solution.cost_after)
+
+    def relative_covariance(self, problem: AtlasProblem, first: int, second: int) -> FloatArray:
+        """Return the (7, 7) covariance of ``inv(S_world_first) @ S_world_second``, all edges believed.
+
+        Raises
+        ------
+        SolverError
+        """
+        graph = _Graph(problem)
+        everything = np.ones(len(problem.edges), bool)
+        label = graph.pieces(everything)
+        if label[first] != label[second]:
+            raise SolverError("nothing ties the two keyframes: they have no relative covariance")
+        return graph.optimise(everything).relative_covariances([(first, second)])[0]
+
+    def edge_covariances(
+        self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int] = frozenset()
+    ) -> FloatArray:
+        """Return (E, 7, 7) covariances of the similarities between pairs of a submap's keyframes.
+
+        `held`: keyframes whose relative pose is no evidence.
+
+        Raises
+        ------
+        SolverError
+        """
+        return edge_covariances(submap, pairs, self._robust_k, held)
+
+
+class _Graph:
+    """A problem whose edges have covariances that a solver can take."""
+
+    def __init__(self, problem: AtlasProblem) -> None:
+        self.problem = problem
+        least = np.diag(LEAST_SIGMAS**2)
+        self.edges = [
+            Sim3Edge(e.first, e.second, e.S_first_second, e.covariance + (0 if e.kind == "within" else least))
+            for e in problem.edges
+        ]
+        self.nodes = dict(enumerate(problem.S_world_node))
+
+    def optimise(self, believed: BoolArray, nodes: dict[int, FloatArray] | None = None) -> Sim3Solution:
+        """Solve with the believed edges alone; what nothing ties to the rest stays where it is."""
+        chosen = [e for e, kept in zip(self.edges, believed.tolist(), strict=True) if kept]
+        start = self.nodes if nodes is None else nodes
+        fixed = self.problem.fixed
+        priors = {fixed: Sim3Prior(self.nodes[fixed])}
+        at_start = optimise_sim3(start, chosen, priors, max_iterations=0)
+        if at_start.cost_before < SETTLED_COST:
+            return replace(at_start, S_world_node=dict(start))
+        return optimise_sim3(start, chosen, priors, max_iterations=MAX_ITERATIONS)
+
+    def pieces(self, kept: BoolArray) -> IntArray:
+        """Return for each node the piece that it belongs to: the lowest node of it."""
+        parent = list(range(len(self.nodes)))
+        for e, here in zip(self.edges, kept.tolist(), strict=True):
+            if here:
+                _join(parent, e.first, e.second)
+        return np.array([_root(parent, i) for i in range(len(parent))], np.int64)
+
+    # --- what to believe
+
+    def choose(self, doubtful: BoolArray) -> tuple[BoolArray, FloatArray]:
+        """Return which edges are believed, and the chi-square of the doubtful ones against the rest (NaN: no rest)."""
+        believed = ~doubtful | self._base(doubtful)
+        chi2 = np.full(len(self.edges), np.nan)
+        if not (doubtful & ~self._bridges(np.ones(len(doubtful), bool), doubtful)).any():
+            return np.ones(len(doubtful), bool), chi2
+        for _ in range(MAX_PASSES):
+            solution = self.optimise(believed)
+            bridges = self._bridges(believed, doubtful)
+            tested = np.flatnonzero(doubtful & ~bridges)
+            C, r = self._innovations(solution, believed, tested)
+            chi2[:] = np.nan
+            chi2[tested] = np.einsum("ei,ei->e", r, np.linalg.solve(C, r[..., None])[..., 0])
+            after = self._connected(self._graduate(solution, tested, C), doubtful)
+            if (after == believed).all():
+                break
+            believed = after
+        return believed, chi2
+
+    def _base(self, doubtful: BoolArray) -> BoolArray:
+        """Return the doubtful edges that are believed to begin with: those that were, and what it takes to connect."""
+        known = np.array([e.known for e in self.problem.edges], bool)
+        return self._connected(~doubtful | known, doubtful) & doubtful
+
+    def _connected(self, believed: BoolArray, doubtful: BoolArray) -> BoolArray:
+        """Take back in what is needed so that no part of the graph hangs loose: the edges that arrived first."""
+        believed = believed | ~doubtful
+        parent = list(range(len(self.nodes)))
+        for i in (*np.flatnonzero(believed).tolist(), *np.flatnonzero(~believed).tolist()):
+            e = self.edges[i]
+            believed[i] |= _join(parent, e.first, e.second)
+        return believed
+
+    def _bridges(self, believed: BoolArray, doubtful: BoolArray) -> BoolArray:
+        """Return the doubtful edges that alone tie two parts of the believed graph: nothing can contradict them."""
+        sure = self.pieces(believed & ~doubtful)
+        among = np.flatnonzero(believed & doubtful).tolist()
+        bridges = np.zeros(len(believed), bool)
+        for i in among:
+            parent = list(range(len(self.nodes)))
+            for j in among:
+                if j != i:
+                    _join(parent, int(sure[self.edges[j].first]), int(sure[self.edges[j].second]))
+            ends = (int(sure[n]) for n in (self.edges[i].first, self.edges[i].second))
+            a, b = (_root(parent, n) for n in ends)
+            bridges[i] = a != b
+        return bridges
+
+    def _innovations(
+        self, solution: Sim3Solution, believed: BoolArray, tested: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return covariance (E, 7, 7) and residual (E, 7) of each tested edge against all believed ones but itself.
+
+        For an edge in the solution both follow from those after it (R the edge's covariance, P the solution's of the
+        same similarity): the innovation's covariance is ``R inv(R - P) R``, the innovation ``R inv(R - P) r``.
+        """
+        edges = [self.edges[i] for i in tested.tolist()]
+        P = solution.relative_covariances([(e.first, e.second) for e in edges])
+        r = solution.residuals(edges)
+        C = np.empty_like(P)
+        for i, (e, inside) in enumerate(zip(edges, believed[tested].tolist(), strict=True)):
+            if not inside:
+                J = sim3.right_jacobian_inverse(r[i])  # the solution's covariance, seen from the measured similarity
+                C[i] = e.covariance + J @ P[i] @ J.T
+                continue
+            L = np.linalg.cholesky(e.covariance)
+            share = np.eye(7) - np.linalg.solve(L, np.linalg.solve(L, P[i]).T)
+            values, vectors = np.linalg.eigh(0.5 * (share + share.T))
+            back = vectors / np.maximum(values, LEAST_REDUNDANCY) @ vectors.T
+            C[i] = L @ back @ L.T
+            r[i] = L @ back @ np.linalg.solve(L, r[i])
+        return 0.5 * (C + C.transpose(0, 2, 1)), r
+
+    def _graduate(self, solution: Sim3Solution, tested: IntArray, covariances: FloatArray) -> BoolArray:
+        """Let graduated non-convexity decide about the tested edges, each as uncertain as its innovation."""
+        asked = list(self.edges)
+        for i, C in zip(tested.tolist(), covariances, strict=True):
+            asked[i] = replace(asked[i], covariance=C, doubtful=True)
+        priors = {self.problem.fixed: Sim3Prior(self.nodes[self.problem.fixed])}
+        return optimise_sim3(solution.S_world_node, asked, priors, robust=True).inliers
+
+
+def _root(parent: list[int], i: int) -> int:
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+def _join(parent: list[int], a: int, b: int) -> bool:
+    """Join two pieces; return whether they were two."""
+    a, b = _root(parent, a), _root(parent, b)
+    parent[max(a, b)] = min(a, b)
+    return a != b

@@ -1,0 +1,190 @@
+"""How well a submap's own factors know the similarity between two of its keyframes, without opening its graph.
+
+The graph of an archived submap is gone, and iSAM2 tells marginals of single poses against the gauge only: neither
+gives the covariance of a relative pose, and none has a scale, which drifts from keyframe to keyframe where no loop
+holds it. Made anew and asked for joint marginals, the graph of 150 keyframes would take seconds. Therefore the same
+projection factors, of the keyframes between the two and a few beside them, are linearised here as they stand in the
+arrays, their landmarks eliminated (Schur complement), and the pose and the unit of length at the first keyframe held.
+What is left is the covariance of the second keyframe's pose and unit. The unit at a keyframe is the mean logarithm of
+the depths of what it sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dualslam.backend.observability import MIN_DEPTH_MU
+from dualslam.core.errors import SolverError
+from dualslam.core.geometry import se3, so3
+from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.submap import Submap
+
+BESIDE = 3
+"""Keyframes beyond either end that are looked at: what the ends see of the way between hangs on them too."""
+LONGEST = 24
+"""Of more keyframes between two ends only those near the ends are looked at (an edge across what both of them see)."""
+LOOSE_ROTATION_RAD, LOOSE_TRANSLATION_MU = 0.3, 1.0
+"""Sigmas of a prior on each pose of the window: where its factors say nothing the answer is large, and not infinite."""
+UNIT_SIGMA = 1e-5
+"""With which the unit at the first keyframe is held."""
+
+
+def edge_covariances(
+    submap: Submap, pairs: Sequence[tuple[int, int]], robust_k: float, held: frozenset[int] = frozenset()
+) -> FloatArray:
+    """Return the covariances of similarities between keyframes of a submap.
+
+    Parameters
+    ----------
+    submap : Submap
+    pairs : sequence of (int, int)
+        Keyframe ids.
+    robust_k : float
+        Huber threshold in sigmas.
+    held : frozenset of int
+        Keyframes whose relative pose is no evidence.
+
+    Returns
+    -------
+    (E, 7, 7)
+        Of the right perturbation of ``S_first_second``: rotation, translation, log-scale, in the second keyframe's
+        frame and the submap's unit.
+
+    Raises
+    ------
+    SolverError
+        If a keyframe is not in the submap, or the answer is not finite.
+    """
+    for k in {k for pair in pairs for k in pair}:
+        if k not in submap.keyframes:
+            raise SolverError(f"keyframe {k} is not in submap {submap.id}: no covariance of an edge to it")
+    ids = np.array(sorted(submap.keyframes), np.int64)
+    covariances = np.array([_covariance(submap, ids, *pair, robust_k, held) for pair in pairs]).reshape(-1, 7, 7)
+    if not np.isfinite(covariances).all():
+        raise SolverError(f"submap {submap.id}: its factors give no covariance of some edges between keyframes")
+    return covariances
+
+
+def _window(ids: IntArray, first: int, second: int) -> IntArray:
+    a, b = sorted(np.searchsorted(ids, (first, second)).tolist())
+    if b - a <= LONGEST:
+        return ids[max(a - BESIDE, 0) : b + BESIDE + 1]
+    ends = [ids[max(i - BESIDE, 0) : i + BESIDE + 1] for i in (a, b)]
+    return np.asarray(np.union1d(*ends), np.int64)
+
+
+def _covariance(
+    submap: Submap, ids: IntArray, first: int, second: int, robust_k: float, held: frozenset[int]
+) -> FloatArray:
+    window = _window(ids, first, second)
+    n = len(window)
+    a, b = np.searchsorted(window, (first, second)).tolist()
+    kf, point, x_cam, J_pose, J_point = _linearise(submap, window, robust_k)
+    information = np.zeros((n, 6, n, 6))
+    loose = np.repeat([LOOSE_ROTATION_RAD**-2, LOOSE_TRANSLATION_MU**-2], 3)
+    information[np.arange(n), :, np.arange(n), :] = np.diag(loose)
+    own = np.zeros((n, 6, 6))
+    np.add.at(own, kf, np.einsum("rai,raj->rij", J_pose, J_pose))
+    information[np.arange(n), :, np.arange(n), :] += own
+    _add_relative_poses(information, submap, window, held)
+    n_points = int(point.max()) + 1 if len(point) else 0
+    H_points = np.zeros((n_points, 3, 3))
+    np.add.at(H_points, point, np.einsum("rai,raj->rij", J_point, J_point))
+    cross = np.zeros((n_points, n, 3, 6))  # one observation of a point in a keyframe at most
+    cross[point, kf] = np.einsum("rai,raj->rij", J_point, J_pose)
+    # How a point moves with the poses: dp = moves @ dc.
+    solved = np.linalg.solve(H_points[:, None], cross)
+    moves = np.asarray(-solved.transpose(0, 2, 1, 3).reshape(n_points, 3, 6 * n), np.float64)
+    flat = cross.transpose(0, 2, 1, 3).reshape(n_points * 3, 6 * n)
+    system = information.reshape(6 * n, 6 * n) + flat.T @ moves.reshape(n_points * 3, 6 * n)
+    R = submap.keyframe_poses(window)[:, :3, :3]
+    units = [_unit(c, kf, point, x_cam, R[c], moves, n) for c in (a, b)]
+    system += np.outer(units[0], units[0]) / UNIT_SIGMA**2
+    free = np.delete(np.arange(6 * n), np.arange(6 * a, 6 * a + 6))
+    read = np.zeros((7, 6 * n))
+    read[:6, 6 * b : 6 * b + 6] = np.eye(6)
+    read[6] = units[1]
+    system = 0.5 * (system + system.T)[np.ix_(free, free)]
+    try:
+        found = read[:, free] @ np.linalg.solve(system, read[:, free].T)
+    except np.linalg.LinAlgError as error:
+        raise SolverError(f"no covariance between keyframes {first} and {second} of submap {submap.id}") from error
+    return np.asarray(0.5 * (found + found.T), np.float64)
+
+
+def _linearise(
+    submap: Submap, window: IntArray, robust_k: float
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray]:
+    """Linearise the observations of landmarks with two views in the window.
+
+    Returns of each its keyframe's place there, its point, where that stands in the camera, and the whitened
+    derivatives by pose (right perturbation) and point.
+    """
+    rows = submap.rows_of_landmarks(submap.landmarks_of_keyframes(window))
+    kf = submap.observations["kf"][rows]
+    here = np.isin(kf, window)
+    rows, place = rows[here], np.searchsorted(window, kf[here])
+    landmark = submap.observations["landmark"][rows]
+    T = submap.keyframe_poses(window)
+    x = np.einsum("rji,rj->ri", T[place, :3, :3], submap.landmarks["xyz_mu"][landmark] - T[place, :3, 3])
+    front = x[:, 2] > MIN_DEPTH_MU
+    twice = np.bincount(landmark[front], minlength=len(submap.landmarks)) >= 2
+    kept = front & twice[landmark]
+    rows, place, landmark, x = rows[kept], place[kept], landmark[kept], x[kept]
+    uv, sigma = submap.observed_pixels(rows)
+    K, z = submap.K, x[:, 2]
+    residual = np.stack(
+        (
+            (K[0, 0] * x[:, 0] + K[0, 1] * x[:, 1]) / z + K[0, 2] - uv[:, 0],
+            K[1, 1] * x[:, 1] / z + K[1, 2] - uv[:, 1],
+        ),
+        1,
+    )
+    size = np.linalg.norm(residual, axis=1) / sigma
+    weight = np.sqrt(np.minimum(1.0, robust_k / np.maximum(size, 1e-9))) / sigma
+    J = np.zeros((len(x), 2, 3))
+    J[:, 0, 0], J[:, 0, 1] = K[0, 0] / z, K[0, 1] / z
+    J[:, 0, 2] = -(K[0, 0] * x[:, 0] + K[0, 1] * x[:, 1]) / (z * z)
+    J[:, 1, 1], J[:, 1, 2] = K[1, 1] / z, -K[1, 1] * x[:, 1] / (z * z)
+    J *= weight[:, None, None]
+    J_pose = np.concatenate((J @ so3.hat(x), -J), axis=2)  # T exp(xi) takes the point to x + hat(x) w - u
+    _, point = np.unique(landmark, return_inverse=True)
+    H = np.zeros((int(point.max()) + 1 if len(point) else 0, 3, 3))
+    J_point = J @ T[place, :3, :3].transpose(0, 2, 1)
+    np.add.at(H, point, np.einsum("rai,raj->rij", J_point, J_point))
+    # Points that hardly have a depth are left out: their share of the matrix would be noise.
+    certain = np.linalg.cond(H)[point] < 1e10 if len(H) else np.zeros(0, bool)
+    _, point = np.unique(point[certain], return_inverse=True)
+    return place[certain], point, x[certain], J_pose[certain], J_point[certain]
+
+
+def _unit(
+    c: int, kf: IntArray, point: IntArray, x_cam: FloatArray, R: FloatArray, moves: FloatArray, n: int
+) -> FloatArray:
+    """Return the derivative (6 n,) of the mean log-depth of what keyframe `c` of the window sees, by all poses."""
+    seen = np.flatnonzero(kf == c)
+    derivative = np.zeros(6 * n)
+    if not len(seen):
+        return derivative
+    x = x_cam[seen]
+    derivative += (np.einsum("r,i,rij->j", 1 / x[:, 2], R[:, 2], moves[point[seen]])) / len(seen)
+    own = np.concatenate((so3.hat(x)[:, 2], np.broadcast_to([0.0, 0.0, -1.0], x.shape)), axis=1)
+    derivative[6 * c : 6 * c + 6] += (own / x[:, 2:]).mean(0)
+    return derivative
+
+
+def _add_relative_poses(information: FloatArray, submap: Submap, window: IntArray, held: frozenset[int]) -> None:
+    """Add what another front end says of keyframes across a gap relocalisation."""
+    place = {k: i for i, k in enumerate(window.tolist())}
+    for k, known in submap.relative_poses.items():
+        if k in held or k not in place or known.keyframe_id not in place:
+            continue
+        i, j = place[known.keyframe_id], place[k]
+        T_k_ref = se3.inverse(submap.T_submap_kf[k]) @ submap.T_submap_kf[known.keyframe_id]
+        W, Ad = np.linalg.inv(known.covariance), se3.adjoint(T_k_ref)
+        information[j, :, j, :] += W
+        information[i, :, i, :] += Ad.T @ W @ Ad
+        information[i, :, j, :] -= Ad.T @ W
+        information[j, :, i, :] -= W @ Ad

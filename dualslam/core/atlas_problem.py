@@ -1,0 +1,120 @@
+"""The atlas as a solver sees it: keyframes of several submaps, and what is known of the similarities between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from dualslam.core.types import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from dualslam.map.submap import Submap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AtlasEdge:
+    """A measured similarity between two keyframes, each in its own submap's unit of length.
+
+    Attributes
+    ----------
+    first, second : int
+        Rows of `AtlasProblem.S_world_node`.
+    S_first_second : (4, 4)
+        ``[[s R, t], [0, 1]]``, takes coordinates in the second keyframe to the first.
+    covariance : (7, 7)
+        Of the right perturbation ``S_first_second @ exp(xi)``: rotation, translation, log-scale, in the second
+        keyframe's frame and unit.
+    kind : str
+        ``within`` a submap, or the kind of the connection.
+    doubtful : bool
+        Where true, and where others contradict it, it may be rejected.
+    known : bool
+        Whether an earlier solution has believed it.
+    """
+
+    first: int
+    second: int
+    S_first_second: FloatArray
+    covariance: FloatArray
+    kind: str
+    doubtful: bool = False
+    known: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AtlasProblem:
+    """A connected piece of the atlas; plain arrays, so that it can be solved in another process.
+
+    Attributes
+    ----------
+    S_world_node : (N, 4, 4)
+        Initial similarities: keyframe, in its submap's unit, to world.
+    fixed : int
+        The node that stays where it is: the gauge.
+    edges : tuple of AtlasEdge
+        Connections in the order in which they arrived.
+    """
+
+    S_world_node: FloatArray
+    fixed: int
+    edges: tuple[AtlasEdge, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AtlasSolution:
+    """The optimum of an `AtlasProblem`.
+
+    Attributes
+    ----------
+    S_world_node : (N, 4, 4)
+    believed : (E,) bool
+        False for doubtful edges that were rejected.
+    chi2 : (E,) float64
+        Of each doubtful edge against all others that are believed (7 degrees of freedom); NaN where nothing else ties
+        its ends, or it is not doubtful.
+    cost_before, cost_after : float
+        Half the sum of squared whitened residuals of the believed edges.
+    """
+
+    S_world_node: FloatArray
+    believed: BoolArray
+    chi2: FloatArray
+    cost_before: float
+    cost_after: float
+
+
+class AtlasSolver(Protocol):
+    """Solves graphs over Sim(3), and knows what a submap's own factors say about its inner similarities."""
+
+    def solve(self, problem: AtlasProblem) -> AtlasSolution:
+        """Find the similarities that agree best with the edges, without those that are wrong.
+
+        Raises
+        ------
+        SolverError
+        """
+        ...
+
+    def relative_covariance(self, problem: AtlasProblem, first: int, second: int) -> FloatArray:
+        """Return the (7, 7) covariance of ``inv(S_world_first) @ S_world_second`` (right perturbation), as solved.
+
+        Raises
+        ------
+        SolverError
+            Also where nothing ties the two.
+        """
+        ...
+
+    def edge_covariances(
+        self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int] = frozenset()
+    ) -> FloatArray:
+        """Return (E, 7, 7) covariances of the similarities between pairs of a submap's keyframes, as its factors say.
+
+        `held`: keyframes whose `Submap.relative_poses` hold an earlier bend, and are no evidence.
+
+        Raises
+        ------
+        SolverError
+        """
+        ...

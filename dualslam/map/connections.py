@@ -1,0 +1,398 @@
+"""The one way in which maps are joined and moved: connections come in, the atlas is solved, every submap follows.
+
+All that a solution moves is moved in one go: keyframes, landmarks, culled keyframes, frames, links with their
+covariances, the live front end. Graphs are not: they follow the arrays, and are made anew when they are asked next.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+
+from dualslam.core.atlas_problem import AtlasEdge, AtlasSolution, AtlasSolver
+from dualslam.core.errors import SolverError
+from dualslam.core.events import EventKind
+from dualslam.core.geometry import sim3
+from dualslam.core.interfaces import SubmapGraph, VisualOdometry
+from dualslam.core.types import Failure, FailureReason, FloatArray
+from dualslam.map.atlas import Atlas, Link, joined
+from dualslam.map.bending import Move, bend_frames, bend_link, bend_submap, hold
+from dualslam.map.propagation import propagate_anchors, propagate_poses
+from dualslam.map.record import FrameStamp, Record
+from dualslam.map.skeleton import EdgeCovariances, Skeleton, build_skeleton
+from dualslam.map.submap import Submap
+from dualslam.map.warp import Warp
+from dualslam.recovery.merge import propagate_links
+
+log = logging.getLogger(__name__)
+
+STILL = 1e-6
+"""Bends up to this (radians, share of scale, submap units: a thousandth of a pixel) are none: the arrays stay as they
+are, to the bit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AtlasReport:
+    """What a solution of the atlas did.
+
+    Attributes
+    ----------
+    rejected : tuple of Link
+        All that are rejected now, in the linked sets that were solved.
+    newly_rejected, readmitted : tuple of Link
+    factors : dict of str to int
+        Edges by kind, rejected ones left out.
+    cost_before, cost_after : float
+        Half the sum of squared whitened residuals.
+    bent : dict of int to float
+        By submap: farthest move of a keyframe within its submap's frame, in the submap's unit; those that moved.
+    placed : dict of int to float
+        By submap: how far its frame's keyframe went in the world.
+    seconds : float
+    failure : Failure, optional
+        The solver's: nothing has changed.
+    """
+
+    rejected: tuple[Link, ...] = ()
+    newly_rejected: tuple[Link, ...] = ()
+    readmitted: tuple[Link, ...] = ()
+    factors: dict[str, int] = field(default_factory=dict)
+    cost_before: float = 0.0
+    cost_after: float = 0.0
+    bent: dict[int, float] = field(default_factory=dict)
+    placed: dict[int, float] = field(default_factory=dict)
+    seconds: float = 0.0
+    failure: Failure | None = None
+
+    def __bool__(self) -> bool:
+        """Whether there is a solution."""
+        return self.failure is None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinkVerdict:
+    """What the atlas would say of a connection.
+
+    Attributes
+    ----------
+    accepted : bool
+    redundant : bool
+        Whether anything else ties its ends; else nothing can contradict it.
+    chi2 : float
+        Against all others (7 degrees of freedom); NaN where it is not redundant.
+    """
+
+    accepted: bool
+    redundant: bool
+    chi2: float
+
+
+class Connections:
+    """Joins submaps, solves the atlas, and lets everything follow.
+
+    Parameters
+    ----------
+    record : Record
+    solver : AtlasSolver
+    new_graph : callable
+        Makes an empty graph, for a front end whose submap has been bent.
+    front_ends : callable
+        Gives those that go on, or may go on, in a submap of the atlas.
+    """
+
+    def __init__(
+        self,
+        record: Record,
+        solver: AtlasSolver,
+        new_graph: Callable[[], SubmapGraph],
+        front_ends: Callable[[], Iterable[VisualOdometry]] = tuple,
+    ) -> None:
+        self._record = record
+        self._solver = solver
+        self._new_graph = new_graph
+        self._front_ends = front_ends
+        self._covariances = EdgeCovariances(solver.edge_covariances)
+
+    @property
+    def _atlas(self) -> Atlas:
+        return self._record.atlas
+
+    # --- what others ask for
+
+    def connect(self, links: Sequence[Link], now: FrameStamp) -> AtlasReport:
+        """Take connections in, solve what they join, and move all that the solution moves.
+
+        Parameters
+        ----------
+        links : sequence of Link
+        now : FrameStamp
+            For the event log.
+
+        Returns
+        -------
+        AtlasReport
+            Falsy where the solver failed: the connections are not taken in then.
+        """
+        touched = {m for link in links for m in (link.a, link.b)}
+        return self._solve(touched, links, now)
+
+    def follow(self, before: Submap, after: Submap, now: FrameStamp) -> None:
+        """Let all that is known against a submap follow a change that its own graph has made.
+
+        Frames, culled keyframes and links go along; where the submap lies on a cycle the atlas is solved again.
+
+        Parameters
+        ----------
+        before, after : Submap
+            Two states of it; `after` is the one in the atlas.
+        now : FrameStamp
+            For the event log.
+        """
+        for pose in propagate_poses(self._record.poses.values(), before, after):
+            self._record.poses[pose.index] = pose
+        propagate_anchors(before, after)
+        propagate_links(self._atlas, before, after)
+        if after.id in self._atlas.placement:
+            self._solve({after.id}, (), now)
+
+    def settle(self, now: FrameStamp) -> None:
+        """Solve all sets with cycles once more, as their submaps are by now."""
+        for component in self._atlas.components():
+            if component[0] in self._atlas.placement:
+                self._solve(set(component), (), now)
+
+    def judge(self, link: Link) -> LinkVerdict | Failure:
+        """Return what `connect` would say of a connection; nothing is changed."""
+        try:
+            skeleton = self._skeleton({link.a, link.b}, (link,))
+            if skeleton.is_tree:
+                return LinkVerdict(True, False, float("nan"))
+            solution = self._solver.solve(skeleton.problem)
+        except SolverError as error:
+            return Failure(FailureReason.SOLVER, str(error))
+        chi2 = float(solution.chi2[-1])
+        return LinkVerdict(bool(solution.believed[-1]), bool(np.isfinite(chi2)), chi2)
+
+    def relative(self, a: tuple[int, int], b: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+        """Return ``S_ka_kb`` between two keyframes, each a submap and an id there, and its (7, 7) covariance.
+
+        It goes through the whole atlas, by connections that are believed, also across submaps.
+
+        Raises
+        ------
+        SolverError
+            If the two are not connected, or the solver cannot tell.
+        """
+        component = next(c for c in self._atlas.components() if a[0] in c)
+        if b[0] not in component:
+            raise SolverError(f"submaps {a[0]} and {b[0]} are not connected: keyframes in them have no relative pose")
+        links = [link for link in self._atlas.believed if link.a in component]
+        more = {m: {k for n, k in (a, b) if n == m} for m in (a[0], b[0])}
+        skeleton = build_skeleton(self._atlas, component, links, self._covariances, lambda link: True, more, True)
+        first, second = (skeleton.nodes.index(node) for node in (a, b))
+        S = skeleton.problem.S_world_node
+        return sim3.inverse(S[first]) @ S[second], self._solver.relative_covariance(skeleton.problem, first, second)
+
+    # --- solving
+
+    def _skeleton(self, touched: set[int], new: Sequence[Link]) -> Skeleton:
+        """Make the problem of the linked set that new connections make of what they touch."""
+        links = [*self._atlas.links, *new]
+        component = next(c for c in joined(self._atlas.submaps, links) if touched & set(c))
+        within = [link for link in links if link.a in component]
+        fresh = set(map(id, new))
+        return build_skeleton(
+            self._atlas,
+            component,
+            within,
+            self._covariances,
+            lambda link: id(link) not in fresh and not link.rejected,
+        )
+
+    def _solve(self, touched: set[int], new: Sequence[Link], now: FrameStamp) -> AtlasReport:
+        started = time.perf_counter()
+        solved: list[_Solved] = []
+        try:
+            while touched:
+                skeleton = self._skeleton(touched, [link for link in new if link.a in touched])
+                solution = self._solver.solve(skeleton.problem)
+                moves: list[Move] | None = None
+                if not new or not _changes_nothing(skeleton, solution, new):
+                    moves = [] if skeleton.is_tree else _moves(self._atlas, skeleton, solution)
+                bent = [move.submap_id for move in moves or () if move.bent]
+                holds = {m: self._to_hold(skeleton, m) for m in bent}
+                solved.append(_Solved(skeleton, solution, moves, holds))
+                touched = touched - set(skeleton.component)
+        except SolverError as error:
+            log.warning("the atlas stays as it is: %s", error)
+            return AtlasReport(failure=Failure(FailureReason.SOLVER, str(error)))
+        self._atlas.links.extend(new)
+        report = replace(_together([self._apply(s) for s in solved]), seconds=time.perf_counter() - started)
+        self._tell(report, solved, now)
+        return report
+
+    def _to_hold(self, skeleton: Skeleton, submap_id: int) -> tuple[list[int], FloatArray]:
+        """Return the knots that are to hold a submap's bend, and what its own factors say from one to the next."""
+        _, knots = skeleton.knots(submap_id)
+        pairs = list(pairwise(knots))
+        held = self._atlas.held.get(submap_id, frozenset())
+        return knots, self._covariances(self._atlas.submaps[submap_id], pairs, held)
+
+    # --- the transaction
+
+    def _apply(self, solved: _Solved) -> AtlasReport:
+        """Move all that a solution moves. Whatever can fail has been done before."""
+        atlas, skeleton = self._atlas, solved.skeleton
+        ends = {id(link): link.attached(atlas) for link in skeleton.links}
+        moves = solved.moves or []
+        warps = {move.submap_id: move.warp for move in moves if move.bent}
+        befores = {m: atlas.submaps[m].copy() for m in warps}
+        for m, warp in warps.items():
+            submap = atlas.submaps[m]
+            bend_submap(submap, warp)
+            for pose in bend_frames(self._record.poses.values(), befores[m], submap, warp):
+                self._record.poses[pose.index] = pose
+            atlas.warps[m] = warp.after(atlas.warps[m]) if m in atlas.warps else warp
+            atlas.held[m] = hold(submap, *solved.holds[m], atlas.held.get(m, frozenset()))
+            self._covariances.bent(submap, warp)
+        if solved.moves is not None:
+            for m in skeleton.component:
+                atlas.placement.pop(m, None)
+            atlas.placement |= {move.submap_id: move.S_world_submap for move in moves}
+        believed = dict(zip(map(id, skeleton.links), solved.believed, strict=True))
+        changed: dict[bool, list[Link]] = {True: [], False: []}
+        for i, link in enumerate(atlas.links):
+            if id(link) not in believed:
+                continue
+            kept = believed[id(link)]
+            atlas.links[i] = replace(bend_link(link, ends[id(link)], warps), rejected=not kept)
+            if kept == link.rejected:
+                changed[kept].append(atlas.links[i])
+        for front_end in self._front_ends():
+            if front_end.submap.id in befores:
+                front_end.adopt(self._new_graph(), befores[front_end.submap.id])
+        return AtlasReport(
+            rejected=tuple(k for k in atlas.links if k.rejected and k.a in skeleton.component),
+            newly_rejected=tuple(changed[False]),
+            readmitted=tuple(changed[True]),
+            factors=count_kinds(e for e, kept in zip(solved.edges, solved.solution.believed, strict=True) if kept),
+            cost_before=solved.solution.cost_before,
+            cost_after=solved.solution.cost_after,
+            bent={move.submap_id: move.bend_mu for move in moves if move.bent},
+            placed=_placed(skeleton, solved.solution) if solved.moves is not None else {},
+        )
+
+    def _tell(self, report: AtlasReport, solved: Sequence[_Solved], now: FrameStamp) -> None:
+        self._record.event(
+            EventKind.ATLAS_SOLVED,
+            now,
+            solved[0].skeleton.component[0],
+            submaps=[m for each in solved for m in each.skeleton.component],
+            factors=report.factors,
+            cost_before=report.cost_before,
+            cost_after=report.cost_after,
+            rejected=[{"submap": link.b, **_named(link)} for link in report.rejected],
+            bent={str(m): bend for m, bend in report.bent.items()},
+            largest_bend=max(report.bent.values(), default=0.0),
+            largest_move=max(report.placed.values(), default=0.0),
+            seconds=report.seconds,
+        )
+        for kind, links in (
+            (EventKind.CONNECTION_REJECTED, report.newly_rejected),
+            (EventKind.CONNECTION_READMITTED, report.readmitted),
+        ):
+            for link in links:
+                self._record.event(kind, now, link.b, **_named(link))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solved:
+    """A linked set with its solution, what that moves (None: all stays), and what is to hold the bends."""
+
+    skeleton: Skeleton
+    solution: AtlasSolution
+    moves: list[Move] | None
+    holds: dict[int, tuple[list[int], FloatArray]]
+
+    @property
+    def edges(self) -> tuple[AtlasEdge, ...]:
+        return self.skeleton.problem.edges
+
+    @property
+    def believed(self) -> list[bool]:
+        """Of the connections, which are the last edges."""
+        n = len(self.skeleton.links)
+        return [bool(kept) for kept in self.solution.believed[len(self.edges) - n :]]
+
+
+def _changes_nothing(skeleton: Skeleton, solution: AtlasSolution, new: Sequence[Link]) -> bool:
+    """Whether all that is new was rejected, and what was there before is believed as before."""
+    fresh = set(map(id, new))
+    n = len(skeleton.links)
+    for link, kept in zip(skeleton.links, solution.believed[len(solution.believed) - n :].tolist(), strict=True):
+        if kept == (link.rejected or id(link) in fresh):
+            return False
+    return True
+
+
+def _moves(atlas: Atlas, skeleton: Skeleton, solution: AtlasSolution) -> list[Move]:
+    """Return what a solution does to each submap, whose frame stays with the keyframe of its gauge."""
+    moves = []
+    for m in skeleton.component:
+        submap = atlas.submaps[m]
+        rows, knots = skeleton.knots(m)
+        T = submap.keyframe_poses(knots)
+        at = skeleton.reference[m]
+        S_world_submap = solution.S_world_node[at] @ sim3.inverse(submap.T_submap_kf[skeleton.nodes[at][1]])
+        S = sim3.inverse(S_world_submap) @ solution.S_world_node[rows] @ sim3.inverse(T)
+        bent = bool(np.abs(sim3.log(S)).max() > STILL)
+        warp = Warp(np.array(knots, np.int64), sim3.normalise(S))
+        centres = T[:, :3, 3]
+        bend_mu = float(np.linalg.norm(sim3.act_each(S, centres) - centres, axis=1).max())
+        moves.append(Move(m, warp, S_world_submap, bend_mu, bent))
+    return moves
+
+
+def _placed(skeleton: Skeleton, solution: AtlasSolution) -> dict[int, float]:
+    gone = np.linalg.norm(solution.S_world_node[:, :3, 3] - skeleton.problem.S_world_node[:, :3, 3], axis=1)
+    return {m: float(gone[row]) for m, row in skeleton.reference.items()}
+
+
+def _together(reports: Sequence[AtlasReport]) -> AtlasReport:
+    factors: dict[str, int] = {}
+    for report in reports:
+        for kind, n in report.factors.items():
+            factors[kind] = factors.get(kind, 0) + n
+    return AtlasReport(
+        rejected=tuple(link for r in reports for link in r.rejected),
+        newly_rejected=tuple(link for r in reports for link in r.newly_rejected),
+        readmitted=tuple(link for r in reports for link in r.readmitted),
+        factors=factors,
+        cost_before=sum(r.cost_before for r in reports),
+        cost_after=sum(r.cost_after for r in reports),
+        bent={m: bend for r in reports for m, bend in r.bent.items()},
+        placed={m: gone for r in reports for m, gone in r.placed.items()},
+    )
+
+
+def count_kinds(edges: Iterable[AtlasEdge]) -> dict[str, int]:
+    """Return how many edges there are of each kind, in the order of their first."""
+    counts: dict[str, int] = {}
+    for e in edges:
+        counts[e.kind] = counts.get(e.kind, 0) + 1
+    return counts
+
+
+def _named(link: Link) -> dict[str, object]:
+    """A connection as the event log names it."""
+    return {
+        "connection": str(link.kind),
+        "other_submap": link.a,
+        "keyframe": link.keyframe_b,
+        "other_keyframe": link.keyframe_a,
+    }

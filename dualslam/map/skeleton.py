@@ -1,0 +1,234 @@
+"""The atlas as a graph over Sim(3): a sparse skeleton of each submap's keyframes, and the connections between them.
+
+Each tenth keyframe of a submap is a node, those at which connections are attached, and those of its gauge. Neighbours
+along the frames are tied by what the submap itself says of them, and so are places between which many landmarks are
+shared: where a camera looks at the same desk all the time, the map is stiff. What earlier solutions have bent is taken
+out of these measurements (`Atlas.warps`): a bend is no evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dualslam.core.atlas_problem import AtlasEdge, AtlasProblem
+from dualslam.core.geometry import sim3
+from dualslam.core.types import FloatArray
+from dualslam.map.atlas import Atlas, Link, joined
+from dualslam.map.submap import Submap
+from dualslam.map.warp import Warp
+
+WITHIN = "within"
+"""The kind of an edge between keyframes of one submap."""
+STRIDE = 10
+"""Keyframes from one node to the next."""
+MIN_SHARED, MAX_ACROSS = 30, 2
+"""Landmarks that two nodes which are no neighbours share at least to be tied; so many such ties a node looks for."""
+DRIFT = 3.0
+"""Measured errors of a submap's inner similarities over what its factors say of them; see `docs/results.md`."""
+
+Node = tuple[int, int]
+"""Submap and keyframe."""
+Covariances = Callable[[Submap, Sequence[tuple[int, int]], frozenset[int]], FloatArray]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Skeleton:
+    """A connected piece of the atlas as a problem, and what its rows stand for.
+
+    Attributes
+    ----------
+    component : list of int
+        Submaps, ascending.
+    problem : AtlasProblem
+    nodes : list of (int, int)
+        Submap and keyframe of each row.
+    reference : dict of int to int
+        For each submap the row of the keyframe that its frame goes by.
+    links : list of Link
+        Those of its edges that are connections, in order; the last edges of the problem.
+    is_tree : bool
+        Whether there is one way only between any two of its submaps, and none was ever bent: nothing to optimise.
+    """
+
+    component: list[int]
+    problem: AtlasProblem
+    nodes: list[Node]
+    reference: dict[int, int]
+    links: list[Link]
+    is_tree: bool
+
+    def knots(self, submap_id: int) -> tuple[list[int], list[int]]:
+        """Return rows and keyframes of a submap's nodes, ascending."""
+        rows = [row for row, (m, _) in enumerate(self.nodes) if m == submap_id]
+        return rows, [self.nodes[row][1] for row in rows]
+
+
+@dataclass(slots=True, eq=False)
+class EdgeCovariances:
+    """Covariances of edges within submaps, remembered as long as the edge's keyframes stand where they stood.
+
+    `compute`: gives them from a submap's factors.
+    """
+
+    compute: Covariances
+    _known: dict[tuple[int, int, int], tuple[bytes, FloatArray]] = field(default_factory=dict)
+
+    def __call__(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
+        """Return (E, 7, 7)."""
+        state = {pair: _state(submap, pair) for pair in pairs}
+        new = [p for p in pairs if self._known.get((submap.id, *p), (b"", None))[0] != state[p]]
+        if new:
+            for pair, C in zip(new, self.compute(submap, new, held), strict=True):
+                self._known[(submap.id, *pair)] = state[pair], C
+        return np.array([self._known[(submap.id, *pair)][1] for pair in pairs]).reshape(-1, 7, 7)
+
+    def bent(self, submap: Submap, warp: Warp) -> None:
+        """Take in that a submap stands otherwise by a solution of the atlas: its own factors say what they said."""
+        for (m, first, second), (_, C) in list(self._known.items()):
+            if m != submap.id:
+                continue
+            if first not in submap.keyframes or second not in submap.keyframes:
+                del self._known[m, first, second]
+                continue
+            units = np.ones(7)
+            units[3:6] = sim3.scale(warp.at([second])[0])
+            self._known[m, first, second] = _state(submap, (first, second)), units[:, None] * C * units
+
+
+def _state(submap: Submap, pair: tuple[int, int]) -> bytes:
+    return b"".join(submap.T_submap_kf[k].tobytes() for k in pair)
+
+
+def build_skeleton(
+    atlas: Atlas,
+    component: list[int],
+    links: Sequence[Link],
+    covariances: Covariances,
+    known: Callable[[Link], bool],
+    more_nodes: Mapping[int, set[int]] | None = None,
+    with_covariances: bool = False,
+) -> Skeleton:
+    """Make the problem of a linked set of submaps.
+
+    Parameters
+    ----------
+    atlas : Atlas
+    component : list of int
+        Submaps that `links` join.
+    links : sequence of Link
+        All between them, also those that are rejected so far, in the order in which they arrived.
+    covariances : callable
+        See `EdgeCovariances`.
+    known : callable
+        Whether an earlier solution has believed a link.
+    more_nodes : mapping of int to set of int, optional
+        Keyframes, by submap, that are to be nodes besides.
+    with_covariances : bool
+        Ask for them also where there is nothing to optimise.
+    """
+    wanted: dict[int, set[int]] = {m: set((more_nodes or {}).get(m, set())) for m in component}
+    for link in links:
+        if not link.rejected:
+            k_a, k_b = link.attached(atlas)
+            wanted[link.a].add(k_a)
+            wanted[link.b].add(k_b)
+    knots_of = {m: _knots(atlas.submaps[m], wanted[m]) for m in component}
+    S_world_submap = _initial(atlas, component, links)
+    is_tree = len(links) < len(component) and not any(m in atlas.warps for m in component)
+    nodes: list[Node] = []
+    S_world_node: list[FloatArray] = []
+    edges: list[AtlasEdge] = []
+    reference: dict[int, int] = {}
+    for m in component:
+        submap = atlas.submaps[m]
+        knots = knots_of[m]
+        first = len(nodes)
+        reference[m] = first + knots.index(_reference(submap))
+        nodes += [(m, k) for k in knots]
+        T = submap.keyframe_poses(knots)
+        S_world_node += list(S_world_submap[m] @ T)
+        edges += _within(atlas, submap, knots, first, None if is_tree and not with_covariances else covariances)
+    row = {node: i for i, node in enumerate(nodes)}
+    for link in links:
+        k_a, k_b = link.attached(atlas)
+        if link.rejected:  # it is asked again, but adds no node: what does not count changes nothing
+            k_a, k_b = _nearest(knots_of[link.a], k_a), _nearest(knots_of[link.b], k_b)
+        edges.append(_across(atlas, link, k_a, k_b, row, known(link)))
+    problem = AtlasProblem(np.array(S_world_node), reference[component[0]], tuple(edges))
+    return Skeleton(component, problem, nodes, reference, list(links), is_tree)
+
+
+def _initial(atlas: Atlas, component: list[int], links: Sequence[Link]) -> dict[int, FloatArray]:
+    """Return where each submap stands, links that are new followed too."""
+    trial = Atlas()
+    trial.submaps = {m: atlas.submaps[m] for m in component}
+    home = joined(component, [link for link in links if not link.rejected and link in atlas.links])[0]
+    trial.placement = {m: atlas.placement[m] for m in home if m in atlas.placement}
+    trial.links = [link for link in links if not link.rejected]
+    return trial.S_world_submap(component)
+
+
+def _knots(submap: Submap, wanted: set[int]) -> list[int]:
+    ids = sorted(submap.keyframes)
+    return sorted({*ids[::STRIDE], ids[-1], _reference(submap), *wanted})
+
+
+def _nearest(knots: list[int], k: int) -> int:
+    return min(knots, key=lambda knot: (abs(knot - k), knot))
+
+
+def _reference(submap: Submap) -> int:
+    """Return the keyframe that a submap's frame goes by: the first of its gauge."""
+    k = submap.gauge[0]
+    while k not in submap.keyframes and k in submap.anchors:
+        k = submap.anchors[k].keyframe_id
+    return k if k in submap.keyframes else min(submap.keyframes)
+
+
+def _within(
+    atlas: Atlas, submap: Submap, knots: list[int], first: int, covariances: Covariances | None
+) -> list[AtlasEdge]:
+    """Tie a submap's nodes to each other, as it says itself."""
+    places = [(i, i + 1) for i in range(len(knots) - 1)] + ([] if covariances is None else _across_knots(submap, knots))
+    pairs = [(knots[i], knots[j]) for i, j in places]
+    if covariances is None:  # in a tree no edge pulls at another, whatever they are
+        C = np.broadcast_to(np.eye(7), (len(pairs), 7, 7))
+    else:
+        C = DRIFT**2 * covariances(submap, pairs, atlas.held.get(submap.id, frozenset()))
+    S = submap.keyframe_poses(knots)
+    if submap.id in atlas.warps:
+        S = sim3.inverse(atlas.warps[submap.id].at(knots)) @ S
+    edges = []
+    for (i, j), covariance in zip(places, C, strict=True):
+        S_i_j = sim3.inverse(S[i]) @ S[j]
+        edges.append(AtlasEdge(first + i, first + j, S_i_j, covariance, WITHIN))
+    return edges
+
+
+def _across_knots(submap: Submap, knots: list[int]) -> list[tuple[int, int]]:
+    """Return pairs of nodes that are no neighbours and yet see the same landmarks."""
+    sees = np.zeros((len(knots), len(submap.landmarks)), np.float32)
+    for i, k in enumerate(knots):
+        ids = submap.landmark_of[k]
+        sees[i, ids[ids >= 0]] = 1
+    shared = sees @ sees.T
+    place = np.arange(len(knots))
+    shared[np.abs(place[:, None] - place) <= 1] = 0
+    found: set[tuple[int, int]] = set()
+    for i, row in enumerate(shared):
+        best = np.argsort(-row, kind="stable")[:MAX_ACROSS]
+        found |= {(min(i, j), max(i, j)) for j in best[row[best] >= MIN_SHARED].tolist()}
+    return sorted(found)
+
+
+def _across(atlas: Atlas, link: Link, k_a: int, k_b: int, row: dict[Node, int], known: bool) -> AtlasEdge:
+    """Make the factor of a connection."""
+    T_a, T_b = atlas.submaps[link.a].T_submap_kf[k_a], atlas.submaps[link.b].T_submap_kf[k_b]
+    S_ka_kb = sim3.inverse(T_a) @ link.S_a_b @ T_b
+    Ad = sim3.adjoint(sim3.inverse(T_b))
+    C = Ad @ link.covariance @ Ad.T
+    first, second = row[link.a, k_a], row[link.b, k_b]
+    return AtlasEdge(first, second, S_ka_kb, 0.5 * (C + C.T), str(link.kind), link.doubtful, known)
