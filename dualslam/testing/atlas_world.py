@@ -1,4 +1,4 @@
-"""A camera that drives round a square of houses: submaps of it that have drifted as monocular ones do, with the truth."""
+"""A camera that drives round in a circle: submaps of it that drift as monocular ones do, with the truth."""
 
 from __future__ import annotations
 
