@@ -24,7 +24,10 @@ from dualslam.map.tables import Table
 Arrays = Mapping[str, NDArray[Any]]
 
 METADATA = "map.json"
-SUBMAP_FORMAT = 2
+MAP_FORMAT = 2
+"""Of what `save_map` writes; 1, without connections that can be bent, is read as well."""
+SUBMAP_FORMAT = 3
+"""Of a submap's arrays; 2, in which nothing was condemned, is read as well."""
 _FEATURE_FIELDS = tuple(f.name for f in fields(Features))
 
 
@@ -67,7 +70,7 @@ def save_map(folder: str | Path, arrays: Mapping[str, Arrays], metadata: Mapping
     folder = Path(folder)
     for group, content in arrays.items():
         save_arrays(folder / f"{group}.npz", content)
-    document = {"format": 1, "groups": sorted(arrays), "metadata": to_plain(metadata)}
+    document = {"format": MAP_FORMAT, "groups": sorted(arrays), "metadata": to_plain(metadata)}
     write_text(folder / METADATA, json.dumps(document, indent=2, allow_nan=False) + "\n")
 
 
@@ -84,11 +87,14 @@ def load_metadata(folder: str | Path) -> tuple[list[str], dict[str, Any]]:
     text = read_text(path)
     try:
         document = json.loads(text)
+        version = int(document.get("format", 1))
         groups, metadata = list(document["groups"]), dict(document["metadata"])
         if not all(isinstance(group, str) for group in groups):
             raise TypeError("a group is named by a word")
     except (KeyError, TypeError, ValueError):
         raise InputError(f"{path} is not the metadata of a map, or is damaged.") from None
+    if version > MAP_FORMAT:
+        raise InputError(f"{path} is of format {version}, newer than this version of dualslam reads ({MAP_FORMAT}).")
     return groups, metadata
 
 
@@ -121,6 +127,7 @@ def submap_to_arrays(submap: Submap) -> dict[str, NDArray[Any]]:
         "id": np.array(submap.id),
         "K": submap.K,
         "gauge": np.array(submap.gauge, np.int64),
+        "condemned": np.array(sorted(submap.condemned), np.int64),
         "kf_id": np.array(ids, np.int64),
         "kf_timestamp_s": np.array([kf.timestamp_s for kf in keyframes], np.float64),
         "kf_T_submap_kf": submap.keyframe_poses(ids),
@@ -149,12 +156,16 @@ def submap_from_arrays(arrays: Arrays) -> Submap:
     KeyError, ValueError
         If an array is missing or of another shape.
     """
-    if int(arrays["format"]) != SUBMAP_FORMAT:
-        raise ValueError(f"format {int(arrays['format'])} where {SUBMAP_FORMAT} is due")
+    version = int(arrays["format"])
+    if version not in (SUBMAP_FORMAT - 1, SUBMAP_FORMAT):
+        raise ValueError(f"format {version} where {SUBMAP_FORMAT} is due")
     landmarks, observations = _group(arrays, "landmarks_"), _group(arrays, "observations_")
+    if version < SUBMAP_FORMAT:
+        landmarks["condemned"] = np.zeros(len(landmarks["alive"]), bool)
     descriptors = landmarks["descriptor"]
     submap = Submap(int(arrays["id"]), arrays["K"], np.zeros(descriptors.shape[1:], descriptors.dtype))
     submap.gauge = (int(arrays["gauge"][0]), int(arrays["gauge"][1]))
+    submap.condemned = set(arrays["condemned"].tolist()) if version == SUBMAP_FORMAT else set()
     ends = np.cumsum(arrays["kf_n_features"]).tolist()
     features = _group(arrays, "features_")
     rows = zip([0, *ends[:-1]], ends, arrays["kf_id"].tolist(), arrays["kf_timestamp_s"].tolist(), strict=False)

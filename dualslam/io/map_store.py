@@ -21,11 +21,13 @@ from dualslam.io.map_files import (
     submap_to_arrays,
 )
 from dualslam.io.run_folder import MAP
-from dualslam.map.atlas import Atlas, Link, LinkKind
+from dualslam.map.atlas import ROLLOVER_SIGMAS, Atlas, Link, LinkKind
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
+from dualslam.map.warp import Warp
 
-LINKS, FRAMES, SUBMAP = "links", "frames", "submap_"
+LINKS, FRAMES, SUBMAP, SOLUTION = "links", "frames", "submap_", "solution"
+_OTHER = (LINKS, FRAMES, SOLUTION)
 _DAMAGE = (KeyError, ValueError, IndexError, TypeError)
 
 
@@ -67,7 +69,11 @@ def save_atlas(folder: str | Path, atlas: Atlas, poses: dict[int, FramePose]) ->
         "ab": np.array([(link.a, link.b) for link in links], np.int64).reshape(-1, 2),
         "S_a_b": np.array([link.S_a_b for link in links], np.float64).reshape(-1, 4, 4),
         "covariance": np.array([link.covariance for link in links], np.float64).reshape(-1, 7, 7),
+        "keyframes_ab": np.array([(link.keyframe_a, link.keyframe_b) for link in links], np.int64).reshape(-1, 2),
+        "doubtful": np.array([link.doubtful for link in links], bool),
+        "rejected": np.array([link.rejected for link in links], bool),
     }
+    groups.small[SOLUTION] = _solution_arrays(atlas)
     ordered = list(poses.values())
     groups.small[FRAMES] = {
         "index": np.array([p.index for p in ordered], np.int64),
@@ -94,10 +100,9 @@ def load_atlas(folder: str | Path) -> StoredMap:
     groups, metadata = load_map(folder)
     try:
         atlas = Atlas()
-        for name in sorted(groups.keys() - {LINKS, FRAMES}):
+        for name in sorted(groups.keys() - set(_OTHER)):
             atlas.add(submap_from_arrays(groups[name]))
-        for link in _links(groups[LINKS], metadata):
-            atlas.link(link)
+        _join(atlas, groups[LINKS], groups.get(SOLUTION), metadata)
         frames = groups[FRAMES]
         columns = (frames[name].tolist() for name in ("index", "timestamp_s", "submap", "keyframe"))
         rows = zip(*columns, frames["T_kf_cam"], strict=True)
@@ -107,8 +112,13 @@ def load_atlas(folder: str | Path) -> StoredMap:
     return StoredMap(atlas, poses)
 
 
-def load_links(folder: str | Path) -> tuple[list[int], list[Link]]:
-    """Read the ids of a map's submaps and the links between them, from its ``map`` folder, and nothing larger.
+def load_joints(folder: str | Path) -> tuple[list[int], Atlas]:
+    """Read the ids of a map's submaps and how they are joined, from its ``map`` folder, and nothing larger.
+
+    Returns
+    -------
+    list of int, Atlas
+        The atlas has links and what was solved of them, but no submaps.
 
     Raises
     ------
@@ -118,13 +128,52 @@ def load_links(folder: str | Path) -> tuple[list[int], list[Link]]:
     folder = Path(folder)
     groups, metadata = load_metadata(folder)
     try:
-        ids = sorted(int(name.removeprefix(SUBMAP)) for name in groups if name not in (LINKS, FRAMES))
-        return ids, _links(load_arrays(folder / f"{LINKS}.npz"), metadata)
+        ids = sorted(int(name.removeprefix(SUBMAP)) for name in groups if name not in _OTHER)
+        solution = load_arrays(folder / f"{SOLUTION}.npz") if SOLUTION in groups else None
+        atlas = Atlas()
+        _join(atlas, load_arrays(folder / f"{LINKS}.npz"), solution, metadata)
+        return ids, atlas
     except _DAMAGE as error:
         raise InputError(f"{folder} is no map of this version, or is damaged: {error}.") from error
 
 
+def _solution_arrays(atlas: Atlas) -> dict[str, NDArray[Any]]:
+    """Return what the solutions of an atlas have left: placements, bends, and which keyframes hold them."""
+    warps = [(m, i, S) for m, warp in atlas.warps.items() for i, S in zip(warp.index.tolist(), warp.S, strict=True)]
+    held = [(m, k) for m, keyframe_ids in atlas.held.items() for k in sorted(keyframe_ids)]
+    return {
+        "placed": np.array(list(atlas.placement), np.int64),
+        "S_world_submap": np.array(list(atlas.placement.values()), np.float64).reshape(-1, 4, 4),
+        "warp": np.array([(m, i) for m, i, _ in warps], np.int64).reshape(-1, 2),
+        "warp_S": np.array([S for _, _, S in warps], np.float64).reshape(-1, 4, 4),
+        "held": np.array(held, np.int64).reshape(-1, 2),
+    }
+
+
+def _join(atlas: Atlas, links: Arrays, solution: Arrays | None, metadata: Mapping[str, Any]) -> None:
+    """Fill in how the submaps of an atlas are joined; `solution` is None for a map of an earlier version."""
+    for link in _links(links, metadata):
+        atlas.link(link)
+    if solution is None:
+        return
+    atlas.placement = dict(zip(solution["placed"].tolist(), solution["S_world_submap"], strict=True))
+    for m in np.unique(solution["warp"][:, 0]).tolist():
+        own = solution["warp"][:, 0] == m
+        atlas.warps[m] = Warp(solution["warp"][own, 1], solution["warp_S"][own])
+    for m in np.unique(solution["held"][:, 0]).tolist():
+        atlas.held[m] = frozenset(solution["held"][solution["held"][:, 0] == m, 1].tolist())
+
+
 def _links(arrays: Arrays, metadata: Mapping[str, Any]) -> list[Link]:
-    columns = arrays["ab"].tolist(), arrays["S_a_b"], arrays["covariance"]
-    rows = zip(*columns, metadata["link_kinds"], metadata["link_keyframes"], strict=True)
-    return [Link(a, b, S_a_b, C, LinkKind(kind), tuple(ids)) for (a, b), S_a_b, C, kind, ids in rows]
+    ab, S_a_b, covariance = arrays["ab"].tolist(), arrays["S_a_b"], arrays["covariance"]
+    kinds = [LinkKind(kind) for kind in metadata["link_kinds"]]
+    ends = arrays["keyframes_ab"].tolist() if "keyframes_ab" in arrays else [(-1, -1)] * len(ab)
+    doubtful = arrays["doubtful"].tolist() if "doubtful" in arrays else [k is not LinkKind.ROLLOVER for k in kinds]
+    rejected = arrays["rejected"].tolist() if "rejected" in arrays else [False] * len(ab)
+    rows = zip(ab, S_a_b, covariance, kinds, metadata["link_keyframes"], ends, doubtful, rejected, strict=True)
+    links = []
+    for (a, b), S, C, kind, shared, (k_a, k_b), may_doubt, refused in rows:
+        if kind is LinkKind.ROLLOVER and not C.any():  # an earlier version took these links as exact
+            C = np.diag(ROLLOVER_SIGMAS**2)
+        links.append(Link(a, b, S, C, kind, tuple(shared), k_a, k_b, may_doubt, refused))
+    return links

@@ -161,7 +161,8 @@ class Atlas:
         found: dict[int, FloatArray] = {component[0]: np.eye(4)}
         if component[0] in self.placement:
             S_first_world = sim3.inverse(self.placement[component[0]])
-            own = next(c for c in self.components() if component[0] in c)
+            every = {m for link in self.believed for m in (link.a, link.b)} | set(component)
+            own = next(c for c in joined(every, self.believed) if component[0] in c)
             found |= {m: S_first_world @ self.placement[m] for m in component[1:] if m in own and m in self.placement}
         grown = True
         while grown:

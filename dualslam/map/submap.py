@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -72,7 +72,7 @@ class Submap:
     landmarks : Table
         ``xyz_mu`` (3), ``alive``, ``descriptor``, ``normal`` (3, mean unit vector from landmark to cameras),
         ``distance_mu`` (at the reference view), ``scale`` (patch scale there), ``first_kf``, ``replaced_by``,
-        ``n_visible``, ``n_found`` (how often tracking should have seen it, and did).
+        ``n_visible``, ``n_found`` (how often tracking should have seen it, and did), ``condemned``.
     observations : Table
         ``kf``, ``feature``, ``landmark``, ``alive``.
     anchors : dict of int to Anchor
@@ -81,6 +81,9 @@ class Submap:
         Keyframes of which more is known than their observations say.
     gauge : tuple of int
         The two keyframes of the first baseline: the first pose is fixed, their distance fixes the scale.
+    condemned : set of int
+        Keyframes that are not to be relied on: by-passed by another map, or of a tail that was corrupted. Landmarks
+        that no other keyframe sees have ``condemned`` set.
     """
 
     def __init__(self, submap_id: int, K: FloatArray, descriptor: NDArray[np.generic]) -> None:
@@ -93,6 +96,7 @@ class Submap:
         self.anchors: dict[int, Anchor] = {}
         self.relative_poses: dict[int, RelativePose] = {}
         self.gauge: tuple[int, int] = (-1, -1)
+        self.condemned: set[int] = set()
         self.landmarks = Table(
             xyz_mu=(np.float64, (3,)),
             alive=(np.bool_, ()),
@@ -104,6 +108,7 @@ class Submap:
             replaced_by=(np.int64, ()),
             n_visible=(np.int64, ()),
             n_found=(np.int64, ()),
+            condemned=(np.bool_, ()),
         )
         self.observations = Table(
             kf=(np.int64, ()), feature=(np.int64, ()), landmark=(np.int64, ()), alive=(np.bool_, ())
@@ -142,12 +147,21 @@ class Submap:
         T_kf_cam = se3.inverse(self.T_submap_kf[anchor_id]) @ self.T_submap_kf[keyframe_id]
         self.anchors[keyframe_id] = Anchor(anchor_id, T_kf_cam)
         self.relative_poses.pop(keyframe_id, None)
+        self.condemned.discard(keyframe_id)
         for k, known in self.relative_poses.items():
             if known.keyframe_id == keyframe_id:
                 self.relative_poses[k] = known.seen_from(anchor_id, T_kf_cam)
         if anchor_id in self.relative_poses and self.relative_poses[anchor_id].keyframe_id == anchor_id:
             del self.relative_poses[anchor_id]
         del self.keyframes[keyframe_id], self.T_submap_kf[keyframe_id], self.landmark_of[keyframe_id]
+
+    def condemn(self, keyframe_ids: Iterable[int]) -> None:
+        """Mark keyframes, and the landmarks that no other keyframe sees, as not to be relied on. All stay."""
+        self.condemned |= set(keyframe_ids) & self.keyframes.keys()
+        healthy = self.landmarks_of_keyframes([k for k in self.keyframes if k not in self.condemned])
+        lm = self.landmarks
+        lm["condemned"][:] = lm["alive"]
+        lm["condemned"][healthy] = False
 
     def resolve_anchor(self, keyframe_id: int, T_kf_cam: FloatArray) -> FloatArray:
         """Return ``T_submap_cam`` of a frame posed relative to a keyframe, also if that keyframe was culled since."""
@@ -202,6 +216,7 @@ class Submap:
         """
         columns = {name: column[landmark_ids] for name, column in other.landmarks.columns().items()}
         columns["replaced_by"] = np.full(len(landmark_ids), NO_LANDMARK)
+        columns["condemned"] = np.zeros(len(landmark_ids), bool)
         if S_self_other is not None:
             columns["xyz_mu"] = sim3.act(S_self_other, columns["xyz_mu"])
             columns["normal"] = columns["normal"] @ sim3.rotation(S_self_other).T
@@ -373,7 +388,7 @@ class Submap:
         twin.landmark_of = {k: a.copy() for k, a in self.landmark_of.items()}
         twin.anchors = dict(self.anchors)
         twin.relative_poses = dict(self.relative_poses)
-        twin.gauge = self.gauge
+        twin.gauge, twin.condemned = self.gauge, set(self.condemned)
         twin.landmarks = Table.from_columns(self.landmarks.columns())
         twin.observations = Table.from_columns(self.observations.columns())
         return twin
@@ -390,13 +405,14 @@ class Submap:
             for k, known in twin.relative_poses.items()
         }
         twin.gauge = (number_of(self.gauge[0]), number_of(self.gauge[1]))
+        twin.condemned = {number_of(k) for k in self.condemned}
         for column in (twin.observations["kf"], twin.landmarks["first_kf"]):
             column[:] = [number_of(k) for k in column.tolist()]
         return twin
 
     def take_over(self, changed: Submap) -> None:
         """Become what a copy of this submap was changed to."""
-        self.K, self.gauge = changed.K, changed.gauge
+        self.K, self.gauge, self.condemned = changed.K, changed.gauge, changed.condemned
         self.keyframes, self.T_submap_kf = changed.keyframes, changed.T_submap_kf
         self.landmark_of, self.anchors = changed.landmark_of, changed.anchors
         self.relative_poses = changed.relative_poses

@@ -48,6 +48,20 @@ def drop_corrupted(record: Record, old_id: int, since: int, order: int) -> int:
     return len(corrupted)
 
 
+def condemn_tail(
+    record: Record, recovered_frames: Collection[RecoveredFrame], old_id: int, handover: int, since: int, order: int
+) -> int:
+    """Mark the keyframes of a linked old map that are not to be relied on any more; return how many.
+
+    Those beyond the handover that the new map has posed, and all of the corrupted tail (`since`, times `order` as in
+    `drop_corrupted`).
+    """
+    submap, own = record.atlas.submaps[old_id], {frame.pose.index for frame in recovered_frames}
+    tail = {k for k in submap.keyframes if order * k >= since or (order * k > order * handover and k in own)}
+    submap.condemn(tail)
+    return len(submap.condemned)
+
+
 def absorb(
     record: Record, recovered_frames: Collection[RecoveredFrame], new_id: int, lost: Collection[int], now: FrameStamp
 ) -> list[int]:
@@ -86,5 +100,7 @@ def absorb(
             record.pose(found[i])
             record.rows[i].status = FrameStatus.BYPASSED
         gone += component
+        for m in component:
+            record.atlas.submaps[m].condemn(record.atlas.submaps[m].keyframes)
         record.event(EventKind.ABSORBED, now, new_id, old_submaps=component, frames=len(frames))
     return gone

@@ -22,7 +22,7 @@ from dualslam.map.record import FrameStamp, Record
 from dualslam.map.solving import solve
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
-from dualslam.recovery.bypass import absorb, bypass, drop_corrupted
+from dualslam.recovery.bypass import absorb, bypass, condemn_tail, drop_corrupted
 from dualslam.recovery.direction import reads_backwards
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
@@ -357,6 +357,7 @@ class Recoveries:
             corrupted_since = min(corrupted_since, order * link.change_point)
         n_bypassed = bypass(record, recovered_frames, new_id, agreeing[-1], order)
         n_dropped = drop_corrupted(record, found.old_id, corrupted_since, order)
+        n_condemned = condemn_tail(record, recovered_frames, found.old_id, agreeing[-1], corrupted_since, order)
         for frame in recovered_frames:
             if order * frame.pose.index >= order * onset and self._was_lost(frame.pose.index, found.old_id):
                 record.rows[frame.pose.index].status = FrameStatus.RECOVERED
@@ -367,7 +368,15 @@ class Recoveries:
             else {"overlap": "refined", **refinement.numbers}
         )
         record.event(
-            EventKind.FUSED, now, new_id, old_submap=found.old_id, bypassed=n_bypassed, dropped=n_dropped, **numbers
+            EventKind.FUSED,
+            now,
+            new_id,
+            old_submap=found.old_id,
+            bypassed=n_bypassed,
+            dropped=n_dropped,
+            condemned_keyframes=n_condemned,
+            condemned_landmarks=int(record.atlas.submaps[found.old_id].landmarks["condemned"].sum()),
+            **numbers,
         )
 
     def _refused(self, found: FoundLink, new_id: int, report: AtlasReport, now: FrameStamp) -> None:

@@ -17,10 +17,10 @@ from dualslam.core.geometry import sim3
 from dualslam.core.types import BoolArray, FloatArray, FrameStatus, IntArray
 from dualslam.io import run_folder
 from dualslam.io.map_files import METADATA, load_arrays
-from dualslam.io.map_store import load_links, submap_path
+from dualslam.io.map_store import load_joints, submap_path
 from dualslam.io.run_folder import FrameRow, read_events, read_frames, unlinked_submaps
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate, nearest_in_time, read_text, read_tum
-from dualslam.map.atlas import Atlas
+from dualslam.map.atlas import joined
 
 MAX_POINTS = 2500
 MAX_VIEW_DISTANCE_MU = 8.0
@@ -194,12 +194,8 @@ def linked_submaps(folder: Path, submap_ids: set[int | None]) -> tuple[list[int]
     ids = sorted(m for m in submap_ids if m is not None)
     if not ids or not (folder / METADATA).is_file():
         return [], {}
-    stored, links = load_links(folder)
-    atlas = Atlas()
-    for link in links:
-        atlas.link(link)
-    component = {ids[0]}
-    while grown := {m for link in links for m in (link.a, link.b) if {link.a, link.b} & component} - component:
-        component |= grown
-    ordered = sorted(component & set(stored))
+    stored, atlas = load_joints(folder)
+    ordered = next((c for c in joined(stored, atlas.believed) if ids[0] in c), [])
+    if not ordered:
+        return [], {}
     return ordered, atlas.S_world_submap(ordered)
