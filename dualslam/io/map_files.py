@@ -50,12 +50,18 @@ def save_arrays(path: str | Path, arrays: Arrays) -> None:
         np.savez(file, allow_pickle=False, **{name: np.asarray(a) for name, a in arrays.items()})
 
 
-def load_arrays(path: str | Path, names: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Read an ``.npz`` of `save_arrays`, or some of its arrays; a file that would need unpickling is refused."""
+def load_arrays(
+    path: str | Path, names: Iterable[str] | None = None, optional: Iterable[str] = ()
+) -> dict[str, NDArray[Any]]:
+    """Read an ``.npz`` of `save_arrays`, or some of its arrays; a file that would need unpickling is refused.
+
+    `optional`: arrays besides `names` that an earlier version did not write.
+    """
     try:
         # Opened here, as numpy leaves the file open where it is no archive.
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in (archive.files if names is None else names)}
+            there = [name for name in optional if name in archive.files]
+            return {name: archive[name] for name in (archive.files if names is None else [*names, *there])}
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; check the path.") from None
     except (OSError, ValueError, zipfile.BadZipFile, zlib.error, EOFError, KeyError, TypeError, AttributeError) as e:

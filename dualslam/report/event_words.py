@@ -15,6 +15,8 @@ def event_words(event: dict[str, Any]) -> str:
     def shown(value: object) -> str:
         if isinstance(value, list):
             return "[" + ", ".join(map(shown, value)) + "]"
+        if isinstance(value, dict):
+            return "(" + ", ".join(f"{k} {shown(v)}" for k, v in value.items()) + ")"
         return number(value, 4) if isinstance(value, float) else str(value)
 
     return ", ".join(f"{k} {shown(v)}" for k, v in event.items() if k not in _WHERE and v is not None)

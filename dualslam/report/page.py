@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from dualslam.config.settings import Config
@@ -67,6 +68,15 @@ def _warnings(run: RunData) -> Markup:
     return join([tag("p", f"⚠ {sentence}", cls="warning") for sentence in words])
 
 
+def _submap_words(s: Mapping[str, Any]) -> str:
+    words = f"{s.get('keyframes', 0)} keyframes, {s.get('landmarks', 0)} landmarks"
+    if s.get("condemned_keyframes"):
+        words += f"; of these {s['condemned_keyframes']} and {s.get('condemned_landmarks', 0)} by-passed"
+    if s.get("rejected_connections"):
+        words += f"; {count(s['rejected_connections'], 'connection')} rejected"
+    return words
+
+
 def _tiles(run: RunData) -> Markup:
     s = run.summary
     latency = s.get("latency_ms") or {}
@@ -76,9 +86,7 @@ def _tiles(run: RunData) -> Markup:
         _tile("coverage", f"{100 * s.get('coverage', 0):.1f} %", f"{s.get('posed', 0)} of {len(run.rows)} frames"),
         _tile("failures", str(s.get("failures", 0)), f"{count(unposed, 'frame')} without a pose"),
         _tile("recoveries", str(s.get("recoveries", 0)), _recovery_words(s)),
-        _tile(
-            "submaps", str(s.get("submaps", 0)), f"{s.get('keyframes', 0)} keyframes, {s.get('landmarks', 0)} landmarks"
-        ),
+        _tile("submaps", str(s.get("submaps", 0)), _submap_words(s)),
     ]
     if s.get("ate_rmse_m") is not None:
         tiles.append(_tile("ATE", f"{number(s['ate_rmse_m'])} m", "RMSE of the main map, Sim(3)-aligned"))

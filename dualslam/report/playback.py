@@ -15,7 +15,7 @@ from dualslam.io.map_files import METADATA, load_arrays
 from dualslam.io.map_store import submap_path
 from dualslam.io.run_folder import EVENTS, MAP, SUMMARY, FrameRow
 from dualslam.report.placement import align
-from dualslam.report.run_data import PosedRows, RunData, are_shown, linked_submaps
+from dualslam.report.run_data import CONDEMNED, PosedRows, RunData, are_shown, linked_submaps
 from dualslam.report.statuses import WITHOUT_POSE
 
 _ARRAYS = (
@@ -155,7 +155,7 @@ def _map_parts(run: RunData, rows: Sequence[FrameRow], submap: int | None) -> tu
     row_of = {row.index: i for i, row in enumerate(rows)}
     keyframes, landmarks = [], []
     for m in component:
-        arrays, S = load_arrays(submap_path(folder, m), _ARRAYS), S_world_submap[m]
+        arrays, S = load_arrays(submap_path(folder, m), _ARRAYS, (CONDEMNED,)), S_world_submap[m]
         shown = are_shown(arrays)
         keyframes.append((m, arrays["kf_id"], sim3.act(S, arrays["kf_T_submap_kf"][:, :3, 3])))
         landmarks.append((m, arrays["landmarks_first_kf"][shown], sim3.act(S, arrays["landmarks_xyz_mu"][shown])))

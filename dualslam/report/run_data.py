@@ -26,6 +26,7 @@ MAX_POINTS = 2500
 MAX_VIEW_DISTANCE_MU = 8.0
 """Landmarks farther from the camera that made them (the start's median depth is 1) are left out of the pictures."""
 _POINT_ARRAYS = ("landmarks_xyz_mu", "landmarks_distance_mu", "landmarks_alive")
+CONDEMNED = "landmarks_condemned"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,15 +176,16 @@ def _map_points(folder: Path, submap_ids: set[int | None]) -> FloatArray:
     component, S_world_submap = linked_submaps(folder, submap_ids)
     clouds = [np.zeros((0, 3))]
     for m in component:
-        arrays = load_arrays(submap_path(folder, m), _POINT_ARRAYS)
+        arrays = load_arrays(submap_path(folder, m), _POINT_ARRAYS, (CONDEMNED,))
         clouds.append(sim3.act(S_world_submap[m], arrays["landmarks_xyz_mu"][are_shown(arrays)]))
     points = np.concatenate(clouds)
     return points[:: max(1, len(points) // MAX_POINTS)]
 
 
 def are_shown(arrays: Mapping[str, NDArray[Any]]) -> BoolArray:
-    """Return which landmarks of a stored submap belong into a picture."""
-    return np.asarray(arrays["landmarks_alive"] & (arrays["landmarks_distance_mu"] < MAX_VIEW_DISTANCE_MU))
+    """Return which landmarks of a stored submap belong into a picture: none that a by-pass has condemned."""
+    shown = arrays["landmarks_alive"] & (arrays["landmarks_distance_mu"] < MAX_VIEW_DISTANCE_MU)
+    return np.asarray(shown & ~arrays[CONDEMNED] if CONDEMNED in arrays else shown)
 
 
 def linked_submaps(folder: Path, submap_ids: set[int | None]) -> tuple[list[int], Mapping[int, FloatArray]]:

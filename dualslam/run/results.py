@@ -96,13 +96,17 @@ def summarise(
         "coverage": posed / report.n_frames if report.n_frames else 0.0,
         "posed_in_all_submaps": posed + sum(len(frames) for frames in trajectories.unlinked.values()),
         "failures": len(system.events.of_kind(EventKind.FAILED)),
-        "recoveries": sum(link.kind is LinkKind.RECOVERY for link in system.atlas.links),
+        "recoveries": sum(link.kind is LinkKind.RECOVERY for link in system.atlas.believed),
         "relocalised": len(system.events.of_kind(EventKind.RELOCALISED)),
         "recoveries_failed": len(system.events.of_kind(EventKind.RECOVERY_FAILED)),
         "submaps": len(system.atlas.submaps),
-        "links": len(system.atlas.links),
+        "links": len(system.atlas.believed),
+        "connections": _connections(system),
+        "rejected_connections": sum(link.rejected for link in system.atlas.links),
         "keyframes": sum(len(submap.keyframes) for submap in system.atlas.submaps.values()),
         "landmarks": sum(int(submap.landmarks["alive"].sum()) for submap in system.atlas.submaps.values()),
+        "condemned_keyframes": sum(len(submap.condemned) for submap in system.atlas.submaps.values()),
+        "condemned_landmarks": sum(int(s.landmarks["condemned"].sum()) for s in system.atlas.submaps.values()),
         "seed": config.seed,
         "dropped": len(report.dropped),
         "interrupted": report.interrupted,
@@ -122,6 +126,12 @@ def summarise(
     if truth is not None:
         summary |= _errors(system, main, truth, report)
     return summary
+
+
+def _connections(system: System) -> dict[str, int]:
+    """How many connections of each kind the atlas believes."""
+    kinds = [str(link.kind) for link in system.atlas.believed]
+    return {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)}
 
 
 def truth_of_frames(truth: Trajectory, rows: Iterable[FrameRow]) -> Trajectory:
