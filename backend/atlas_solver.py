@@ -11,7 +11,7 @@ itself uses each connection's own covariance.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +31,8 @@ SETTLED_COST = 1e-9
 MAX_PASSES = 4
 """What is believed decides what the others are asked; it settled in two rounds in every trial."""
 MAX_ITERATIONS = 100
+OUTLIER_CHI2 = 18.48
+"""The 0.99 quantile of chi-square with 7 degrees of freedom: the price of a rejection."""
 LEAST_REDUNDANCY = 1e-6
 """Share of an edge's variance below which the rest of the graph has no say in it."""
 
@@ -95,6 +97,15 @@ class GtsamAtlasSolver:
         return edge_covariances(submap, pairs, self._robust_k, held)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Choice:
+    """What is believed, the chi-square of what was asked, and what it costs: residuals, and a price per rejection."""
+
+    believed: BoolArray
+    chi2: FloatArray
+    objective: float
+
+
 class _Graph:
     """A problem whose edges have covariances that a solver can take."""
 
@@ -130,14 +141,23 @@ class _Graph:
 
     def choose(self, doubtful: BoolArray) -> tuple[BoolArray, FloatArray]:
         """Return which edges are believed, and the chi-square of the doubtful ones against the rest (NaN: no rest)."""
-        believed = ~doubtful | self._base(doubtful)
-        chi2 = np.full(len(self.edges), np.nan)
         if not (doubtful & ~self._bridges(np.ones(len(doubtful), bool), doubtful)).any():
-            return np.ones(len(doubtful), bool), chi2
+            return np.ones(len(doubtful), bool), np.full(len(doubtful), np.nan)
+        found = self._settle(~doubtful | self._base(doubtful), doubtful)
+        for accused in self._accused(found.believed, doubtful):
+            without = found.believed.copy()
+            without[accused] = False
+            other = self._settle(self._connected(without, doubtful, last=accused), doubtful)
+            if other.objective < found.objective - 0.5 * OUTLIER_CHI2:
+                found = other
+        return found.believed, found.chi2
+
+    def _settle(self, believed: BoolArray, doubtful: BoolArray) -> _Choice:
+        """Ask all that can be asked, from what is believed now, until it stays the same."""
+        chi2 = np.full(len(self.edges), np.nan)
         for _ in range(MAX_PASSES):
             solution = self.optimise(believed)
-            bridges = self._bridges(believed, doubtful)
-            tested = np.flatnonzero(doubtful & ~bridges)
+            tested = np.flatnonzero(doubtful & ~self._bridges(believed, doubtful))
             C, r = self._innovations(solution, believed, tested)
             chi2[:] = np.nan
             chi2[tested] = np.einsum("ei,ei->e", r, np.linalg.solve(C, r[..., None])[..., 0])
@@ -145,18 +165,36 @@ class _Graph:
             if (after == believed).all():
                 break
             believed = after
-        return believed, chi2
+        cost = self.optimise(believed).cost_after
+        return _Choice(believed, chi2, cost + 0.5 * OUTLIER_CHI2 * np.count_nonzero(~believed))
+
+    def _accused(self, believed: BoolArray, doubtful: BoolArray) -> list[int]:
+        """Return the believed edges that two rejected ones or more would do without: one of them may be the wrong one.
+
+        What came first connects the map and is believed; where what comes later contradicts it more than once, that
+        is tried the other way round.
+        """
+        rejected = np.flatnonzero(~believed).tolist()
+        found = []
+        for i in np.flatnonzero(believed & doubtful).tolist() if len(rejected) > 1 else ():
+            rest = believed.copy()
+            rest[i] = False
+            label = self.pieces(rest)
+            if sum(label[self.edges[j].first] != label[self.edges[j].second] for j in rejected) > 1:
+                found.append(i)
+        return found
 
     def _base(self, doubtful: BoolArray) -> BoolArray:
         """Return the doubtful edges that are believed to begin with: those that were, and what it takes to connect."""
         known = np.array([e.known for e in self.problem.edges], bool)
         return self._connected(~doubtful | known, doubtful) & doubtful
 
-    def _connected(self, believed: BoolArray, doubtful: BoolArray) -> BoolArray:
-        """Take back in what is needed so that no part of the graph hangs loose: the edges that arrived first."""
+    def _connected(self, believed: BoolArray, doubtful: BoolArray, last: int = -1) -> BoolArray:
+        """Take back in what is needed so that no part of the graph hangs loose: what arrived first, but `last` last."""
         believed = believed | ~doubtful
         parent = list(range(len(self.nodes)))
-        for i in (*np.flatnonzero(believed).tolist(), *np.flatnonzero(~believed).tolist()):
+        others = sorted(np.flatnonzero(~believed).tolist(), key=lambda i: (i == last, i))
+        for i in (*np.flatnonzero(believed).tolist(), *others):
             e = self.edges[i]
             believed[i] |= _join(parent, e.first, e.second)
         return believed
