@@ -180,12 +180,18 @@ class DriftingMap:
 
 
 def align(estimate: FloatArray, truth: FloatArray) -> FloatArray:
-    """Take points onto others by the best similarity (Umeyama)."""
-    a, b = estimate - estimate.mean(0), truth - truth.mean(0)
+    """Take points onto others by the best similarity."""
+    return sim3.act(fit_similarity(estimate, truth), estimate)
+
+
+def fit_similarity(from_: FloatArray, to: FloatArray) -> FloatArray:
+    """Return the similarity that takes points nearest to others (Umeyama)."""
+    a, b = from_ - from_.mean(0), to - to.mean(0)
     U, D, Vt = np.linalg.svd(b.T @ a)
     sign = np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))])
     s = (D * np.diag(sign)).sum() / (a**2).sum()
-    return s * a @ (U @ sign @ Vt).T + truth.mean(0)
+    R = U @ sign @ Vt
+    return sim3.from_parts(s, R, to.mean(0) - s * R @ from_.mean(0))
 
 
 def lap_in_submaps(n: int = 130, every: int = 50, robust: bool = True, **options: object) -> DriftingMap:
