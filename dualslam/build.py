@@ -125,6 +125,7 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
             shutter=shutter,
             recovery=recovery or recovery_executor(config, size_px, faults, frontend),
             atlas_solver=atlas_solver(config),
+            adjust_bundle=partial(bundle_adjust_arrays, robust_k=config.graph.robust_k),
         ),
         config,
     )

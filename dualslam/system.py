@@ -12,6 +12,7 @@ import numpy as np
 from dualslam.calibration.lens import Calibration
 from dualslam.config.settings import Config
 from dualslam.core.atlas_problem import AtlasSolver
+from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
@@ -49,6 +50,7 @@ class Components:
     shutter: Shutter
     recovery: RecoveryExecutor
     atlas_solver: AtlasSolver
+    adjust_bundle: BundleAdjuster
 
     @property
     def K(self) -> FloatArray:
@@ -84,7 +86,9 @@ class System:
         self._starter = components.new_starter()
         self._lost: list[View] = []
         self._health = HealthMonitor(config.health)
-        self._connections = Connections(record, components.atlas_solver, components.new_graph, self._front_ends)
+        self._connections = Connections(
+            record, components.atlas_solver, components.new_graph, components.adjust_bundle, self._front_ends
+        )
         self._recoveries = Recoveries(
             record,
             self.buffer,

@@ -15,11 +15,12 @@ from itertools import pairwise
 import numpy as np
 
 from dualslam.core.atlas_problem import AtlasEdge, AtlasSolution, AtlasSolver
+from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
-from dualslam.core.types import Failure, FailureReason, FloatArray
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.atlas import Atlas, Link, joined
 from dualslam.map.bending import Move, bend_frames, bend_link, bend_submap, hold
 from dualslam.map.propagation import propagate_anchors, propagate_poses
@@ -28,6 +29,7 @@ from dualslam.map.skeleton import EdgeCovariances, Skeleton, build_skeleton
 from dualslam.map.submap import Submap
 from dualslam.map.warp import Warp
 from dualslam.recovery.merge import propagate_links
+from dualslam.recovery.overlap_sides import SeamRefinement, apply_seam, seam_problem
 
 log = logging.getLogger(__name__)
 
@@ -101,6 +103,8 @@ class Connections:
     solver : AtlasSolver
     new_graph : callable
         Makes an empty graph, for a front end whose submap has been bent.
+    adjust : BundleAdjuster
+        Of overlaps.
     front_ends : callable
         Gives those that go on, or may go on, in a submap of the atlas.
     """
@@ -110,11 +114,13 @@ class Connections:
         record: Record,
         solver: AtlasSolver,
         new_graph: Callable[[], SubmapGraph],
+        adjust: BundleAdjuster,
         front_ends: Callable[[], Iterable[VisualOdometry]] = tuple,
     ) -> None:
         self._record = record
         self._solver = solver
         self._new_graph = new_graph
+        self._adjust = adjust
         self._front_ends = front_ends
         self._covariances = EdgeCovariances(solver.edge_covariances)
 
@@ -153,12 +159,15 @@ class Connections:
         now : FrameStamp
             For the event log.
         """
+        self._carry(before, after)
+        if after.id in self._atlas.placement:
+            self._solve({after.id}, (), now)
+
+    def _carry(self, before: Submap, after: Submap) -> None:
         for pose in propagate_poses(self._record.poses.values(), before, after):
             self._record.poses[pose.index] = pose
         propagate_anchors(before, after)
         propagate_links(self._atlas, before, after)
-        if after.id in self._atlas.placement:
-            self._solve({after.id}, (), now)
 
     def settle(self, now: FrameStamp) -> None:
         """Solve all sets with cycles once more, as their submaps are by now."""
@@ -197,6 +206,64 @@ class Connections:
         first, second = (skeleton.nodes.index(node) for node in (a, b))
         S = skeleton.problem.S_world_node
         return sim3.inverse(S[first]) @ S[second], self._solver.relative_covariance(skeleton.problem, first, second)
+
+    def refine_overlap(self, link: Link, landmark_pairs: IntArray) -> SeamRefinement | Failure:
+        """Refine keyframes and landmarks about a connection together, on both of its sides, live or archived.
+
+        Parameters
+        ----------
+        link : Link
+            One that has been taken in.
+        landmark_pairs : (I, 2) int64
+            Landmarks of its two submaps that are the same point; those of frames that both hold are known already.
+
+        Returns
+        -------
+        SeamRefinement or Failure
+            `TOO_FEW_MATCHES` where too few points are seen from both sides; nothing has changed then.
+        """
+        sides = self._atlas.submaps[link.a], self._atlas.submaps[link.b]
+        component = next(c for c in self._atlas.components() if link.a in c)
+        S_world = self._atlas.S_world_submap(component)
+        S_a_b = sim3.inverse(S_world[link.a]) @ S_world[link.b]
+        refinement = seam_problem(sides, link.attached(self._atlas), S_a_b, landmark_pairs)
+        if isinstance(refinement, Failure):
+            return refinement
+        try:
+            result = self._adjust(refinement.problem)
+        except SolverError as error:
+            return Failure(FailureReason.SOLVER, str(error))
+        befores = {submap.id: submap.copy() for submap in sides}
+        moved = apply_seam(sides, refinement, result)
+        for m, before in befores.items():
+            for front_end in self._front_ends():
+                if front_end.submap.id == m:
+                    front_end.adopt(self._new_graph(), before)
+            self._carry(before, self._atlas.submaps[m])
+        # The pixels of both sides have said how they stand to each other: that is the measurement now.
+        self._atlas.links = [
+            replace(other, S_a_b=S_a_b) if other.attached_as(link) else other for other in self._atlas.links
+        ]
+        return SeamRefinement(
+            n_keyframes=int((~refinement.problem.fixed).sum()),
+            n_landmarks=len(refinement.problem.xyz_mu),
+            n_joined=refinement.n_joined,
+            n_observations=len(refinement.problem.kf),
+            cost_before=result.cost_before,
+            cost_after=result.cost_after,
+            moved=moved,
+        )
+
+    def open_graph(self, submap_id: int) -> SubmapGraph:
+        """Return the graph of any submap, made from its arrays, which stay as they are: to ask it for covariances.
+
+        Raises
+        ------
+        SolverError
+        """
+        graph = self._new_graph()
+        graph.rebuild(self._atlas.submaps[submap_id].copy())
+        return graph
 
     # --- solving
 

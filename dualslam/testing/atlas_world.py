@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dualslam.backend.atlas_solver import GtsamAtlasSolver
+from dualslam.backend.local_ba import bundle_adjust_arrays
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.config.settings import GraphConfig
 from dualslam.core.geometry import se3, sim3
@@ -53,7 +54,7 @@ class DriftingMap:
     def __post_init__(self) -> None:
         self.rng = np.random.default_rng(self.seed)
         self.T_true = np.array([ring_pose(k) for k in range(self.n)])
-        i = np.arange(12 * self.n)
+        i = np.arange(12 * N_ROUND)
         a = 2 * np.pi * i / 12 / N_ROUND
         r = RADIUS + self.rng.uniform(1.0, 2.5, len(i))
         self.xyz = np.column_stack([r * np.cos(a), self.rng.uniform(-0.8, 0.8, len(i)), r * np.sin(a)])
@@ -67,12 +68,14 @@ class DriftingMap:
             self.record,
             GtsamAtlasSolver(self.robust, 0.8),
             lambda: ISam2SubmapGraph(GraphConfig()),
+            bundle_adjust_arrays,
             lambda: self.front_ends,
         )
         self.front_ends: list = []
         self.now = FrameRecord(0, 0.0, FrameStatus.TRACKED)
         self.submap = self._new_submap(0)
         self.place_of: dict[int, int] = {}  # landmark of the submap by point
+        self.last_seen: dict[int, int] = {}
         self.points: dict[int, np.ndarray] = {}  # of each keyframe's features
 
     @property
@@ -86,7 +89,8 @@ class DriftingMap:
 
     def seen(self, k: int) -> tuple[np.ndarray, FloatArray]:
         p = (self.xyz - self.T_true[k][:3, 3]) @ self.T_true[k][:3, :3]
-        near = np.abs(np.arange(len(self.xyz)) / 12 - k) < 12
+        apart = np.abs(np.arange(len(self.xyz)) / 12 - k) % N_ROUND
+        near = np.minimum(apart, N_ROUND - apart) < 12
         ok: BoolArray = near & (p[:, 2] > 0.3)
         uv = np.full((len(p), 2), np.nan)
         uv[ok] = CAMERA.project(p[ok])
@@ -102,6 +106,9 @@ class DriftingMap:
             uv, np.full(len(uv), 0.5), np.zeros(len(uv), np.int64), np.zeros((len(uv), 1), np.uint8)
         )
         self.submap.add_keyframe(Keyframe(k, 0.1 * k, features), sim3.act_on_pose(S, np.eye(4)))
+        # What is seen again after a lap is not recognised.
+        self.place_of = {p: j for p, j in self.place_of.items() if k - self.last_seen[p] < N_ROUND // 2}
+        self.last_seen.update(dict.fromkeys(points.tolist(), k))
         new = np.array([p not in self.place_of for p in points.tolist()], bool)
         xyz = sim3.act(S @ se3.inverse(self.T_true[k]), self.xyz[points[new]])
         ids = self.submap.add_landmarks(xyz, np.zeros((int(new.sum()), 1), np.uint8), np.ones(int(new.sum())), k)
