@@ -12,7 +12,7 @@ from dualslam.backend.atlas_solver import GtsamAtlasSolver
 from dualslam.backend.local_ba import bundle_adjust, bundle_adjust_arrays
 from dualslam.backend.self_calibration import estimate_calibration, find_preferred_camera
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.calibration.lens import Calibration
+from dualslam.calibration.lens import Calibration, CalibrationAnswer, CalibrationJob, answer
 from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.camera.models import Camera
 from dualslam.core.camera.rectification import rectify
@@ -20,7 +20,7 @@ from dualslam.core.errors import ConfigError
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend, PreferredCamera, SelfCalibrator, SubmapGraph
 from dualslam.core.threads import spare_cores
-from dualslam.core.types import Failure, FailureReason, Frame, IntArray, View
+from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, IntArray, View
 from dualslam.frontends.features.image_features import ImageFeatures
 from dualslam.frontends.features.images import to_grey
 from dualslam.frontends.features.motion_statistics import nearest_search
@@ -35,10 +35,12 @@ from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.health import judge_track
 from dualslam.lab.disturbances import FaultScript
 from dualslam.map.submap import Submap
-from dualslam.recovery.executor import InlineExecutor, RecoveryExecutor
+from dualslam.recovery.direction import recover
+from dualslam.recovery.executor import DeskExecutor, InlineExecutor, RecoveryExecutor
+from dualslam.recovery.jobs import Handlers, InlineDesk, JobKind
 from dualslam.recovery.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
 from dualslam.recovery.reverse_tracking import Attempt, RecoveryJob, RecoveryParts
-from dualslam.recovery.worker import WorkerExecutor
+from dualslam.recovery.worker import Lane, WorkerDesk
 from dualslam.system import Components, System
 
 ADJUST_ITERATIONS = 20
@@ -46,6 +48,10 @@ FEATURE_THREADS = 2
 """That find other front ends' features beside a walk back, where the tracking waits for it."""
 WORKER_BUDGET = 0.75
 """Share of the time after which a worker counts as hung that its walks may take: what they have by then is not lost."""
+
+
+WALK_NICENESS = 5
+"""Of the processes for long work: a third of the share of what tracks, where cores are short."""
 
 
 def check_config(config: Config) -> None:
@@ -89,12 +95,7 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
     check_config(config)
     frontend = create_frontend(config.frontend)
     size_px = (camera.width, camera.height)
-    calibration = Calibration(
-        camera,
-        config.calibration,
-        estimate=self_calibrator(config),
-        adjust=lambda submap: adjust_submap(submap, config.graph.robust_k),
-    )
+    calibration = new_calibration(config, camera)
     faults = FaultScript(config.corruptions)
     shutter = RollingShutter(frontend, config.camera, config.seed)
 
@@ -112,6 +113,14 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
         refinder = Refinder(submap, frontend, calibrated, sigma_px)
         return VisualFrontEnd(frontend, config, submap, graph, size_px, refinder, n_covering)
 
+    workers = config.recovery.workers
+    if recovery is None:
+        # Built here in any case: a mistake in the config is told at once, not by a worker.
+        parts = recovery_parts(config, size_px, frontend=frontend)
+    desk = worker_desk(config, size_px, faults) if workers else InlineDesk(calibration_handlers(config))
+    if recovery is None:
+        recovery = DeskExecutor(desk) if workers else faults.around_inline(InlineExecutor(parts))
+
     return System(
         Components(
             view_of=faults.around_views(corrected_view_of),
@@ -123,7 +132,8 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
             new_relocaliser=faults.around_odometry(partial(odometry, n_covering=config.recovery.covering_keyframes)),
             calibration=calibration,
             shutter=shutter,
-            recovery=recovery or recovery_executor(config, size_px, faults, frontend),
+            recovery=recovery,
+            desk=desk,
             atlas_solver=atlas_solver(config),
             adjust_bundle=partial(bundle_adjust_arrays, robust_k=config.graph.robust_k),
         ),
@@ -151,20 +161,48 @@ def _preferred_camera(
     return find_preferred_camera(submap, keyframe_ids, job.camera, *settings, job.camera_covariance)
 
 
-def recovery_executor(
-    config: Config, size_px: tuple[int, int], faults: FaultScript, frontend: Frontend
-) -> RecoveryExecutor:
-    """Build what runs walks back in time: in this process, or in workers, which are started at once."""
+def new_calibration(config: Config, camera: Camera, covariance: FloatArray | None = None) -> Calibration:
+    """Build what knows the camera; `covariance`: of the correction that it has, if it was estimated."""
+    return Calibration(
+        camera,
+        config.calibration,
+        estimate=self_calibrator(config),
+        adjust=lambda submap: adjust_submap(submap, config.graph.robust_k),
+        covariance=covariance,
+    )
+
+
+def calibration_handlers(config: Config) -> Handlers:
+    """Build what answers questions about the camera."""
+
+    def answered(job: CalibrationJob) -> CalibrationAnswer | Failure:
+        calibration = new_calibration(config, job.camera, job.covariance)
+        return answer(job, calibration, lambda: ISam2SubmapGraph(config.graph))
+
+    return {JobKind.CALIBRATION: answered}
+
+
+def walk_handlers(config: Config, size_px: tuple[int, int], n_threads: int) -> Handlers:
+    """Build what a worker for long work does: walks back and calibrations."""
+    budget_s = WORKER_BUDGET * config.recovery.time_limit_s
+    parts = recovery_parts(config, size_px, budget_s, n_threads=n_threads)
+    return {JobKind.WALK: lambda job: recover(job, parts), **calibration_handlers(config)}
+
+
+def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript) -> WorkerDesk:
+    """Build the desk whose work is done in processes, which are started at once."""
     recovery = config.recovery
-    # Built here in any case: a mistake in the config is told at once, not by a worker.
-    parts = recovery_parts(config, size_px, frontend=frontend)
-    if recovery.workers == 0:
-        return faults.around_inline(InlineExecutor(parts))
     # Live frames come first: threads beside the walk only where a core is left beside the tracking and the workers.
     n_threads = min(FEATURE_THREADS, spare_cores(1 + recovery.workers))
-    make_parts = partial(recovery_parts, config, size_px, WORKER_BUDGET * recovery.time_limit_s, n_threads=n_threads)
-    limits = recovery.time_limit_s, recovery.finish_wait_s
-    return WorkerExecutor(make_parts, recovery.workers, *limits, on_start=faults.kill_worker)
+    walks = Lane(
+        "walks",
+        (JobKind.CALIBRATION, JobKind.WALK),
+        partial(walk_handlers, config, size_px, n_threads),
+        recovery.workers,
+        recovery.time_limit_s,
+        niceness=WALK_NICENESS,
+    )
+    return WorkerDesk([walks], recovery.finish_wait_s, faults.kill_worker)
 
 
 def recovery_parts(

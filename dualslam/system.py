@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.calibration.background import Calibrations
 from dualslam.calibration.lens import Calibration
 from dualslam.config.settings import Config
 from dualslam.core.atlas_problem import AtlasSolver
@@ -28,6 +29,7 @@ from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
 from dualslam.recovery.executor import RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
+from dualslam.recovery.jobs import Desk
 from dualslam.recovery.manager import Recoveries
 from dualslam.recovery.relocaliser import Relocaliser
 
@@ -38,7 +40,8 @@ log = logging.getLogger(__name__)
 class Components:
     """The parts that the composition root puts in: the system itself knows neither front end nor solver.
 
-    `new_relocaliser`: a front end that finds its submap again wherever it is seen, and goes on from there.
+    `new_relocaliser`: a front end that finds its submap again wherever it is seen, and goes on from there. `desk`: where
+    work beside the tracking is done; walks back have an executor of their own, which may stand at the same desk.
     """
 
     view_of: Callable[[Frame], View | Failure]
@@ -51,6 +54,7 @@ class Components:
     recovery: RecoveryExecutor
     atlas_solver: AtlasSolver
     adjust_bundle: BundleAdjuster
+    desk: Desk
 
     @property
     def K(self) -> FloatArray:
@@ -98,6 +102,9 @@ class System:
             self._connections,
             config.recovery,
         )
+        self._calibrations = Calibrations(
+            record, self.buffer, components.calibration, components.desk, components.new_graph, self._connections
+        )
 
     @property
     def live(self) -> VisualOdometry | None:
@@ -122,7 +129,8 @@ class System:
         """
         started = time.perf_counter()
         self.rows[frame.index] = FrameRecord(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
-        # 1. What walks back in time have found meanwhile comes into the map between two frames.
+        # 1. What was found beside the tracking meanwhile comes into the map between two frames.
+        self._calibrations.collect(self._live, frame, self._recoveries.waiting)
         self._recoveries.collect(self._live, frame)
         # 2. Features, into the buffer that a walk back in time will read.
         with self.timer.measure("features"):
@@ -146,6 +154,7 @@ class System:
         self._recoveries.finish(self._live, next(reversed(self.rows.values()), None), interrupted)
         if self._live is not None:
             self._archive(self._live, "end of sequence")
+        self._parts.desk.close()
 
     # --- initialising
 
@@ -234,8 +243,8 @@ class System:
         if track:
             self._lost = []
             self.buffer.thaw()
-            if live.reference_id == view.index and self._parts.calibration.is_due(live.submap):
-                self._calibrate(live, view)
+            if live.reference_id == view.index:
+                self._calibrations.ask_if_due(live, view, self._recoveries.waiting)
             if len(live.submap.keyframes) >= self._config.graph.max_keyframes:
                 self._roll_over(live, view)
             elif live.reference_id == view.index:
@@ -275,34 +284,6 @@ class System:
         )
         self._record.pose(pose, track.n_matches, track.n_inliers)
         return track
-
-    def _calibrate(self, live: VisualOdometry, view: View) -> None:
-        """Ask the submap about its camera. Where the answer is clear, submap, graph and buffer change to it.
-
-        So do the lost submaps that are to be linked with it.
-        """
-        calibration = self._parts.calibration
-        with self.timer.measure("calibration"):
-            refined = calibration.refine(live.submap, self._parts.new_graph())
-            if isinstance(refined, Failure):
-                self._record.event(
-                    EventKind.CALIBRATION_KEPT, view, live.submap.id, reason=refined.detail, **refined.numbers
-                )
-                return
-            live.adopt(refined.graph, refined.before)
-            self.buffer.map(calibration.rectified)
-            self._connections.follow(refined.before, live.submap, view)
-            changed = [m for m in self._recoveries.waiting if self._update_camera(self.atlas.submaps[m], view)]
-        self._record.event(EventKind.CALIBRATED, view, live.submap.id, lost=changed, **refined.numbers)
-
-    def _update_camera(self, lost: Submap, view: View) -> bool:
-        """Change a lost submap to the present camera, if it can be."""
-        before = self._parts.calibration.update(lost, self._parts.new_graph())
-        if isinstance(before, Failure):
-            log.warning("submap %d keeps its camera: %s", lost.id, before.detail)
-            return False
-        self._connections.follow(before, lost, view)
-        return True
 
     # --- failure
 

@@ -1,7 +1,13 @@
-"""The camera as it is known now: when a submap is asked about it, what changes with the answer, and what must wait."""
+"""The camera as it is known now: when a submap is asked about it, what changes with the answer, and what must wait.
+
+Asking takes up to seconds, so it is a job on a snapshot (`CalibrationJob`), which `answer` does, wherever that is; the
+submap that was asked has gone on when the answer comes (`dualslam/calibration/background.py`).
+"""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,11 +17,58 @@ from dualslam.core.camera.corrected import correct
 from dualslam.core.camera.models import Camera
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph
-from dualslam.core.types import Failure, FailureReason, Features, FloatArray, View
+from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Keyframe, View
 from dualslam.map.submap import Submap
+
+log = logging.getLogger(__name__)
 
 RETRY_KEYFRAMES, RETRY_SHARE = 10, 0.25
 """Where the motion said nothing yet, a submap is asked again after so many more keyframes, or this share more."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationJob:
+    """A question about the camera, with all that the answer is made from. It can be pickled.
+
+    Attributes
+    ----------
+    submap : Submap
+        The one that is asked, a copy.
+    lost : dict of int to Submap
+        Copies of those that are to change with it.
+    camera : Camera
+        The present one, which rectified their features.
+    covariance : (5, 5) or None
+        Of the correction that it has, if it was estimated.
+    """
+
+    submap: Submap
+    lost: dict[int, Submap]
+    camera: Camera
+    covariance: FloatArray | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationAnswer:
+    """What a submap has said of its camera, and what becomes of the maps.
+
+    Attributes
+    ----------
+    camera : Camera
+    covariance : (5, 5)
+    submap : Submap
+        The job's, changed to that camera and adjusted.
+    lost : dict of int to Submap
+        Those of the job's that could be changed, solved.
+    numbers : dict
+        For the event log.
+    """
+
+    camera: Camera
+    covariance: FloatArray
+    submap: Submap
+    lost: dict[int, Submap]
+    numbers: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,15 +77,15 @@ class Refinement:
 
     Attributes
     ----------
-    graph : SubmapGraph
-        Made from the changed submap.
+    graph : SubmapGraph or None
+        Made from the changed submap, where one was given.
     before : Submap
         A copy of the submap as it was.
     numbers : dict
         For the event log.
     """
 
-    graph: SubmapGraph
+    graph: SubmapGraph | None
     before: Submap
     numbers: dict[str, float]
 
@@ -47,10 +100,17 @@ class Calibration:
     config : CalibrationConfig
     estimate : SelfCalibrator
     adjust : SubmapAdjuster
+    covariance : (5, 5), optional
+        Of the correction that the camera has, if it was estimated.
     """
 
     def __init__(
-        self, camera: Camera, config: CalibrationConfig, estimate: SelfCalibrator, adjust: SubmapAdjuster
+        self,
+        camera: Camera,
+        config: CalibrationConfig,
+        estimate: SelfCalibrator,
+        adjust: SubmapAdjuster,
+        covariance: FloatArray | None = None,
     ) -> None:
         self._camera = camera
         self._config = config
@@ -58,7 +118,7 @@ class Calibration:
         self._adjust = adjust
         self._due_at: dict[int, int] = {}
         self._refined_in: int | None = None
-        self._covariance: FloatArray | None = None  # (5, 5), of the correction that the camera holds
+        self._covariance = covariance
 
     @property
     def camera(self) -> Camera:
@@ -77,22 +137,46 @@ class Calibration:
         due_at = self._due_at.get(submap.id, self._config.first_keyframes)
         return self._config.refine and len(submap.keyframes) >= due_at
 
-    def refine(self, submap: Submap, graph: SubmapGraph) -> Refinement | Failure:
+    def ask(self, submap: Submap, lost: dict[int, Submap]) -> CalibrationJob:
+        """Return the question to a submap, on copies of it and of those that are to change with it.
+
+        It is not due again before the submap has grown.
+        """
+        self._asked(submap.id, len(submap.keyframes))
+        copies = {m: each.copy() for m, each in lost.items()}
+        return CalibrationJob(submap.copy(), copies, self._camera, self._covariance)
+
+    def note(self, job: CalibrationJob, failure: Failure) -> None:
+        """Note that a question had no clear answer: where the motion said nothing yet, the next comes sooner."""
+        if failure.reason is FailureReason.DEGENERATE:
+            self._said_nothing(job.submap.id, len(job.submap.keyframes))
+
+    def take(self, answer: CalibrationAnswer) -> None:
+        """Let the frames to come be rectified by the camera that was found."""
+        self._camera, self._refined_in, self._covariance = answer.camera, answer.submap.id, answer.covariance
+
+    def _asked(self, submap_id: int, n: int) -> None:
+        self._due_at[submap_id] = int(np.ceil(self._config.growth * n))
+
+    def _said_nothing(self, submap_id: int, n: int) -> None:
+        self._due_at[submap_id] = n + max(RETRY_KEYFRAMES, int(RETRY_SHARE * n))
+
+    def refine(self, submap: Submap, graph: SubmapGraph | None = None) -> Refinement | Failure:
         """Ask a submap about its camera and, where the answer is clear, change the submap to it.
 
         Parameters
         ----------
         submap : Submap
             Keeps its ids. Only where the whole change succeeds, it gets other intrinsics, pixels, poses and points.
-        graph : SubmapGraph
-            A new one, for the changed submap.
+        graph : SubmapGraph, optional
+            A new one, for the changed submap; without it, whoever asked solves.
         """
         n = len(submap.keyframes)
-        self._due_at[submap.id] = int(np.ceil(self._config.growth * n))
+        self._asked(submap.id, n)
         estimate = self._estimate(submap, self._camera, self._covariance)
         if isinstance(estimate, Failure):
             if estimate.reason is FailureReason.DEGENERATE:
-                self._due_at[submap.id] = n + max(RETRY_KEYFRAMES, int(RETRY_SHARE * n))
+                self._said_nothing(submap.id, n)
             return estimate
         numbers = estimate.numbers
         if not estimate.accepted and not self._is_much_surer(estimate.covariance):
@@ -116,12 +200,13 @@ class Calibration:
         except (InputError, SolverError) as error:
             return Failure(FailureReason.SOLVER, str(error))
 
-    def _change(self, submap: Submap, camera: Camera, graph: SubmapGraph) -> Submap:
+    def _change(self, submap: Submap, camera: Camera, graph: SubmapGraph | None) -> Submap:
         changed = submap.copy()
-        _change_camera(changed, camera)
+        change_camera(changed, camera)
         self._adjust(changed)
-        solved = graph.rebuild(changed)
-        changed.apply_estimate(*solved.values)
+        if graph is not None:
+            solved = graph.rebuild(changed)
+            changed.apply_estimate(*solved.values)
         before = submap.copy()
         submap.take_over(changed)
         return before
@@ -143,7 +228,35 @@ class Calibration:
         return replace(view, features=replace(features, uv_rect_px=uv_rect_px))
 
 
-def _rectified_again(features: Features, camera: Camera) -> Features:
+def answer(
+    job: CalibrationJob, calibration: Calibration, new_graph: Callable[[], SubmapGraph]
+) -> CalibrationAnswer | Failure:
+    """Do a job: ask its submap, and change it and the lost ones where the answer is clear.
+
+    Parameters
+    ----------
+    job : CalibrationJob
+        Its submaps are not changed.
+    calibration : Calibration
+        One of its own, with the camera and the covariance of the job.
+    new_graph : callable
+    """
+    submap, changed = job.submap.copy(), {}
+    refined = calibration.refine(submap)
+    if isinstance(refined, Failure):
+        return refined
+    for m, each in job.lost.items():
+        lost = each.copy()
+        before = calibration.update(lost, new_graph())
+        if isinstance(before, Failure):
+            log.warning("submap %d keeps its camera: %s", m, before.detail)
+        else:
+            changed[m] = lost
+    assert calibration.covariance is not None
+    return CalibrationAnswer(calibration.camera, calibration.covariance, submap, changed, refined.numbers)
+
+
+def rectified_again(features: Features, camera: Camera) -> Features:
     """Return features with their pixels under another camera. None is dropped (observations name them by their row),
     and sigmas stay: a correction changes them by a few per cent.
     """
@@ -154,8 +267,18 @@ def _rectified_again(features: Features, camera: Camera) -> Features:
     return replace(features, uv_rect_px=uv_rect_px)
 
 
-def _change_camera(submap: Submap, camera: Camera) -> None:
+def change_camera(
+    submap: Submap, camera: Camera, done: Mapping[int, Keyframe] | None = None, of: Mapping[int, Keyframe] | None = None
+) -> None:
+    """Give a submap the pixels and the intrinsics of another camera; poses and points stay.
+
+    `done`: keyframes whose pixels were changed already, when they were as they are in `of`.
+    """
     submap.K = camera.K
     submap.relative_poses = {}  # they were measured with the camera of before
+    done, of = done or {}, of or {}
     for k, keyframe in submap.keyframes.items():
-        submap.keyframes[k] = replace(keyframe, features=_rectified_again(keyframe.features, camera))
+        if k in done and k in of and keyframe.features is of[k].features:
+            submap.keyframes[k] = replace(keyframe, features=done[k].features)
+        else:
+            submap.keyframes[k] = replace(keyframe, features=rectified_again(keyframe.features, camera))

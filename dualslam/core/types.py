@@ -264,6 +264,7 @@ class FailureReason(StrEnum):
     UNCONFIRMED = "unconfirmed"
     TIMEOUT = "timeout"
     WORKER = "worker"
+    BUSY = "busy"
     DISABLED = "disabled"
 
 

@@ -1,4 +1,4 @@
-"""What runs walks back in time: here in the process that tracks; `dualslam/recovery/worker.py` has the one with processes."""
+"""What runs walks back in time: here in the process that tracks, or at a desk with processes (`dualslam/recovery/jobs.py`)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Protocol
 
 from dualslam.core.types import Failure
 from dualslam.recovery.direction import recover
+from dualslam.recovery.jobs import Desk, JobKind
 from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryParts, RecoveryResult
 
 Outcome = tuple[RecoveryJob, RecoveryResult | Failure]
@@ -46,3 +47,22 @@ class InlineExecutor:
     def finish(self) -> list[Outcome]:
         """Return what has run since the last call."""
         return self.poll()
+
+
+class DeskExecutor:
+    """Runs each job at a desk, beside the tracking."""
+
+    def __init__(self, desk: Desk) -> None:
+        self.desk = desk
+
+    def submit(self, job: RecoveryJob) -> None:
+        """Hand the job to the desk."""
+        self.desk.submit(JobKind.WALK, job)
+
+    def poll(self) -> list[Outcome]:
+        """Return what has ended since the last call."""
+        return [(ended.work, ended.result) for ended in self.desk.poll(JobKind.WALK)]
+
+    def finish(self) -> list[Outcome]:
+        """Wait for what is under way, for so long and no longer."""
+        return [(ended.work, ended.result) for ended in self.desk.drain(JobKind.WALK)]

@@ -1,7 +1,12 @@
-"""Recovery beside the tracking: warm worker processes, fed with jobs and asked for results without ever waiting.
+"""Work beside the tracking in processes of their own: warm, fed with jobs, asked for results without ever waiting.
 
 A process, because GTSAM holds the interpreter's lock while it solves. A worker that dies, or takes longer than its
-time, costs the recovery that it was busy with: the job ends as a `Failure`, and a fresh worker takes the place.
+time, costs the job that it was busy with: the job ends as a `Failure`, and a fresh worker takes the place.
+
+Workers stand in lanes. One is for what the live map asks for all the time, so that no walk back of 20 s stands before
+its graph; one is for walks and whatever else may take long. Where cores are short, the system's scheduler gives way to
+the tracking first, then to the live map's lane (`Lane.niceness`). A lane's queue is bounded, and its most urgent kind
+goes first.
 
 Workers are spawned, so a script of one's own that asks for them must be importable: what it runs stands under
 ``if __name__ == "__main__":``.
@@ -11,50 +16,65 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
+import os
 import signal
 import time
-from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from queue import Empty, SimpleQueue
 from threading import Thread
+from typing import Any
 
 from dualslam.core.memory import keep_freed_memory
 from dualslam.core.types import Failure, FailureReason
-from dualslam.recovery.direction import recover
-from dualslam.recovery.executor import Outcome
-from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryParts, RecoveryResult
+from dualslam.recovery.jobs import Ended, Handlers, JobKind
+from dualslam.recovery.transport import receive, send
 
 log = logging.getLogger(__name__)
 
-MakeParts = Callable[[], RecoveryParts]
+MakeHandlers = Callable[[], Handlers]
+"""Makes, in the process, what does the work. It is pickled: a function of a module, or a `partial` of one."""
 
 STOP_S = 2.0
 """How long a worker that is idle may take to end by itself; its exit takes tens of milliseconds."""
 PAUSE_S = 0.01
-"""Between two looks at whether the last recoveries have ended, when nothing else is left to do."""
+"""Between two looks at whether the last jobs have ended, when nothing else is left to do."""
+MAX_WAITING = 8
+"""Jobs of a kind that may wait: more are nothing but a back end that is behind, and hold their snapshots in memory."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Answer:
+    result: Any | Failure
+    cpu_s: float = 0.0
 
 
 class Worker:
-    """A process that runs one job after the other. It has imported all that it needs before the first comes.
+    """A process that does one job after the other. It has imported all that it needs before the first comes.
 
     Parameters
     ----------
-    make_parts : callable
-        Makes, in the process, what a walk is made of. It is pickled: a function of a module, or a `partial` of one.
+    make_handlers : callable
+        See `MakeHandlers`.
+    niceness : int
+        By so much it stands behind the process that tracks.
+    name : str
     """
 
-    def __init__(self, make_parts: MakeParts) -> None:
+    def __init__(self, make_handlers: MakeHandlers, niceness: int = 0, name: str = "worker") -> None:
         context = multiprocessing.get_context("spawn")
+        self._name = name
         self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=serve, args=(theirs, make_parts), name="dualslam recovery", daemon=True)
+        process = context.Process(target=serve, args=(theirs, make_handlers, niceness), name=name, daemon=True)
+        self._process = process
         self._process.start()
         theirs.close()
-        self._jobs: SimpleQueue[RecoveryJob | None] = SimpleQueue()
-        self._results: SimpleQueue[RecoveryResult | Failure] = SimpleQueue()
+        self._jobs: SimpleQueue[tuple[JobKind, Any] | None] = SimpleQueue()
+        self._results: SimpleQueue[_Answer] = SimpleQueue()
         # Pipes block, and a job is tens of megabytes: a thread of its own waits for them.
-        self._carrier = Thread(target=self._carry, name="dualslam recovery", daemon=True)
+        self._carrier = Thread(target=self._carry, name=name, daemon=True)
         self._carrier.start()
 
     @property
@@ -62,11 +82,11 @@ class Worker:
         """Of the process."""
         return self._process.pid
 
-    def give(self, job: RecoveryJob) -> None:
+    def give(self, kind: JobKind, work: Any) -> None:
         """Hand over a job; one at a time."""
-        self._jobs.put(job)
+        self._jobs.put((kind, work))
 
-    def result(self) -> RecoveryResult | Failure | None:
+    def result(self) -> _Answer | None:
         """Return what came of the job, or None while it runs. A worker that has died says so by a `Failure`."""
         try:
             return self._results.get_nowait()
@@ -92,140 +112,236 @@ class Worker:
         with self._connection:
             try:
                 while (job := self._jobs.get()) is not None:
-                    _send(self._connection, job)
-                    self._results.put(self._connection.recv())
+                    send(self._connection, job)
+                    self._results.put(receive(self._connection))
             except (EOFError, OSError):
                 self._process.join()
-                detail = f"the recovery process ended with exit code {self._process.exitcode}"
-                self._results.put(Failure(FailureReason.WORKER, detail))
+                detail = f"the {self._name} process ended with exit code {self._process.exitcode}"
+                self._results.put(_Answer(Failure(FailureReason.WORKER, detail)))
 
 
-def serve(connection: Connection, make_parts: MakeParts) -> None:
-    """Run jobs until the other end of the pipe is closed: what a worker process does."""
+def serve(connection: Connection, make_handlers: MakeHandlers, niceness: int = 0) -> None:
+    """Do jobs until the other end of the pipe is closed: what a worker process does."""
     # An interrupt at the terminal reaches all processes; what becomes of the run is the first one's affair.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if niceness:
+        os.nice(niceness)
     keep_freed_memory()
-    parts = make_parts()
+    handlers = make_handlers()
     while True:
         try:
-            job = _receive(connection)
+            kind, work = receive(connection)
         except EOFError:
             return
-        result = recover(job, parts)
+        began_s = time.process_time()
+        result = handlers[kind](work)
         try:
-            connection.send(result)
+            send(connection, _Answer(result, time.process_time() - began_s))
         except BrokenPipeError:  # nobody waits for it any more
             return
 
 
-def _send(connection: Connection, job: RecoveryJob) -> None:
-    # One by one: pickling holds the interpreter's lock, and all images at once would stop the tracking meanwhile.
-    connection.send((replace(job, views=()), len(job.views)))
-    for view in job.views:
-        connection.send(view)
-
-
-def _receive(connection: Connection) -> RecoveryJob:
-    job: RecoveryJob
-    job, n_views = connection.recv()
-    return replace(job, views=tuple(connection.recv() for _ in range(n_views)))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class _Task:
-    job: RecoveryJob
-    worker: Worker
-    began_s: float
+class Lane:
+    """Processes for some kinds of jobs.
 
-
-class WorkerExecutor:
-    """The `dualslam.recovery.executor.RecoveryExecutor` whose jobs run in processes of their own.
-
-    Parameters
+    Attributes
     ----------
-    make_parts : callable
-        As for `Worker`.
+    name : str
+    kinds : sequence of JobKind
+        The most urgent first: where several jobs wait, one of it goes first.
+    make_handlers : callable
     n_workers : int
         Jobs that run at the same time; further ones wait their turn.
     time_limit_s : float
         How long a job may take before its worker counts as hung.
+    niceness : int
+        See `Worker`.
+    max_waiting : int
+        Jobs of a kind that may wait for a worker.
+    """
+
+    name: str
+    kinds: Sequence[JobKind]
+    make_handlers: MakeHandlers
+    n_workers: int
+    time_limit_s: float
+    niceness: int = 0
+    max_waiting: int = MAX_WAITING
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    kind: JobKind
+    work: Any
+    submitted_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Task:
+    job: _Job
+    worker: Worker
+    began_s: float
+
+
+@dataclass(slots=True, eq=False)
+class _Queue:
+    """A lane at work."""
+
+    lane: Lane
+    idle: list[Worker]
+    busy: list[_Task] = field(default_factory=list)
+    waiting: list[_Job] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class QueueStatistics:
+    """What came of the jobs of a kind.
+
+    Attributes
+    ----------
+    n_done, n_failed : int
+        Jobs that have ended; and those of them whose worker died or hung, or that were one too many.
+    max_waiting : int
+        Jobs that waited at the same time.
+    longest_s : float
+        From when a job was submitted to its end.
+    cpu_s : float
+        Of the processes.
+    """
+
+    n_done: int = 0
+    n_failed: int = 0
+    max_waiting: int = 0
+    longest_s: float = 0.0
+    cpu_s: float = 0.0
+
+
+class WorkerDesk:
+    """The `dualslam.recovery.jobs.Desk` whose jobs run in processes of their own.
+
+    Parameters
+    ----------
+    lanes : sequence of Lane
+        No kind stands in two of them.
     finish_wait_s : float
         How long the end of the run waits for what is under way.
     on_start : callable, optional
-        Called with each job that a process begins, and the process's id: where the failure lab takes hold.
+        Called with each job that a process begins (kind and work), and the process's id: where the failure lab takes
+        hold.
     """
 
     def __init__(
         self,
-        make_parts: MakeParts,
-        n_workers: int,
-        time_limit_s: float,
+        lanes: Sequence[Lane],
         finish_wait_s: float,
-        on_start: Callable[[RecoveryJob, int | None], None] | None = None,
+        on_start: Callable[[JobKind, Any, int | None], None] | None = None,
     ) -> None:
-        self._make_parts = make_parts
-        self._time_limit_s = time_limit_s
+        self.on_start = on_start
+        self.statistics: defaultdict[JobKind, QueueStatistics] = defaultdict(QueueStatistics)
         self._finish_wait_s = finish_wait_s
-        self._on_start = on_start
-        self._idle = [Worker(make_parts) for _ in range(n_workers)]
-        self._busy: list[_Task] = []
-        self._waiting: deque[RecoveryJob] = deque()
+        self._queues = [_Queue(lane, [_worker(lane) for _ in range(lane.n_workers)]) for lane in lanes]
+        self._by_kind = {kind: queue for queue in self._queues for kind in queue.lane.kinds}
+        self._ended: defaultdict[JobKind, list[Ended]] = defaultdict(list)
 
     @property
     def pids(self) -> list[int | None]:
-        """Process ids of the workers, the busy ones first."""
-        return [worker.pid for worker in [*(task.worker for task in self._busy), *self._idle]]
+        """Process ids of the workers, lane by lane, the busy ones first."""
+        return [w.pid for queue in self._queues for w in [*(task.worker for task in queue.busy), *queue.idle]]
 
-    def submit(self, job: RecoveryJob) -> None:
+    def submit(self, kind: JobKind, work: Any) -> None:
         """Give the job to an idle worker, or let it wait for one."""
-        self._waiting.append(job)
-        self._hand_out()
+        queue = self._by_kind[kind]
+        n_waiting = sum(job.kind is kind for job in queue.waiting)
+        if n_waiting >= queue.lane.max_waiting:
+            self._end(kind, Ended(work, Failure(FailureReason.BUSY, f"{n_waiting} jobs wait for a {kind} already")))
+            return
+        queue.waiting.append(_Job(kind, work, time.monotonic()))
+        self._hand_out(queue)
+        statistics = self.statistics[kind]
+        statistics.max_waiting = max(statistics.max_waiting, sum(job.kind is kind for job in queue.waiting))
 
-    def poll(self) -> list[Outcome]:
+    def poll(self, kind: JobKind) -> list[Ended]:
         """Return what has ended since the last call; never wait."""
-        ended: list[Outcome] = []
-        for task in list(self._busy):
-            result = task.worker.result()
-            if result is None and time.monotonic() - task.began_s > self._time_limit_s:
-                result = Failure(FailureReason.TIMEOUT, f"the recovery took longer than {self._time_limit_s:g} s")
-            if result is None:
-                continue
-            self._busy.remove(task)
-            lost = isinstance(result, Failure) and result.reason in (FailureReason.WORKER, FailureReason.TIMEOUT)
-            self._idle.append(self._replaced(task.worker) if lost else task.worker)
-            ended.append((task.job, result))
-        self._hand_out()
-        return ended
+        self._look(self._by_kind[kind])
+        return self._ended.pop(kind, [])
 
-    def finish(self) -> list[Outcome]:
-        """Wait for what is under way, for so long and no longer, end the workers, and return what has come of it."""
-        ended, began_s = self.poll(), time.monotonic()
-        while self._busy and time.monotonic() - began_s < self._finish_wait_s:
+    def n_open(self, kind: JobKind) -> int:
+        """Count the jobs of a kind that wait or run."""
+        queue = self._by_kind[kind]
+        return sum(job.kind is kind for job in [*queue.waiting, *(task.job for task in queue.busy)])
+
+    def drain(self, kind: JobKind) -> list[Ended]:
+        """Wait for what is under way, for so long and no longer; what has not ended by then ends as a `Failure`."""
+        queue, ended, began_s = self._by_kind[kind], self.poll(kind), time.monotonic()
+        while self.n_open(kind) and time.monotonic() - began_s < self._finish_wait_s:
             time.sleep(PAUSE_S)
-            ended += self.poll()
-        late = Failure(
-            FailureReason.TIMEOUT, f"the run ended, and {self._finish_wait_s:g} s later its recovery had not"
-        )
-        ended += [(job, late) for job in [*(task.job for task in self._busy), *self._waiting]]
-        for task in self._busy:
+            ended += self.poll(kind)
+        late = Failure(FailureReason.TIMEOUT, f"the run ended, and {self._finish_wait_s:g} s later its {kind} had not")
+        open_jobs = [*(task.job for task in queue.busy if task.job.kind is kind), *queue.waiting]
+        ended += [Ended(job.work, late) for job in open_jobs if job.kind is kind]
+        queue.waiting = [job for job in queue.waiting if job.kind is not kind]
+        for task in [task for task in queue.busy if task.job.kind is kind]:
+            queue.busy.remove(task)
             task.worker.stop()
-        for worker in self._idle:
-            worker.stop(STOP_S)
-        self._busy, self._idle, self._waiting = [], [], deque()
         return ended
 
-    def _hand_out(self) -> None:
-        while self._waiting and self._idle:
-            worker = self._idle.pop(0)
-            if not worker.alive:
-                log.warning("a recovery process had ended while idle; starting another one")
-                worker = self._replaced(worker)
-            job = self._waiting.popleft()
-            worker.give(job)
-            self._busy.append(_Task(job, worker, time.monotonic()))
-            if self._on_start is not None:
-                self._on_start(job, worker.pid)
+    def close(self) -> None:
+        """End the workers."""
+        for queue in self._queues:
+            for task in queue.busy:
+                task.worker.stop()
+            for worker in queue.idle:
+                worker.stop(STOP_S)
+            queue.busy, queue.idle, queue.waiting = [], [], []
 
-    def _replaced(self, worker: Worker) -> Worker:
-        worker.stop()
-        return Worker(self._make_parts)
+    def _look(self, queue: _Queue) -> None:
+        """See what has ended in a lane, and give its idle workers what waits."""
+        for task in list(queue.busy):
+            answer, limit_s = task.worker.result(), queue.lane.time_limit_s
+            if answer is None and time.monotonic() - task.began_s > limit_s:
+                answer = _Answer(Failure(FailureReason.TIMEOUT, f"the {task.job.kind} took longer than {limit_s:g} s"))
+            if answer is None:
+                continue
+            queue.busy.remove(task)
+            lost = _is_lost(answer.result)
+            queue.idle.append(_replaced(task.worker, queue.lane) if lost else task.worker)
+            wall_s = time.monotonic() - task.job.submitted_s
+            self._end(task.job.kind, Ended(task.job.work, answer.result, answer.cpu_s, wall_s))
+        self._hand_out(queue)
+
+    def _end(self, kind: JobKind, ended: Ended) -> None:
+        statistics = self.statistics[kind]
+        statistics.n_done += 1
+        statistics.n_failed += _is_lost(ended.result)
+        statistics.longest_s = max(statistics.longest_s, ended.wall_s)
+        statistics.cpu_s += ended.cpu_s
+        self._ended[kind].append(ended)
+
+    def _hand_out(self, queue: _Queue) -> None:
+        while queue.waiting and queue.idle:
+            worker = queue.idle.pop(0)
+            if not worker.alive:
+                log.warning("a %s process had ended while idle; starting another one", queue.lane.name)
+                worker = _replaced(worker, queue.lane)
+            job = min(queue.waiting, key=lambda job: queue.lane.kinds.index(job.kind))  # the first of equals
+            queue.waiting.remove(job)
+            worker.give(job.kind, job.work)
+            queue.busy.append(_Task(job, worker, time.monotonic()))
+            if self.on_start is not None:
+                self.on_start(job.kind, job.work, worker.pid)
+
+
+def _is_lost(result: Any) -> bool:
+    """Whether it was no answer, but the end of a worker, or of the patience with one."""
+    reasons = (FailureReason.WORKER, FailureReason.TIMEOUT, FailureReason.BUSY)
+    return isinstance(result, Failure) and result.reason in reasons
+
+
+def _worker(lane: Lane) -> Worker:
+    return Worker(lane.make_handlers, lane.niceness, f"dualslam {lane.name}")
+
+
+def _replaced(worker: Worker, lane: Lane) -> Worker:
+    worker.stop()
+    return _worker(lane)

@@ -1,4 +1,4 @@
-"""Recovery in a process of its own: the same result as inline, and no way in which a worker can take the run down."""
+"""Work in processes of its own: the same result as inline, and no way in which a worker can take the run down."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ from functools import partial
 import numpy as np
 import pytest
 
-from dualslam.build import recovery_parts
+from dualslam.build import recovery_parts, walk_handlers
 from dualslam.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.types import Failure, FailureReason
 from dualslam.recovery.executor import Outcome
+from dualslam.recovery.jobs import JobKind
 from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryResult, run_recovery
-from dualslam.recovery.worker import WorkerExecutor
+from dualslam.recovery.worker import Lane, WorkerDesk
 from dualslam.run.results import trajectories_of
 from dualslam.testing.point_world import SIZE_PX, PointWorld, cloud, hand_held, pose_errors, system_in
 
 COVERED = frozenset(range(35, 50))
 MAKE_PARTS = partial(recovery_parts, Config(), SIZE_PX)
+MAKE_HANDLERS = partial(walk_handlers, Config(), SIZE_PX, 1)
 PATIENCE_S = 120.0  # of the test, on a busy machine
 
 
@@ -54,18 +56,22 @@ def job() -> RecoveryJob:
     return job
 
 
+def walking_desk(time_limit_s: float = PATIENCE_S, finish_wait_s: float = 0.0) -> WorkerDesk:
+    return WorkerDesk([Lane("walks", (JobKind.WALK,), MAKE_HANDLERS, 1, time_limit_s)], finish_wait_s)
+
+
 @pytest.fixture
-def executor() -> Iterator[WorkerExecutor]:
-    executor = WorkerExecutor(MAKE_PARTS, 1, time_limit_s=PATIENCE_S, finish_wait_s=0.0)
-    yield executor
-    executor.finish()
+def desk() -> Iterator[WorkerDesk]:
+    desk = walking_desk()
+    yield desk
+    desk.close()
 
 
-def wait_for(executor: WorkerExecutor) -> RecoveryResult | Failure:
+def wait_for(desk: WorkerDesk) -> RecoveryResult | Failure:
     began_s = time.monotonic()
     while time.monotonic() - began_s < PATIENCE_S:
-        for _, result in executor.poll():
-            return result
+        for ended in desk.poll(JobKind.WALK):
+            return ended.result
         time.sleep(0.02)
     raise AssertionError("the worker gave no result")
 
@@ -113,62 +119,64 @@ def test_a_job_can_be_pickled_and_is_left_as_it_was(job: RecoveryJob) -> None:
         assert np.array_equal(column, job.submap.landmarks[name])
 
 
-def test_a_worker_finds_what_would_be_found_inline_and_stays_warm(executor: WorkerExecutor, job: RecoveryJob) -> None:
-    pids = executor.pids
+def test_a_worker_finds_what_would_be_found_inline_and_stays_warm(desk: WorkerDesk, job: RecoveryJob) -> None:
+    pids = desk.pids
     for _ in range(2):
-        executor.submit(job)
-        assert_same(wait_for(executor), run_recovery(job, MAKE_PARTS()))
-    assert executor.pids == pids
-    assert executor.finish() == []
+        desk.submit(JobKind.WALK, job)
+        assert_same(wait_for(desk), run_recovery(job, MAKE_PARTS()))
+    assert desk.pids == pids
+    assert desk.drain(JobKind.WALK) == []
+    desk.close()
     assert gone(pids[0])
 
 
-def test_a_worker_that_is_killed_costs_its_job_only(executor: WorkerExecutor, job: RecoveryJob) -> None:
-    (pid,) = executor.pids
-    executor.submit(job)
-    executor.submit(job)  # waits for its turn
+def test_a_worker_that_is_killed_costs_its_job_only(desk: WorkerDesk, job: RecoveryJob) -> None:
+    (pid,) = desk.pids
+    desk.submit(JobKind.WALK, job)
+    desk.submit(JobKind.WALK, job)  # waits for its turn
     assert pid is not None
     os.kill(pid, signal.SIGKILL)
-    lost = wait_for(executor)
+    lost = wait_for(desk)
     assert isinstance(lost, Failure)
     assert lost.reason is FailureReason.WORKER
     assert "-9" in lost.detail
-    assert isinstance(wait_for(executor), RecoveryResult)
+    assert isinstance(wait_for(desk), RecoveryResult)
 
 
-def test_a_worker_that_died_while_idle_is_replaced(executor: WorkerExecutor, job: RecoveryJob) -> None:
-    (pid,) = executor.pids
+def test_a_worker_that_died_while_idle_is_replaced(desk: WorkerDesk, job: RecoveryJob) -> None:
+    (pid,) = desk.pids
     assert pid is not None
     os.kill(pid, signal.SIGKILL)
-    while executor._idle[0].alive:
+    while desk._queues[0].idle[0].alive:
         time.sleep(0.01)
-    executor.submit(job)
-    assert isinstance(wait_for(executor), RecoveryResult)
+    desk.submit(JobKind.WALK, job)
+    assert isinstance(wait_for(desk), RecoveryResult)
 
 
 def test_a_worker_that_hangs_is_ended_after_its_time(job: RecoveryJob) -> None:
-    executor = WorkerExecutor(MAKE_PARTS, 1, time_limit_s=0.3, finish_wait_s=0.0)
-    (pid,) = executor.pids
+    desk = walking_desk(time_limit_s=0.3)
+    (pid,) = desk.pids
     assert pid is not None
     os.kill(pid, signal.SIGSTOP)
-    executor.submit(job)
-    lost = wait_for(executor)
+    desk.submit(JobKind.WALK, job)
+    lost = wait_for(desk)
     assert isinstance(lost, Failure)
     assert lost.reason is FailureReason.TIMEOUT
     assert gone(pid)
-    assert executor.pids != [pid]
-    executor.finish()
+    assert desk.pids != [pid]
+    desk.close()
 
 
 def test_the_end_of_a_run_waits_so_long_and_no_longer(job: RecoveryJob) -> None:
-    executor = WorkerExecutor(MAKE_PARTS, 1, time_limit_s=PATIENCE_S, finish_wait_s=0.2)
-    (pid,) = executor.pids
+    desk = walking_desk(finish_wait_s=0.2)
+    (pid,) = desk.pids
     assert pid is not None
     os.kill(pid, signal.SIGSTOP)
-    executor.submit(job)
-    executor.submit(job)
-    outcomes = executor.finish()
-    assert [isinstance(r, Failure) and r.reason is FailureReason.TIMEOUT for _, r in outcomes] == [True, True]
+    desk.submit(JobKind.WALK, job)
+    desk.submit(JobKind.WALK, job)
+    ended = desk.drain(JobKind.WALK)
+    assert [bool(e.result) or e.result.reason is FailureReason.TIMEOUT for e in ended] == [True, True]
+    desk.close()
     assert gone(pid)
 
 

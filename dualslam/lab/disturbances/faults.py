@@ -21,6 +21,7 @@ from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, Track, View
 from dualslam.map.submap import Submap
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
+from dualslam.recovery.jobs import JobKind
 from dualslam.recovery.reverse_tracking import RecoveryJob
 
 _KINDS = INTERNAL_KINDS | {CorruptionKind.FEW_FEATURES}
@@ -64,9 +65,9 @@ class FaultScript:
         """Return what runs recoveries in this process, with one of them taken away where the script says so."""
         return _FaultyInline(executor, self) if self._faults else executor
 
-    def kill_worker(self, job: RecoveryJob, pid: int | None) -> None:
+    def kill_worker(self, kind: JobKind, job: Any, pid: int | None) -> None:
         """Kill the process that has begun a recovery, where the script says so."""
-        if pid is not None and self.worker_dies(job):
+        if kind is JobKind.WALK and pid is not None and self.worker_dies(job):
             os.kill(pid, signal.SIGKILL)
 
     def active(self, kind: CorruptionKind, index: int) -> Corruption | None:

@@ -12,7 +12,7 @@ from dualslam.config.files import load_config
 from dualslam.core.events import EventKind
 from dualslam.core.types import Failure, FailureReason, FrameStatus
 from dualslam.lab.disturbances import Corruption, FaultScript
-from dualslam.recovery.worker import WorkerExecutor
+from dualslam.recovery.worker import WorkerDesk
 from dualslam.run.session import run_to_folder
 from dualslam.run.sources import open_source
 from dualslam.system import System
@@ -134,15 +134,15 @@ def test_a_killed_worker_costs_its_recovery_and_nothing_else(workers: int) -> No
     system = system_in(world, recovery={"enabled": True, "workers": workers})
     script = FaultScript([Corruption.model_validate({"kind": "kill_worker", "start": 30})])
     system._parts = replace(system._parts, view_of=script.around_views(system._parts.view_of))
-    executor = system._recoveries._executor
-    if isinstance(executor, WorkerExecutor):
-        executor._on_start = script.kill_worker
+    desk = system._parts.desk
+    if isinstance(desk, WorkerDesk):
+        desk.on_start = script.kill_worker
     else:
-        system._recoveries._executor = script.around_inline(executor)
+        system._recoveries._executor = script.around_inline(system._recoveries._executor)
     for frame in world.frames():
         system.step(frame)
-        if isinstance(executor, WorkerExecutor):  # frames here take no time, and a camera's do
-            wait_until(lambda: not any(task.worker._results.empty() for task in executor._busy))
+        if isinstance(desk, WorkerDesk):  # frames here take no time, and a camera's do
+            wait_until(lambda: not any(task.worker._results.empty() for queue in desk._queues for task in queue.busy))
     system.finish()
     (failed,) = system.events.of_kind(EventKind.RECOVERY_FAILED)
     assert failed.data["reason"] == "worker"

@@ -1,0 +1,109 @@
+"""Work beside the tracking: one mechanism for all that the next frame does not need.
+
+A job is a snapshot of arrays that nobody else changes, and its kind says what is made of it. What comes back is a
+change, and whoever asked for it merges it, between two frames, into a map that has gone on meanwhile. Where the work is
+done is the desk's affair: `InlineDesk` does it at once, in the process that tracks, so that the same seed gives the
+same run to the bit; `dualslam/recovery/worker.py` has the one with processes. A job may come to nothing: then its outcome is a
+`Failure`, and nothing else has changed.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Protocol
+
+from dualslam.core.types import Failure
+
+
+class JobKind(StrEnum):
+    """What is made of a snapshot, the most urgent first."""
+
+    GRAPH = "graph"
+    CALIBRATION = "calibration"
+    LOOP = "loop search"
+    WALK = "walk back"
+
+
+Handler = Callable[[Any], Any]
+"""Makes a result, which can be pickled, or a `Failure` of the work. One that keeps a state is asked in order."""
+Handlers = Mapping[JobKind, Handler]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ended:
+    """A job that has come to its end.
+
+    Attributes
+    ----------
+    work : object
+        As it was submitted.
+    result : object or Failure
+    cpu_s : float
+        CPU time of the process that did it; 0 inline, where the caller's own clock has run.
+    wall_s : float
+        From when it was submitted, the time in the queue included; 0 inline.
+    """
+
+    work: Any
+    result: Any | Failure
+    cpu_s: float = 0.0
+    wall_s: float = 0.0
+
+
+class Desk(Protocol):
+    """Takes work on and gives results out: nobody waits for anything before the run ends."""
+
+    def submit(self, kind: JobKind, work: Any) -> None:
+        """Take a job on; one too many ends at once, as a `Failure`."""
+        ...
+
+    def poll(self, kind: JobKind) -> list[Ended]:
+        """Return what has ended of a kind since the last call, in the order in which it ended; never wait."""
+        ...
+
+    def n_open(self, kind: JobKind) -> int:
+        """Count the jobs of a kind that wait or run."""
+        ...
+
+    def drain(self, kind: JobKind) -> list[Ended]:
+        """Wait for what is under way of a kind, for so long and no longer, and return all that came of it."""
+        ...
+
+    def close(self) -> None:
+        """End the processes, and what they do."""
+        ...
+
+
+class InlineDesk:
+    """Does each job when it is submitted: one process, deterministic.
+
+    Parameters
+    ----------
+    handlers : mapping of JobKind to Handler
+    """
+
+    def __init__(self, handlers: Handlers) -> None:
+        self._handlers = handlers
+        self._done: defaultdict[JobKind, list[Ended]] = defaultdict(list)
+
+    def submit(self, kind: JobKind, work: Any) -> None:
+        """Do the job."""
+        self._done[kind].append(Ended(work, self._handlers[kind](work)))
+
+    def poll(self, kind: JobKind) -> list[Ended]:
+        """Return what was done since the last call."""
+        return self._done.pop(kind, [])
+
+    def n_open(self, kind: JobKind) -> int:
+        """Return 0."""
+        return 0
+
+    def drain(self, kind: JobKind) -> list[Ended]:
+        """Return what was done since the last call."""
+        return self.poll(kind)
+
+    def close(self) -> None:
+        """Do nothing."""

@@ -1,0 +1,38 @@
+"""Toy work for a desk: a module of its own, because workers are spawned and import what they do."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import Any
+
+import numpy as np
+
+from dualslam.recovery.jobs import Handlers, JobKind
+
+
+def handlers() -> Handlers:
+    """Graph jobs keep a sum, as a graph keeps a state; walks do what they are told; calibrations double an array."""
+    total = 0.0
+
+    def add(number: float) -> float:
+        nonlocal total
+        total += number
+        return total
+
+    return {JobKind.GRAPH: add, JobKind.WALK: obey, JobKind.CALIBRATION: double}
+
+
+def obey(order: tuple[str, float]) -> Any:
+    """`die` at once, `sleep` so many seconds, or say who is asked: its process id and its niceness."""
+    what, seconds = order
+    if what == "die":
+        os._exit(3)
+    time.sleep(seconds)
+    return os.getpid(), os.nice(0)
+
+
+def double(array: np.ndarray) -> np.ndarray:
+    """In place, to see that it may be written to, and is nobody else's."""
+    array *= 2
+    return array

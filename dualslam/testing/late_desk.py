@@ -1,0 +1,36 @@
+"""A desk that does its work inline and gives the results out late, as processes do, but by a fixed schedule."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dualslam.recovery.jobs import Desk, Ended, JobKind
+
+
+class LateDesk:
+    """Gives each result out only after so many more polls of its kind (there is one with each frame, or more)."""
+
+    def __init__(self, inner: Desk, polls: int) -> None:
+        self.inner, self.polls = inner, polls
+        self.waiting: dict[JobKind, list[tuple[int, Ended]]] = {}
+        self.n_polls: dict[JobKind, int] = {}
+
+    def submit(self, kind: JobKind, work: Any) -> None:
+        self.inner.submit(kind, work)
+        at = self.n_polls.get(kind, 0) + self.polls
+        self.waiting.setdefault(kind, []).extend((at, ended) for ended in self.inner.poll(kind))
+
+    def poll(self, kind: JobKind) -> list[Ended]:
+        now = self.n_polls[kind] = self.n_polls.get(kind, 0) + 1
+        due = [ended for at, ended in self.waiting.get(kind, []) if at < now]
+        self.waiting[kind] = [(at, ended) for at, ended in self.waiting.get(kind, []) if at >= now]
+        return due
+
+    def n_open(self, kind: JobKind) -> int:
+        return len(self.waiting.get(kind, []))
+
+    def drain(self, kind: JobKind) -> list[Ended]:
+        return [ended for _, ended in self.waiting.pop(kind, [])]
+
+    def close(self) -> None:
+        self.inner.close()

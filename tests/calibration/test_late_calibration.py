@@ -1,0 +1,110 @@
+"""A camera that is found while the map goes on: what has come since changes with it, and nothing is left behind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dualslam.build import build_system
+from dualslam.calibration.background import merge_calibrated
+from dualslam.calibration.lens import CalibrationAnswer, change_camera
+from dualslam.config.settings import Config
+from dualslam.core.events import EventKind
+from dualslam.core.geometry import se3
+from dualslam.core.types import FloatArray, Frame
+from dualslam.run.results import trajectories_of
+from dualslam.system import System
+from dualslam.testing.late_desk import LateDesk
+from dualslam.testing.point_world import pose_errors
+from tests.backend.test_self_calibration import TRUE, make_submap, wrong_camera
+from tests.calibration.test_lens import WRONG, CalibrationWorld
+
+N_FRAMES = 60
+
+
+def run(polls: int, n_frames: int = N_FRAMES, blind: range = range(0)) -> System:
+    settings = {
+        "calibration": {"first_keyframes": 12, "max_observations": 6000},
+        "keyframes": {"max_parallax_deg": 1.0},
+        "mapping": {"redundant_ratio": 1.0},
+        "recovery": {"enabled": False},
+    }
+    system, world = build_system(Config.model_validate(settings), wrong_camera(WRONG)), CalibrationWorld()
+    calibration = system._parts.calibration
+    system._calibrations._desk = LateDesk(system._parts.desk, polls)
+
+    def view_of(frame: Frame) -> object:
+        view = world.view(frame, calibration)
+        return replace(view, features=view.features.take(np.arange(0))) if frame.index in blind else view
+
+    system._parts = replace(system._parts, view_of=view_of)  # type: ignore[arg-type]
+    for i in range(n_frames):
+        system.step(Frame(i, i / 30, None))
+    system.finish()
+    return system
+
+
+def errors(system: System) -> tuple[FloatArray, FloatArray]:
+    main, world = trajectories_of(system).main, CalibrationWorld()
+    return pose_errors(main.T_world_cam, np.array([world.T_world_cam(i) for i in main.index.tolist()]))
+
+
+@pytest.fixture(scope="module")
+def in_time() -> System:
+    return run(polls=0)
+
+
+@pytest.mark.parametrize("polls", [3, 15])
+def test_a_late_answer_is_as_good_as_one_in_time(in_time: System, polls: int) -> None:
+    late = run(polls)
+    asked, found = (system.events.of_kind(EventKind.CALIBRATED)[0] for system in (in_time, late))
+    assert found.frame == asked.frame + polls
+    assert found.data["log_focal"] == pytest.approx(asked.data["log_focal"], abs=1e-12)  # the same snapshot was asked
+    (submap,) = late.atlas.submaps.values()
+    camera = late._parts.calibration.camera
+    np.testing.assert_array_equal(submap.K, camera.K)
+    for keyframe in submap.keyframes.values():
+        np.testing.assert_allclose(keyframe.features.uv_rect_px, camera.rectify(keyframe.features.uv_px)[0])
+    assert len(late.poses) == len(in_time.poses)
+    assert not late.events.of_kind(EventKind.FAILED, EventKind.GAP_RELOCALISED)
+    for measured, expected in zip(errors(late), errors(in_time), strict=True):
+        assert np.sqrt((measured**2).mean()) < 1.3 * np.sqrt((expected**2).mean()) + 1e-3
+
+
+def test_an_answer_for_a_map_that_was_lost_meanwhile_changes_nothing(in_time: System) -> None:
+    asked = in_time.events.of_kind(EventKind.CALIBRATED)[0].frame
+    system = run(polls=40, n_frames=asked + 60, blind=range(asked + 5, asked + 30))
+    assert system.events.of_kind(EventKind.FAILED)
+    assert not system.events.of_kind(EventKind.CALIBRATED)
+    kept = system.events.of_kind(EventKind.CALIBRATION_KEPT)[0]
+    assert "live no more" in kept.data["reason"]
+    np.testing.assert_array_equal(system._parts.calibration.camera.K, wrong_camera(WRONG).K)
+    assert all((submap.K == wrong_camera(WRONG).K).all() for submap in system.atlas.submaps.values())
+
+
+def test_what_has_come_since_follows() -> None:
+    """The newest three keyframes were not there when the submap was asked; the answer moves all, and doubles depths."""
+    live = make_submap(TRUE, turning=True, n=12)
+    live.gauge = (0, 8)
+    base = live.copy()
+    for k in (9, 10, 11):
+        del base.keyframes[k], base.T_submap_kf[k], base.landmark_of[k]
+    rows = np.flatnonzero(base.observations["kf"] >= 9)
+    base.observations["alive"][rows] = False
+    changed = base.copy()
+    camera = wrong_camera(1.1)
+    change_camera(changed, camera)
+    changed.transform(2.0, se3.exp(np.array([0.0, 0.1, 0.0, 0.3, 0.0, 0.0])))
+    merged = merge_calibrated(live, base, CalibrationAnswer(camera, np.eye(5), changed, {}, {}))
+    expected = live.copy()
+    expected.transform(2.0, se3.exp(np.array([0.0, 0.1, 0.0, 0.3, 0.0, 0.0])))
+    for k in live.keyframes:
+        np.testing.assert_allclose(merged.T_submap_kf[k], expected.T_submap_kf[k], atol=1e-9)
+        features = merged.keyframes[k].features
+        np.testing.assert_allclose(features.uv_rect_px, camera.rectify(features.uv_px)[0])
+    alive = live.landmarks["alive"]
+    np.testing.assert_allclose(merged.landmarks["xyz_mu"][alive], expected.landmarks["xyz_mu"][alive], atol=1e-9)
+    np.testing.assert_array_equal(merged.K, camera.K)
+    assert live.K[0, 0] == TRUE.K[0, 0]

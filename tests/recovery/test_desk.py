@@ -1,0 +1,163 @@
+"""The desk for work beside the tracking: lanes, order, bounds, and what a dead or hung worker costs."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Thread
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dualslam.core.types import Failure, FailureReason
+from dualslam.recovery.jobs import Ended, InlineDesk, JobKind
+from dualslam.recovery.transport import receive, send
+from dualslam.recovery.worker import Lane, WorkerDesk
+from dualslam.testing.desk_work import handlers
+from dualslam.testing.waiting import wait_until
+
+GRAPH, CALIBRATION, WALK = JobKind.GRAPH, JobKind.CALIBRATION, JobKind.WALK
+
+
+def test_what_goes_through_a_pipe_is_the_same_at_the_other_end_and_can_be_written_to() -> None:
+    ours, theirs = multiprocessing.Pipe()
+    large, small = np.arange(3e5).reshape(-1, 3), np.arange(5)
+    thing = {"large": large, "again": large, "part": large[::2], "small": small, "empty": np.zeros((0, 7)), "word": "w"}
+    sender = Thread(target=send, args=(ours, thing))  # it is more than a pipe holds
+    sender.start()
+    got = receive(theirs)
+    sender.join()
+    assert got["word"] == "w"
+    for name in ("large", "again", "part", "small", "empty"):
+        np.testing.assert_array_equal(got[name], thing[name])
+    assert got["large"] is got["again"]
+    for name in ("large", "part", "small", "empty"):
+        got[name][:] = 0
+    assert large[-1, -1] == 3e5 - 1
+    ours.close()
+    with pytest.raises(EOFError):
+        receive(theirs)
+
+
+@contextmanager
+def working(*lanes: Lane, finish_wait_s: float = 30.0) -> Iterator[WorkerDesk]:
+    desk = WorkerDesk(lanes, finish_wait_s)
+    try:
+        yield desk
+    finally:
+        desk.close()
+
+
+def lane(*kinds: JobKind, time_limit_s: float = 60.0, **settings: Any) -> Lane:
+    return Lane("toys", kinds, handlers, 1, time_limit_s, **settings)
+
+
+def collect(desk: WorkerDesk, kind: JobKind, n: int = 1) -> list[Ended]:
+    ended: list[Ended] = []
+
+    def are_there() -> bool:
+        ended.extend(desk.poll(kind))
+        return len(ended) >= n
+
+    wait_until(are_there)
+    return ended
+
+
+def reasons(ended: list[Ended]) -> list[FailureReason | None]:
+    return [e.result.reason if isinstance(e.result, Failure) else None for e in ended]
+
+
+def test_an_array_comes_back_changed_and_the_one_that_was_given_stays() -> None:
+    given = np.arange(1e5)
+    with working(lane(CALIBRATION)) as desk:
+        desk.submit(CALIBRATION, given)
+        (ended,) = collect(desk, CALIBRATION)
+    assert ended.work is given
+    assert given[3] == 3
+    np.testing.assert_array_equal(ended.result, 2 * given)
+    assert desk.statistics[CALIBRATION].n_done == 1
+    assert desk.statistics[CALIBRATION].n_failed == 0
+
+
+def test_a_walk_does_not_stand_before_the_graph_that_has_a_lane_of_its_own() -> None:
+    with working(lane(GRAPH), lane(WALK, niceness=3)) as desk:
+        desk.submit(WALK, ("sleep", 600.0))
+        for number in (1.0, 2.0, 3.0):
+            desk.submit(GRAPH, number)
+        assert [ended.result for ended in collect(desk, GRAPH, 3)] == [1.0, 3.0, 6.0]  # in order, on one state
+        assert desk.n_open(WALK) == 1
+
+
+def test_a_lane_for_long_work_stands_behind_the_tracking() -> None:
+    with working(lane(WALK, niceness=3)) as desk:
+        desk.submit(WALK, ("ask", 0.0))
+        (ended,) = collect(desk, WALK)
+    pid, niceness = ended.result
+    assert pid != os.getpid()
+    assert niceness >= min(os.nice(0) + 3, 19)
+
+
+def test_the_most_urgent_kind_that_waits_goes_first() -> None:
+    with working(lane(CALIBRATION, WALK)) as desk:
+        begun: list[JobKind] = []
+        desk.on_start = lambda kind, work, pid: begun.append(kind)
+        for _ in range(3):
+            desk.submit(WALK, ("sleep", 0.0))
+        desk.submit(CALIBRATION, np.zeros(3))
+        ended = desk.drain(WALK)
+    assert begun == [WALK, CALIBRATION, WALK, WALK]
+    assert reasons(ended) == [None] * 3
+
+
+def test_one_job_too_many_ends_at_once() -> None:
+    with working(lane(WALK, max_waiting=2)) as desk:
+        for seconds in (600.0, 1.0, 2.0, 3.0):
+            desk.submit(WALK, ("sleep", seconds))
+        (ended,) = desk.poll(WALK)
+        assert ended.work == ("sleep", 3.0)
+        assert reasons([ended]) == [FailureReason.BUSY]
+        assert desk.n_open(WALK) == 3
+        assert desk.statistics[WALK].max_waiting == 2
+
+
+def kill(desk: WorkerDesk) -> None:
+    os.kill(desk.pids[0] or 0, signal.SIGKILL)
+
+
+def stop(desk: WorkerDesk) -> None:
+    os.kill(desk.pids[0] or 0, signal.SIGSTOP)
+
+
+@pytest.mark.parametrize(("harm", "reason"), [(kill, FailureReason.WORKER), (stop, FailureReason.TIMEOUT)])
+def test_a_worker_that_dies_or_hangs_costs_its_job(harm: Callable[[WorkerDesk], None], reason: FailureReason) -> None:
+    with working(lane(GRAPH, time_limit_s=5.0)) as desk:
+        harm(desk)
+        desk.on_start = lambda kind, work, pid: None
+        desk._queues[0].idle[0]._process.is_alive = lambda: True  # type: ignore[method-assign]  # it harms at work
+        desk.submit(GRAPH, 5.0)
+        desk.submit(GRAPH, 7.0)
+        first, second = collect(desk, GRAPH, 2)
+    assert reasons([first]) == [reason]
+    assert second.result == 7.0  # a fresh one, without the state of the other
+    assert desk.statistics[GRAPH].n_failed == 1
+
+
+def test_one_that_exits_by_itself_says_how() -> None:
+    with working(lane(WALK)) as desk:
+        desk.submit(WALK, ("die", 0.0))
+        (ended,) = collect(desk, WALK)
+    assert isinstance(ended.result, Failure)
+    assert "exit code 3" in ended.result.detail
+
+
+def test_inline_the_work_is_done_when_it_is_asked_for() -> None:
+    desk = InlineDesk(handlers())
+    for number in (1.0, 2.0):
+        desk.submit(GRAPH, number)
+    assert desk.n_open(GRAPH) == 0
+    assert [ended.result for ended in desk.poll(GRAPH)] == [1.0, 3.0]
+    assert desk.drain(GRAPH) == []
