@@ -32,6 +32,7 @@ from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.jobs import Desk
 from dualslam.recovery.manager import Recoveries
 from dualslam.recovery.relocaliser import Relocaliser
+from dualslam.run.pace import Pace
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +75,8 @@ class System:
     events : EventLog
     timer : StageTimer
     buffer : FrameBuffer
+    pace : Pace
+        Told by who feeds the system in real time how late its frames are; otherwise without effect.
     """
 
     def __init__(self, components: Components, config: Config) -> None:
@@ -93,6 +96,8 @@ class System:
         self._connections = Connections(
             record, components.atlas_solver, components.new_graph, components.adjust_bundle, self._front_ends
         )
+        self._weak_landmarks = config.keyframes.weak_landmarks
+        self.pace = Pace()
         self._recoveries = Recoveries(
             record,
             self.buffer,
@@ -105,6 +110,11 @@ class System:
         self._calibrations = Calibrations(
             record, self.buffer, components.calibration, components.desk, components.new_graph, self._connections
         )
+
+    @property
+    def desk(self) -> Desk:
+        """Where work beside the tracking is done."""
+        return self._parts.desk
 
     @property
     def live(self) -> VisualOdometry | None:
@@ -267,7 +277,7 @@ class System:
             return track
         if track.wide:
             self._record.event(EventKind.GAP_RELOCALISED, view, odometry.submap.id, n_inliers=track.n_inliers)
-        if odometry.keyframe_due(track):
+        if odometry.keyframe_due(track) and not self.pace.puts_off(track.n_inliers, self._weak_landmarks):
             try:
                 with self.timer.measure("mapping"):
                     report = odometry.insert_keyframe(track)

@@ -66,19 +66,29 @@ def final_line(outcome: Outcome) -> str:
 
 
 def stage_table(outcome: Outcome) -> str:
-    """Return CPU time per frame of each stage, and of the whole process."""
+    """Return CPU and wall time of each stage, of the processes beside the tracking, and of the whole."""
     n_frames = max(len(outcome.report.latencies_ms), 1)
-    total_s = outcome.report.cpu_s
-    lines = [f"{'stage':<28}{'calls':>8}{'CPU s':>10}{'ms/frame':>10}{'share':>8}"]
+    total_s, system = outcome.report.cpu_s, outcome.system
+    lines = [
+        f"{'stage':<28}{'calls':>8}{'CPU s':>10}{'ms/frame':>10}{'share':>8}{'wall s':>10}{'longest ms':>12}",
+    ]
 
-    def add(name: str, calls: str, seconds: float) -> None:
+    def add(name: str, calls: int, seconds: float, wall_s: float | None = None, longest_s: float | None = None) -> None:
         share = 100 * seconds / total_s if total_s else 0.0
-        lines.append(f"{name:<28}{calls:>8}{seconds:>10.2f}{1e3 * seconds / n_frames:>10.2f}{share:>7.1f}%")
+        line = f"{name:<28}{calls:>8}{seconds:>10.2f}{1e3 * seconds / n_frames:>10.2f}{share:>7.1f}%"
+        line += "" if wall_s is None else f"{wall_s:>10.2f}"
+        lines.append(line if longest_s is None else f"{line}{1e3 * longest_s:>12.0f}")
 
-    for name, stage in sorted(outcome.system.timer.stages.items(), key=lambda item: -item[1].seconds):
-        add(name, str(stage.calls), stage.seconds)
-    add("whole process", str(n_frames), total_s)
-    lines.append("(the whole holds reading and everything between the stages; a stage named (in x) is part of x)")
+    for name, stage in sorted(system.timer.stages.items(), key=lambda item: -item[1].seconds):
+        timed = stage.wall_s > 0
+        add(name, stage.calls, stage.seconds, *((stage.wall_s, stage.longest_s) if timed else ()))
+    for kind, queue in outcome.summary["beside"].items():
+        add(f"beside: {kind}", queue["n_done"], queue["cpu_s"], longest_s=queue["longest_s"], wall_s=queue["wall_s"])
+    add("whole, all processes", n_frames, total_s, outcome.report.wall_s)
+    lines += [
+        "(the whole holds reading and everything between the stages; a stage named (in x) is part of x)",
+        "(beside: in processes of their own, --workers; their longest counts from when a job was submitted)",
+    ]
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""Where the CPU time of the algorithm goes, by stage."""
+"""Where the time of the algorithm goes, by stage: CPU and wall."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from dataclasses import dataclass
 
 @dataclass
 class StageTime:
-    """CPU seconds and calls of one stage."""
+    """CPU seconds, calls and wall seconds of one stage; `longest_s`: wall time of its longest call."""
 
     seconds: float = 0.0
     calls: int = 0
+    wall_s: float = 0.0
+    longest_s: float = 0.0
 
 
 class StageTimer:
@@ -25,14 +27,16 @@ class StageTimer:
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:
         """Count what runs inside to a stage."""
-        start = time.thread_time()
+        start, wall_start = time.thread_time(), time.perf_counter()
         try:
             yield
         finally:
-            self.add(stage, time.thread_time() - start)
+            self.add(stage, time.thread_time() - start, time.perf_counter() - wall_start)
 
-    def add(self, stage: str, seconds: float) -> None:
-        """Count seconds that were measured elsewhere."""
+    def add(self, stage: str, seconds: float, wall_s: float = 0.0) -> None:
+        """Count CPU seconds that were measured elsewhere, and the wall time, where that is known."""
         total = self.stages.setdefault(stage, StageTime())
         total.seconds += seconds
         total.calls += 1
+        total.wall_s += wall_s
+        total.longest_s = max(total.longest_s, wall_s)

@@ -206,6 +206,8 @@ class QueueStatistics:
         Jobs that waited at the same time.
     longest_s : float
         From when a job was submitted to its end.
+    wall_s : float
+        The same, all jobs together.
     cpu_s : float
         Of the processes.
     """
@@ -214,6 +216,7 @@ class QueueStatistics:
     n_failed: int = 0
     max_waiting: int = 0
     longest_s: float = 0.0
+    wall_s: float = 0.0
     cpu_s: float = 0.0
 
 
@@ -315,6 +318,7 @@ class WorkerDesk:
         statistics.n_done += 1
         statistics.n_failed += _is_lost(ended.result)
         statistics.longest_s = max(statistics.longest_s, ended.wall_s)
+        statistics.wall_s += ended.wall_s
         statistics.cpu_s += ended.cpu_s
         self._ended[kind].append(ended)
 

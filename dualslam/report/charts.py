@@ -77,3 +77,40 @@ def stage_table(run: RunData) -> Markup:
     ]
     note = "A stage named (in x) is part of x."
     return tag("table", tag("caption", f"CPU time a frame, by stage. {note}"), tag("tbody", rows), cls="plain stages")
+
+
+def beside_table(run: RunData) -> Markup:
+    """Return what was done in processes beside the tracking, by kind of job; nothing where there were none."""
+    beside = run.summary.get("beside") or {}
+    if not beside:
+        return join(None)
+    head = ("", "jobs", "failed", "waited at once", "longest", "CPU")
+    rows = [
+        tag(
+            "tr",
+            tag("th", kind, scope="row"),
+            tag("td", str(queue["n_done"]), cls="num"),
+            tag("td", str(queue["n_failed"]), cls="num"),
+            tag("td", str(queue["max_waiting"]), cls="num"),
+            tag("td", duration(1e3 * queue["longest_s"]), cls="num"),
+            tag("td", f"{number(queue['cpu_s'])} s", cls="num"),
+        )
+        for kind, queue in beside.items()
+    ]
+    caption = "Work beside the tracking, in processes of its own: the longest counts from when a job was submitted."
+    table_head = tag("thead", tag("tr", [tag("th", word, scope="col") for word in head]))
+    return tag("table", tag("caption", caption), table_head, tag("tbody", rows), cls="plain stages")
+
+
+def pace_words(run: RunData) -> Markup:
+    """Return what a run in real time left out; nothing where it was none."""
+    if not run.summary.get("realtime"):
+        return join(None)
+    pace = run.summary.get("pace") or {}
+    words = (
+        f"In real time: {run.summary.get('late', 0)} frames were looked at after they were due, "
+        f"{run.summary.get('dropped', 0)} came too late and were dropped; a keyframe was put off at "
+        f"{pace.get('put_off', 0)} frames, and the graph beside lagged by {pace.get('max_lag_keyframes', 0)} keyframes "
+        "at most. Latency is from the moment a frame is due to its pose."
+    )
+    return tag("p", words, cls="note")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from platform import python_version
@@ -20,6 +20,7 @@ from dualslam.lab.metrics.trajectory_metrics import score_trajectory
 from dualslam.map.atlas import LinkKind
 from dualslam.map.trajectory import compose
 from dualslam.recovery.frame_buffer import MB
+from dualslam.recovery.worker import WorkerDesk
 from dualslam.run.runner import RunReport
 from dualslam.system import System
 
@@ -58,8 +59,16 @@ def trajectories_of(system: System) -> Trajectories:
     return Trajectories(largest, _posed(system, largest), unlinked)
 
 
-def frame_rows(system: System, main: PosedFrames, dropped: Iterable[tuple[int, float]] = ()) -> list[FrameRow]:
-    """Return a row for every frame of the source, in the order in which they came; dropped ones where they belong."""
+def frame_rows(
+    system: System,
+    main: PosedFrames,
+    dropped: Iterable[tuple[int, float]] = (),
+    latencies_ms: Sequence[float] | None = None,
+) -> list[FrameRow]:
+    """Return a row for every frame of the source, in the order in which they came; dropped ones where they belong.
+
+    `latencies_ms`: of the frames that were looked at, as the harness measured them; else the time of their steps.
+    """
     in_main = set(main.index.tolist())
     rows = [
         FrameRow(
@@ -70,9 +79,9 @@ def frame_rows(system: System, main: PosedFrames, dropped: Iterable[tuple[int, f
             row.index in in_main,
             row.n_matches,
             row.n_inliers,
-            row.latency_ms,
+            row.latency_ms if latencies_ms is None else latencies_ms[n],
         )
-        for row in system.rows.values()
+        for n, row in enumerate(system.rows.values())
     ]
     late = [FrameRow(i, t, FrameStatus.DROPPED, None, False, 0, 0, 0.0) for i, t in dropped]
     if not late:
@@ -115,12 +124,18 @@ def summarise(
         "wall_s": report.wall_s,
         "cpu_ms_per_frame": 1e3 * report.cpu_s / max(len(report.latencies_ms), 1),
         "latency_ms": _latency(report.latencies_ms),
+        "step_ms": _latency(report.steps_ms),
+        "late": report.n_late,
+        "pace": asdict(system.pace.statistics),
+        "beside": _beside(system),
         "recovery_s": [
             event.data["seconds"] for event in system.events.of_kind(EventKind.LINKED) if "seconds" in event.data
         ],
         "peak_rss_mb": report.peak_rss_mb,
         "peak_buffer_mb": system.buffer.peak_bytes / MB,
         "stages_cpu_s": {name: stage.seconds for name, stage in system.timer.stages.items()},
+        "stages_wall_s": {name: stage.wall_s for name, stage in system.timer.stages.items() if stage.wall_s},
+        "stages_longest_ms": {name: 1e3 * s.longest_s for name, s in system.timer.stages.items() if s.wall_s},
         "versions": versions(),
     }
     if truth is not None:
@@ -156,6 +171,12 @@ def _posed(system: System, submap_ids: list[int]) -> PosedFrames:
     S_world_submap = system.atlas.S_world_submap(submap_ids) if submap_ids else {}
     composed = compose(system.poses.values(), system.atlas, S_world_submap)
     return PosedFrames(np.asarray(composed.index, np.int64), composed.timestamp_s, composed.T_world_cam)
+
+
+def _beside(system: System) -> dict[str, Any]:
+    """What came of the jobs in processes of their own, by kind: counts, the longest queue and wait, CPU time."""
+    desk = system.desk
+    return {str(kind): asdict(each) for kind, each in desk.statistics.items()} if isinstance(desk, WorkerDesk) else {}
 
 
 def _latency(latencies_ms: tuple[float, ...]) -> dict[str, float]:

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import FrameType
 from typing import Protocol
 
@@ -17,6 +17,14 @@ from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult
+from dualslam.run.pace import Pace
+
+MAX_LATE_S = 1 / 15
+"""So late a frame may be while the next one waits: two frames of a camera at 30 Hz, which most often are what a
+keyframe takes more than other frames, and are caught up on after it. At 10 Hz a frame that the next one has overtaken
+is later."""
+LATE_S = 2e-3
+"""What a sleeping process wakes up too late by is no lateness of ours."""
 
 
 class Steppable(Protocol):
@@ -42,7 +50,12 @@ class RunReport:
     dropped : tuple of (int, float)
         Index and time of the frames that came too late to be looked at (`realtime`).
     latencies_ms : tuple of float
+        Of each frame that was looked at: in real time from the moment when it was due to its pose, what it waited for
+        included; else the wall time of its step.
+    steps_ms : tuple of float
         Wall time of each step.
+    n_late : int
+        Frames that the system was ready for only after their time (`realtime`).
     wall_s, cpu_s : float
         From the first frame to the end; user and system time of this process and of the children that have ended.
     peak_rss_mb : float
@@ -58,6 +71,8 @@ class RunReport:
     n_frames: int
     dropped: tuple[tuple[int, float], ...]
     latencies_ms: tuple[float, ...]
+    steps_ms: tuple[float, ...]
+    n_late: int
     wall_s: float
     cpu_s: float
     peak_rss_mb: float
@@ -76,6 +91,7 @@ def run_sequence(
     sequence: Sequence,
     *,
     realtime: bool = False,
+    pace: Pace | None = None,
     on_frame: Callable[[FrameResult], None] | None = None,
     clock: Callable[[], float] = time.perf_counter,
     sleep: Callable[[float], None] = time.sleep,
@@ -91,8 +107,11 @@ def run_sequence(
     system : Steppable
     sequence : Sequence
     realtime : bool
-        Frames come at the times that their timestamps tell. A frame is dropped when the next one has come before the
-        system was ready for it, as with a camera that keeps its latest image only.
+        Frames come at the times that their timestamps tell, and those that are too late are dropped before anything is
+        done with them: a frame is, if it is more than `MAX_LATE_S` late when the system is ready for it, and the next
+        one is due already.
+    pace : Pace, optional
+        Is told, in real time, how late each frame is.
     on_frame : callable, optional
         Called with the result of each step.
     clock, sleep : callables
@@ -109,11 +128,14 @@ def run_sequence(
     """
     dropped: list[tuple[int, float]] = []
     latencies_ms: list[float] = []
+    steps_ms: list[float] = []
+    n_late = 0
     error: InputError | None = None
     bug: Exception | None = None
     began, cpu_began = clock(), _cpu_s()
     source = iter(sequence)
-    frames = _in_real_time(source, dropped, clock, sleep) if realtime else source
+    schedule = _Schedule(clock, sleep)
+    frames = schedule.hand_out(source, dropped) if realtime else source
     with _closing(source), _stop_on_signal() as stop:
         while not stop.is_set():
             try:
@@ -126,15 +148,20 @@ def run_sequence(
                 error = problem
                 break
             before = clock()
+            late_s = schedule.late_s(frame, before) if realtime else 0.0
+            n_late += late_s > LATE_S
+            if pace is not None and realtime:
+                pace.note(late_s)
             try:
                 result = system.step(frame)
             except Exception as problem:
                 bug = problem
                 break
             finally:
-                latencies_ms.append(1e3 * (clock() - before))
+                steps_ms.append(1e3 * (clock() - before))
+                latencies_ms.append(1e3 * max(late_s, 0.0) + steps_ms[-1])
             if on_frame is not None:
-                on_frame(result)
+                on_frame(replace(result, latency_ms=latencies_ms[-1]))
         interrupted = stop.is_set()
         if not latencies_ms and not interrupted:
             raise InputError(f"{sequence.name} gave no frame; check the source and which frames were asked for.")
@@ -146,6 +173,8 @@ def run_sequence(
         n_frames=len(latencies_ms) + len(dropped),
         dropped=tuple(dropped),
         latencies_ms=tuple(latencies_ms),
+        steps_ms=tuple(steps_ms),
+        n_late=n_late,
         wall_s=clock() - began,
         cpu_s=_cpu_s() - cpu_began,
         peak_rss_mb=_peak_rss_mb(),
@@ -155,28 +184,37 @@ def run_sequence(
     )
 
 
-def _in_real_time(
-    frames: Iterator[Frame],
-    dropped: list[tuple[int, float]],
-    clock: Callable[[], float],
-    sleep: Callable[[float], None],
-) -> Iterator[Frame]:
-    """Yield each frame when its time has come, and note as dropped those that the next one overtook."""
-    frame = next(frames, None)
-    if frame is None:
-        return
-    first_s, began = frame.timestamp_s, clock()
-    while frame is not None:
-        upcoming = next(frames, None)
+class _Schedule:
+    """When frames are due: as far after the first one as their timestamps are."""
+
+    def __init__(self, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
+        self._clock = clock
+        self._sleep = sleep
+        self._first_s = 0.0
+        self._began = 0.0
+
+    def late_s(self, frame: Frame, now: float) -> float:
+        """Return how long ago a frame was due."""
         # Absolute: a sequence that is read in reverse runs at the same rate.
-        if upcoming is not None and clock() - began >= abs(upcoming.timestamp_s - first_s):
-            dropped.append((frame.index, frame.timestamp_s))
-        else:
-            early_s = abs(frame.timestamp_s - first_s) - (clock() - began)
-            if early_s > 0:
-                sleep(early_s)
-            yield frame
-        frame = upcoming
+        return now - self._began - abs(frame.timestamp_s - self._first_s)
+
+    def hand_out(self, frames: Iterator[Frame], dropped: list[tuple[int, float]]) -> Iterator[Frame]:
+        """Yield each frame when its time has come, and note as dropped those that came too late."""
+        frame = next(frames, None)
+        if frame is None:
+            return
+        self._first_s, self._began = frame.timestamp_s, self._clock()
+        while frame is not None:
+            upcoming = next(frames, None)
+            now = self._clock()
+            late_s = self.late_s(frame, now)
+            if upcoming is not None and late_s > MAX_LATE_S and self.late_s(upcoming, now) >= 0:
+                dropped.append((frame.index, frame.timestamp_s))
+            else:
+                if late_s < 0:
+                    self._sleep(-late_s)
+                yield frame
+            frame = upcoming
 
 
 @contextmanager

@@ -98,7 +98,7 @@ def run_to_folder(
                 on_frame(result)
 
         watched = _Watched(system, SampleKeeper(folder.write_sample))
-        report = run_sequence(watched, sequence, realtime=realtime, on_frame=after_frame)
+        report = run_sequence(watched, sequence, realtime=realtime, pace=system.pace, on_frame=after_frame)
         if report.interrupted and system.rows:
             last = next(reversed(system.rows.values()))
             system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap_id)
@@ -135,7 +135,7 @@ def _write_results(
     trajectories = trajectories_of(system)
     truth: Trajectory | None = getattr(sequence, "ground_truth", None)
     summary = given | summarise(system, report, trajectories, config, truth)
-    rows = frame_rows(system, trajectories.main, report.dropped)
+    rows = frame_rows(system, trajectories.main, report.dropped, report.latencies_ms)
     folder.write(RunRecord(rows, trajectories.main, trajectories.unlinked, summary))
     if truth is not None:
         folder.write_truth(truth_of_frames(truth, rows))

@@ -16,6 +16,8 @@ from dualslam.map.frame_records import FrameRecord, FrameResult
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
 from dualslam.recovery.frame_buffer import FrameBuffer
+from dualslam.recovery.jobs import InlineDesk
+from dualslam.run.pace import Pace
 
 NO_FEATURES = Features(
     np.zeros((0, 2)),
@@ -43,6 +45,8 @@ class FakeSystem:
         self.events = EventLog()
         self.timer = StageTimer()
         self.buffer = FrameBuffer(1.0, 1.0)
+        self.pace = Pace()
+        self.desk = InlineDesk({})
         self.n_finished = 0
         self.was_interrupted = False
         self._truth, self._lost, self._before_step = truth, lost, before_step

@@ -177,9 +177,9 @@ def test_profile_prints_a_table(
 ) -> None:
     assert main(["run", str(folder), "--out", str(tmp_path / "run"), "--profile"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split() == ["stage", "calls", "CPU", "s", "ms/frame", "share"]
+    assert lines[0].split() == ["stage", "calls", "CPU", "s", "ms/frame", "share", "wall", "s", "longest", "ms"]
     assert any(line.startswith("tracking ") for line in lines)
-    assert any(line.startswith("whole process") for line in lines)
+    assert any(line.startswith("whole, all processes") for line in lines)
 
 
 def test_eval_gives_coverage_first(

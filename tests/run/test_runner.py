@@ -10,8 +10,9 @@ import pytest
 from dualslam.core.errors import InputError
 from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult
+from dualslam.run.pace import Pace
 from dualslam.run.results import frame_rows
-from dualslam.run.runner import run_sequence
+from dualslam.run.runner import RunReport, run_sequence
 from tests.cli.fakes import FakeSystem
 
 EVERYWHERE = {i: np.eye(4) for i in range(100)}
@@ -83,6 +84,52 @@ def test_in_real_time_a_slow_step_costs_the_frames_that_came_meanwhile() -> None
     # Frame 1 is ready at 0.1 + 0.25 s: frame 2 (0.2 s) has been overtaken by frame 3 (0.3 s), which is taken late.
     seen, dropped, _ = in_real_time([0, 1, 2, 3, 4, 5], {1: 0.25})
     assert (seen, dropped) == ([0, 1, 3, 4, 5], [2])
+
+
+def test_a_frame_may_be_as_late_as_two_of_a_quick_camera() -> None:
+    class Quick(Frames):
+        def __iter__(self) -> Iterator[Frame]:
+            for i in self.indices:
+                yield Frame(i, i / 30, None)
+
+    # Frame 2 is looked at 1 / 30 s + 60 ms - 2 / 30 s late, while frame 3 is due already, and is caught up on.
+    seen, report = quick_run(Quick(list(range(8))), {1: 0.060})
+    assert (seen, report.dropped) == (list(range(8)), ())
+    assert report.latencies_ms[2] == pytest.approx(60 - 33.3 + 10, abs=0.2)
+    assert report.steps_ms[2] == pytest.approx(10)
+    assert report.n_late == 2  # frame 3 waits a little for frame 2
+    # After 160 ms frames 2 and 3 are dropped: they are 127 and 93 ms late. Frame 4 is 60 ms late, and taken.
+    seen, report = quick_run(Quick(list(range(12))), {1: 0.160})
+    assert [i for i, _ in report.dropped] == [2, 3]
+    assert report.latencies_ms[2] == pytest.approx(1e3 * (1 / 30 + 0.160 - 4 / 30) + 10, abs=0.2)
+
+
+def quick_run(frames: Frames, work_s: dict[int, float]) -> tuple[list[int], RunReport]:
+    clock = Clock()
+
+    def work(frame: Frame) -> None:
+        clock.now_s += work_s.get(frame.index, 0.01)
+
+    system = FakeSystem(EVERYWHERE, before_step=work)
+    report = run_sequence(system, frames, realtime=True, clock=clock, sleep=clock.sleep)  # type: ignore[arg-type]
+    return list(system.rows), report
+
+
+def test_the_pace_is_told_how_late_frames_are_in_real_time_alone() -> None:
+    class Told(Pace):
+        def __init__(self) -> None:
+            super().__init__()
+            self.late_s: list[float] = []
+
+        def note(self, late_s: float) -> None:
+            self.late_s.append(late_s)
+
+    clock, pace = Clock(), Told()
+    system = FakeSystem(EVERYWHERE, before_step=lambda frame: clock.sleep(0.13))
+    run_sequence(system, Frames([0, 1, 2]), realtime=True, pace=pace, clock=clock, sleep=clock.sleep)  # type: ignore[arg-type]
+    assert pace.late_s == pytest.approx([0, 0.03, 0.06])
+    run_sequence(system, Frames([0, 1, 2]), pace=pace, clock=clock, sleep=clock.sleep)  # type: ignore[arg-type]
+    assert len(pace.late_s) == 3
 
 
 def test_in_real_time_backwards() -> None:

@@ -1,0 +1,85 @@
+"""Whether the system keeps up with its camera, and what it leaves out where it does not.
+
+Two things can be behind: the tracking, when frames are looked at after their time, and the back end, when keyframes
+wait for the graph that runs beside. In either case new keyframes are what there is to save: each costs the tracking its
+insertion and the back end its solution. A keyframe that is due but not urgent is put off until both have caught up.
+
+Only real time has a pace. Without it nothing here ever changes what a run does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+BEHIND_S = 1 / 60
+"""A frame that is half a frame of 30 Hz late was held up by more than chance: the step before it was too long."""
+MAX_LAG_KEYFRAMES = 4
+"""Keyframes that the graph beside may not know yet: a job on its way, and what comes until it ends."""
+MAX_PUT_OFF = 5
+"""Frames by which a keyframe is put off at most. At 30 Hz that is a sixth of a second: long enough to work off what a
+keyframe and a relinearisation hold up, too short for the view to change by more than a few degrees."""
+URGENT_TIMES = 2
+"""A frame that tracks fewer than so many times the landmarks of a weak track needs new ones now, or is lost."""
+
+
+@dataclass(slots=True)
+class PaceStatistics:
+    """What was left out.
+
+    Attributes
+    ----------
+    put_off : int
+        Frames at which a keyframe was due and did not come.
+    behind : int
+        Frames that were looked at while the system was behind.
+    max_lag_keyframes : int
+        Keyframes that the graph beside did not know yet, at most.
+    """
+
+    put_off: int = 0
+    behind: int = 0
+    max_lag_keyframes: int = 0
+
+
+class Pace:
+    """Knows how late the frames are, and how many keyframes the graph beside does not know yet."""
+
+    def __init__(self) -> None:
+        self.statistics = PaceStatistics()
+        self._in_real_time = False
+        self._late_s = 0.0
+        self._lag = 0
+        self._n_put_off = 0
+
+    def note(self, late_s: float) -> None:
+        """Note, before a frame is looked at, how late it is: real time has begun with the first."""
+        self._in_real_time = True
+        self._late_s = late_s
+        self.statistics.behind += self.behind
+
+    def note_lag(self, n_keyframes: int) -> None:
+        """Note how many keyframes the graph beside does not know yet."""
+        self._lag = n_keyframes
+        self.statistics.max_lag_keyframes = max(self.statistics.max_lag_keyframes, n_keyframes)
+
+    @property
+    def behind(self) -> bool:
+        """Whether tracking or back end have something to catch up on."""
+        return self._in_real_time and (self._late_s > BEHIND_S or self._lag > MAX_LAG_KEYFRAMES)
+
+    def puts_off(self, n_tracked: int, n_weak: int) -> bool:
+        """Whether a keyframe that is due is put off to a later frame.
+
+        Parameters
+        ----------
+        n_tracked : int
+            Landmarks that the frame tracks.
+        n_weak : int
+            So few are a weak track (`KeyframeConfig.weak_landmarks`).
+        """
+        if not self.behind or self._n_put_off >= MAX_PUT_OFF or n_tracked < URGENT_TIMES * n_weak:
+            self._n_put_off = 0
+            return False
+        self._n_put_off += 1
+        self.statistics.put_off += 1
+        return True
