@@ -40,6 +40,7 @@ So 80 with a guide, beyond which far more wrong ones come in than right ones are
 
 from __future__ import annotations
 
+from itertools import repeat
 from math import ceil
 from typing import Annotated
 
@@ -51,7 +52,14 @@ from pydantic import Field
 
 from dualslam.config.settings import StrictModel
 from dualslam.core.types import Features, FloatArray, IntArray, Matches
-from dualslam.frontends.features.corners import detect_corners, refine_corners, select_spread, share_out, stand_out
+from dualslam.frontends.features.corners import (
+    detect_corners,
+    find_peaks,
+    refine_corners,
+    select_spread,
+    share_out,
+    stand_out,
+)
 from dualslam.frontends.features.groups import consistent_rotation, mutual_best
 from dualslam.frontends.features.image_noise import estimate_noise, noise_of_levels
 from dualslam.frontends.features.images import to_grey
@@ -143,12 +151,14 @@ class OrbFrontend(OptionedFrontend):
         noise = noise_of_levels(estimate_noise(levels[0]), len(levels), self.scale_factor)
         corners = self._corners(levels, noise)
         chosen, octave, patches = self._spread(levels, corners)
-        placed = stand_out(patches, noise[octave])
+        peaks = find_peaks(patches)
+        placed = stand_out(peaks, noise[octave])
         if placed.sum() < SHARP_SHARE * len(placed):
             chosen, octave, patches = self._spread(levels, _placed(levels, corners, noise))
+            peaks = find_peaks(patches)
             placed = np.ones(len(patches), np.bool_)
         angle = self._angles(patches)
-        offset, found = refine_corners(patches)
+        offset, found = refine_corners(peaks)
         descriptors = self._descriptors(levels, chosen, angle)
         # INTER_LINEAR keeps the outer edges of the image in place, so it is pixel edges that scale, not centres; the
         # ratio is of the true sizes, which are rounded.
@@ -226,12 +236,12 @@ class OrbFrontend(OptionedFrontend):
         # One level and no border of its own: the pyramid and the rim are ours. Made anew each time, which costs
         # nothing, because a front end that holds it could not be sent to another process.
         orb = cv2.ORB.create(nfeatures=1, nlevels=1, edgeThreshold=0, patchSize=PATCH_SIDE_PX)
-        turns = iter((np.degrees(angle_rad) % 360.0).tolist())
+        turns = iter((np.degrees(angle_rad) % 360.0).tolist())  # one by one, across the levels
         rows = [np.empty((0, DESCRIPTOR_BYTES), np.uint8)]
         for level, xy in zip(levels, corners, strict=True):
             if len(xy) == 0:
                 continue
-            keypoints = [cv2.KeyPoint(x, y, PATCH_SIDE_PX, next(turns)) for x, y in xy.tolist()]
+            keypoints = list(map(cv2.KeyPoint, *xy.T.tolist(), repeat(PATCH_SIDE_PX), turns))
             kept, descriptors = orb.compute(level, keypoints)
             assert len(kept) == len(xy), "cv2.ORB dropped keypoints although it was given no border"
             rows.append(np.asarray(descriptors, np.uint8))
@@ -242,7 +252,7 @@ def _placed(levels: list[NDArray[np.uint8]], corners: list[Corners], noise: Floa
     """Those of each level's corners that are not placed by its noise."""
     found = []
     for level, (xy, response), sigma in zip(levels, corners, noise.tolist(), strict=True):
-        kept = stand_out(_patches(level, xy), np.full(len(xy), sigma))
+        kept = stand_out(find_peaks(_patches(level, xy)), np.full(len(xy), sigma))
         found.append((xy[kept], response[kept]))
     return found
 

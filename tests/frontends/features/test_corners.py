@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dualslam.frontends.features.corners import detect_corners, refine_corners, select_spread, share_out, stand_out
+from dualslam.frontends.features.corners import (
+    detect_corners,
+    find_peaks,
+    refine_corners,
+    select_spread,
+    share_out,
+    stand_out,
+)
 from tests.frontends.conftest import textured
 
 
@@ -57,7 +64,7 @@ def test_refine_finds_the_centre_of_a_blob() -> None:
     squared = (u - truth[:, 0, None, None]) ** 2 + (v - truth[:, 1, None, None]) ** 2
     for amplitude in (150.0, -100.0):
         patches = np.rint(105 + amplitude * np.exp(-squared / (2 * 1.5**2))).astype(np.uint8)
-        offset, found = refine_corners(patches)
+        offset, found = refine_corners(find_peaks(patches))
         assert found.all()
         assert np.abs(offset - truth).max() < 0.08
 
@@ -65,7 +72,7 @@ def test_refine_finds_the_centre_of_a_blob() -> None:
 def test_refine_stays_where_there_is_nothing() -> None:
     ramp = np.tile(np.arange(31, dtype=np.uint8) * 5, (1, 31, 1))
     for patches in (np.zeros((3, 31, 31), np.uint8), ramp, np.empty((0, 31, 31), np.uint8)):
-        offset, found = refine_corners(patches)
+        offset, found = refine_corners(find_peaks(patches))
         assert not found.any()
         assert (offset == 0).all()
 
@@ -76,12 +83,12 @@ def test_corners_of_noise_do_not_stand_out_and_those_of_the_scene_do() -> None:
     xy, _ = detect_corners(noise, (4,), 16, 32)
     of_noise = np.array([noise[y - 15 : y + 16, x - 15 : x + 16] for x, y in xy.tolist()])
     assert len(of_noise) > 200
-    assert stand_out(of_noise, np.full(len(of_noise), 2.0)).mean() < 0.06
+    assert stand_out(find_peaks(of_noise), np.full(len(of_noise), 2.0)).mean() < 0.06
     v, u = np.mgrid[-15:16, -15:16]
     grain = 2.0 * rng.standard_normal((200, 31, 31))
     blobs = np.rint(100 + 60 * np.exp(-(u**2 + v**2) / (2 * 1.5**2)) + grain).astype(np.uint8)
-    assert stand_out(blobs, np.full(200, 2.0)).all()
+    assert stand_out(find_peaks(blobs), np.full(200, 2.0)).all()
     # An edge is no place: along it noise decides.
     edges = np.rint(np.where(u > 0, 160, 80) + grain).astype(np.uint8)
-    assert stand_out(edges, np.full(200, 2.0)).mean() < 0.06
-    assert stand_out(blobs[:0], np.empty(0)).shape == (0,)
+    assert stand_out(find_peaks(edges), np.full(200, 2.0)).mean() < 0.06
+    assert stand_out(find_peaks(blobs[:0]), np.empty(0)).shape == (0,)
