@@ -77,6 +77,9 @@ class System:
     buffer : FrameBuffer
     pace : Pace
         Told by who feeds the system in real time how late its frames are; otherwise without effect.
+    on_pose : callable or None
+        Called with each frame's track as soon as it is posed, before the map grows from it: who steers by the poses
+        need not wait for a keyframe.
     """
 
     def __init__(self, components: Components, config: Config) -> None:
@@ -98,6 +101,8 @@ class System:
         )
         self._weak_landmarks = config.keyframes.weak_landmarks
         self.pace = Pace()
+        self.on_pose: Callable[[Track], None] | None = None
+        self._posed_at: float | None = None  # on the clock of `time.perf_counter`
         self._recoveries = Recoveries(
             record,
             self.buffer,
@@ -137,7 +142,7 @@ class System:
         -------
         FrameResult
         """
-        started = time.perf_counter()
+        started, self._posed_at = time.perf_counter(), None
         self.rows[frame.index] = FrameRecord(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
         # 1. What was found beside the tracking meanwhile comes into the map between two frames.
         self._calibrations.collect(self._live, frame, self._recoveries.waiting)
@@ -151,7 +156,7 @@ class System:
             self.buffer.append(view)
             # 3. Without a live submap, look for the lost one, or try to start one; with one, track.
             outcome = self._initialise(view) if self._live is None else self._track(self._live, view)
-        return self._result(frame, outcome, time.perf_counter() - started)
+        return self._result(frame, outcome, started)
 
     def finish(self, interrupted: bool = False) -> None:
         """End the run: wait for walks back that are under way, for so long and no longer; archive what is live.
@@ -275,6 +280,9 @@ class System:
             track = self._health.judge(odometry.track(view), view.index)
         if isinstance(track, Failure):
             return track
+        self._posed_at = time.perf_counter()
+        if self.on_pose is not None:
+            self.on_pose(track)
         if track.wide:
             self._record.event(EventKind.GAP_RELOCALISED, view, odometry.submap.id, n_inliers=track.n_inliers)
         if odometry.keyframe_due(track) and not self.pace.puts_off(track.n_inliers, self._weak_landmarks):
@@ -370,14 +378,23 @@ class System:
 
     # --- records
 
-    def _result(self, frame: Frame, outcome: Track | Failure, seconds: float) -> FrameResult:
+    def _result(self, frame: Frame, outcome: Track | Failure, started: float) -> FrameResult:
         row = self.rows[frame.index]
-        row.latency_ms = 1000 * seconds
+        row.latency_ms = 1e3 * (time.perf_counter() - started)
+        pose_ms = None if self._posed_at is None else 1e3 * (self._posed_at - started)
         pose = self.poses.get(frame.index)
         T_submap_cam = None
         if pose is not None:
             T_submap_cam = self.atlas.submaps[pose.submap_id].resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
         failure = outcome if isinstance(outcome, Failure) else None
         return FrameResult(
-            frame.index, row.status, row.submap_id, T_submap_cam, row.n_matches, row.n_inliers, row.latency_ms, failure
+            frame.index,
+            row.status,
+            row.submap_id,
+            T_submap_cam,
+            row.n_matches,
+            row.n_inliers,
+            row.latency_ms,
+            failure,
+            pose_ms,
         )

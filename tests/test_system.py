@@ -7,7 +7,7 @@ import pytest
 
 from dualslam.config.settings import RecoveryConfig
 from dualslam.core.events import EventKind
-from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.core.types import FloatArray, FrameStatus, Track
 from dualslam.lab.bench.measure import breakages
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.system import System
@@ -282,3 +282,20 @@ def test_cpu_times_of_the_stages_are_kept(plain: System) -> None:
     stages = plain.timer.stages
     assert {"features", "initialisation", "tracking", "mapping", "graph (in mapping)"} <= set(stages)
     assert stages["graph (in mapping)"].seconds <= stages["mapping"].seconds
+
+
+def test_a_pose_is_told_before_the_map_grows_from_it() -> None:
+    world = PointWorld(cloud(), hand_held(30))
+    system = system_in(world)
+    told: dict[int, bool] = {}
+
+    def on_pose(track: Track) -> None:
+        told[track.view.index] = system.live is not None and track.view.index in system.live.submap.keyframes
+
+    system.on_pose = on_pose
+    results = [system.step(frame) for frame in world.frames()]
+    assert not any(told.values())
+    assert set(told) & set(system.atlas.submaps[0].keyframes)  # some of them became keyframes
+    for result in results:
+        assert (result.pose_ms is not None) == (result.index in told)
+        assert result.pose_ms is None or 0 < result.pose_ms <= result.latency_ms

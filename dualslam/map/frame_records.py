@@ -30,6 +30,8 @@ class FrameResult:
         In the unit and frame of submap `submap_id`, as known now; later frames refine it.
     failure : Failure or None
         Why the frame has no pose.
+    pose_ms : float or None
+        From the start of the step to the frame's pose, before the map grew from it.
     """
 
     index: int
@@ -40,3 +42,4 @@ class FrameResult:
     n_inliers: int
     latency_ms: float
     failure: Failure | None
+    pose_ms: float | None = None

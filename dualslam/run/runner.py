@@ -51,7 +51,7 @@ class RunReport:
         Index and time of the frames that came too late to be looked at (`realtime`).
     latencies_ms : tuple of float
         Of each frame that was looked at: in real time from the moment when it was due to its pose, what it waited for
-        included; else the wall time of its step.
+        included (to the end of its step, where it has none); else the wall time of its step.
     steps_ms : tuple of float
         Wall time of each step.
     n_late : int
@@ -152,14 +152,16 @@ def run_sequence(
             n_late += late_s > LATE_S
             if pace is not None and realtime:
                 pace.note(late_s)
+            pose_ms = None
             try:
                 result = system.step(frame)
+                pose_ms = result.pose_ms if realtime else None
             except Exception as problem:
                 bug = problem
                 break
             finally:
                 steps_ms.append(1e3 * (clock() - before))
-                latencies_ms.append(1e3 * max(late_s, 0.0) + steps_ms[-1])
+                latencies_ms.append(1e3 * max(late_s, 0.0) + (steps_ms[-1] if pose_ms is None else pose_ms))
             if on_frame is not None:
                 on_frame(replace(result, latency_ms=latencies_ms[-1]))
         interrupted = stop.is_set()

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -102,6 +102,21 @@ def test_a_frame_may_be_as_late_as_two_of_a_quick_camera() -> None:
     seen, report = quick_run(Quick(list(range(12))), {1: 0.160})
     assert [i for i, _ in report.dropped] == [2, 3]
     assert report.latencies_ms[2] == pytest.approx(1e3 * (1 / 30 + 0.160 - 4 / 30) + 10, abs=0.2)
+
+
+def test_the_latency_of_a_keyframe_ends_with_its_pose_and_not_with_the_map() -> None:
+    clock = Clock()
+
+    class PosesFirst(FakeSystem):
+        def step(self, frame: Frame) -> FrameResult:
+            clock.now_s += 0.05
+            return replace(super().step(frame), pose_ms=20.0)
+
+    for realtime, expected in ((True, 20.0), (False, 50.0)):
+        system = PosesFirst(EVERYWHERE)
+        report = run_sequence(system, Frames([0, 1]), realtime=realtime, clock=clock, sleep=clock.sleep)  # type: ignore[arg-type]
+        assert report.latencies_ms == pytest.approx([expected] * 2)
+        assert report.steps_ms == pytest.approx([50] * 2)
 
 
 def quick_run(frames: Frames, work_s: dict[int, float]) -> tuple[list[int], RunReport]:
