@@ -9,9 +9,11 @@ from functools import partial
 import numpy as np
 
 from dualslam.backend.atlas_solver import GtsamAtlasSolver
+from dualslam.backend.beside_window import adjust_window
 from dualslam.backend.local_ba import bundle_adjust, bundle_adjust_arrays
 from dualslam.backend.self_calibration import estimate_calibration, find_preferred_camera
 from dualslam.backend.submap_graph import ISam2SubmapGraph
+from dualslam.beside_graph import BesideGraphs, GraphServer
 from dualslam.calibration.lens import Calibration, CalibrationAnswer, CalibrationJob, answer
 from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.camera.models import Camera
@@ -50,6 +52,8 @@ WORKER_BUDGET = 0.75
 """Share of the time after which a worker counts as hung that its walks may take: what they have by then is not lost."""
 
 
+GRAPH_LIMIT_S = 30.0
+"""After which the process that has the graphs counts as hung: a batch over a full submap takes a second."""
 WALK_NICENESS = 5
 """Of the processes for long work: a third of the share of what tracks, where cores are short."""
 
@@ -118,6 +122,7 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
         # Built here in any case: a mistake in the config is told at once, not by a worker.
         parts = recovery_parts(config, size_px, frontend=frontend)
     desk = worker_desk(config, size_px, faults) if workers else InlineDesk(calibration_handlers(config))
+    graphs = BesideGraphs(desk, lambda submap: adjust_window(submap, config.graph)) if workers else None
     if recovery is None:
         recovery = DeskExecutor(desk) if workers else faults.around_inline(InlineExecutor(parts))
 
@@ -127,7 +132,7 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
             new_starter=lambda: Initialiser(
                 frontend, bundle_adjust_arrays, config.initialiser, calibration.camera.K, size_px, config.seed
             ),
-            new_graph=lambda: ISam2SubmapGraph(config.graph),
+            new_graph=graphs.new_graph if graphs is not None else lambda: ISam2SubmapGraph(config.graph),
             new_odometry=faults.around_odometry(odometry),
             new_relocaliser=faults.around_odometry(partial(odometry, n_covering=config.recovery.covering_keyframes)),
             calibration=calibration,
@@ -136,6 +141,7 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
             desk=desk,
             atlas_solver=atlas_solver(config),
             adjust_bundle=partial(bundle_adjust_arrays, robust_k=config.graph.robust_k),
+            graphs=graphs,
         ),
         config,
     )
@@ -182,6 +188,11 @@ def calibration_handlers(config: Config) -> Handlers:
     return {JobKind.CALIBRATION: answered}
 
 
+def graph_handlers(config: Config) -> Handlers:
+    """Build what the worker for the live map does: it keeps and solves the graphs of submaps."""
+    return {JobKind.GRAPH: GraphServer(lambda: ISam2SubmapGraph(config.graph))}
+
+
 def walk_handlers(config: Config, size_px: tuple[int, int], n_threads: int) -> Handlers:
     """Build what a worker for long work does: walks back and calibrations."""
     budget_s = WORKER_BUDGET * config.recovery.time_limit_s
@@ -202,7 +213,8 @@ def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript) -
         recovery.time_limit_s,
         niceness=WALK_NICENESS,
     )
-    return WorkerDesk([walks], recovery.finish_wait_s, faults.kill_worker)
+    graphs = Lane("map", (JobKind.GRAPH,), partial(graph_handlers, config), 1, GRAPH_LIMIT_S)
+    return WorkerDesk([graphs, walks], recovery.finish_wait_s, faults.kill_worker)
 
 
 def recovery_parts(

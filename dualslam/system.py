@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.beside_graph import BesideGraphs, Moved
 from dualslam.calibration.background import Calibrations
 from dualslam.calibration.lens import Calibration
 from dualslam.config.settings import Config
@@ -23,7 +24,7 @@ from dualslam.health import HealthMonitor, count_signs
 from dualslam.map.atlas import Link
 from dualslam.map.connections import Connections
 from dualslam.map.frame_records import FrameRecord, FrameResult
-from dualslam.map.record import Record
+from dualslam.map.record import FrameStamp, Record
 from dualslam.map.split import next_submap
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
@@ -31,6 +32,7 @@ from dualslam.recovery.executor import RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.jobs import Desk
 from dualslam.recovery.manager import Recoveries
+from dualslam.recovery.merge import propagate_links
 from dualslam.recovery.relocaliser import Relocaliser
 from dualslam.run.pace import Pace
 
@@ -43,6 +45,7 @@ class Components:
 
     `new_relocaliser`: a front end that finds its submap again wherever it is seen, and goes on from there. `desk`: where
     work beside the tracking is done; walks back have an executor of their own, which may stand at the same desk.
+    `graphs`: where submaps' graphs are solved in another process, what brings changes there and back.
     """
 
     view_of: Callable[[Frame], View | Failure]
@@ -56,6 +59,7 @@ class Components:
     atlas_solver: AtlasSolver
     adjust_bundle: BundleAdjuster
     desk: Desk
+    graphs: BesideGraphs | None = None
 
     @property
     def K(self) -> FloatArray:
@@ -145,6 +149,7 @@ class System:
         started, self._posed_at = time.perf_counter(), None
         self.rows[frame.index] = FrameRecord(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
         # 1. What was found beside the tracking meanwhile comes into the map between two frames.
+        self._collect_graphs(frame)
         self._calibrations.collect(self._live, frame, self._recoveries.waiting)
         self._recoveries.collect(self._live, frame)
         # 2. Features, into the buffer that a walk back in time will read.
@@ -166,7 +171,12 @@ class System:
         interrupted : bool
             Someone waits: leave out the last walk back, for which the live map has grown since the one before.
         """
-        self._recoveries.finish(self._live, next(reversed(self.rows.values()), None), interrupted)
+        last = next(reversed(self.rows.values()), None)
+        if self._parts.graphs is not None and last is not None:
+            self._follow_graphs(self._parts.graphs.finish(self.atlas.submaps), last)
+        self._recoveries.finish(self._live, last, interrupted)
+        if self._parts.graphs is not None and last is not None:
+            self._follow_graphs(self._parts.graphs.finish(self.atlas.submaps), last)
         if self._live is not None:
             self._archive(self._live, "end of sequence")
         self._parts.desk.close()
@@ -302,6 +312,26 @@ class System:
         )
         self._record.pose(pose, track.n_matches, track.n_inliers)
         return track
+
+    # --- graphs beside the tracking
+
+    def _collect_graphs(self, now: FrameStamp) -> None:
+        """Let submaps move to where their graphs have put them meanwhile, and tell the graphs what is new."""
+        graphs = self._parts.graphs
+        if graphs is None:
+            return
+        with self.timer.measure("graph (late)"):
+            if self._live is not None and not self.pace.may_lag(graphs.lag(self._live.submap)):
+                self._follow_graphs(graphs.wait(self.atlas.submaps), now)
+            self._follow_graphs(graphs.collect(self.atlas.submaps), now)
+
+    def _follow_graphs(self, moved: Iterable[Moved], now: FrameStamp) -> None:
+        for each in moved:
+            propagate_links(self.atlas, each.before, each.submap)
+            if self._live is not None and self._live.submap is each.submap:
+                self._live.adopt(self._live.graph, each.before)
+            if each.rebuilt:
+                self._record.event(EventKind.GRAPH_REBUILT, now, each.submap.id)
 
     # --- failure
 

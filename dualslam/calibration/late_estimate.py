@@ -21,7 +21,11 @@ N_SCALE = 5
 
 
 def apply_late(
-    submap: Submap, keyframe_ids: IntArray, T_submap_kf: FloatArray, landmark_ids: IntArray, xyz_mu: FloatArray
+    submap: Submap,
+    keyframe_ids: IntArray,
+    T_submap_kf: FloatArray,
+    landmark_ids: IntArray,
+    xyz_mu: FloatArray,
 ) -> Submap:
     """Apply an estimate of a part of a submap, and let the rest follow; return a copy of the submap as it was.
 
@@ -36,7 +40,8 @@ def apply_late(
     submap.apply_estimate(keyframe_ids, T_submap_kf, landmark_ids, xyz_mu)
     if not len(known):
         return before
-    newer = [k for k in submap.keyframes if k not in set(known.tolist())]
+    estimated = set(known.tolist())
+    newer = [k for k in submap.keyframes if k not in estimated]
     changes = {k: change_of_frame(before, submap, _nearest(known, k)) for k in newer}
     for k, S in changes.items():
         submap.T_submap_kf[k] = sim3.act_on_pose(S, before.T_submap_kf[k])

@@ -57,10 +57,14 @@ class Pace:
         self._late_s = late_s
         self.statistics.behind += self.behind
 
-    def note_lag(self, n_keyframes: int) -> None:
-        """Note how many keyframes the graph beside does not know yet."""
+    def may_lag(self, n_keyframes: int) -> bool:
+        """Note how many keyframes the graph beside does not know yet; return whether the tracking may go on meanwhile.
+
+        In real time it always does. Without a clock there is no reason to be further ahead than real time would be.
+        """
         self._lag = n_keyframes
         self.statistics.max_lag_keyframes = max(self.statistics.max_lag_keyframes, n_keyframes)
+        return self._in_real_time or n_keyframes <= MAX_LAG_KEYFRAMES
 
     @property
     def behind(self) -> bool:

@@ -12,7 +12,8 @@ MANY, WEAK = 300, 60
 
 def test_without_real_time_no_keyframe_is_put_off() -> None:
     pace = Pace()
-    pace.note_lag(100)
+    assert not pace.may_lag(100)
+    assert pace.may_lag(MAX_LAG_KEYFRAMES)
     assert not pace.behind
     assert not pace.puts_off(MANY, WEAK)
 
@@ -32,9 +33,9 @@ def test_a_keyframe_is_put_off_while_frames_are_late_and_no_longer_than_that() -
 def test_nor_while_the_graph_has_much_to_learn() -> None:
     pace = Pace()
     pace.note(0.0)
-    pace.note_lag(MAX_LAG_KEYFRAMES)
+    assert pace.may_lag(MAX_LAG_KEYFRAMES)
     assert not pace.behind
-    pace.note_lag(MAX_LAG_KEYFRAMES + 1)
+    assert pace.may_lag(MAX_LAG_KEYFRAMES + 1)
     assert pace.puts_off(MANY, WEAK)
     assert pace.statistics.max_lag_keyframes == MAX_LAG_KEYFRAMES + 1
 

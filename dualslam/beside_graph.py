@@ -1,0 +1,263 @@
+"""A submap's graph in a process of its own: the tracking solves a window meanwhile, and takes the whole when it comes.
+
+`BesideGraph` is the `SubmapGraph` that the tracking sees. Its updates adjust the newest keyframes (`Window`), and note
+that the graph proper has something to learn. Between two frames `BesideGraphs` sends what has changed in the arrays
+(`dualslam/submap_delta.py`) to the process, one job at a time, so that a graph that is behind takes several keyframes
+in at once; and it puts what came back into the submap as it is now: known keyframes and landmarks take their values,
+what has come since follows (`dualslam/calibration/late_estimate.py`). A process that dies costs its graph: the next job brings the
+whole submap to a fresh one. A graph that fails leaves the submap to its window, and is made anew with the next
+keyframe.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import count
+
+import numpy as np
+
+from dualslam.calibration.late_estimate import apply_late
+from dualslam.core.errors import SolverError
+from dualslam.core.interfaces import GraphEstimate, SubmapGraph
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
+from dualslam.map.submap import Submap
+from dualslam.recovery.jobs import Desk, JobKind
+from dualslam.submap_delta import SubmapDelta, SubmapMirror
+
+log = logging.getLogger(__name__)
+
+Window = Callable[[Submap], GraphEstimate]
+"""Adjusts the newest keyframes of a submap and what they see; the submap is not changed."""
+
+PAUSE_S = 1e-3
+"""Between two looks at whether a graph has been solved, where a run waits for it."""
+MAX_GRAPHS = 3
+"""Graphs that a process keeps: the live one, and those that a merge or a map that was seen again may still ask for."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraphJob:
+    """What a graph in another process is to take in. It can be pickled.
+
+    Attributes
+    ----------
+    graph_id : int
+    delta : SubmapDelta
+    rebuild : bool
+        Whether the graph is to be made anew, by a batch solution.
+    near_optimum : bool
+        See `SubmapGraph.rebuild`.
+    """
+
+    graph_id: int
+    delta: SubmapDelta
+    rebuild: bool
+    near_optimum: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraphAnswer:
+    """What a graph holds after a job.
+
+    Attributes
+    ----------
+    estimate : GraphEstimate
+        Of everything in it.
+    """
+
+    estimate: GraphEstimate
+
+
+class GraphServer:
+    """Keeps graphs and the replicas of their submaps, in the process that solves them.
+
+    Parameters
+    ----------
+    new_graph : callable
+    """
+
+    def __init__(self, new_graph: Callable[[], SubmapGraph]) -> None:
+        self._new_graph = new_graph
+        self._graphs: dict[int, tuple[Submap, SubmapGraph]] = {}
+
+    def __call__(self, job: GraphJob) -> GraphAnswer | Failure:
+        """Do a job; a failure forgets the graph, and the next job must bring the whole submap."""
+        known = self._graphs.pop(job.graph_id, None)
+        if known is None and not job.delta.is_whole:
+            return Failure(FailureReason.DISABLED, f"graph {job.graph_id} is not known here")
+        replica = job.delta.apply(None if known is None else known[0])
+        graph = self._new_graph() if known is None or job.delta.is_whole else known[1]
+        try:
+            solved = graph.rebuild(replica, job.near_optimum) if job.rebuild else graph.update(replica)
+            whole = graph.full_estimate(replica)
+        except SolverError as error:
+            return Failure(FailureReason.SOLVER, str(error))
+        replica.apply_estimate(*whole.values)
+        self._graphs[job.graph_id] = replica, graph
+        while len(self._graphs) > MAX_GRAPHS:
+            del self._graphs[next(iter(self._graphs))]
+        outliers = np.union1d(solved.outlier_rows, whole.outlier_rows)
+        ids, T, landmarks, xyz = whole.values
+        return GraphAnswer(
+            replace(solved, keyframe_ids=ids, T_submap_kf=T, landmark_ids=landmarks, xyz_mu=xyz, outlier_rows=outliers)
+        )
+
+
+class BesideGraph:
+    """The `SubmapGraph` of the tracking, whose solutions come from a window first and from beside later.
+
+    Parameters
+    ----------
+    graph_id : int
+    window : Window
+    register : callable
+        Told, whenever there is something to send, of which submap.
+    """
+
+    def __init__(self, graph_id: int, window: Window, register: Callable[[int, BesideGraph], None]) -> None:
+        self.id = graph_id
+        self.is_behind = False
+        self.rebuild_asked: bool | None = None  # near the optimum, or not
+        self.mirror = SubmapMirror()
+        self.noise2 = 1.0
+        self._window = window
+        self._register = register
+
+    def update(self, submap: Submap) -> GraphEstimate:
+        """Adjust the window; the graph will take in what has changed."""
+        self._ask(submap)
+        start = time.thread_time()
+        estimate = self._window(submap)
+        return replace(estimate, seconds=time.thread_time() - start)
+
+    def rebuild(self, submap: Submap, near_optimum: bool = False) -> GraphEstimate:
+        """Let the graph be made anew; meanwhile the submap stays as it is."""
+        self.rebuild_asked = near_optimum
+        self.mirror = SubmapMirror()
+        self._ask(submap)
+        return self.full_estimate(submap)
+
+    def full_estimate(self, submap: Submap) -> GraphEstimate:
+        """Return the submap as it stands."""
+        ids = np.fromiter(submap.keyframes, np.int64, len(submap.keyframes))
+        alive, none = np.flatnonzero(submap.landmarks["alive"]), np.zeros(0, np.int64)
+        T, xyz = submap.keyframe_poses(ids), submap.landmarks["xyz_mu"][alive]
+        return GraphEstimate(ids, T, alive, xyz, none, float("nan"), self.noise2, rebuilt=False, seconds=0.0)
+
+    def pose_covariance(self, keyframe_id: int) -> FloatArray:
+        """Raise `SolverError`: the graph is elsewhere."""
+        raise SolverError("the graph is in another process, which gives no covariances")
+
+    def point_covariances(self, landmark_ids: IntArray) -> FloatArray:
+        """Raise `SolverError`: the graph is elsewhere."""
+        raise SolverError("the graph is in another process, which gives no covariances")
+
+    def _ask(self, submap: Submap) -> None:
+        self.is_behind = True
+        self._register(submap.id, self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moved:
+    """A submap that has taken in what its graph found. `before`: a copy of it as it was; `rebuilt`: from scratch."""
+
+    submap: Submap
+    before: Submap
+    rebuilt: bool
+
+
+class BesideGraphs:
+    """Sends the changes of submaps to the process that has their graphs, and puts what comes back into them.
+
+    Parameters
+    ----------
+    desk : Desk
+    window : Window
+    """
+
+    def __init__(self, desk: Desk, window: Window) -> None:
+        self._desk = desk
+        self._window = window
+        self._ids = count()
+        self._graphs: dict[int, BesideGraph] = {}  # by the submap's id: the one that it has now
+        self._under_way: tuple[int, BesideGraph] | None = None
+        self.n_rebuilt = 0
+
+    def new_graph(self) -> SubmapGraph:
+        """Make the graph of a submap."""
+        return BesideGraph(next(self._ids), self._window, self._note)
+
+    def lag(self, submap: Submap) -> int:
+        """Count the keyframes of a submap that its graph does not know yet."""
+        graph = self._graphs.get(submap.id)
+        return 0 if graph is None else len(submap.keyframes.keys() - set(graph.mirror.keyframe_ids))
+
+    def collect(self, submaps: Mapping[int, Submap]) -> Iterator[Moved]:
+        """Put what has come back into its submap, and send what has changed since, if nothing is under way."""
+        for ended in self._desk.poll(JobKind.GRAPH):
+            if (moved := self._take(ended.result, submaps)) is not None:
+                yield moved
+        self._send(submaps)
+
+    def wait(self, submaps: Mapping[int, Submap]) -> Iterator[Moved]:
+        """Wait for what is under way, as a run does that has no clock to keep up with, and collect."""
+        while self._under_way is not None and self._desk.n_open(JobKind.GRAPH):
+            ended = self._desk.poll(JobKind.GRAPH)
+            for each in ended:
+                if (moved := self._take(each.result, submaps)) is not None:
+                    yield moved
+            if not ended:
+                time.sleep(PAUSE_S)
+        yield from self.collect(submaps)
+
+    def finish(self, submaps: Mapping[int, Submap]) -> Iterator[Moved]:
+        """Let all graphs take in what they lack, as long as that ends soon."""
+        while True:
+            self._send(submaps)
+            if self._under_way is None:
+                return
+            for ended in self._desk.drain(JobKind.GRAPH):
+                if isinstance(ended.result, Failure):
+                    log.warning("a graph was left behind at the end: %s", ended.result.detail)
+                    return
+                if (moved := self._take(ended.result, submaps)) is not None:
+                    yield moved
+
+    def _note(self, submap_id: int, graph: BesideGraph) -> None:
+        self._graphs[submap_id] = graph
+
+    def _send(self, submaps: Mapping[int, Submap]) -> None:
+        if self._under_way is not None:
+            return
+        # The newest submap first: it is the live one.
+        waiting = [m for m, graph in self._graphs.items() if graph.is_behind and m in submaps]
+        if not waiting:
+            return
+        submap, graph = submaps[max(waiting)], self._graphs[max(waiting)]
+        near, graph.rebuild_asked = graph.rebuild_asked, None
+        graph.is_behind = False
+        self._under_way = submap.id, graph
+        self._desk.submit(JobKind.GRAPH, GraphJob(graph.id, graph.mirror.delta(submap), near is not None, bool(near)))
+
+    def _take(self, result: GraphAnswer | Failure, submaps: Mapping[int, Submap]) -> Moved | None:
+        assert self._under_way is not None
+        (submap_id, graph), self._under_way = self._under_way, None
+        if isinstance(result, Failure):
+            log.warning("graph of submap %d: %s; it is made anew", submap_id, result.detail)
+            graph.mirror, graph.rebuild_asked = SubmapMirror(), False
+            # A solver that has failed on these arrays would fail again: it waits for the next keyframe.
+            graph.is_behind = graph.is_behind or result.reason is not FailureReason.SOLVER
+            return None
+        if self._graphs.get(submap_id) is not graph or graph.rebuild_asked is not None:
+            return None  # the submap has another graph by now, or is to be made anew from what it has become
+        submap, estimate = submaps[submap_id], result.estimate
+        graph.noise2 = estimate.noise2
+        before = apply_late(submap, *estimate.values)
+        rows = estimate.outlier_rows[submap.observations["alive"][estimate.outlier_rows]]
+        submap.remove_outliers(rows)
+        graph.is_behind = graph.is_behind or len(rows) > 0
+        self.n_rebuilt += estimate.rebuilt
+        return Moved(submap, before, estimate.rebuilt)

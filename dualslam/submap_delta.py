@@ -1,0 +1,178 @@
+"""What changed in a submap since its replica was brought up to date: how a graph in another process follows the arrays.
+
+A replica holds what a graph needs of a submap: poses, points, pixels with their sigmas, observations, gauge. Keyframes
+and rows that were added go there once, and of the rest only what died or moved: tens of kilobytes a keyframe, where the
+whole is megabytes. The first delta of a replica holds everything.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.types import Features, FloatArray, IntArray, Keyframe
+from dualslam.map.submap import NO_LANDMARK, Anchor, RelativePose, Submap
+
+N_RECENT = 8
+"""Keyframes whose poses and landmarks are sent each time: the window adjustment has moved them."""
+NO_DESCRIPTORS = np.zeros((0, 1), np.uint8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SubmapDelta:
+    """A change of a replica. It can be pickled.
+
+    Attributes
+    ----------
+    submap_id : int
+    is_whole : bool
+        Whether it holds the whole submap: the replica is made anew.
+    K : (3, 3)
+    gauge : tuple of int
+    keyframes : tuple of Keyframe
+        Those added, and those that have more features now: pixels and sigmas only, in the submap's order.
+    poses : dict of int to (4, 4)
+        Of those, and of the newest ones.
+    removed : dict of int to Anchor or None
+        Keyframes that were culled.
+    relative_poses : dict of int to RelativePose or None
+        Those that have changed; None: gone.
+    landmarks : (L,) int64
+        Rows whose points come with it, those added included; `xyz_mu` : (L, 3), `first_kf` : (L,)
+    n_landmarks : int
+        Rows of the table.
+    dead_landmarks, dead_rows : int64 arrays
+        Landmarks and observations that have died.
+    kf, feature, landmark, alive : arrays
+        Observations added.
+    """
+
+    submap_id: int
+    is_whole: bool
+    K: FloatArray
+    gauge: tuple[int, int]
+    keyframes: tuple[Keyframe, ...]
+    poses: dict[int, FloatArray]
+    removed: dict[int, Anchor | None]
+    relative_poses: dict[int, RelativePose | None]
+    landmarks: IntArray
+    xyz_mu: FloatArray
+    first_kf: IntArray
+    n_landmarks: int
+    dead_landmarks: IntArray
+    dead_rows: IntArray
+    kf: IntArray
+    feature: IntArray
+    landmark: IntArray
+    alive: NDArray[np.bool_]
+
+    def apply(self, replica: Submap | None) -> Submap:
+        """Bring a replica up to date; a whole delta makes one."""
+        if self.is_whole or replica is None:
+            replica = Submap(self.submap_id, self.K, NO_DESCRIPTORS[:0].reshape(0))
+        replica.K, replica.gauge = self.K, self.gauge
+        self._keyframes(replica)
+        lm = replica.landmarks
+        if (n_new := self.n_landmarks - len(lm)) > 0:
+            lm.append(n_new, alive=True, replaced_by=NO_LANDMARK)
+        lm["xyz_mu"][self.landmarks] = self.xyz_mu
+        lm["first_kf"][self.landmarks] = self.first_kf
+        lm["alive"][self.dead_landmarks] = False
+        replica.remove_observations(self.dead_rows)
+        obs = replica.observations
+        obs.append(len(self.kf), kf=self.kf, feature=self.feature, landmark=self.landmark, alive=self.alive)
+        for k in np.unique(self.kf[self.alive]).tolist():
+            here = self.alive & (self.kf == k)
+            if k in replica.landmark_of:
+                replica.landmark_of[k][self.feature[here]] = self.landmark[here]
+        return replica
+
+    def _keyframes(self, replica: Submap) -> None:
+        for k, anchor in self.removed.items():
+            for table in (replica.keyframes, replica.T_submap_kf, replica.landmark_of):
+                table.pop(k, None)
+            if anchor is not None:
+                replica.anchors[k] = anchor
+        for keyframe in self.keyframes:
+            known = replica.landmark_of.get(keyframe.id, np.zeros(0, np.int64))
+            ids = np.full(len(keyframe.features), NO_LANDMARK, np.int64)
+            ids[: len(known)] = known
+            replica.keyframes[keyframe.id], replica.landmark_of[keyframe.id] = keyframe, ids
+        for k, T in self.poses.items():
+            replica.T_submap_kf[k] = T
+        for k, relative in self.relative_poses.items():
+            if relative is None:
+                replica.relative_poses.pop(k, None)
+            else:
+                replica.relative_poses[k] = relative
+
+
+class SubmapMirror:
+    """Knows what a replica knows, and tells what it lacks."""
+
+    def __init__(self) -> None:
+        self._features: dict[int, Features] = {}
+        self._relative: dict[int, RelativePose] = {}
+        self._row_alive = np.zeros(0, bool)
+        self._landmark_alive = np.zeros(0, bool)
+        self._is_new = True
+
+    @property
+    def keyframe_ids(self) -> list[int]:
+        """Those that the replica holds."""
+        return list(self._features)
+
+    def delta(self, submap: Submap) -> SubmapDelta:
+        """Return what brings the replica up to date with a submap, and take it as done."""
+        obs, lm = submap.observations, submap.landmarks
+        n_rows, n_points = len(self._row_alive), len(self._landmark_alive)
+        added = [k for k, kf in submap.keyframes.items() if self._features.get(k) is not kf.features]
+        removed = {k: submap.anchors.get(k) for k in self._features if k not in submap.keyframes}
+        recent = list(submap.keyframes)[-N_RECENT:]
+        relative: dict[int, RelativePose | None] = {
+            k: r for k, r in submap.relative_poses.items() if self._relative.get(k) is not r
+        }
+        relative |= {k: None for k in self._relative if k not in submap.relative_poses}
+        points = np.union1d(np.arange(n_points, len(lm)), submap.landmarks_of_keyframes(recent))
+        new_rows = slice(n_rows, len(obs))
+        made = SubmapDelta(
+            submap_id=submap.id,
+            is_whole=self._is_new,
+            K=submap.K,
+            gauge=submap.gauge,
+            keyframes=tuple(_slim(submap.keyframes[k]) for k in added),
+            poses={k: submap.T_submap_kf[k].copy() for k in dict.fromkeys((*added, *recent))},
+            removed=removed,
+            relative_poses=relative,
+            landmarks=points,
+            xyz_mu=lm["xyz_mu"][points],
+            first_kf=lm["first_kf"][points],
+            n_landmarks=len(lm),
+            dead_landmarks=np.flatnonzero(_died(self._landmark_alive, lm["alive"])),
+            dead_rows=np.flatnonzero(self._row_alive & ~obs["alive"][:n_rows]),
+            kf=obs["kf"][new_rows].copy(),
+            feature=obs["feature"][new_rows].copy(),
+            landmark=obs["landmark"][new_rows].copy(),
+            alive=obs["alive"][new_rows].copy(),
+        )
+        self._is_new = False
+        self._features = {k: kf.features for k, kf in submap.keyframes.items()}
+        self._relative = dict(submap.relative_poses)
+        self._row_alive, self._landmark_alive = obs["alive"].copy(), lm["alive"].copy()
+        return made
+
+
+def _died(before: NDArray[np.bool_], now: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which are dead now and were not known to be: those that have come since count as alive before."""
+    known = np.ones(len(now), bool)
+    known[: len(before)] = before
+    return known & ~now
+
+
+def _slim(keyframe: Keyframe) -> Keyframe:
+    """What a graph needs of a keyframe: pixels and their sigmas."""
+    f, none = keyframe.features, np.zeros(0)
+    slim = Features(f.uv_rect_px, f.uv_rect_px, f.sigma_px, none, np.zeros(0, np.int64), none, NO_DESCRIPTORS)
+    return replace(keyframe, features=slim)

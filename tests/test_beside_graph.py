@@ -1,0 +1,148 @@
+"""A submap's graph in another process: it follows the arrays by deltas, and an answer that is late is as good."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dualslam.beside_graph import BesideGraph, BesideGraphs, GraphServer
+from dualslam.build import build_system, graph_handlers
+from dualslam.config.settings import Config
+from dualslam.core.types import FailureReason, FrameStatus
+from dualslam.map.submap import Submap
+from dualslam.recovery.jobs import InlineDesk, JobKind
+from dualslam.recovery.worker import WorkerDesk
+from dualslam.run.results import trajectories_of
+from dualslam.submap_delta import SubmapMirror
+from dualslam.system import System
+from dualslam.testing.late_desk import LateDesk
+from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, pose_errors, system_in
+from tests.map.test_submap import assert_consistent
+
+DENSE = {"keyframes": {"max_parallax_deg": 2.0}}
+POSITION_M, ROTATION_RAD = 0.08, 0.01
+
+
+def assert_follows(replica: Submap, submap: Submap) -> None:
+    """Assert that a replica holds what a graph looks at."""
+    assert set(replica.keyframes) == set(submap.keyframes)
+    assert replica.gauge == submap.gauge
+    np.testing.assert_array_equal(replica.K, submap.K)
+    for name in ("kf", "feature", "landmark", "alive"):
+        np.testing.assert_array_equal(replica.observations[name], submap.observations[name])
+    np.testing.assert_array_equal(replica.landmarks["alive"], submap.landmarks["alive"])
+    for k, keyframe in submap.keyframes.items():
+        np.testing.assert_array_equal(replica.landmark_of[k], submap.landmark_of[k])
+        np.testing.assert_array_equal(replica.keyframes[k].features.uv_rect_px, keyframe.features.uv_rect_px)
+    assert replica.relative_poses.keys() == submap.relative_poses.keys()
+    assert set(replica.anchors) <= set(submap.anchors)
+
+
+def test_a_replica_follows_a_map_that_grows_and_is_culled() -> None:
+    world = PointWorld(cloud(), hand_held(60))
+    system, mirror, replica = system_in(world, **DENSE), SubmapMirror(), None
+    sizes = []
+    for frame in world.frames():
+        system.step(frame)
+        if frame.index % 3 == 0 and system.live is not None:
+            sent = pickle.dumps(mirror.delta(system.live.submap))
+            sizes.append(len(sent))
+            replica = pickle.loads(sent).apply(replica)
+            assert_follows(replica, system.live.submap)
+    submap = system.atlas.submaps[0]
+    assert submap.anchors
+    replica = mirror.delta(submap).apply(replica)
+    for k in list(submap.keyframes)[-5:]:
+        np.testing.assert_array_equal(replica.T_submap_kf[k], submap.T_submap_kf[k])
+    whole = len(pickle.dumps(SubmapMirror().delta(submap)))
+    assert np.median(sizes) < 0.5 * whole
+
+
+def beside(world: PointWorld, polls: int, **settings: object) -> System:
+    """A system whose graphs are solved inline, but come back late, by way of a delta as to another process."""
+    system = system_in(world, **settings)
+    desk = LateDesk(InlineDesk(graph_handlers(system._config)), polls)
+    from dualslam.backend.beside_window import adjust_window
+
+    graphs = BesideGraphs(desk, lambda submap: adjust_window(submap, system._config.graph))
+    system._parts = replace(system._parts, new_graph=graphs.new_graph, graphs=graphs)
+    system._recoveries._new_graph = graphs.new_graph
+    system._calibrations._new_graph = graphs.new_graph
+    return system
+
+
+def run(system: System, world: PointWorld) -> System:
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    return system
+
+
+@pytest.fixture(scope="module")
+def world() -> PointWorld:
+    return PointWorld(cloud(), hand_held(70))
+
+
+def assert_right(system: System, world: PointWorld) -> None:
+    """Assert that every frame is where it was: within what merges that come late are allowed (`test_late_merge.py`)."""
+    main = trajectories_of(system).main
+    assert set(main.index.tolist()) == set(range(len(world.T_world_cam))) - world.covered
+    translation, rotation = pose_errors(main.T_world_cam, world.T_world_cam[main.index])
+    assert translation.max() < POSITION_M
+    assert rotation.max() < ROTATION_RAD
+
+
+@pytest.mark.parametrize("polls", [1, 6])
+def test_a_graph_that_answers_late_is_as_good_as_one_in_time(world: PointWorld, polls: int) -> None:
+    system = run(beside(world, polls, **DENSE), world)
+    assert isinstance(system.live and system.live.graph, BesideGraph)
+    assert all(row.status is FrameStatus.TRACKED for row in list(system.rows.values())[5:])
+    assert_right(system, world)
+    assert_consistent(system.atlas.submaps[0])
+    graphs = system._parts.graphs
+    assert graphs is not None
+    assert graphs.lag(system.atlas.submaps[0]) == 0
+
+
+def test_two_maps_are_linked_whose_graphs_answer_late() -> None:
+    world = PointWorld(cloud(), hand_held(90), covered=frozenset(range(35, 50)))
+    system = run(beside(world, 2, recovery={"enabled": True}), world)
+    assert_right(system, world)
+
+
+def test_a_server_that_does_not_know_a_graph_says_so() -> None:
+    world = PointWorld(cloud(), hand_held(20))
+    system = run(system_in(world), world)
+    from dualslam.backend.submap_graph import ISam2SubmapGraph
+    from dualslam.beside_graph import GraphJob
+
+    mirror = SubmapMirror()
+    first, second = (mirror.delta(system.atlas.submaps[0]) for _ in range(2))
+    server = GraphServer(lambda: ISam2SubmapGraph(Config().graph))
+    lost = server(GraphJob(7, second, False, False))
+    assert not lost
+    assert lost.reason is FailureReason.DISABLED  # type: ignore[union-attr]
+    assert server(GraphJob(7, first, False, False))
+    assert server(GraphJob(7, second, False, False))
+
+
+def test_a_process_that_is_killed_costs_the_map_nothing(world: PointWorld) -> None:
+    """With a real one: its graph is lost, and made anew from the arrays by the next."""
+    settings = {"recovery": {"enabled": False, "workers": 1}, "calibration": {"refine": False}}
+    config = Config.model_validate(DENSE | settings | {"camera": {"model_sigma_px": 0.0}})
+    system = build_system(config, CAMERA)
+    system._parts = replace(system._parts, view_of=lambda frame: world.view(frame.index))
+    desk = system.desk
+    assert isinstance(desk, WorkerDesk)
+    for frame in world.frames():
+        system.step(frame)
+        if frame.index == 40:
+            os.kill(desk.pids[0] or 0, signal.SIGKILL)
+    system.finish()
+    assert desk.statistics[JobKind.GRAPH].n_done > 5
+    assert_right(system, world)
