@@ -124,10 +124,7 @@ class _Graph:
         start = self.nodes if nodes is None else nodes
         fixed = self.problem.fixed
         priors = {fixed: Sim3Prior(self.nodes[fixed])}
-        at_start = optimise_sim3(start, chosen, priors, max_iterations=0)
-        if at_start.cost_before < SETTLED_COST:
-            return replace(at_start, S_world_node=dict(start))
-        return optimise_sim3(start, chosen, priors, max_iterations=MAX_ITERATIONS)
+        return optimise_sim3(start, chosen, priors, max_iterations=MAX_ITERATIONS, settled_cost=SETTLED_COST)
 
     def pieces(self, kept: BoolArray) -> IntArray:
         """Return for each node the piece that it belongs to: the lowest node of it."""

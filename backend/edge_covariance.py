@@ -86,19 +86,18 @@ def _covariance(
     loose = np.repeat([LOOSE_ROTATION_RAD**-2, LOOSE_TRANSLATION_MU**-2], 3)
     information[np.arange(n), :, np.arange(n), :] = np.diag(loose)
     own = np.zeros((n, 6, 6))
-    np.add.at(own, kf, np.einsum("rai,raj->rij", J_pose, J_pose))
+    np.add.at(own, kf, J_pose.transpose(0, 2, 1) @ J_pose)
     information[np.arange(n), :, np.arange(n), :] += own
     _add_relative_poses(information, submap, window, held)
     n_points = int(point.max()) + 1 if len(point) else 0
     H_points = np.zeros((n_points, 3, 3))
-    np.add.at(H_points, point, np.einsum("rai,raj->rij", J_point, J_point))
-    cross = np.zeros((n_points, n, 3, 6))  # one observation of a point in a keyframe at most
-    cross[point, kf] = np.einsum("rai,raj->rij", J_point, J_pose)
+    np.add.at(H_points, point, J_point.transpose(0, 2, 1) @ J_point)
+    cross = np.zeros((n_points, 3, n, 6))  # one observation of a point in a keyframe at most
+    cross[point, :, kf] = J_point.transpose(0, 2, 1) @ J_pose
+    flat = cross.reshape(n_points, 3, 6 * n)
     # How a point moves with the poses: dp = moves @ dc.
-    solved = np.linalg.solve(H_points[:, None], cross)
-    moves = np.asarray(-solved.transpose(0, 2, 1, 3).reshape(n_points, 3, 6 * n), np.float64)
-    flat = cross.transpose(0, 2, 1, 3).reshape(n_points * 3, 6 * n)
-    system = information.reshape(6 * n, 6 * n) + flat.T @ moves.reshape(n_points * 3, 6 * n)
+    moves = np.asarray(-np.linalg.inv(H_points) @ flat, np.float64)
+    system = information.reshape(6 * n, 6 * n) + flat.reshape(-1, 6 * n).T @ moves.reshape(-1, 6 * n)
     R = submap.keyframe_poses(window)[:, :3, :3]
     units = [_unit(c, kf, point, x_cam, R[c], moves, n) for c in (a, b)]
     system += np.outer(units[0], units[0]) / UNIT_SIGMA**2
@@ -153,9 +152,10 @@ def _linearise(
     _, point = np.unique(landmark, return_inverse=True)
     H = np.zeros((int(point.max()) + 1 if len(point) else 0, 3, 3))
     J_point = J @ T[place, :3, :3].transpose(0, 2, 1)
-    np.add.at(H, point, np.einsum("rai,raj->rij", J_point, J_point))
+    np.add.at(H, point, J_point.transpose(0, 2, 1) @ J_point)
     # Points that hardly have a depth are left out: their share of the matrix would be noise.
-    certain = np.linalg.cond(H)[point] < 1e10 if len(H) else np.zeros(0, bool)
+    spread = np.linalg.eigvalsh(H)
+    certain = (spread[:, 0] > 1e-10 * spread[:, -1])[point] if len(H) else np.zeros(0, bool)
     _, point = np.unique(point[certain], return_inverse=True)
     return place[certain], point, x[certain], J_pose[certain], J_point[certain]
 

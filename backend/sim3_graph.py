@@ -24,6 +24,10 @@ from dualslam.core.types import BoolArray, FloatArray, IntArray
 GNC_INLIER_PROBABILITY = 0.99
 """A doubtful edge is an outlier beyond this quantile of the chi-square with 7 degrees of freedom."""
 
+GNC_STEP, GNC_TOLERANCE = 2.0, 1e-3
+"""By how much each round is less convex than the one before, and how far each is solved. With 1.4 and 1e-8 a choice
+took nearly twice as long (1,070 nodes, 150 doubtful edges, 50 of them false), and judged all of them alike."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sim3Edge:
@@ -125,6 +129,7 @@ def optimise_sim3(
     priors: Mapping[int, Sim3Prior] | None = None,
     robust: bool = False,
     max_iterations: int = 50,
+    settled_cost: float = 0.0,
 ) -> Sim3Solution:
     """Find the similarities that agree best with the edges.
 
@@ -140,6 +145,8 @@ def optimise_sim3(
         Let graduated non-convexity choose among the doubtful edges; else all edges count.
     max_iterations : int
         Of Levenberg-Marquardt.
+    settled_cost : float
+        With no more than this to gain the nodes stay as they are, to the bit.
 
     Raises
     ------
@@ -170,8 +177,11 @@ def optimise_sim3(
         if robust and doubtful.any():
             inliers = _choose_edges(graph, values, doubtful, max_iterations)
             graph = _without(graph, np.flatnonzero(~inliers))
+        before = float(graph.error(values))
+        if before <= settled_cost:
+            return Sim3Solution(dict(nodes), inliers, before, before, graph, values)
         result = gtsam.LevenbergMarquardtOptimizer(graph, values, _lm_params(max_iterations)).optimize()
-        before, after = float(graph.error(values)), float(graph.error(result))
+        after = float(graph.error(result))
         found = {int(n): convert.from_similarity3(result.atSimilarity3(int(n))) for n in nodes}
     except GTSAM_ERRORS as error:
         raise SolverError(f"the graph of {len(nodes)} Sim(3) nodes failed: {SolverFailure.of(error)}") from error
@@ -192,7 +202,10 @@ def _choose_edges(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, doubtful: BoolArray, max_iterations: int
 ) -> BoolArray:
     """Return which edges graduated non-convexity believes; the other factors of the graph are taken as true."""
-    params = gtsam.GncLMParams(_lm_params(max_iterations))
+    inner = _lm_params(max_iterations)
+    inner.setRelativeErrorTol(GNC_TOLERANCE)  # the next weights come anyway
+    params = gtsam.GncLMParams(inner)
+    params.setLambdaStep(GNC_STEP)
     sure = np.ones(graph.size(), bool)
     sure[np.flatnonzero(doubtful)] = False
     params.setKnownInliers(np.flatnonzero(sure).tolist())

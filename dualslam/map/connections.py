@@ -21,11 +21,11 @@ from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
-from dualslam.map.atlas import Atlas, Link, joined
+from dualslam.map.atlas import Atlas, Link, LinkKind, joined
 from dualslam.map.bending import Move, bend_frames, bend_link, bend_submap, hold
 from dualslam.map.propagation import propagate_anchors, propagate_poses
 from dualslam.map.record import FrameStamp, Record
-from dualslam.map.skeleton import EdgeCovariances, Skeleton, build_skeleton
+from dualslam.map.skeleton import EdgeCovariances, Skeleton, build_skeleton, skeleton_knots
 from dualslam.map.submap import Submap
 from dualslam.map.warp import Warp
 from dualslam.recovery.merge import propagate_links
@@ -145,7 +145,11 @@ class Connections:
             Falsy where the solver failed: the connections are not taken in then.
         """
         touched = {m for link in links for m in (link.a, link.b)}
-        return self._solve(touched, links, now)
+        report = self._solve(touched, links, now)
+        for link in links if report else ():
+            if link.kind is LinkKind.ROLLOVER:
+                self._prepare(link.a)
+        return report
 
     def follow(self, before: Submap, after: Submap, now: FrameStamp) -> None:
         """Let all that is known against a submap follow a change that its own graph has made.
@@ -302,6 +306,15 @@ class Connections:
         report = replace(_together([self._apply(s) for s in solved]), seconds=time.perf_counter() - started)
         self._tell(report, solved, now)
         return report
+
+    def _prepare(self, submap_id: int) -> None:
+        """Ask a full submap for its covariances now: the first loop of a long run would wait for those of all."""
+        try:
+            knots = skeleton_knots(self._atlas.submaps[submap_id])
+            held = self._atlas.held.get(submap_id, frozenset())
+            self._covariances(self._atlas.submaps[submap_id], list(pairwise(knots)), held)
+        except SolverError as error:
+            log.warning("submap %d: %s", submap_id, error)
 
     def _to_hold(self, skeleton: Skeleton, submap_id: int) -> tuple[list[int], FloatArray]:
         """Return the knots that are to hold a submap's bend, and what its own factors say from one to the next."""

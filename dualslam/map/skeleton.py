@@ -8,8 +8,8 @@ out of these measurements (`Atlas.warps`): a bend is no evidence.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -32,6 +32,9 @@ one that was assumed, or of a shutter. Sigmas are taken `DRIFT` times, and to th
 radians, way in depths of the scene). Chosen on `tum_fr1_rpy`, `hololens_000` and two rendered streets, at 10 and 20
 keyframes: RMS errors over what the factors say are 0.8 to 2.2 where the camera is exact, 2.4 to 18 on the sequences.
 With these numbers they are 0.03 to 0.3, and 0.7 to 2.5 (a submap with a broken stretch: to 5)."""
+
+SAME_TURN_RAD, SAME_WAY, SAME_SEEN = 0.02, 0.05, 0.2
+"""Changes of an edge, and of how much its keyframes see, up to which its covariance is that of before."""
 
 Node = tuple[int, int]
 """Submap and keyframe."""
@@ -70,40 +73,63 @@ class Skeleton:
         return rows, [self.nodes[row][1] for row in rows]
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """The covariance of an edge, and the state of the two keyframes for which it was computed."""
+
+    T_first_second: FloatArray
+    n_seen: tuple[int, int]
+    covariance: FloatArray
+
+    def holds(self, T_first_second: FloatArray, n_seen: tuple[int, int]) -> bool:
+        """Whether the keyframes are much as they were."""
+        change = np.abs(T_first_second - self.T_first_second)
+        way = float(np.linalg.norm(self.T_first_second[:3, 3]))
+        seen = all(abs(now - was) <= SAME_SEEN * was for now, was in zip(n_seen, self.n_seen, strict=True))
+        return seen and bool(change[:3, :3].max() < SAME_TURN_RAD and change[:3, 3].max() < SAME_WAY * way)
+
+
 class EdgeCovariances:
-    """Covariances of edges within submaps, remembered as long as the edge's keyframes stand where they stood.
+    """Covariances of edges within submaps, remembered as long as the edge's keyframes are much as they were.
 
     `compute`: gives them from a submap's factors.
     """
 
-    compute: Covariances
-    _known: dict[tuple[int, int, int], tuple[bytes, FloatArray]] = field(default_factory=dict)
+    def __init__(self, compute: Covariances) -> None:
+        self._compute = compute
+        self._known: dict[tuple[int, int, int], _Known] = {}
 
     def __call__(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
         """Return (E, 7, 7)."""
-        state = {pair: _state(submap, pair) for pair in pairs}
-        new = [p for p in pairs if self._known.get((submap.id, *p), (b"", None))[0] != state[p]]
+        new = []
+        for pair in pairs:
+            known = self._known.get((submap.id, *pair))
+            if known is None or not known.holds(*_state(submap, pair)):
+                new.append(pair)
         if new:
-            for pair, C in zip(new, self.compute(submap, new, held), strict=True):
-                self._known[(submap.id, *pair)] = state[pair], C
-        return np.array([self._known[(submap.id, *pair)][1] for pair in pairs]).reshape(-1, 7, 7)
+            for pair, C in zip(new, self._compute(submap, new, held), strict=True):
+                self._known[(submap.id, *pair)] = _Known(*_state(submap, pair), C)
+        return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, 7, 7)
 
     def bent(self, submap: Submap, warp: Warp) -> None:
         """Take in that a submap stands otherwise by a solution of the atlas: its own factors say what they said."""
-        for (m, first, second), (_, C) in list(self._known.items()):
+        for key, known in list(self._known.items()):
+            m, first, second = key
             if m != submap.id:
                 continue
             if first not in submap.keyframes or second not in submap.keyframes:
-                del self._known[m, first, second]
+                del self._known[key]
                 continue
             units = np.ones(7)
             units[3:6] = sim3.scale(warp.at([second])[0])
-            self._known[m, first, second] = _state(submap, (first, second)), units[:, None] * C * units
+            self._known[key] = _Known(*_state(submap, (first, second)), units[:, None] * known.covariance * units)
 
 
-def _state(submap: Submap, pair: tuple[int, int]) -> bytes:
-    return b"".join(submap.T_submap_kf[k].tobytes() for k in pair)
+def _state(submap: Submap, pair: tuple[int, int]) -> tuple[FloatArray, tuple[int, int]]:
+    first, second = pair
+    T_first_second = se3.inverse(submap.T_submap_kf[first]) @ submap.T_submap_kf[second]
+    n_first, n_second = (int((submap.landmark_of[k] >= 0).sum()) for k in pair)
+    return T_first_second, (n_first, n_second)
 
 
 def build_skeleton(
@@ -139,7 +165,7 @@ def build_skeleton(
             k_a, k_b = link.attached(atlas)
             wanted[link.a].add(k_a)
             wanted[link.b].add(k_b)
-    knots_of = {m: _knots(atlas.submaps[m], wanted[m]) for m in component}
+    knots_of = {m: skeleton_knots(atlas.submaps[m], wanted[m]) for m in component}
     S_world_submap = _initial(atlas, component, links)
     is_tree = len(links) < len(component) and not any(m in atlas.warps for m in component)
     nodes: list[Node] = []
@@ -175,7 +201,8 @@ def _initial(atlas: Atlas, component: list[int], links: Sequence[Link]) -> dict[
     return trial.S_world_submap(component)
 
 
-def _knots(submap: Submap, wanted: set[int]) -> list[int]:
+def skeleton_knots(submap: Submap, wanted: Set[int] = frozenset()) -> list[int]:
+    """Return the keyframes of a submap that are nodes, ascending; `wanted` ones besides."""
     ids = sorted(submap.keyframes)
     return sorted({*ids[::STRIDE], ids[-1], _reference(submap), *wanted})
 
