@@ -179,6 +179,8 @@ class System:
             self._follow_graphs(self._parts.graphs.finish(self.atlas.submaps), last)
         if self._live is not None:
             self._archive(self._live, "end of sequence")
+        if last is not None:
+            self._connections.settle(last)
         self._parts.desk.close()
 
     # --- initialising

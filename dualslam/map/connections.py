@@ -9,12 +9,23 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
-from dualslam.core.atlas_problem import AtlasEdge, AtlasSolution, AtlasSolver
+from dualslam.atlas_report import (
+    AtlasReport,
+    LinkVerdict,
+    Solved,
+    changes_nothing,
+    count_kinds,
+    moves_of,
+    named,
+    placed_by,
+    together,
+)
+from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
@@ -27,71 +38,10 @@ from dualslam.map.propagation import propagate_anchors, propagate_poses
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.skeleton import EdgeCovariances, Skeleton, build_skeleton, skeleton_knots
 from dualslam.map.submap import Submap
-from dualslam.map.warp import Warp
 from dualslam.recovery.merge import propagate_links
 from dualslam.recovery.overlap_sides import SeamRefinement, apply_seam, seam_problem
 
 log = logging.getLogger(__name__)
-
-STILL = 1e-6
-"""Bends up to this (radians, share of scale, submap units: a thousandth of a pixel) are none: the arrays stay as they
-are, to the bit."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class AtlasReport:
-    """What a solution of the atlas did.
-
-    Attributes
-    ----------
-    rejected : tuple of Link
-        All that are rejected now, in the linked sets that were solved.
-    newly_rejected, readmitted : tuple of Link
-    factors : dict of str to int
-        Edges by kind, rejected ones left out.
-    cost_before, cost_after : float
-        Half the sum of squared whitened residuals.
-    bent : dict of int to float
-        By submap: farthest move of a keyframe within its submap's frame, in the submap's unit; those that moved.
-    placed : dict of int to float
-        By submap: how far its frame's keyframe went in the world.
-    seconds : float
-    failure : Failure, optional
-        The solver's: nothing has changed.
-    """
-
-    rejected: tuple[Link, ...] = ()
-    newly_rejected: tuple[Link, ...] = ()
-    readmitted: tuple[Link, ...] = ()
-    factors: dict[str, int] = field(default_factory=dict)
-    cost_before: float = 0.0
-    cost_after: float = 0.0
-    bent: dict[int, float] = field(default_factory=dict)
-    placed: dict[int, float] = field(default_factory=dict)
-    seconds: float = 0.0
-    failure: Failure | None = None
-
-    def __bool__(self) -> bool:
-        """Whether there is a solution."""
-        return self.failure is None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LinkVerdict:
-    """What the atlas would say of a connection.
-
-    Attributes
-    ----------
-    accepted : bool
-    redundant : bool
-        Whether anything else ties its ends; else nothing can contradict it.
-    chi2 : float
-        Against all others (7 degrees of freedom); NaN where it is not redundant.
-    """
-
-    accepted: bool
-    redundant: bool
-    chi2: float
 
 
 class Connections:
@@ -287,23 +237,23 @@ class Connections:
 
     def _solve(self, touched: set[int], new: Sequence[Link], now: FrameStamp) -> AtlasReport:
         started = time.perf_counter()
-        solved: list[_Solved] = []
+        solved: list[Solved] = []
         try:
             while touched:
                 skeleton = self._skeleton(touched, [link for link in new if link.a in touched])
                 solution = self._solver.solve(skeleton.problem)
                 moves: list[Move] | None = None
-                if not new or not _changes_nothing(skeleton, solution, new):
-                    moves = [] if skeleton.is_tree else _moves(self._atlas, skeleton, solution)
+                if not new or not changes_nothing(skeleton, solution, new):
+                    moves = [] if skeleton.is_tree else moves_of(self._atlas, skeleton, solution)
                 bent = [move.submap_id for move in moves or () if move.bent]
                 holds = {m: self._to_hold(skeleton, m) for m in bent}
-                solved.append(_Solved(skeleton, solution, moves, holds))
+                solved.append(Solved(skeleton, solution, moves, holds))
                 touched = touched - set(skeleton.component)
         except SolverError as error:
             log.warning("the atlas stays as it is: %s", error)
             return AtlasReport(failure=Failure(FailureReason.SOLVER, str(error)))
         self._atlas.links.extend(new)
-        report = replace(_together([self._apply(s) for s in solved]), seconds=time.perf_counter() - started)
+        report = replace(together([self._apply(s) for s in solved]), seconds=time.perf_counter() - started)
         self._tell(report, solved, now)
         return report
 
@@ -325,7 +275,7 @@ class Connections:
 
     # --- the transaction
 
-    def _apply(self, solved: _Solved) -> AtlasReport:
+    def _apply(self, solved: Solved) -> AtlasReport:
         """Move all that a solution moves. Whatever can fail has been done before."""
         atlas, skeleton = self._atlas, solved.skeleton
         ends = {id(link): link.attached(atlas) for link in skeleton.links}
@@ -364,10 +314,10 @@ class Connections:
             cost_before=solved.solution.cost_before,
             cost_after=solved.solution.cost_after,
             bent={move.submap_id: move.bend_mu for move in moves if move.bent},
-            placed=_placed(skeleton, solved.solution) if solved.moves is not None else {},
+            placed=placed_by(skeleton, solved.solution) if solved.moves is not None else {},
         )
 
-    def _tell(self, report: AtlasReport, solved: Sequence[_Solved], now: FrameStamp) -> None:
+    def _tell(self, report: AtlasReport, solved: Sequence[Solved], now: FrameStamp) -> None:
         self._record.event(
             EventKind.ATLAS_SOLVED,
             now,
@@ -376,7 +326,7 @@ class Connections:
             factors=report.factors,
             cost_before=report.cost_before,
             cost_after=report.cost_after,
-            rejected=[{"submap": link.b, **_named(link)} for link in report.rejected],
+            rejected=[{"submap": link.b, **named(link)} for link in report.rejected],
             bent={str(m): bend for m, bend in report.bent.items()},
             largest_bend=max(report.bent.values(), default=0.0),
             largest_move=max(report.placed.values(), default=0.0),
@@ -387,92 +337,4 @@ class Connections:
             (EventKind.CONNECTION_READMITTED, report.readmitted),
         ):
             for link in links:
-                self._record.event(kind, now, link.b, **_named(link))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Solved:
-    """A linked set with its solution, what that moves (None: all stays), and what is to hold the bends."""
-
-    skeleton: Skeleton
-    solution: AtlasSolution
-    moves: list[Move] | None
-    holds: dict[int, tuple[list[int], FloatArray]]
-
-    @property
-    def edges(self) -> tuple[AtlasEdge, ...]:
-        return self.skeleton.problem.edges
-
-    @property
-    def believed(self) -> list[bool]:
-        """Of the connections, which are the last edges."""
-        n = len(self.skeleton.links)
-        return [bool(kept) for kept in self.solution.believed[len(self.edges) - n :]]
-
-
-def _changes_nothing(skeleton: Skeleton, solution: AtlasSolution, new: Sequence[Link]) -> bool:
-    """Whether all that is new was rejected, and what was there before is believed as before."""
-    fresh = set(map(id, new))
-    n = len(skeleton.links)
-    for link, kept in zip(skeleton.links, solution.believed[len(solution.believed) - n :].tolist(), strict=True):
-        if kept == (link.rejected or id(link) in fresh):
-            return False
-    return True
-
-
-def _moves(atlas: Atlas, skeleton: Skeleton, solution: AtlasSolution) -> list[Move]:
-    """Return what a solution does to each submap, whose frame stays with the keyframe of its gauge."""
-    moves = []
-    for m in skeleton.component:
-        submap = atlas.submaps[m]
-        rows, knots = skeleton.knots(m)
-        T = submap.keyframe_poses(knots)
-        at = skeleton.reference[m]
-        S_world_submap = solution.S_world_node[at] @ sim3.inverse(submap.T_submap_kf[skeleton.nodes[at][1]])
-        S = sim3.inverse(S_world_submap) @ solution.S_world_node[rows] @ sim3.inverse(T)
-        bent = bool(np.abs(sim3.log(S)).max() > STILL)
-        warp = Warp(np.array(knots, np.int64), sim3.normalise(S))
-        centres = T[:, :3, 3]
-        bend_mu = float(np.linalg.norm(sim3.act_each(S, centres) - centres, axis=1).max())
-        moves.append(Move(m, warp, S_world_submap, bend_mu, bent))
-    return moves
-
-
-def _placed(skeleton: Skeleton, solution: AtlasSolution) -> dict[int, float]:
-    gone = np.linalg.norm(solution.S_world_node[:, :3, 3] - skeleton.problem.S_world_node[:, :3, 3], axis=1)
-    return {m: float(gone[row]) for m, row in skeleton.reference.items()}
-
-
-def _together(reports: Sequence[AtlasReport]) -> AtlasReport:
-    factors: dict[str, int] = {}
-    for report in reports:
-        for kind, n in report.factors.items():
-            factors[kind] = factors.get(kind, 0) + n
-    return AtlasReport(
-        rejected=tuple(link for r in reports for link in r.rejected),
-        newly_rejected=tuple(link for r in reports for link in r.newly_rejected),
-        readmitted=tuple(link for r in reports for link in r.readmitted),
-        factors=factors,
-        cost_before=sum(r.cost_before for r in reports),
-        cost_after=sum(r.cost_after for r in reports),
-        bent={m: bend for r in reports for m, bend in r.bent.items()},
-        placed={m: gone for r in reports for m, gone in r.placed.items()},
-    )
-
-
-def count_kinds(edges: Iterable[AtlasEdge]) -> dict[str, int]:
-    """Return how many edges there are of each kind, in the order of their first."""
-    counts: dict[str, int] = {}
-    for e in edges:
-        counts[e.kind] = counts.get(e.kind, 0) + 1
-    return counts
-
-
-def _named(link: Link) -> dict[str, object]:
-    """A connection as the event log names it."""
-    return {
-        "connection": str(link.kind),
-        "other_submap": link.a,
-        "keyframe": link.keyframe_b,
-        "other_keyframe": link.keyframe_a,
-    }
+                self._record.event(kind, now, link.b, **named(link))

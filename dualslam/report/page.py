@@ -8,6 +8,7 @@ from typing import Any
 from dualslam.config.settings import Config
 from dualslam.core.types import FrameStatus
 from dualslam.io.run_folder import EVENTS
+from dualslam.report.atlas_table import atlas_section
 from dualslam.report.charts import beside_table, latency_histogram, pace_words, stage_table
 from dualslam.report.event_words import event_words
 from dualslam.report.failures import failures_section, stories
@@ -29,12 +30,18 @@ def report_page(run: RunData) -> str:
         _section("Trajectory", top_view(run)),
         _section("Every frame", timeline(run)),
         _section("Failures and recoveries", failures_section(run)),
+        _atlas(run),
         _section("Time", [pace_words(run), latency_histogram(run), stage_table(run), beside_table(run)]),
         _section("Configuration", _configuration(run)),
         _section("All events", _events(run)),
         _footer(run),
     ]
     return document(f"{sequence} - dualslam report", body)
+
+
+def _atlas(run: RunData) -> Markup | None:
+    table = atlas_section(run)
+    return None if table is None else _section("Connections between submaps", table)
 
 
 def headline(run: RunData) -> str:

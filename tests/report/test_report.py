@@ -224,6 +224,27 @@ def test_a_run_without_a_map_says_so(make_run: MakeRun) -> None:
     assert len([name for name, _ in found.elements if name == "img"]) == 2  # the first frame and the last
 
 
+def test_solutions_of_the_atlas_have_a_table(broken_run: RunData) -> None:
+    event = {
+        "event": "atlas_solved",
+        "frame": 40,
+        "timestamp_s": 4.0,
+        "submap": 0,
+        "submaps": [0, 1],
+        "factors": {"within": 12, "recovery": 1, "loop": 1},
+        "cost_before": 129.2,
+        "cost_after": 0.34,
+        "rejected": [{"connection": "loop", "submap": 1, "other_submap": 0, "keyframe": 9, "other_keyframe": 3}],
+        "largest_bend": 0.018,
+        "largest_move": 0.2,
+    }
+    without = [e for e in broken_run.events if e["event"] != "atlas_solved"]
+    page = report_page(replace(broken_run, events=[*without, event]))
+    for words in ("Connections between submaps", "12 within, 1 recovery, 1 loop", "129", "loop 0-1", "0.018"):
+        assert words in page
+    assert "Connections between submaps" not in report_page(replace(broken_run, events=without))
+
+
 def test_landmarks_of_all_linked_submaps_come_in_the_main_maps_frame(tmp_path: Path) -> None:
     S = sim3.from_parts(2.0, so3.exp(np.array([0.0, 0.5, 0.0])), np.array([1.0, 0.0, 3.0]))
     xyz = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (40, 3))

@@ -1,0 +1,167 @@
+"""What a solution of the atlas says and does, before it is done and after."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dualslam.core.atlas_problem import AtlasEdge, AtlasSolution
+from dualslam.core.geometry import sim3
+from dualslam.core.types import Failure, FloatArray
+from dualslam.map.atlas import Atlas, Link
+from dualslam.map.bending import Move
+from dualslam.map.skeleton import Skeleton
+from dualslam.map.warp import Warp
+
+STILL = 1e-6
+"""Bends up to this (radians, share of scale, submap units: a thousandth of a pixel) are none: the arrays stay as they
+are, to the bit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AtlasReport:
+    """What a solution of the atlas did.
+
+    Attributes
+    ----------
+    rejected : tuple of Link
+        All that are rejected now, in the linked sets that were solved.
+    newly_rejected, readmitted : tuple of Link
+    factors : dict of str to int
+        Edges by kind, rejected ones left out.
+    cost_before, cost_after : float
+        Half the sum of squared whitened residuals.
+    bent : dict of int to float
+        By submap: farthest move of a keyframe within its submap's frame, in the submap's unit; those that moved.
+    placed : dict of int to float
+        By submap: how far its frame's keyframe went in the world.
+    seconds : float
+    failure : Failure, optional
+        The solver's: nothing has changed.
+    """
+
+    rejected: tuple[Link, ...] = ()
+    newly_rejected: tuple[Link, ...] = ()
+    readmitted: tuple[Link, ...] = ()
+    factors: dict[str, int] = field(default_factory=dict)
+    cost_before: float = 0.0
+    cost_after: float = 0.0
+    bent: dict[int, float] = field(default_factory=dict)
+    placed: dict[int, float] = field(default_factory=dict)
+    seconds: float = 0.0
+    failure: Failure | None = None
+
+    def __bool__(self) -> bool:
+        """Whether there is a solution."""
+        return self.failure is None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinkVerdict:
+    """What the atlas would say of a connection.
+
+    Attributes
+    ----------
+    accepted : bool
+    redundant : bool
+        Whether anything else ties its ends; else nothing can contradict it.
+    chi2 : float
+        Against all others (7 degrees of freedom); NaN where it is not redundant.
+    """
+
+    accepted: bool
+    redundant: bool
+    chi2: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """A linked set with its solution, what that moves (None: all stays), and what is to hold the bends."""
+
+    skeleton: Skeleton
+    solution: AtlasSolution
+    moves: list[Move] | None
+    holds: dict[int, tuple[list[int], FloatArray]]
+
+    @property
+    def edges(self) -> tuple[AtlasEdge, ...]:
+        """Of the problem."""
+        return self.skeleton.problem.edges
+
+    @property
+    def believed(self) -> list[bool]:
+        """Of the connections, which are the last edges."""
+        n = len(self.skeleton.links)
+        return [bool(kept) for kept in self.solution.believed[len(self.edges) - n :]]
+
+
+def changes_nothing(skeleton: Skeleton, solution: AtlasSolution, new: Sequence[Link]) -> bool:
+    """Whether all that is new was rejected, and what was there before is believed as before."""
+    fresh = set(map(id, new))
+    n = len(skeleton.links)
+    for link, kept in zip(skeleton.links, solution.believed[len(solution.believed) - n :].tolist(), strict=True):
+        if kept == (link.rejected or id(link) in fresh):
+            return False
+    return True
+
+
+def moves_of(atlas: Atlas, skeleton: Skeleton, solution: AtlasSolution) -> list[Move]:
+    """Return what a solution does to each submap, whose frame stays with the keyframe of its gauge."""
+    moves = []
+    for m in skeleton.component:
+        submap = atlas.submaps[m]
+        rows, knots = skeleton.knots(m)
+        T = submap.keyframe_poses(knots)
+        at = skeleton.reference[m]
+        S_world_submap = solution.S_world_node[at] @ sim3.inverse(submap.T_submap_kf[skeleton.nodes[at][1]])
+        S = sim3.inverse(S_world_submap) @ solution.S_world_node[rows] @ sim3.inverse(T)
+        bent = bool(np.abs(sim3.log(S)).max() > STILL)
+        warp = Warp(np.array(knots, np.int64), sim3.normalise(S))
+        centres = T[:, :3, 3]
+        bend_mu = float(np.linalg.norm(sim3.act_each(S, centres) - centres, axis=1).max())
+        moves.append(Move(m, warp, S_world_submap, bend_mu, bent))
+    return moves
+
+
+def placed_by(skeleton: Skeleton, solution: AtlasSolution) -> dict[int, float]:
+    """Return how far the keyframe that each submap's frame goes by has moved in the world."""
+    gone = np.linalg.norm(solution.S_world_node[:, :3, 3] - skeleton.problem.S_world_node[:, :3, 3], axis=1)
+    return {m: float(gone[row]) for m, row in skeleton.reference.items()}
+
+
+def together(reports: Sequence[AtlasReport]) -> AtlasReport:
+    """Return one report of several linked sets."""
+    factors: dict[str, int] = {}
+    for report in reports:
+        for kind, n in report.factors.items():
+            factors[kind] = factors.get(kind, 0) + n
+    return AtlasReport(
+        rejected=tuple(link for r in reports for link in r.rejected),
+        newly_rejected=tuple(link for r in reports for link in r.newly_rejected),
+        readmitted=tuple(link for r in reports for link in r.readmitted),
+        factors=factors,
+        cost_before=sum(r.cost_before for r in reports),
+        cost_after=sum(r.cost_after for r in reports),
+        bent={m: bend for r in reports for m, bend in r.bent.items()},
+        placed={m: gone for r in reports for m, gone in r.placed.items()},
+    )
+
+
+def count_kinds(edges: Iterable[AtlasEdge]) -> dict[str, int]:
+    """Return how many edges there are of each kind, in the order of their first."""
+    counts: dict[str, int] = {}
+    for e in edges:
+        counts[e.kind] = counts.get(e.kind, 0) + 1
+    return counts
+
+
+def named(link: Link) -> dict[str, object]:
+    """A connection as the event log names it."""
+    return {
+        "connection": str(link.kind),
+        "other_submap": link.a,
+        "keyframe": link.keyframe_b,
+        "other_keyframe": link.keyframe_a,
+    }
