@@ -1,4 +1,5 @@
-"""Ask OpenCV contrib's `matchGMS` about many pairs, for `tests/frontends/features/test_gms.py`, and compare it with ours.
+"""Ask OpenCV contrib's `matchGMS` about many pairs, for `tests/frontends/features/test_gms.py`, and compare it with
+ours.
 
     pip install --no-deps --target DIR opencv-contrib-python-headless
     python tools/gms_oracle.py DIR                      write tests/frontends/features/gms_oracle.npz anew

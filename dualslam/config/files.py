@@ -19,6 +19,15 @@ from dualslam.core.errors import ConfigError
 
 Model = TypeVar("Model", bound=BaseModel)
 
+_RENAMED = {
+    "max_leap_frames": "max_gap_frames",
+    "max_leap_scale_sigma": "max_gap_scale_sigma",
+    "resume_after": "relocalise_after",
+    "seam_keyframes": "overlap_keyframes",
+    "walk": "tracking",
+}
+"""Fields of configurations that older versions wrote, and what they are called now."""
+
 _PLAIN_WORDS = {
     "must be an object": "must be a mapping of fields",
     "a valid integer": "a whole number",
@@ -171,6 +180,8 @@ def _unknown(path: tuple[str | int, ...], root: type[BaseModel]) -> str:
     *sections, field = map(str, path)
     model = _model_at(root, path[:-1])
     known = list(model.model_fields) if model else []
+    if _RENAMED.get(field) in known:
+        return f"{'.'.join(map(str, path))} is now called {'.'.join([*sections, _RENAMED[field]])}"
     section = ".".join(sections)
     near = difflib.get_close_matches(field, known, n=1)
     if near:

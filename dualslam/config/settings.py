@@ -156,11 +156,11 @@ class AttemptConfig(StrictModel):
 
     frontend: str = "live"
     """`live`: the live features, guided by the motion model in reverse. Or a front end by its name: features of its
-    own, found in the buffered images, pose the frames by PnP from one to the next, and leap those that cannot be used.
+    own, found in the buffered images, pose the frames by PnP from one to the next, and skip those that cannot be used.
     Landmarks, and what is compared when linking, are made of the live features in either case."""
     tracking: Literal["own", "live"] = "own"
     """Whether that front end poses every frame, so that the attempt does not depend on the live features, or only the
-    leaps and what comes after them until the live features can take over, which is several times as fast."""
+    first frames beyond gaps and what follows until the live features can take over, which is several times as fast."""
     n_features: int = Field(2000, ge=50, le=20000)
     """Keypoints per image of that front end."""
     options: dict[str, Any] = Field(default_factory=dict)
@@ -179,6 +179,8 @@ class AttemptConfig(StrictModel):
     @model_validator(mode="before")
     @classmethod
     def _from_word(cls, value: Any) -> Any:
+        if value == "leap":
+            raise ValueError("the attempt `leap` is now called `gap`")
         if value == "gap":
             return {"frontend": "sift", "tracking": "live"}
         return {"frontend": value} if isinstance(value, str) else value
@@ -196,7 +198,7 @@ class RecoveryConfig(StrictModel):
     enabled: bool = True
     """Off: a lost track ends the submap, and the next one stays apart from it."""
     max_gap_frames: int = Field(30, ge=0)
-    """Frames in a row that the walk may leap, because none of its keyframes can be matched in them. A walk that
+    """Frames in a row that reverse tracking may skip, because none of its keyframes can be matched in them. A walk that
     links no map, but poses the frames before a start, goes on to the end of the buffer."""
     attempts: tuple[AttemptConfig, ...] = Field(
         (AttemptConfig(frontend="sift", tracking="live"), AttemptConfig(), AttemptConfig(frontend="sift")), min_length=1

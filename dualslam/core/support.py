@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dualslam.config.settings import HealthConfig
+from typing import TYPE_CHECKING
+
 from dualslam.core.types import Failure, FailureReason
+
+if TYPE_CHECKING:
+    from dualslam.config.settings import HealthConfig
 
 
 def find_lack_of_support(n_inliers: int, n_matches: int, chi2: float, config: HealthConfig) -> Failure | None:

@@ -1,4 +1,4 @@
-"""What runs walks back in time: here in the process that tracks, or at a desk with processes (`dualslam/recovery/jobs.py`)."""
+"""What runs reverse tracking: here in the process that tracks, or in processes beside it (`dualslam/workers`)."""
 
 from __future__ import annotations
 

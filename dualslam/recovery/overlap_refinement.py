@@ -2,8 +2,8 @@
 
 Fused submaps stay submaps. What the newer one gains are keyframes of the old map's healthy end and what they saw: as
 observations, never as poses. Landmarks of the overlap that both maps hold become one, with the views of both; poses and
-points around the overlap are solved in batch; and since the two maps now overlap by more, with twice the evidence, their
-similarity is estimated again and must agree with the first one.
+points around the overlap are solved in batch; and since the two maps now overlap by more, with twice the evidence,
+their similarity is estimated again and must agree with the first one.
 """
 
 from __future__ import annotations
@@ -136,8 +136,8 @@ def gauge_at_overlap(submap: Submap, keyframe_ids: IntArray) -> tuple[int, int]:
     """Return the two keyframes that are to hold a submap's gauge from now on: the widest baseline of the overlap.
 
     A link is measured at its overlap. While the map goes on at its other end its scale is still solved for, and if the
-    gauge lay there, the overlap would drift away under the link. Where the overlap spans less than the gauge in use (a turn
-    in place), that one stays.
+    gauge lay there, the overlap would drift away under the link. Where the overlap spans less than the gauge in use (a
+    turn in place), that one stays.
     """
     ids = [int(k) for k in keyframe_ids if int(k) in submap.keyframes]
     if len(ids) < 2:
@@ -192,7 +192,8 @@ def _landmarks_in_new(old: Submap, new: Submap, pairs: IntArray) -> IntArray:
 
 
 def _unpaired(old: Submap, new: Submap, grafted: list[int], shared: list[int], landmark_of: IntArray) -> IntArray:
-    """Return the old map's landmarks that are new to the new one: seen twice at the overlap, and not contradicted there.
+    """Return the old map's landmarks that are new to the new one: seen twice at the overlap, and not contradicted
+    there.
 
     Where a shared keyframe's keypoint has a landmark in either map and the two were not found to be the same, the maps
     disagree about it, and the new one is believed.

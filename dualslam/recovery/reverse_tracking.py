@@ -1,6 +1,6 @@
-"""Algorithm 1: progress back in time from a new submap until it overlaps a lost one so well that a Sim(3) links the two.
+"""Algorithm 1: walk back in time from a new submap until it overlaps a lost one so well that a Sim(3) links the two.
 
-The progress is a visual front end, given the buffered frames latest first. It sees images and features only, never the
+The walk is a visual front end, given the buffered frames latest first. It sees images and features only, never the
 old map's poses or landmarks: a link must not confirm itself. What it takes from the old map is which frames were
 keyframes, so that both maps hold the same ones. Several attempts, each with poses from another front end, start from
 the same snapshot one after the other until one leads to a link; what one of them got wrong does not reach the next.
@@ -38,7 +38,7 @@ Judge = Callable[[Track | Failure], Track | Failure]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecoveryJob:
-    """Everything that a progress back needs, as it was when the new submap started. It can be pickled.
+    """Everything that a walk back needs, as it was when the new submap started. It can be pickled.
 
     Attributes
     ----------
@@ -47,11 +47,11 @@ class RecoveryJob:
     newest_id : int
         The keyframe of it to start from.
     lost : dict of int to Submap
-        Copies of the lost submaps that it may link to. With none the progress only poses the frames before the start.
+        Copies of the lost submaps that it may link to. With none the walk only poses the frames before the start.
     onsets : dict of int to int
         For each of them the frame from which on it is suspected to be corrupted.
     views : tuple of View
-        What is buffered, latest first, from the frame before `newest_id` on. Where a progress is made again for the sake of
+        What is buffered, latest first, from the frame before `newest_id` on. Where a walk is made again for the sake of
         frames without a pose: those, and what leads to them.
     own : tuple of View
         Buffered views of the new submap's keyframes, `newest_id` included: for attempts that need their images.
@@ -73,7 +73,7 @@ class RecoveryJob:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecoveredFrame:
-    """A frame that the progress posed, relative to a keyframe of its submap."""
+    """A frame that the walk posed, relative to a keyframe of its submap."""
 
     pose: FramePose
     n_matches: int
@@ -82,7 +82,7 @@ class RecoveredFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundLink:
-    """The link that a progress ended with, and the attempt that it was. `overlap`: how that was refined, or why it was not."""
+    """The link that an attempt ended with. `refinement`: of the overlap, or why there was none."""
 
     old_id: int
     estimate: LinkEstimate
@@ -99,12 +99,12 @@ class RecoveryResult:
     submap : Submap
         The job's, grown at its early end.
     frames : tuple of RecoveredFrame
-        In the order of the progress.
+        In the order of the walk.
     link : FoundLink or None
     events : tuple of Event
         Of all attempts, in order.
     seconds, cpu_s : float
-        Wall time of all attempts, and CPU time of the process, whose threads find features beside the progress.
+        Wall time of all attempts, and CPU time of the process, whose threads find features beside the walk.
     """
 
     submap: Submap
@@ -117,7 +117,7 @@ class RecoveryResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attempt:
-    """One way to progress back, by the name of the front end that its poses come from."""
+    """One way to walk back, by the name of the front end that its poses come from."""
 
     name: str
     new_odometry: Callable[[RecoveryJob, Submap, SubmapGraph], VisualOdometry]
@@ -144,7 +144,7 @@ class RecoveryParts:
 
 
 def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Failure:
-    """Walk back from the job's submap until a link to a lost one passes its gates, or nothing is left to progress on.
+    """Walk back from the job's submap until a link to a lost one passes its gates, or nothing is left to walk on.
 
     The job is left as it was. Where there is no map to link with, the live features pose the frames before the start.
     """
@@ -185,7 +185,7 @@ class _Progress:
     n_unusable: int = 0  # the last frames
     out_of_time: bool = False
     given_up: bool = False
-    needs_camera: bool = False  # no other progress would do better, before the camera is calibrated
+    needs_camera: bool = False  # no other walk would do better, before the camera is calibrated
     why_unusable: str = ""
     why_not_linked: str = ""
 
@@ -227,7 +227,7 @@ def _make_attempt(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, unti
     relinker = Relinker(submap, job.lost, job.onsets, parts.link, parts.config)
     reverse_tracker.keep(relinker.keyframe_ids)  # redundant or not: linking stands on keyframes that both maps hold
     progress = _Progress(submap)
-    # Frames before a start are worth a look each, however many show nothing; no map waits for the end of that progress.
+    # Frames before a start are worth a look each, however many show nothing; no map waits for the end of that walk.
     max_gap_frames = parts.config.max_gap_frames if job.lost else len(job.views)
     views = job.views if job.lost else _there_and_back(job.views, progress)
     for step in track_in_reverse(reverse_tracker, views, parts.judge, relinker.keyframe_ids, max_gap_frames):
@@ -260,7 +260,7 @@ def _make_attempt(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, unti
 
 
 def _there_and_back(views: tuple[View, ...], progress: _Progress) -> Iterator[View]:
-    """Yield the views, and then, the other way round, those that the progress has found no pose for.
+    """Yield the views, and then, the other way round, those that the walk has found no pose for.
 
     A camera that turns away slowly and back at once is lost on the way back in time, and followed on the way there.
     """
@@ -269,7 +269,7 @@ def _there_and_back(views: tuple[View, ...], progress: _Progress) -> Iterator[Vi
 
 
 def _fused(tried: LinkTry, job: RecoveryJob, submap: Submap, attempt: str, parts: RecoveryParts) -> FoundLink | Failure:
-    """Refine the overlap and with it the link, which must hold as far as where the progress set out, and beyond."""
+    """Refine the overlap and with it the link, which must hold as far as where the walk set out, and beyond."""
     found = tried.result
     if isinstance(found, Failure):
         return found
@@ -335,7 +335,7 @@ def _event_of(job: RecoveryJob, progress: _Progress, attempt: str, seconds: floa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReverseStep:
-    """One frame of a progress back: where it was found to be or why not, and whether it became a keyframe."""
+    """One frame of a walk back: where it was found to be or why not, and whether it became a keyframe."""
 
     view: View
     track: Track | Failure
@@ -358,14 +358,14 @@ def track_in_reverse(
     keyframe_ids : set of int
         Frames that become keyframes in any case: those that were keyframes of an older submap.
     max_gap_frames : int
-        So many frames in a row may be unusable before the progress ends.
+        So many frames in a row may be unusable before the walk ends.
     """
     n_failed = 0
     for view in views:
         try:
             step = _track_one(reverse_tracker, view, judge(reverse_tracker.track(view)), view.index in keyframe_ids)
         except SolverError as error:
-            log.warning("the progress back ends: %s", error)
+            log.warning("the walk back ends: %s", error)
             return
         yield step
         n_failed = 0 if step.track else n_failed + 1

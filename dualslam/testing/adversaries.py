@@ -27,6 +27,7 @@ ONSET_ID = ONSET * FRAME_STEP
 
 
 def set_points(submap: Submap, xyz: FloatArray) -> None:
+    """Put all landmarks elsewhere (L, 3)."""
     submap.landmarks["xyz_mu"][:] = xyz
 
 

@@ -43,6 +43,7 @@ class GraphScene:
     features: list[Features]
 
     def keyframe(self, k: int) -> Keyframe:
+        """Return keyframe `k` with its features."""
         return Keyframe(k, 0.1 * k, self.features[k])
 
 
@@ -67,10 +68,10 @@ def make_scene(
             uv = cam[:, :2] / cam[:, 2:] * 700.0 + K[:2, 2]
         ok = (cam[:, 2] > 0.25) & (cam[:, 2] < 2.2)
         ok &= (uv[:, 0] > 0) & (uv[:, 0] < WIDTH) & (uv[:, 1] > 0) & (uv[:, 1] < HEIGHT)
-        ids = np.flatnonzero(ok)
+        ids: IntArray = np.flatnonzero(ok)
         ids = np.sort(ids[rng.permutation(len(ids))[:per_view]]) if len(ids) > per_view else ids
         octave = rng.integers(0, 4, len(ids))
-        sigma = OCTAVE_SIGMAS[octave]
+        sigma = np.asarray(OCTAVE_SIGMAS[octave], np.float64)
         noisy = uv[ids] + noise_px * sigma[:, None] * rng.normal(size=(len(ids), 2))
         seen.append(ids)
         features.append(make_features(noisy, sigma, octave))
@@ -78,6 +79,7 @@ def make_scene(
 
 
 def make_features(uv: FloatArray, sigma: FloatArray, octave: IntArray | None = None) -> Features:
+    """Return features at pixels (N, 2) with their noise (sigma, px); their descriptors are all zero."""
     n = len(uv)
     octave = np.zeros(n, np.int64) if octave is None else octave
     return Features(uv, uv, sigma, sigma, octave, np.zeros(n), np.zeros((n, 4), np.uint8))
@@ -98,12 +100,14 @@ class Feeder:
         self.first_view: dict[int, tuple[int, int]] = {}
 
     def point_of_landmark(self) -> IntArray:
+        """Return the scene's point of each landmark (L,), -1 where it has none."""
         points = np.full(len(self.submap.landmarks), -1)
         has = np.flatnonzero(self.landmark_of_point >= 0)
         points[self.landmark_of_point[has]] = has
         return points
 
     def add(self, k: int, exact: bool = False) -> None:
+        """Put keyframe `k` into the submap, with its landmarks; `exact`: at its true pose."""
         scene, submap = self.scene, self.submap
         # Where the drift of the neighbouring keyframe puts this one, as a tracker would find it.
         near = min(submap.keyframes, key=lambda other: abs(other - k), default=None)

@@ -38,11 +38,13 @@ class World:
 
 
 def hamming(a: np.ndarray, b: np.ndarray) -> FloatArray:
+    """Return the number of bits in which binary descriptors (..., bytes) differ."""
     return np.bitwise_count(a ^ b).sum(-1).astype(float)
 
 
 @lru_cache(maxsize=64)
 def make_world(layout: str, seed: int, n_frames: int = 24, noise_px: float = 0.8, per_view: int = 220) -> World:
+    """Make the world of a layout (`street`, ...), and what a camera on its way through it sees in each frame."""
     rng = np.random.default_rng(seed)
     i = np.arange(n_frames)
     if layout == "street":
@@ -132,6 +134,7 @@ def build(
 def add_points(
     submap: Submap, world: World, frames: IntArray, poses: FloatArray, recipe: Recipe, rng: np.random.Generator
 ) -> None:
+    """Triangulate what the keyframes of a submap see, some of it wrong, as the recipe says."""
     visible = (world.seen[frames] & (rng.random((len(frames), len(world.xyz))) < recipe.tracked)).T
     points = np.flatnonzero(visible.sum(1) >= 2)
     visible = visible[points]
@@ -166,10 +169,12 @@ class Case:
 
 
 def random_gauge(rng: np.random.Generator, spread: float = 3.0) -> FloatArray:
+    """Return a random similarity (4, 4): the frame and unit of a monocular map are anybody's."""
     return sim3.exp(np.r_[rng.normal(size=3), rng.normal(size=3) * spread, rng.uniform(-1.5, 1.5)])
 
 
 def regauge(submap: Submap, S_new_old: FloatArray) -> None:
+    """Put a submap into another frame and unit."""
     submap.transform(
         float(sim3.scale(S_new_old)), se3.from_parts(sim3.rotation(S_new_old), sim3.translation(S_new_old))
     )
@@ -282,5 +287,6 @@ def link_error(case: Case, S_old_new: FloatArray) -> tuple[float, float, float]:
 
 
 def is_wrong(case: Case, S_old_new: FloatArray) -> bool:
+    """Whether a link is wrong: off by more than 5 % in scale, 3 degrees, or 5 % in position."""
     scale, angle, position = link_error(case, S_old_new)
     return scale > 0.05 or angle > 3.0 or position > 0.05

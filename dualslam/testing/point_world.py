@@ -48,6 +48,7 @@ class PointWorld:
         object.__setattr__(self, "descriptors", words)
 
     def features(self, i: int) -> Features:
+        """Return what a front end finds in frame `i`: the same whenever it is asked."""
         rng = np.random.default_rng([self.seed, 2, i])
         if i in self.covered:
             return random_features(rng)
@@ -65,20 +66,25 @@ class PointWorld:
         return make_features(uv[seen], sigma[seen], octave[seen], self.descriptors[seen] ^ flips)
 
     def view(self, i: int) -> View:
+        """Return frame `i` with its features."""
         return View(i, i / RATE_HZ, self.features(i))
 
     def views(self) -> list[View]:
+        """Return all frames with their features."""
         return [self.view(i) for i in range(len(self.T_world_cam))]
 
     def frames(self) -> list[Frame]:
+        """Return all frames without images, for a system of `system_in`."""
         return [Frame(i, i / RATE_HZ, None) for i in range(len(self.T_world_cam))]
 
 
 def make_features(uv: FloatArray, sigma: FloatArray, octave: np.ndarray, descriptors: np.ndarray) -> Features:
+    """Return features of an undistorted image at pixels (N, 2), with their noise (sigma, px) and octave (N,)."""
     return Features(uv, uv, sigma, SCALE_FACTOR ** octave.astype(float), octave, np.zeros(len(uv)), descriptors)
 
 
 def random_features(rng: np.random.Generator, n: int = 300) -> Features:
+    """Return features that belong to nothing: random places, random descriptors."""
     uv = rng.uniform([0, 0], SIZE_PX, (n, 2))
     words = rng.integers(0, 256, (n, 32), np.uint8)
     return make_features(uv, np.full(n, 0.5), np.zeros(n, np.int64), words)

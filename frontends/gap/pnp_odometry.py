@@ -153,7 +153,9 @@ class PnpOdometry:
         return self._live.relative_pose(track)
 
     def keyframe_due(self, track: Track) -> bool:
-        """Whether the frame should become a keyframe: in any case after a gap relocalisation, which only its landmarks tie down."""
+        """Whether the frame should become a keyframe: in any case after a gap relocalisation, which only its landmarks
+        tie down.
+        """
         return track.wide or self._live.keyframe_due(track)
 
     def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
@@ -225,7 +227,9 @@ class PnpOdometry:
         return self._live.track_at(view, GivenPose(T_cam_submap, n, n, 1.0, np.zeros((6, 6)), wide=False))
 
     def _catch_up(self) -> None:
-        """Find the auxiliary front end's features in the frames that have been posed without them, those that the next one needs."""
+        """Find the auxiliary front end's features in the frames that have been posed without them, those that the next
+        one needs.
+        """
         for index, view in self._needed().items():
             features = self._features(view)
             if not isinstance(features, Failure):
@@ -233,7 +237,9 @@ class PnpOdometry:
         self._pending = {}
 
     def _needed(self) -> dict[int, View]:
-        """Return the frames, of those posed without the auxiliary front end's features, that it needs to pose the next one."""
+        """Return the frames, of those posed without the auxiliary front end's features, that it needs to pose the next
+        one.
+        """
         needed = {*self._pending_keyframes(), *list(self._pending)[-FOLLOW_FRAMES:]}
         return {index: view for index, view in self._pending.items() if index in needed}
 
@@ -349,11 +355,13 @@ class PnpOdometry:
         return GivenPose(wide.T_cam_submap, len(rows), n_inliers, wide.chi2, wide.covariance, wide=True)
 
     def _small_step(self, view: View, found: GapPose) -> Track | None:
-        """Let the submap's landmarks decide where the auxiliary front end's matches alone do not, if the camera has hardly moved.
+        """Let the submap's landmarks decide where the auxiliary front end's matches alone do not, if the camera has
+        hardly moved.
 
-        A camera in the hand turns fast and moves little: few of the auxiliary front end's points have parallax enough to keep the
-        scale, but the landmarks that it still sees have, and a step that is small against their depth changes nothing
-        in that. (Across a long one, landmarks of two or three views would carry their errors over as scale.)
+        A camera in the hand turns fast and moves little: few of the auxiliary front end's points have parallax enough
+        to keep the scale, but the landmarks that it still sees have, and a step that is small against their depth
+        changes nothing in that. (Across a long one, landmarks of two or three views would carry their errors over as
+        scale.)
         """
         track = self._live.track_near(view, found.T_cam_submap)
         if isinstance(track, Failure) or not self._healthy(track.n_inliers, track.n_matches, track.chi2):

@@ -5,11 +5,11 @@ that are seen on both sides, and the detector finds few of the same points at ha
 now known about, each landmark's place and size there are too: the keyframes beyond the gap are searched for what the
 last keyframes before it saw, by its patch of the image, and what is found becomes a feature of theirs like any other.
 
-The pose of a gap relocalisation comes from few matches over a long way. There a landmark is looked for once its place is known to
-within what is searched, by the pose's covariance and its own: in a smaller search than that, what looks alike and
-confirms a wrong pose is all there is to find. Landmarks far away come first; what they tell of the pose makes way for
-those nearby (active search: Davison, ICCV 2003). The pose of a tracked frame is by the landmarks that it follows, and
-within the search.
+The pose of a gap relocalisation comes from few matches over a long way. There a landmark is looked for once its place
+is known to within what is searched, by the pose's covariance and its own: in a smaller search than that, what looks
+alike and confirms a wrong pose is all there is to find. Landmarks far away come first; what they tell of the pose makes
+way for those nearby (active search: Davison, ICCV 2003). The pose of a tracked frame is by the landmarks that it
+follows, and within the search.
 """
 
 from __future__ import annotations
@@ -59,7 +59,9 @@ MAJORITY = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PosePrior:
-    """What a gap relocalisation knows of a frame's pose, beside the landmarks that it sees: the pose and its information (6, 6)."""
+    """What a gap relocalisation knows of a frame's pose, beside the landmarks that it sees: the pose and its
+    information (6, 6).
+    """
 
     T_cam_submap: FloatArray
     information: FloatArray
@@ -173,7 +175,9 @@ class Refinder:
         return found
 
     def _pose_covariance(self, track: Track, pose_prior: _PosePrior) -> FloatArray:
-        """Return how well the frame's pose is known (6, 6), by the gap relocalisation and by the landmarks that it sees."""
+        """Return how well the frame's pose is known (6, 6), by the gap relocalisation and by the landmarks that it
+        sees.
+        """
         row = np.flatnonzero(track.landmark_ids >= 0)
         sigma = track.view.features.sigma_px[row]
         by_landmarks = pose_uncertainty(self._submap, track.T_cam_submap, track.landmark_ids[row], sigma)

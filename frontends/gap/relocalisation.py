@@ -3,8 +3,8 @@
 Two ways lead to a first pose. Where the known frames have seen enough parallax, their points and a 3-point solver. And
 where they have not (a map that has just begun knows the depth of what lies ahead to a tenth, and a camera that drives
 on through a gap sees it at half the distance), the essential matrix between the gap's two sides, and one number for the
-length of the gap relocalisation, which each track that a second known frame sees tells by itself. Both are then refined with the
-points, the known poses held, and the one that more tracks agree with stays.
+length of the gap relocalisation, which each track that a second known frame sees tells by itself. Both are then refined
+with the points, the known poses held, and the one that more tracks agree with stays.
 
 The refinement hears only tracks that two known frames see, where there are enough of these. What one of them sees may
 lie anywhere on a line: a few false matches at the image's edge, on a road that looks alike everywhere, bend a pose by a

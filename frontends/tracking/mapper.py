@@ -106,7 +106,8 @@ class Mapper:
         covisible = [int(k) for k in found[keep][: self._config.triangulate_against]]
         if covisible:
             return covisible
-        # Beyond a gap relocalisation hardly a landmark may be known: what the frames on the other side see is found by its features.
+        # Beyond a gap relocalisation hardly a landmark may be known: what the frames on the other side see is found by
+        # its features.
         return [k for k in submap.keyframes_near(keyframe_id) if k != keyframe_id][: self._config.triangulate_against]
 
     def _on_this_side(self, keyframe_id: int, neighbours: list[int], apart: Set[int]) -> list[int]:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -177,3 +178,17 @@ nested = st.recursive(
 @given(nested)
 def test_what_is_written_reads_back(value: object) -> None:
     assert strict_yaml.loads(strict_yaml.dumps(value)) == value
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("recovery.resume_after=5", "recovery.resume_after is now called recovery.relocalise_after"),
+        ("fusion.seam_keyframes=5", "fusion.seam_keyframes is now called fusion.overlap_keyframes"),
+        ("recovery.attempts=[{frontend: sift, walk: live}]", "recovery.attempts.0.walk is now called"),
+        ("recovery.attempts=[leap]", "the attempt `leap` is now called `gap`"),
+    ],
+)
+def test_old_names_are_answered_with_the_new_ones(old: str, new: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(new)):
+        load_config(overrides=[old])

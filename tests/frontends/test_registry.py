@@ -107,5 +107,6 @@ def test_broken_entry_point_is_a_config_error(monkeypatch: pytest.MonkeyPatch, v
 
 
 def test_registry_imports_no_front_end_by_itself() -> None:
-    code = "import sys, dualslam.frontends.registry; sys.exit('cv2' in sys.modules or 'dualslam.frontends.features.orb' in sys.modules)"
+    orb = "dualslam.frontends.features.orb"
+    code = f"import sys, dualslam.frontends.registry; sys.exit('cv2' in sys.modules or {orb!r} in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -195,7 +195,8 @@ def test_a_black_out_on_the_road_is_leapt(attempt: str) -> None:
         ids = [k for k in submap.keyframes if (k > 35) == (m == link.b)]
         est, true = submap.keyframe_poses(ids)[:, :3, 3], truth[ids][:, :3, 3]
         scales.append(np.linalg.norm(true - true.mean(0)) / np.linalg.norm(est - est.mean(0)))
-    # What the gap relocalisation knew is still known once the walk's result is in the map, whatever frame the map has by then.
+    # What the gap relocalisation knew is still known once the walk's result is in the map, whatever frame the map has
+    # by then.
     new = system.atlas.submaps[link.b]
     (k, known), *_ = new.relative_poses.items()
     assert k < 35 < known.keyframe_id

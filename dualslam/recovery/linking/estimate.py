@@ -105,8 +105,9 @@ def estimate_link(
     pairs = place_pairs(old, new, matched, None)
     if len(pairs) < config.min_inliers:
         return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(pairs)} pairs, {config.min_inliers} needed")
-    # 2. Which keyframes may be trusted: those older than what is suspected, by others or by a discontinuity in the old map.
-    #    The new map must be one piece there (but for its newest keyframe, the oldest, which may hang by little yet).
+    # 2. Which keyframes may be trusted: those older than what is suspected, by others or by a discontinuity in the old
+    #    map. The new map must be one piece there (but for its newest keyframe, the oldest, which may hang by
+    #    little yet).
     discontinuities_old = find_discontinuities(
         old, _look_back(old, int(pairs.keyframes[0]), config), max(old.keyframes), config
     )

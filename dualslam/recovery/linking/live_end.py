@@ -40,8 +40,8 @@ def propagate_to_live_end(
     Returns
     -------
     LinkEstimate or Failure
-        With `sigma_scale` in its numbers as it is at the live end, the walk's share of it, `sigma_scale_reverse`, and the
-        camera's, `sigma_scale_camera`, where there is one.
+        With `sigma_scale` in its numbers as it is at the live end, the walk's share of it, `sigma_scale_reverse`, and
+        the camera's, `sigma_scale_camera`, where there is one.
     """
     live = np.array([k for k in new.keyframes if k >= live_since], np.int64)
     walk = scale_sigma_between(new, link.agreeing_keyframes, live, config.pixel_chi2)

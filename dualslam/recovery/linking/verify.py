@@ -78,7 +78,8 @@ def check_parting(
     link is true where it is measured and wrong at the live end, for which it is made. What parts them is shared out in
     proportion to their variances between the two places, so the old map is to blame only where it is the looser one by
     far. That holds for what the variances allow: where the scales differ by more, one of the maps is broken, and says
-    nothing of it (HoloLens, a gap relocalisation of 24 frames: 47 % off, where the old map left 3 % open and the new one 0.7 %).
+    nothing of it (HoloLens, a gap relocalisation of 24 frames: 47 % off, where the old map left 3 % open and the new
+    one 0.7 %).
     """
     sigma_old, sigma_new = (scale_sigma_between(m, agreeing, parted, config.pixel_chi2) for m in (old, new))
     apart = _log_scale_at(model, parted) - math.log(sim3.scale(S_old_new))

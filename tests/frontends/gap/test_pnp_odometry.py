@@ -228,7 +228,9 @@ class TestGapRelocalisation:
                 assert set(features.asked) <= before
 
     def test_no_gap_no_features_of_the_guest(self) -> None:
-        """The older submap ends where this one begins, and nothing lies between that the auxiliary front end would be needed for."""
+        """The older submap ends where this one begins, and nothing lies between that the auxiliary front end would be
+        needed for.
+        """
         live, auxiliary = worlds()
         features = WorldFeatures(auxiliary)
         reverse_tracker = odometry(live, features, tracks_live=True, overlap_id=40)

@@ -44,8 +44,8 @@ def audit(
 ) -> LinkAudit:
     """Audit a link between two maps.
 
-    `tail`: scale of the old map from the overlap on, about the overlap: corrupted, which is not the link's fault. `drift`: a
-    frame, and the scale of the new map from there on. `noise`: of the new map's centres, in its unit.
+    `tail`: scale of the old map from the overlap on, about the overlap: corrupted, which is not the link's fault.
+    `drift`: a frame, and the scale of the new map from there on. `noise`: of the new map's centres, in its unit.
     """
     atlas = Atlas()
     old, new = submap(0, S_OLD_WORLD, range(36), T_world_cam), submap(1, S_NEW_WORLD, range(25, N), T_world_cam)

@@ -1,7 +1,7 @@
 """Is the synthetic world like a real one to a feature detector? Prints the same numbers for recordings and renderings.
 
-``python -m tests.lab.synthetic.realism street room /path/to/recording ...``; a recording is a folder as `render_to_folder`
-writes it. Not a test: it measures and asserts nothing.
+``python -m tests.lab.synthetic.realism street room /path/to/recording ...``; a recording is a folder as
+`render_to_folder` writes it. Not a test: it measures and asserts nothing.
 """
 
 from __future__ import annotations
