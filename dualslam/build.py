@@ -13,7 +13,6 @@ from dualslam.backend.beside_window import adjust_window
 from dualslam.backend.local_ba import bundle_adjust, bundle_adjust_arrays
 from dualslam.backend.self_calibration import estimate_calibration, find_preferred_camera
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.beside_graph import BesideGraphs, GraphServer
 from dualslam.calibration.lens import Calibration, CalibrationAnswer, CalibrationJob, answer
 from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.camera.models import Camera
@@ -36,14 +35,15 @@ from dualslam.frontends.tracking.rolling_shutter import RollingShutter
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.health import judge_track
 from dualslam.lab.disturbances import FaultScript
+from dualslam.map.graph_beside import BesideGraphs, GraphServer
 from dualslam.map.submap import Submap
 from dualslam.recovery.direction import recover
 from dualslam.recovery.executor import DeskExecutor, InlineExecutor, RecoveryExecutor
-from dualslam.recovery.jobs import Handlers, InlineDesk, JobKind
 from dualslam.recovery.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
 from dualslam.recovery.reverse_tracking import Attempt, RecoveryJob, RecoveryParts
-from dualslam.recovery.worker import Lane, WorkerDesk
 from dualslam.system import Components, System
+from dualslam.workers.desk import Lane, WorkerDesk
+from dualslam.workers.jobs import Handlers, InlineDesk, JobKind
 
 ADJUST_ITERATIONS = 20
 FEATURE_THREADS = 2

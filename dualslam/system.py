@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.beside_graph import BesideGraphs, Moved
 from dualslam.calibration.background import Calibrations
 from dualslam.calibration.lens import Calibration
 from dualslam.config.settings import Config
@@ -24,17 +23,18 @@ from dualslam.health import HealthMonitor, count_signs
 from dualslam.map.atlas import Link
 from dualslam.map.connections import Connections
 from dualslam.map.frame_records import FrameRecord, FrameResult
+from dualslam.map.graph_beside import BesideGraphs, Moved
+from dualslam.map.propagation import propagate_links
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.split import next_submap
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
+from dualslam.pace import Pace
 from dualslam.recovery.executor import RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
-from dualslam.recovery.jobs import Desk
 from dualslam.recovery.manager import Recoveries
-from dualslam.recovery.merge import propagate_links
 from dualslam.recovery.relocaliser import Relocaliser
-from dualslam.run.pace import Pace
+from dualslam.workers.jobs import Desk
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +43,8 @@ log = logging.getLogger(__name__)
 class Components:
     """The parts that the composition root puts in: the system itself knows neither front end nor solver.
 
-    `new_relocaliser`: a front end that finds its submap again wherever it is seen, and goes on from there. `desk`: where
-    work beside the tracking is done; walks back have an executor of their own, which may stand at the same desk.
+    `new_relocaliser`: a front end that finds its submap again wherever it is seen, and goes on from there. `desk`:
+    where work beside the tracking is done; walks back have an executor of their own, which may stand at the same desk.
     `graphs`: where submaps' graphs are solved in another process, what brings changes there and back.
     """
 

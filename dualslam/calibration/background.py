@@ -2,35 +2,43 @@
 
 The snapshot that was asked comes back changed to another camera: other pixels, poses and points. All keyframes of the
 live submap take the new camera, those of the snapshot their new poses too, and what has come since follows them
-(`dualslam/calibration/late_estimate.py`); then the graph is made anew. Inline nothing has come since, and the live submap becomes
-what the snapshot was changed to.
+(`dualslam/map/late_estimate.py`); then the graph is made anew. Inline nothing has come since, and the live submap
+becomes what the snapshot was changed to.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection
+from typing import Protocol
 
 import numpy as np
 
-from dualslam.calibration.late_estimate import apply_late
 from dualslam.calibration.lens import Calibration, CalibrationAnswer, CalibrationJob, change_camera
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
-from dualslam.core.types import Failure, FailureReason
+from dualslam.core.types import Failure, FailureReason, View
 from dualslam.map.connections import Connections
+from dualslam.map.late_estimate import apply_late
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
-from dualslam.recovery.frame_buffer import FrameBuffer
-from dualslam.recovery.jobs import Desk, JobKind
+from dualslam.workers.jobs import Desk, JobKind
 
 log = logging.getLogger(__name__)
 
 SAME_GAUGE = 1e-6
 """Relative. A snapshot whose gauge the submap still has needs no change of frame; a solution moves it by rounding."""
+
+
+class Views(Protocol):
+    """Buffered views, which change to another camera with the maps."""
+
+    def map(self, change: Callable[[View], View]) -> None:
+        """Change each view."""
+        ...
 
 
 class Calibrations:
@@ -39,7 +47,7 @@ class Calibrations:
     Parameters
     ----------
     record : Record
-    buffer : FrameBuffer
+    buffer : Views
     calibration : Calibration
     desk : Desk
         Where the questions are answered.
@@ -50,7 +58,7 @@ class Calibrations:
     def __init__(
         self,
         record: Record,
-        buffer: FrameBuffer,
+        buffer: Views,
         calibration: Calibration,
         desk: Desk,
         new_graph: Callable[[], SubmapGraph],

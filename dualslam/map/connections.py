@@ -34,12 +34,11 @@ from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.atlas import Atlas, Link, LinkKind, joined
 from dualslam.map.bending import Move, bend_frames, bend_link, bend_submap, hold
-from dualslam.map.propagation import propagate_anchors, propagate_poses
+from dualslam.map.overlap_sides import OverlapRefinement, apply_overlap, overlap_problem
+from dualslam.map.propagation import propagate_anchors, propagate_links, propagate_poses
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.skeleton import EdgeCovariances, Skeleton, build_skeleton, skeleton_knots
 from dualslam.map.submap import Submap
-from dualslam.recovery.merge import propagate_links
-from dualslam.recovery.overlap_sides import SeamRefinement, apply_seam, seam_problem
 
 log = logging.getLogger(__name__)
 
@@ -161,7 +160,7 @@ class Connections:
         S = skeleton.problem.S_world_node
         return sim3.inverse(S[first]) @ S[second], self._solver.relative_covariance(skeleton.problem, first, second)
 
-    def refine_overlap(self, link: Link, landmark_pairs: IntArray) -> SeamRefinement | Failure:
+    def refine_overlap(self, link: Link, landmark_pairs: IntArray) -> OverlapRefinement | Failure:
         """Refine keyframes and landmarks about a connection together, on both of its sides, live or archived.
 
         Parameters
@@ -173,14 +172,14 @@ class Connections:
 
         Returns
         -------
-        SeamRefinement or Failure
+        OverlapRefinement or Failure
             `TOO_FEW_MATCHES` where too few points are seen from both sides; nothing has changed then.
         """
         sides = self._atlas.submaps[link.a], self._atlas.submaps[link.b]
         component = next(c for c in self._atlas.components() if link.a in c)
         S_world = self._atlas.S_world_submap(component)
         S_a_b = sim3.inverse(S_world[link.a]) @ S_world[link.b]
-        refinement = seam_problem(sides, link.attached(self._atlas), S_a_b, landmark_pairs)
+        refinement = overlap_problem(sides, link.attached(self._atlas), S_a_b, landmark_pairs)
         if isinstance(refinement, Failure):
             return refinement
         try:
@@ -188,7 +187,7 @@ class Connections:
         except SolverError as error:
             return Failure(FailureReason.SOLVER, str(error))
         befores = {submap.id: submap.copy() for submap in sides}
-        moved = apply_seam(sides, refinement, result)
+        moved = apply_overlap(sides, refinement, result)
         for m, before in befores.items():
             for front_end in self._front_ends():
                 if front_end.submap.id == m:
@@ -198,7 +197,7 @@ class Connections:
         self._atlas.links = [
             replace(other, S_a_b=S_a_b) if other.attached_as(link) else other for other in self._atlas.links
         ]
-        return SeamRefinement(
+        return OverlapRefinement(
             n_keyframes=int((~refinement.problem.fixed).sum()),
             n_landmarks=len(refinement.problem.xyz_mu),
             n_joined=refinement.n_joined,

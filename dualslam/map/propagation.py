@@ -1,4 +1,4 @@
-"""Frames that are no keyframes, after all keyframes have moved at once: carried along with their neighbours in time."""
+"""What follows a submap that has moved: its frames that are no keyframes, its culled keyframes, its links."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from dualslam.core.geometry import se3
+from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.atlas import Atlas, Link
 from dualslam.map.submap import Anchor, Submap
+from dualslam.map.submap_change import change_of_frame
 from dualslam.map.trajectory import FramePose
 
 
@@ -71,3 +73,23 @@ def _propagate(
     T_a_b = se3.inverse(after.T_submap_kf[a]) @ after.T_submap_kf[b]
     gap = se3.log(se3.inverse(T_a) @ T_a_b @ T_b)
     return a, T_a @ se3.exp(share * gap)
+
+
+def propagate_links(atlas: Atlas, before: Submap, after: Submap) -> None:
+    """Let the links of a submap follow a change of it, each as the keyframes moved that it stands on there."""
+    for i, link in enumerate(atlas.links):
+        S_a_b, covariance = link.S_a_b, link.covariance
+        if link.a == after.id:
+            S_a_b = _change_at(before, after, link, link.keyframe_a) @ S_a_b
+        if link.b == after.id:
+            S_after_before = _change_at(before, after, link, link.keyframe_b)
+            Ad = sim3.adjoint(S_after_before)
+            S_a_b = S_a_b @ sim3.inverse(S_after_before)
+            covariance = Ad @ covariance @ Ad.T
+        atlas.links[i] = replace(link, S_a_b=S_a_b, covariance=covariance)
+
+
+def _change_at(before: Submap, after: Submap, link: Link, attached: int) -> FloatArray:
+    """Return how a submap has changed about the keyframes that a link stands on there."""
+    stands_on = [k for k in (*link.keyframes, attached) if k in before.keyframes and k in after.keyframes]
+    return change_of_frame(before, after, stands_on or before.keyframes)

@@ -6,8 +6,8 @@ from typing import Protocol
 
 from dualslam.core.types import Failure
 from dualslam.recovery.direction import recover
-from dualslam.recovery.jobs import Desk, JobKind
 from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryParts, RecoveryResult
+from dualslam.workers.jobs import Desk, JobKind
 
 Outcome = tuple[RecoveryJob, RecoveryResult | Failure]
 

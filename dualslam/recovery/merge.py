@@ -9,13 +9,12 @@ walk added are observations; its poses and points are initial values for the nex
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe
-from dualslam.map.atlas import Atlas, Link
 from dualslam.map.submap import NO_LANDMARK, Anchor, Submap
 from dualslam.map.submap_change import change_of_frame
 
@@ -65,26 +64,6 @@ def merge_recovery(live: Submap, base: Submap, grown: Submap, rectify: Rectify) 
     merged.add_observations(*_new_rows(merged, base, moved, id_of))
     _add_counts(merged, base, moved)
     return Merged(merged, moved, S_live_grown)
-
-
-def propagate_links(atlas: Atlas, before: Submap, after: Submap) -> None:
-    """Let the links of a submap follow a change of it, each as the keyframes moved that it stands on there."""
-    for i, link in enumerate(atlas.links):
-        S_a_b, covariance = link.S_a_b, link.covariance
-        if link.a == after.id:
-            S_a_b = _change_at(before, after, link, link.keyframe_a) @ S_a_b
-        if link.b == after.id:
-            S_after_before = _change_at(before, after, link, link.keyframe_b)
-            Ad = sim3.adjoint(S_after_before)
-            S_a_b = S_a_b @ sim3.inverse(S_after_before)
-            covariance = Ad @ covariance @ Ad.T
-        atlas.links[i] = replace(link, S_a_b=S_a_b, covariance=covariance)
-
-
-def _change_at(before: Submap, after: Submap, link: Link, attached: int) -> FloatArray:
-    """Return how a submap has changed about the keyframes that a link stands on there."""
-    stands_on = [k for k in (*link.keyframes, attached) if k in before.keyframes and k in after.keyframes]
-    return change_of_frame(before, after, stands_on or before.keyframes)
 
 
 def _add_keyframes(merged: Submap, base: Submap, moved: Submap, rectify: Rectify) -> None:

@@ -20,9 +20,9 @@ from dualslam.lab.metrics.trajectory_metrics import score_trajectory
 from dualslam.map.atlas import LinkKind
 from dualslam.map.trajectory import compose
 from dualslam.recovery.frame_buffer import MB
-from dualslam.recovery.worker import WorkerDesk
 from dualslam.run.runner import RunReport
 from dualslam.system import System
+from dualslam.workers.desk import WorkerDesk
 
 PACKAGES = ("dualslam", "numpy", "scipy", "opencv-python-headless", "gtsam", "poselib", "pydantic")
 PACKAGES_OF_EXTRAS = ("torch", "kornia")

@@ -17,7 +17,7 @@ from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult
-from dualslam.run.pace import Pace
+from dualslam.pace import Pace
 
 MAX_LATE_S = 1 / 15
 """So late a frame may be while the next one waits: two frames of a camera at 30 Hz, which most often are what a

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -71,7 +72,7 @@ class DriftingMap:
             bundle_adjust_arrays,
             lambda: self.front_ends,
         )
-        self.front_ends: list = []
+        self.front_ends: list[Any] = []
         self.now = FrameRecord(0, 0.0, FrameStatus.TRACKED)
         self.submap = self._new_submap(0)
         self.place_of: dict[int, int] = {}  # landmark of the submap by point
@@ -80,6 +81,7 @@ class DriftingMap:
 
     @property
     def atlas(self) -> Atlas:
+        """The atlas of the record."""
         return self.record.atlas
 
     def _new_submap(self, submap_id: int) -> Submap:
@@ -88,6 +90,7 @@ class DriftingMap:
         return submap
 
     def seen(self, k: int) -> tuple[np.ndarray, FloatArray]:
+        """Return the points that keyframe `k` sees, and their pixels (n, 2)."""
         p = (self.xyz - self.T_true[k][:3, 3]) @ self.T_true[k][:3, :3]
         apart = np.abs(np.arange(len(self.xyz)) / 12 - k) % N_ROUND
         near = np.minimum(apart, N_ROUND - apart) < 12
@@ -122,10 +125,11 @@ class DriftingMap:
             self.submap.gauge = (ids_[0], ids_[-1])
 
     def roll_over(self) -> None:
+        """Go on in a new submap that shares its first keyframes with the full one."""
         full = self.submap
         self.submap = next_submap(full, len(self.atlas.submaps), N_SHARED)
         self.atlas.add(self.submap)
-        old_of = {}
+        old_of: dict[int, int] = {}
         for k in self.submap.keyframes:
             both = (full.landmark_of[k] >= 0) & (self.submap.landmark_of[k] >= 0)
             old, new = full.landmark_of[k][both].tolist(), self.submap.landmark_of[k][both].tolist()

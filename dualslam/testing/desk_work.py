@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.recovery.jobs import Handlers, JobKind
+from dualslam.workers.jobs import Handlers, JobKind
 
 
 def handlers() -> Handlers:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from dualslam.recovery.jobs import Desk, Ended, JobKind
+from dualslam.workers.jobs import Desk, Ended, JobKind
 
 
 class LateDesk:
@@ -16,21 +16,26 @@ class LateDesk:
         self.n_polls: dict[JobKind, int] = {}
 
     def submit(self, kind: JobKind, work: Any) -> None:
+        """Do the work at once, and keep its result back."""
         self.inner.submit(kind, work)
         at = self.n_polls.get(kind, 0) + self.polls
         self.waiting.setdefault(kind, []).extend((at, ended) for ended in self.inner.poll(kind))
 
     def poll(self, kind: JobKind) -> list[Ended]:
+        """Return what is due."""
         now = self.n_polls[kind] = self.n_polls.get(kind, 0) + 1
         due = [ended for at, ended in self.waiting.get(kind, []) if at < now]
         self.waiting[kind] = [(at, ended) for at, ended in self.waiting.get(kind, []) if at >= now]
         return due
 
     def n_open(self, kind: JobKind) -> int:
+        """Return how many results are kept back."""
         return len(self.waiting.get(kind, []))
 
     def drain(self, kind: JobKind) -> list[Ended]:
+        """Return all results, due or not."""
         return [ended for _, ended in self.waiting.pop(kind, [])]
 
     def close(self) -> None:
+        """Close the desk within."""
         self.inner.close()

@@ -15,9 +15,9 @@ from dualslam.map.atlas import Atlas
 from dualslam.map.frame_records import FrameRecord, FrameResult
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
+from dualslam.pace import Pace
 from dualslam.recovery.frame_buffer import FrameBuffer
-from dualslam.recovery.jobs import InlineDesk
-from dualslam.run.pace import Pace
+from dualslam.workers.jobs import InlineDesk
 
 NO_FEATURES = Features(
     np.zeros((0, 2)),

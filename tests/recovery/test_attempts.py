@@ -22,7 +22,7 @@ from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryResult, run_
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
-from tests.recovery.test_worker import assert_same
+from tests.workers.test_worker import assert_same
 
 COVERED = frozenset(range(35, 50))
 CAMERA = PinholeCamera(640, 480, 450.0, 450.0, 319.5, 239.5)

@@ -10,7 +10,7 @@ import pytest
 from dualslam.core.errors import InputError
 from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult
-from dualslam.run.pace import Pace
+from dualslam.pace import Pace
 from dualslam.run.results import frame_rows
 from dualslam.run.runner import RunReport, run_sequence
 from tests.cli.fakes import FakeSystem

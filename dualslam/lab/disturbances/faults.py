@@ -21,8 +21,8 @@ from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, Track, View
 from dualslam.map.submap import Submap
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
-from dualslam.recovery.jobs import JobKind
 from dualslam.recovery.reverse_tracking import RecoveryJob
+from dualslam.workers.jobs import JobKind
 
 _KINDS = INTERNAL_KINDS | {CorruptionKind.FEW_FEATURES}
 

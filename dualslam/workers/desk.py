@@ -29,8 +29,8 @@ from typing import Any
 
 from dualslam.core.memory import keep_freed_memory
 from dualslam.core.types import Failure, FailureReason
-from dualslam.recovery.jobs import Ended, Handlers, JobKind
-from dualslam.recovery.transport import receive, send
+from dualslam.workers.jobs import Ended, Handlers, JobKind
+from dualslam.workers.transport import receive, send
 
 log = logging.getLogger(__name__)
 
@@ -221,7 +221,7 @@ class QueueStatistics:
 
 
 class WorkerDesk:
-    """The `dualslam.recovery.jobs.Desk` whose jobs run in processes of their own.
+    """The `dualslam.workers.jobs.Desk` whose jobs run in processes of their own.
 
     Parameters
     ----------

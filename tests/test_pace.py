@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from dualslam.run.pace import BEHIND_S, MAX_LAG_KEYFRAMES, MAX_PUT_OFF, Pace
+from dualslam.pace import BEHIND_S, MAX_LAG_KEYFRAMES, MAX_PUT_OFF, Pace
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
 
 MANY, WEAK = 300, 60

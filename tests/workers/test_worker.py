@@ -17,11 +17,11 @@ from dualslam.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.types import Failure, FailureReason
 from dualslam.recovery.executor import Outcome
-from dualslam.recovery.jobs import JobKind
 from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryResult, run_recovery
-from dualslam.recovery.worker import Lane, WorkerDesk
 from dualslam.run.results import trajectories_of
 from dualslam.testing.point_world import SIZE_PX, PointWorld, cloud, hand_held, pose_errors, system_in
+from dualslam.workers.desk import Lane, WorkerDesk
+from dualslam.workers.jobs import JobKind
 
 COVERED = frozenset(range(35, 50))
 MAKE_PARTS = partial(recovery_parts, Config(), SIZE_PX)

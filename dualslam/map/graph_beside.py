@@ -2,11 +2,11 @@
 
 `BesideGraph` is the `SubmapGraph` that the tracking sees. Its updates adjust the newest keyframes (`Window`), and note
 that the graph proper has something to learn. Between two frames `BesideGraphs` sends what has changed in the arrays
-(`dualslam/submap_delta.py`) to the process, one job at a time, so that a graph that is behind takes several keyframes
-in at once; and it puts what came back into the submap as it is now: known keyframes and landmarks take their values,
-what has come since follows (`dualslam/calibration/late_estimate.py`). A process that dies costs its graph: the next job brings the
-whole submap to a fresh one. A graph that fails leaves the submap to its window, and is made anew with the next
-keyframe.
+(`dualslam/map/submap_delta.py`) to the process, one job at a time, so that a graph that is behind takes several
+keyframes in at once; and it puts what came back into the submap as it is now: known keyframes and landmarks take their
+values, what has come since follows (`dualslam/map/late_estimate.py`). A process that dies costs its graph: the next job
+brings the whole submap to a fresh one. A graph that fails leaves the submap to its window, and is made anew with the
+next keyframe.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from itertools import count
 
 import numpy as np
 
-from dualslam.calibration.late_estimate import apply_late
 from dualslam.core.errors import SolverError
 from dualslam.core.interfaces import GraphEstimate, SubmapGraph
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
+from dualslam.map.late_estimate import apply_late
 from dualslam.map.submap import Submap
-from dualslam.recovery.jobs import Desk, JobKind
-from dualslam.submap_delta import SubmapDelta, SubmapMirror
+from dualslam.map.submap_delta import SubmapDelta, SubmapMirror
+from dualslam.workers.jobs import Desk, JobKind
 
 log = logging.getLogger(__name__)
 

@@ -3,8 +3,8 @@
 A job is a snapshot of arrays that nobody else changes, and its kind says what is made of it. What comes back is a
 change, and whoever asked for it merges it, between two frames, into a map that has gone on meanwhile. Where the work is
 done is the desk's affair: `InlineDesk` does it at once, in the process that tracks, so that the same seed gives the
-same run to the bit; `dualslam/recovery/worker.py` has the one with processes. A job may come to nothing: then its outcome is a
-`Failure`, and nothing else has changed.
+same run to the bit; `dualslam/workers/desk.py` has the one with processes. A job may come to nothing: then its outcome
+is a `Failure`, and nothing else has changed.
 """
 
 from __future__ import annotations

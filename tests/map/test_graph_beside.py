@@ -10,18 +10,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dualslam.beside_graph import BesideGraph, BesideGraphs, GraphServer
 from dualslam.build import build_system, graph_handlers
 from dualslam.config.settings import Config
 from dualslam.core.types import FailureReason, FrameStatus
+from dualslam.map.graph_beside import BesideGraph, BesideGraphs, GraphServer
 from dualslam.map.submap import Submap
-from dualslam.recovery.jobs import InlineDesk, JobKind
-from dualslam.recovery.worker import WorkerDesk
+from dualslam.map.submap_delta import SubmapMirror
 from dualslam.run.results import trajectories_of
-from dualslam.submap_delta import SubmapMirror
 from dualslam.system import System
 from dualslam.testing.late_desk import LateDesk
 from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, pose_errors, system_in
+from dualslam.workers.desk import WorkerDesk
+from dualslam.workers.jobs import InlineDesk, JobKind
 from tests.map.test_submap import assert_consistent
 
 DENSE = {"keyframes": {"max_parallax_deg": 2.0}}
@@ -119,7 +119,7 @@ def test_a_server_that_does_not_know_a_graph_says_so() -> None:
     world = PointWorld(cloud(), hand_held(20))
     system = run(system_in(world), world)
     from dualslam.backend.submap_graph import ISam2SubmapGraph
-    from dualslam.beside_graph import GraphJob
+    from dualslam.map.graph_beside import GraphJob
 
     mirror = SubmapMirror()
     first, second = (mirror.delta(system.atlas.submaps[0]) for _ in range(2))

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from dualslam.core.types import Failure, FailureReason
-from dualslam.recovery.jobs import Ended, InlineDesk, JobKind
-from dualslam.recovery.transport import receive, send
-from dualslam.recovery.worker import Lane, WorkerDesk
 from dualslam.testing.desk_work import handlers
 from dualslam.testing.waiting import wait_until
+from dualslam.workers.desk import Lane, WorkerDesk
+from dualslam.workers.jobs import Ended, InlineDesk, JobKind
+from dualslam.workers.transport import receive, send
 
 GRAPH, CALIBRATION, WALK = JobKind.GRAPH, JobKind.CALIBRATION, JobKind.WALK
 

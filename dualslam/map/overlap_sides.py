@@ -1,7 +1,8 @@
-"""An overlap refined on both of its sides: keyframes and landmarks about a connection, of two submaps or two ends of one.
+"""An overlap refined on both of its sides: keyframes and landmarks about a connection, of two submaps or two ends of
+one.
 
 What the two maps see there becomes one bundle: the same frame is one camera, landmarks that are the same are one point
-with the views of both. The keyframes beyond stay where they are, on either side, so that nothing discontinuities.
+with the views of both. The keyframes beyond stay where they are, on either side, so that nothing tears.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ MIN_JOINED = 10
 
 
 @dataclass(frozen=True, slots=True)
-class SeamRefinement:
+class OverlapRefinement:
     """What a refinement did.
 
     Attributes
@@ -66,7 +67,7 @@ class SeamProblem:
     n_joined: int
 
 
-def seam_problem(
+def overlap_problem(
     sides: tuple[Submap, Submap], keyframes: tuple[int, int], S_first_second: FloatArray, landmark_pairs: IntArray
 ) -> SeamProblem | Failure:
     """Gather what two sides of an overlap see.
@@ -113,7 +114,7 @@ def seam_problem(
     return SeamProblem(problem, ids, points, S_side_first, n_joined)
 
 
-def apply_seam(sides: tuple[Submap, Submap], refinement: SeamProblem, result: BundleResult) -> dict[int, float]:
+def apply_overlap(sides: tuple[Submap, Submap], refinement: SeamProblem, result: BundleResult) -> dict[int, float]:
     """Take a solution over on both sides; return how far a keyframe went in each submap, in its unit."""
     moved: dict[int, float] = {}
     for submap, points, S in zip(sides, refinement.points, refinement.S_side_first, strict=True):
