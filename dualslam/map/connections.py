@@ -14,7 +14,15 @@ from itertools import pairwise
 
 import numpy as np
 
-from dualslam.atlas_report import (
+from dualslam.core.atlas_problem import AtlasSolver
+from dualslam.core.bundle import BundleAdjuster
+from dualslam.core.errors import SolverError
+from dualslam.core.events import EventKind
+from dualslam.core.geometry import sim3
+from dualslam.core.interfaces import SubmapGraph, VisualOdometry
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
+from dualslam.map.atlas import Atlas, Link, LinkKind, joined
+from dualslam.map.atlas_report import (
     AtlasReport,
     LinkVerdict,
     Solved,
@@ -25,14 +33,6 @@ from dualslam.atlas_report import (
     placed_by,
     together,
 )
-from dualslam.core.atlas_problem import AtlasSolver
-from dualslam.core.bundle import BundleAdjuster
-from dualslam.core.errors import SolverError
-from dualslam.core.events import EventKind
-from dualslam.core.geometry import sim3
-from dualslam.core.interfaces import SubmapGraph, VisualOdometry
-from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
-from dualslam.map.atlas import Atlas, Link, LinkKind, joined
 from dualslam.map.bending import Move, bend_frames, bend_link, bend_submap, hold
 from dualslam.map.overlap_sides import OverlapRefinement, apply_overlap, overlap_problem
 from dualslam.map.propagation import propagate_anchors, propagate_links, propagate_poses

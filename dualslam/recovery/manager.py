@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from itertools import takewhile
 from typing import Any
 
-from dualslam.atlas_report import AtlasReport
 from dualslam.calibration.lens import Calibration
 from dualslam.config.settings import RecoveryConfig
 from dualslam.core.errors import SolverError
@@ -17,6 +16,7 @@ from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus, Keyframe, View
 from dualslam.map.atlas import Link, LinkKind
+from dualslam.map.atlas_report import AtlasReport
 from dualslam.map.connections import Connections
 from dualslam.map.propagation import propagate_poses
 from dualslam.map.record import FrameStamp, Record

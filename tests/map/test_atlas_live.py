@@ -6,12 +6,12 @@ from functools import cache
 
 import numpy as np
 
-from dualslam.atlas_report import AtlasReport
 from dualslam.backend.atlas_solver import GtsamAtlasSolver
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FloatArray
 from dualslam.map.atlas import Link, LinkKind
+from dualslam.map.atlas_report import AtlasReport
 from dualslam.map.trajectory import compose
 from dualslam.system import System
 from dualslam.testing.atlas_world import LINK_SIGMAS, align, fit_similarity
