@@ -54,7 +54,7 @@ class Frame:
     error: str = ""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class Features:
     """Keypoints of one image with their descriptors, N of them.
 

@@ -163,7 +163,7 @@ def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Fai
         events += progress.events
         if best is None or progress.link is not None:
             best = progress
-        if progress.link is not None or progress.needs_camera:
+        if progress.link is not None or progress.needs_camera or progress.needs_live_end:
             break
     if best is None:
         return problem
@@ -186,6 +186,7 @@ class _Progress:
     out_of_time: bool = False
     given_up: bool = False
     needs_camera: bool = False  # no other walk would do better, before the camera is calibrated
+    needs_live_end: bool = False  # nor before the live end has grown, from which all of them set out
     why_unusable: str = ""
     why_not_linked: str = ""
 
@@ -249,6 +250,8 @@ def _make_attempt(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, unti
                 break
             progress.why_not_linked = found.detail
             progress.needs_camera |= found.reason is FailureReason.CAMERA
+            # What was lost in a gap relocalisation the others lose as well: they leap by the same matches, or by fewer.
+            progress.needs_live_end |= found.reason is FailureReason.SCALE_LOST and progress.n_gaps > 0
             progress.given_up |= progress.needs_camera or found.reason is FailureReason.SCALE_LOST
             progress.events.append(_refusal(tried, found, attempt.name, step.view, submap.id))
         progress.given_up |= relinker.has_seen_enough

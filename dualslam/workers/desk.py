@@ -30,7 +30,7 @@ from typing import Any
 from dualslam.core.memory import keep_freed_memory
 from dualslam.core.types import Failure, FailureReason
 from dualslam.workers.jobs import Ended, Handlers, JobKind
-from dualslam.workers.transport import receive, send
+from dualslam.workers.transport import Channel
 
 log = logging.getLogger(__name__)
 
@@ -110,10 +110,11 @@ class Worker:
     def _carry(self) -> None:
         """Carry jobs to the process and results back, until told to stop or the process is gone."""
         with self._connection:
+            channel = Channel(self._connection, first=0)
             try:
                 while (job := self._jobs.get()) is not None:
-                    send(self._connection, job)
-                    self._results.put(receive(self._connection))
+                    channel.send(job)
+                    self._results.put(channel.receive())
             except (EOFError, OSError):
                 self._process.join()
                 detail = f"the {self._name} process ended with exit code {self._process.exitcode}"
@@ -127,18 +128,19 @@ def serve(connection: Connection, make_handlers: MakeHandlers, niceness: int = 0
     if niceness:
         os.nice(niceness)
     keep_freed_memory()
-    handlers = make_handlers()
+    handlers, channel = make_handlers(), Channel(connection, first=1)
     while True:
         try:
-            kind, work = receive(connection)
+            kind, work = channel.receive()
         except EOFError:
             return
         began_s = time.process_time()
         result = handlers[kind](work)
         try:
-            send(connection, _Answer(result, time.process_time() - began_s))
+            channel.send(_Answer(result, time.process_time() - began_s))
         except BrokenPipeError:  # nobody waits for it any more
             return
+        del work, result  # as they go with the next job, what they held may go
 
 
 @dataclass(frozen=True, slots=True, eq=False)

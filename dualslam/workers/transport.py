@@ -1,64 +1,149 @@
-"""Objects of numpy arrays through a pipe: what is small is pickled, large arrays go past the pickle as they are.
+"""Objects of numpy arrays through a pipe: large arrays go past the pickle, and what was sent before is not sent again.
 
 Pickling holds the interpreter's lock, and so does each turn at a pipe: a thread that carries a job of a thousand arrays
 must come to its turn a thousand times beside the one that tracks. So the structure alone is pickled, the memory of
 large arrays is written from where it lies, and many pieces go with one call of the system, which holds no lock.
+
+Features and images never change, and most of a job is made of those that the one before held already: the frames in the
+buffer, the keyframes of a map. Each goes through a `Channel` once. The other end keeps it as long as this one does, and
+what comes back names it only, so that a result is what has changed. An object stays the same object at the other end,
+job after job: what was found in an image is known when it comes again.
 """
 
 from __future__ import annotations
 
+import io
 import os
 import pickle
 import struct
-from collections.abc import Sequence
+import weakref
+from collections.abc import Callable, Sequence
+from itertools import count
 from multiprocessing.connection import Connection
 from typing import Any
+
+from dualslam.core.grey_image import GreyImage
+from dualslam.core.types import Features
 
 LARGE_BYTES = 2**14
 """Arrays from here on go beside the pickle; a smaller one is copied faster than it is handled apart."""
 MAX_PIECES = 512
 """In one call of the system; Linux and macOS take 1,024."""
+ONCE = (Features, GreyImage)
+"""Immutable, large, and held by job after job."""
 
 _COUNT = struct.Struct("<Q")
 
 
-def send(connection: Connection, thing: Any) -> int:
-    """Send what can be pickled; blocks until all of it is under way, and returns how many bytes it was.
+class Channel:
+    """One end of a pipe.
 
-    Raises
-    ------
-    OSError
-        Nobody is at the other end any more.
+    Parameters
+    ----------
+    connection : Connection
+    first, step : int
+        Of the numbers that this end gives to what it sends once: the two ends must not give the same.
     """
-    large: list[memoryview] = []
 
-    def beside(buffer: pickle.PickleBuffer) -> bool:
+    def __init__(self, connection: Connection, first: int = 0, step: int = 2) -> None:
+        self._connection = connection
+        self._numbers = count(first, step)
+        self._number_of: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
+        self._ours: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()
+        self._theirs: dict[int, Any] = {}
+        self._gone: list[int] = []  # ours that nobody here holds any more
+
+    def send(self, thing: Any) -> int:
+        """Send what can be pickled; blocks until all of it is under way, and returns how many bytes it was.
+
+        Raises
+        ------
+        OSError
+            Nobody is at the other end any more.
+        """
+        large: list[memoryview] = []
+        fresh: dict[int, Any] = {}
+        gone = list(self._gone)
+        del self._gone[: len(gone)]  # others may go meanwhile, whichever thread lets go of them
+        stream = io.BytesIO()
+        _Pickler(stream, self, fresh, large).dump(thing)
+        n_before = len(large)
+        head = pickle.dumps((fresh, gone), protocol=5, buffer_callback=_beside(large))
+        pieces = [memoryview(head), stream.getbuffer(), *large[n_before:], *large[:n_before]]
+        sizes = [piece.nbytes for piece in pieces]
+        table = b"".join(_COUNT.pack(n) for n in (len(sizes), n_before, *sizes))
+        _write(self._connection.fileno(), [memoryview(table), *pieces])
+        return len(table) + sum(sizes)
+
+    def receive(self) -> Any:
+        """Wait for what the other end sends, and return it; its arrays can be written to, each in memory of its own.
+
+        Raises
+        ------
+        EOFError
+            The other end was closed.
+        """
+        fd = self._connection.fileno()
+        n, n_own = (_COUNT.unpack(each)[0] for each in _read(fd, [_COUNT.size] * 2))
+        sizes = [_COUNT.unpack(each)[0] for each in _read(fd, [_COUNT.size] * n)]
+        head, body, *large = _read(fd, sizes)
+        n_fresh = len(large) - n_own
+        fresh, gone = pickle.loads(head, buffers=large[:n_fresh])
+        for number, thing in fresh.items():
+            self._theirs[number] = thing
+            self._number_of[thing] = number
+        thing = _Unpickler(io.BytesIO(body), self, buffers=large[n_fresh:]).load()
+        for number in gone:
+            self._theirs.pop(number, None)
+        return thing
+
+    def _number(self, thing: Any, fresh: dict[int, Any]) -> int:
+        """Return the number of what goes once, and put it among the fresh ones if it has never gone."""
+        number = self._number_of.get(thing)
+        if number is None:
+            number = self._number_of[thing] = next(self._numbers)
+            self._ours[number] = fresh[number] = thing
+            weakref.finalize(thing, self._gone.append, number).atexit = False
+        return number
+
+    def _named(self, number: int) -> Any:
+        thing = self._theirs.get(number)
+        if thing is None:
+            thing = self._ours.get(number)
+        if thing is None:
+            raise pickle.UnpicklingError(f"object {number} is gone at this end")
+        return thing
+
+
+class _Pickler(pickle.Pickler):
+    def __init__(self, stream: io.BytesIO, channel: Channel, fresh: dict[int, Any], large: list[memoryview]) -> None:
+        super().__init__(stream, protocol=5, buffer_callback=_beside(large))
+        self._channel, self._fresh = channel, fresh
+
+    def persistent_id(self, obj: Any) -> int | None:
+        return self._channel._number(obj, self._fresh) if isinstance(obj, ONCE) else None
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, stream: io.BytesIO, channel: Channel, buffers: Sequence[bytearray]) -> None:
+        super().__init__(stream, buffers=buffers)
+        self._channel = channel
+
+    def persistent_load(self, pid: Any) -> Any:
+        return self._channel._named(pid)
+
+
+def _beside(large: list[memoryview]) -> Callable[[pickle.PickleBuffer], bool]:
+    """Return what keeps large buffers out of a pickle, and puts them at the end of a list."""
+
+    def keep_out(buffer: pickle.PickleBuffer) -> bool:
         memory = buffer.raw()
         if memory.nbytes < LARGE_BYTES:
             return True  # into the pickle
         large.append(memory)
         return False
 
-    structure = pickle.dumps(thing, protocol=5, buffer_callback=beside)
-    sizes = [len(structure), *(memory.nbytes for memory in large)]
-    head = b"".join(_COUNT.pack(n) for n in (len(sizes), *sizes))
-    _write(connection.fileno(), [memoryview(head), memoryview(structure), *large])
-    return len(head) + sum(sizes)
-
-
-def receive(connection: Connection) -> Any:
-    """Wait for what the other end sends, and return it; its arrays can be written to, and each has memory of its own.
-
-    Raises
-    ------
-    EOFError
-        The other end was closed.
-    """
-    fd = connection.fileno()
-    (n,) = _COUNT.unpack(_read(fd, [_COUNT.size])[0])
-    sizes = [_COUNT.unpack_from(head)[0] for head in _read(fd, [_COUNT.size] * n)]
-    structure, *large = _read(fd, sizes)
-    return pickle.loads(structure, buffers=large)
+    return keep_out
 
 
 def _write(fd: int, pieces: Sequence[memoryview]) -> None:
@@ -66,11 +151,9 @@ def _write(fd: int, pieces: Sequence[memoryview]) -> None:
     begin = 0
     while begin < len(waiting):
         written = os.writev(fd, waiting[begin : begin + MAX_PIECES])
-        while written and written >= waiting[begin].nbytes:
+        while begin < len(waiting) and written >= waiting[begin].nbytes:
             written -= waiting[begin].nbytes
             begin += 1
-            if begin == len(waiting):
-                break
         if written:
             waiting[begin] = waiting[begin][written:]
 

@@ -2,35 +2,54 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import signal
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from threading import Thread
 from typing import Any
 
 import numpy as np
 import pytest
 
+from dualslam.core.grey_image import GreyImage
 from dualslam.core.types import Failure, FailureReason
 from dualslam.testing.desk_work import handlers
+from dualslam.testing.point_world import PointWorld, cloud, hand_held
 from dualslam.testing.waiting import wait_until
 from dualslam.workers.desk import Lane, WorkerDesk
 from dualslam.workers.jobs import Ended, InlineDesk, JobKind
-from dualslam.workers.transport import receive, send
+from dualslam.workers.transport import Channel
 
 GRAPH, CALIBRATION, WALK = JobKind.GRAPH, JobKind.CALIBRATION, JobKind.WALK
 
 
-def test_what_goes_through_a_pipe_is_the_same_at_the_other_end_and_can_be_written_to() -> None:
+@pytest.fixture
+def ends() -> tuple[Channel, Channel]:
     ours, theirs = multiprocessing.Pipe()
+    return Channel(ours, first=0), Channel(theirs, first=1)
+
+
+def through(sender: Channel, receiver: Channel, thing: Any) -> tuple[Any, int]:
+    """What comes out at the other end, and how many bytes it took; a pipe does not hold it, so that two must work."""
+    sizes: list[int] = []
+    thread = Thread(target=lambda: sizes.append(sender.send(thing)))
+    thread.start()
+    got = receiver.receive()
+    thread.join()
+    return got, sizes[0]
+
+
+def test_what_goes_through_a_pipe_is_the_same_at_the_other_end_and_can_be_written_to(
+    ends: tuple[Channel, Channel],
+) -> None:
     large, small = np.arange(3e5).reshape(-1, 3), np.arange(5)
     thing = {"large": large, "again": large, "part": large[::2], "small": small, "empty": np.zeros((0, 7)), "word": "w"}
-    sender = Thread(target=send, args=(ours, thing))  # it is more than a pipe holds
-    sender.start()
-    got = receive(theirs)
-    sender.join()
+    got, _ = through(*ends, thing)
     assert got["word"] == "w"
     for name in ("large", "again", "part", "small", "empty"):
         np.testing.assert_array_equal(got[name], thing[name])
@@ -38,9 +57,45 @@ def test_what_goes_through_a_pipe_is_the_same_at_the_other_end_and_can_be_writte
     for name in ("large", "part", "small", "empty"):
         got[name][:] = 0
     assert large[-1, -1] == 3e5 - 1
+
+
+def test_the_other_end_that_is_closed_is_told() -> None:
+    ours, theirs = multiprocessing.Pipe()
     ours.close()
     with pytest.raises(EOFError):
-        receive(theirs)
+        Channel(theirs).receive()
+
+
+def test_what_never_changes_goes_once_and_comes_back_as_itself(ends: tuple[Channel, Channel]) -> None:
+    here, there = ends
+    world = PointWorld(cloud(), hand_held(3))
+    image = GreyImage.of(np.arange(120_000, dtype=np.uint32).astype(np.uint8).reshape(300, 400))
+    views = [replace(world.view(i), image=image) for i in range(3)]
+    first, n_first = through(here, there, views[:2])
+    second, n_second = through(here, there, views)
+    assert n_second < 0.6 * n_first  # one more view's features, and no image
+    assert first[0].features is second[0].features
+    assert first[1].image is second[2].image
+    np.testing.assert_array_equal(second[2].features.descriptors, views[2].features.descriptors)
+    np.testing.assert_array_equal(first[0].image.pixels(), image.pixels())
+    back, n_back = through(there, here, {"known": second, "new": world.features(0)})
+    assert back["known"][2].features is views[2].features
+    assert n_back < n_first
+    assert len(back["new"]) == len(views[0].features)
+
+
+def test_what_nobody_holds_any_more_is_let_go_at_the_other_end(ends: tuple[Channel, Channel]) -> None:
+    here, there = ends
+    world = PointWorld(cloud(), hand_held(3))
+    view = world.view(0)
+    got, _ = through(here, there, view)
+    held = weakref.ref(got.features)
+    del view, got
+    gc.collect()
+    assert held() is not None
+    through(here, there, "next")
+    gc.collect()
+    assert held() is None
 
 
 @contextmanager

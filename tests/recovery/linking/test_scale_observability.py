@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -123,6 +125,23 @@ def test_a_walk_that_hangs_by_few_landmarks_carries_no_link() -> None:
         refused = propagate_to_live_end(link, thinned(case.new, 18 * FRAME_STEP, n_ties), int(THERE[0]), CONFIG)
         assert isinstance(refused, Failure)
         assert refused.reason in (FailureReason.SCALE, FailureReason.SCALE_LOST)
+
+
+def test_what_more_keyframes_cannot_cure_is_said_to_be_lost() -> None:
+    """The walk's share is 1.5 times the bound: with few keyframes at the far end it may shrink, with many not."""
+    case, link = linked()
+    live_since = int(THERE[0])
+    live = np.array([k for k in case.new.keyframes if k >= live_since])
+    walk = scale_sigma_between(case.new, link.agreeing_keyframes, live, CONFIG.pixel_chi2)
+    strict = CONFIG.model_copy(update={"max_live_scale_sigma": walk / 1.5})
+    assert len(link.agreeing_keyframes) >= 4
+    reasons = []
+    for n in (4, 16):
+        keyframes = np.resize(link.agreeing_keyframes, n)
+        refused = propagate_to_live_end(replace(link, agreeing_keyframes=keyframes), case.new, live_since, strict)
+        assert isinstance(refused, Failure)
+        reasons.append(refused.reason)
+    assert reasons == [FailureReason.SCALE, FailureReason.SCALE_LOST]
 
 
 # --- maps that part
