@@ -3,6 +3,8 @@
 Two things can be behind: the tracking, when frames are looked at after their time, and the back end, when keyframes
 wait for the graph that runs beside. In either case new keyframes are what there is to save: each costs the tracking its
 insertion and the back end its solution. A keyframe that is due but not urgent is put off until both have caught up.
+While there is no map, each try to start one takes longer than a frame: none is made while frames are late, and one pair
+of frames is tried at a time.
 
 Only real time has a pace. Without it nothing here ever changes what a run does.
 """
@@ -42,18 +44,25 @@ class PaceStatistics:
 
 
 class Pace:
-    """Knows how late the frames are, and how many keyframes the graph beside does not know yet."""
+    """Knows how late the frames are, and how many keyframes the graph beside does not know yet.
+
+    Attributes
+    ----------
+    in_real_time : bool
+        Whether frames come by a clock.
+    statistics : PaceStatistics
+    """
 
     def __init__(self) -> None:
         self.statistics = PaceStatistics()
-        self._in_real_time = False
+        self.in_real_time = False
         self._late_s = 0.0
         self._lag = 0
         self._n_put_off = 0
 
     def note(self, late_s: float) -> None:
         """Note, before a frame is looked at, how late it is: real time has begun with the first."""
-        self._in_real_time = True
+        self.in_real_time = True
         self._late_s = late_s
         self.statistics.behind += self.behind
 
@@ -64,12 +73,12 @@ class Pace:
         """
         self._lag = n_keyframes
         self.statistics.max_lag_keyframes = max(self.statistics.max_lag_keyframes, n_keyframes)
-        return self._in_real_time or n_keyframes <= MAX_LAG_KEYFRAMES
+        return self.in_real_time or n_keyframes <= MAX_LAG_KEYFRAMES
 
     @property
     def behind(self) -> bool:
         """Whether tracking or back end have something to catch up on."""
-        return self._in_real_time and (self._late_s > BEHIND_S or self._lag > MAX_LAG_KEYFRAMES)
+        return self.in_real_time and (self._late_s > BEHIND_S or self._lag > MAX_LAG_KEYFRAMES)
 
     def puts_off(self, n_tracked: int, n_weak: int) -> bool:
         """Whether a keyframe that is due is put off to a later frame.

@@ -196,8 +196,11 @@ class System:
                 view = self._correct_shutter(view)
         if not may_start:
             return Failure(FailureReason.DOUBTFUL_INITIALISATION, "a fast turn before the shutter is known")
+        if self.pace.behind:  # each try takes longer than a frame
+            self._starter.collect(view)
+            return Failure(FailureReason.DOUBTFUL_INITIALISATION, "no start is tried while frames are late")
         with self.timer.measure("initialisation"):
-            start = self._starter.add(view)
+            start = self._starter.add(view, interrupted=self.pace.in_real_time)
         if isinstance(start, Failure):
             if start.reason is FailureReason.DOUBTFUL_INITIALISATION:
                 self._record.event(EventKind.INITIALISATION_REFUSED, view, None, reason=start.detail, **start.numbers)

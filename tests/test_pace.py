@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from dualslam.pace import BEHIND_S, MAX_LAG_KEYFRAMES, MAX_PUT_OFF, Pace
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
 
@@ -51,10 +49,27 @@ def test_a_system_that_is_behind_makes_fewer_keyframes_and_keeps_its_track() -> 
     world = PointWorld(cloud(), hand_held(60))
     dense = {"keyframes": {"max_parallax_deg": 1.0}, "mapping": {"redundant_ratio": 1.0}}
     systems = [system_in(world, **dense) for _ in range(2)]
-    systems[1].pace.note(1.0)
-    for system in systems:
+    for system, late_s in zip(systems, (0.0, 1.0), strict=True):
         for frame in world.frames():
-            system.step(replace(frame))
+            if frame.index == 10:  # there is a map
+                system.pace.note(late_s)
+            system.step(frame)
     counts = [len(system.atlas.submaps[0].keyframes) for system in systems]
     assert counts[1] < 0.5 * counts[0]
     assert all(len(system.poses) == len(systems[0].poses) for system in systems)
+
+
+def test_no_start_is_tried_while_frames_are_late_and_what_came_meanwhile_serves_the_next_try() -> None:
+    world = PointWorld(cloud(), hand_held(30))
+    system = system_in(world)
+    frames = world.frames()
+    system.pace.note(1.0)
+    results = [system.step(frame) for frame in frames[:10]]
+    assert not system.atlas.submaps
+    assert all(result.failure is not None and "late" in result.failure.detail for result in results)
+    system.pace.note(0.0)
+    for frame in frames[10:]:
+        system.step(frame)
+    (submap,) = system.atlas.submaps.values()
+    assert min(submap.keyframes) < 10
+    assert len(system.poses) == 30  # those before the start by a walk back

@@ -307,8 +307,8 @@ class MapStarter(Protocol):
         """Keep a view as a possible first view, without trying to start from it."""
         ...
 
-    def add(self, view: View) -> Start | Failure:
-        """Take a view in and try to start a map that ends with it."""
+    def add(self, view: View, interrupted: bool = False) -> Start | Failure:
+        """Take a view in and try to start a map that ends with it; in a `interrupted` with a part of what could be tried."""
         ...
 
 

@@ -84,26 +84,33 @@ class Initialiser:
         self._size_px = size_px
         self._seed = seed
         self._views: list[View] = []
+        self._turn = 0  # of `LAGS`, in a hurry
 
     def collect(self, view: View) -> None:
         """Keep a view as a possible first view, without trying to start from it."""
         self._views = [*self._views[-self._config.max_views :], view]
 
-    def add(self, view: View) -> Start | Failure:
-        """Take a view in and try to start from it and an earlier one, the nearest first."""
+    def add(self, view: View, interrupted: bool = False) -> Start | Failure:
+        """Take a view in and try to start from it and an earlier one, the nearest first.
+
+        `interrupted`: with one earlier view only, the next in turn with the next view.
+        """
         self.collect(view)
         best = Failure(FailureReason.TOO_FEW_MATCHES, "one view")
         if len(view.features) < self._config.min_matches:
             return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image")
-        for lag in LAGS:
-            if lag >= len(self._views):
-                break
+        lags = [lag for lag in LAGS if lag < len(self._views)]
+        if interrupted and lags:
+            self._turn %= len(lags)
+            lags, self._turn = lags[self._turn : self._turn + 1], self._turn + 1
+        for lag in lags:
             start = self.try_pair(len(self._views) - 1 - lag, len(self._views) - 1)
             if start:
                 return start
             assert isinstance(start, Failure)
             best = start
             if start.reason in (FailureReason.TOO_FEW_MATCHES, FailureReason.NO_TEXTURE):
+                self._turn = 0  # those farther back have less in common with it
                 break
         return best
 

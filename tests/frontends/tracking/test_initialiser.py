@@ -168,3 +168,29 @@ def test_the_same_views_give_the_same_start() -> None:
     assert b is not None
     assert np.array_equal(a.T_first_cam, b.T_first_cam)
     assert np.array_equal(a.xyz, b.xyz)
+
+
+def test_in_a_hurry_one_pair_is_tried_at_a_time_and_the_map_that_starts_is_right() -> None:
+    world = PointWorld(cloud(), path(30, np.array([0.02, 0, 0]), np.array([0, 0.001, 0])))
+    starter, lags = initialiser(), []
+    try_pair = starter.try_pair
+
+    def noted(first: int, last: int) -> Start | Failure:
+        lags.append(last - first)
+        return try_pair(first, last)
+
+    starter.try_pair = noted  # type: ignore[method-assign]
+    starts = []
+    for view in world.views():
+        n_tried = len(lags)
+        start = starter.add(view, interrupted=True)
+        assert len(lags) <= n_tried + 1
+        if start:
+            starts.append(start)
+            break
+    (start,) = starts
+    assert max(lags) >= 4  # not the nearest alone
+    T_true = world.T_world_cam[[view.index for view in start.views]]
+    translation, rotation = pose_errors(start.T_first_cam, T_true)
+    assert rotation.max() < ROTATION_RAD
+    assert translation.max() < TRANSLATION * np.linalg.norm(T_true[-1, :3, 3] - T_true[0, :3, 3])
