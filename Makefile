@@ -1,4 +1,4 @@
-# make setup | demo | test | check | docs | bench | lock | clean
+# make setup | demo | test | check | docs | bench | accuracy | lock | clean
 # A fresh clone needs python3 (3.11 to 3.13, choose with PYTHON=python3.12), its venv and pip modules, and make.
 
 PYTHON ?= python3
@@ -13,7 +13,7 @@ export OPENBLAS_NUM_THREADS = 1
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 unexport PYTHONPATH
 
-.PHONY: setup demo test check docs format bench lock clean
+.PHONY: setup demo test check docs format bench accuracy lock clean
 .DEFAULT_GOAL := setup
 
 setup: $(STAMP)
@@ -50,6 +50,9 @@ format: setup
 	$(BIN)/ruff format .
 
 bench: setup
+	$(BIN)/python benchmarks/cost.py $(ARGS)
+
+accuracy: setup
 	$(BIN)/python benchmarks/sequences.py $(ARGS)
 
 lock: setup

@@ -134,6 +134,7 @@ def summarise(
         "peak_rss_mb": report.peak_rss_mb,
         "peak_buffer_mb": system.buffer.peak_bytes / MB,
         "stages_cpu_s": {name: stage.seconds for name, stage in system.timer.stages.items()},
+        "stages_calls": {name: stage.calls for name, stage in system.timer.stages.items()},
         "stages_wall_s": {name: stage.wall_s for name, stage in system.timer.stages.items() if stage.wall_s},
         "stages_longest_ms": {name: 1e3 * s.longest_s for name, s in system.timer.stages.items() if s.wall_s},
         "versions": versions(),

@@ -26,6 +26,7 @@ from dualslam.report import SampleKeeper, read_run, report_page
 from dualslam.run.results import frame_rows, summarise, trajectories_of, truth_of_frames
 from dualslam.run.runner import RunReport, run_sequence
 from dualslam.system import System
+from dualslam.workers.desk import WorkerDesk
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +98,8 @@ def run_to_folder(
             if on_frame is not None:
                 on_frame(result)
 
+        if realtime and isinstance(system.desk, WorkerDesk):
+            system.desk.wait_until_ready()
         watched = _Watched(system, SampleKeeper(folder.write_sample))
         report = run_sequence(watched, sequence, realtime=realtime, pace=system.pace, on_frame=after_frame)
         if report.interrupted and system.rows:

@@ -24,7 +24,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from queue import Empty, SimpleQueue
-from threading import Thread
+from threading import Event, Thread
 from typing import Any
 
 from dualslam.core.memory import keep_freed_memory
@@ -39,6 +39,8 @@ MakeHandlers = Callable[[], Handlers]
 
 STOP_S = 2.0
 """How long a worker that is idle may take to end by itself; its exit takes tens of milliseconds."""
+START_S = 60.0
+"""How long a run in real time waits for its workers at most: seconds on a free machine."""
 PAUSE_S = 0.01
 """Between two looks at whether the last jobs have ended, when nothing else is left to do."""
 MAX_WAITING = 8
@@ -73,6 +75,7 @@ class Worker:
         theirs.close()
         self._jobs: SimpleQueue[tuple[JobKind, Any] | None] = SimpleQueue()
         self._results: SimpleQueue[_Answer] = SimpleQueue()
+        self._ready = Event()
         # Pipes block, and a job is tens of megabytes: a thread of its own waits for them.
         self._carrier = Thread(target=self._carry, name=name, daemon=True)
         self._carrier.start()
@@ -98,6 +101,10 @@ class Worker:
         """Whether the process is there to take a job."""
         return self._process.is_alive()
 
+    def wait_until_ready(self, limit_s: float) -> bool:
+        """Wait until the process has imported what it needs; return whether it has."""
+        return self._ready.wait(limit_s)
+
     def stop(self, patience_s: float = 0.0) -> None:
         """End the process: by itself if it is idle and takes no longer than `patience_s`, else by force."""
         self._jobs.put(None)
@@ -112,6 +119,8 @@ class Worker:
         with self._connection:
             channel = Channel(self._connection, first=0)
             try:
+                channel.receive()  # that it is ready
+                self._ready.set()
                 while (job := self._jobs.get()) is not None:
                     channel.send(job)
                     self._results.put(channel.receive())
@@ -129,6 +138,10 @@ def serve(connection: Connection, make_handlers: MakeHandlers, niceness: int = 0
         os.nice(niceness)
     keep_freed_memory()
     handlers, channel = make_handlers(), Channel(connection, first=1)
+    try:
+        channel.send(None)
+    except BrokenPipeError:
+        return
     while True:
         try:
             kind, work = channel.receive()
@@ -253,6 +266,10 @@ class WorkerDesk:
     def pids(self) -> list[int | None]:
         """Process ids of the workers, lane by lane, the busy ones first."""
         return [w.pid for queue in self._queues for w in [*(task.worker for task in queue.busy), *queue.idle]]
+
+    def wait_until_ready(self) -> bool:
+        """Wait, so long and no longer, until all workers are warm: a clock that has begun does not wait for imports."""
+        return all(worker.wait_until_ready(START_S) for queue in self._queues for worker in queue.idle)
 
     def submit(self, kind: JobKind, work: Any) -> None:
         """Give the job to an idle worker, or let it wait for one."""

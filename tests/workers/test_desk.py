@@ -201,6 +201,13 @@ def test_a_worker_that_dies_or_hangs_costs_its_job(harm: Callable[[WorkerDesk], 
     assert desk.statistics[GRAPH].n_failed == 1
 
 
+def test_a_desk_says_when_its_workers_are_warm() -> None:
+    with working(lane(GRAPH), lane(WALK)) as desk:
+        assert desk.wait_until_ready()
+        desk.submit(GRAPH, 1.0)
+        assert collect(desk, GRAPH)[0].result == 1.0
+
+
 def test_one_that_exits_by_itself_says_how() -> None:
     with working(lane(WALK)) as desk:
         desk.submit(WALK, ("die", 0.0))
