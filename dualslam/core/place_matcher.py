@@ -1,0 +1,57 @@
+"""What the verification of places needs of a front end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.types import Features, FloatArray, IntArray, Matches
+from dualslam.map.submap import Submap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """Which landmarks a camera should see, and where they are found.
+
+    Attributes
+    ----------
+    landmark_ids : (V,) int64
+        In the image, in front of the camera, and from a like side and distance as they were seen from.
+    feature : (V,) int64
+        The feature that each is found at, or -1.
+    """
+
+    landmark_ids: IntArray
+    feature: IntArray
+
+    @property
+    def share(self) -> float:
+        """Share of what should be seen that is found; 0 where nothing should."""
+        return float((self.feature >= 0).mean()) if len(self.feature) else 0.0
+
+
+class PlaceMatcher(Protocol):
+    """Compares places; made of a front end by `dualslam.build`."""
+
+    max_distance: float
+    max_distance_strict: float
+
+    def distance(self, a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
+        """Distance of paired descriptors."""
+        ...
+
+    def match_wide(self, a: Features, b: Features) -> Matches:
+        """Match without a geometric guide, one to one."""
+        ...
+
+    def look(
+        self, submap: Submap, landmark_ids: IntArray, T_cam_submap: FloatArray, features: Features, radius_px: float
+    ) -> Sighting:
+        """Look for landmarks of a submap in an image, about where they should be under a pose.
+
+        `radius_px`: at the finest octave.
+        """
+        ...

@@ -1,0 +1,176 @@
+"""Places by direct voting: each feature of an image asks for the nearest landmarks, which vote for their keyframes.
+
+No bag of words: with its 4,096 words the recall at full precision was 0.21 to 0.44 where this has 0.91 to 0.97. An
+inverted file over fixed cells makes the search as quick (5 to 12 ms among 60,000 landmarks).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import faiss
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.types import Features, IntArray
+from dualslam.map.submap import Submap
+from dualslam.places.cells import shipped_cells
+from dualslam.places.recogniser import PlaceCandidate
+
+N_PROBED = 8
+"""Cells that are searched for a descriptor: between the 4 and 16 that were measured (recall 0.91 and 0.97)."""
+N_NEAREST = 3
+"""Landmarks that one feature may vote for: a point is often in the map more than once (lost and found again)."""
+MIN_VOTES = 15
+"""Below it a keyframe is not worth the verification, which wants 20 landmarks on a pose: matching around the
+keyframe finds about as many again as vote for it."""
+SAME_PLACE = 0.3
+"""Share of landmarks in common from which two keyframes show one place: the worse of them is no other candidate."""
+
+
+class FaissRecogniser:
+    """An index over the landmarks of all submaps.
+
+    Binary descriptors of 32 bytes go into the cells that are shipped; others, and floats, are searched exhaustively.
+
+    Parameters
+    ----------
+    max_distance : float
+        Between the descriptors of two views of one point, as the front end measures it: bits, or the norm of the
+        difference (`Frontend.max_distance_strict`).
+    """
+
+    def __init__(self, max_distance: float) -> None:
+        self._max_distance = max_distance
+        self._index: Any = None
+        self._quantizer: Any = None  # FAISS holds no reference to it
+        self._submap_of: list[NDArray[np.int64]] = []
+        self._landmark_of: list[NDArray[np.int64]] = []
+        self._n_taken: dict[int, int] = {}
+        self._table: tuple[IntArray, IntArray] | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the index: codes, their numbers in the lists, and what they stand for."""
+        if self._index is None:
+            return 0
+        code = int(self._index.d) // 8 if isinstance(self._index, faiss.IndexBinary) else 4 * int(self._index.d)
+        return int(self._index.ntotal) * (code + 8 + 16)
+
+    def __len__(self) -> int:
+        return 0 if self._index is None else int(self._index.ntotal)
+
+    def take_in(self, submap: Submap, n_newest_left_out: int = 0) -> int:
+        """Add the landmarks that a submap has gained since the last call."""
+        start, stop = self._n_taken.get(submap.id, 0), len(submap.landmarks)
+        if n_newest_left_out:
+            young = np.isin(submap.landmarks["first_kf"][start:], list(submap.keyframes)[-n_newest_left_out:])
+            stop = start + int(young.argmax()) if young.any() else stop
+        if stop <= start:
+            return 0
+        self._n_taken[submap.id] = stop
+        lm = submap.landmarks
+        ids = start + np.flatnonzero(lm["alive"][start:stop] & ~lm["condemned"][start:stop])
+        if len(ids):
+            self._add(np.ascontiguousarray(lm["descriptor"][ids]))
+            self._submap_of.append(np.full(len(ids), submap.id))
+            self._landmark_of.append(ids)
+            self._table = None
+        return len(ids)
+
+    def query(
+        self,
+        features: Features,
+        submaps: Mapping[int, Submap],
+        may_be: Callable[[int, int], bool] = lambda submap_id, keyframe_id: True,
+        at_most: int = 3,
+    ) -> list[PlaceCandidate]:
+        """Return the keyframes that an image resembles most, best first, each of another place."""
+        if not len(self) or not len(features):
+            return []
+        feature, row = self._nearest(np.ascontiguousarray(features.descriptors))
+        submap_of, landmark_of = self._rows()
+        voted: list[PlaceCandidate] = []
+        for m in np.unique(submap_of[row]).tolist():
+            if m not in submaps:
+                continue
+            own = submap_of[row] == m
+            keyframes, votes = _votes(submaps[m], feature[own], landmark_of[row[own]])
+            strong = votes >= MIN_VOTES
+            pairs = zip(keyframes[strong].tolist(), votes[strong].tolist(), strict=True)
+            voted += [PlaceCandidate(m, k, n) for k, n in pairs]
+        voted.sort(key=lambda c: (-c.n_votes, c.submap_id, c.keyframe_id))
+        chosen: list[PlaceCandidate] = []
+        for candidate in voted:
+            if len(chosen) == at_most:
+                break
+            m, k = candidate.submap_id, candidate.keyframe_id
+            if k in submaps[m].condemned or not may_be(m, k):
+                continue
+            if not any(_same_place(submaps, candidate, better) for better in chosen):
+                chosen.append(candidate)
+        return chosen
+
+    # --- the index
+
+    def _add(self, descriptors: NDArray[Any]) -> None:
+        if self._index is None:
+            self._index = self._make(descriptors)
+        self._index.add(descriptors if descriptors.dtype == np.uint8 else descriptors.astype(np.float32))
+
+    def _make(self, descriptors: NDArray[Any]) -> Any:
+        n = descriptors.shape[1]
+        if descriptors.dtype != np.uint8:
+            return faiss.IndexFlatL2(n)
+        cells = shipped_cells()
+        if n != cells.shape[1]:
+            return faiss.IndexBinaryFlat(8 * n)
+        self._quantizer = faiss.IndexBinaryFlat(8 * n)
+        self._quantizer.add(cells)
+        index = faiss.IndexBinaryIVF(self._quantizer, 8 * n, len(cells))
+        index.nprobe = N_PROBED
+        return index
+
+    def _nearest(self, descriptors: NDArray[Any]) -> tuple[IntArray, IntArray]:
+        """Return pairs (feature, row of the index) of descriptors that are near enough."""
+        binary = descriptors.dtype == np.uint8
+        asked = descriptors if binary else descriptors.astype(np.float32)
+        distance, row = self._index.search(asked, min(N_NEAREST, len(self)))
+        limit = self._max_distance if binary else self._max_distance**2
+        feature, column = np.nonzero((row >= 0) & (distance <= limit))
+        return feature, row[feature, column]
+
+    def _rows(self) -> tuple[IntArray, IntArray]:
+        if self._table is None:
+            self._submap_of, self._landmark_of = (
+                [np.concatenate(parts)] for parts in (self._submap_of, self._landmark_of)
+            )
+            self._table = self._submap_of[0], self._landmark_of[0]
+        return self._table
+
+
+def _votes(submap: Submap, feature: IntArray, landmark: IntArray) -> tuple[IntArray, IntArray]:
+    """Return keyframes, ascending, and how many features vote for each: one has one vote for a keyframe at most."""
+    current = submap.current_ids(landmark)
+    there = current >= 0
+    feature, current = feature[there], current[there]
+    rows = submap.rows_of_landmarks(current)
+    if not len(rows):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    seen, kf = submap.observations["landmark"][rows], submap.observations["kf"][rows]
+    order = np.argsort(seen, kind="stable")
+    first, last = (np.searchsorted(seen[order], current, side=side) for side in ("left", "right"))
+    n = last - first
+    place = np.repeat(first - np.cumsum(n) + n, n) + np.arange(int(n.sum()))
+    votes = np.unique(np.stack([kf[order][place], np.repeat(feature, n)], 1), axis=0)
+    keyframes, counts = np.unique(votes[:, 0], return_counts=True)
+    return keyframes, counts
+
+
+def _same_place(submaps: Mapping[int, Submap], a: PlaceCandidate, b: PlaceCandidate) -> bool:
+    if a.submap_id != b.submap_id:
+        return a.keyframe_id == b.keyframe_id  # one frame that two submaps hold
+    own, other = (submaps[a.submap_id].landmark_of[c.keyframe_id] for c in (a, b))
+    own, other = own[own >= 0], other[other >= 0]
+    return np.isin(own, other).sum() >= SAME_PLACE * min(len(own), len(other))

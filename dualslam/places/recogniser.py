@@ -1,0 +1,67 @@
+"""What recognises places, as the rest of the system sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from dualslam.core.types import Features
+from dualslam.map.submap import Submap
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceCandidate:
+    """A keyframe that may show what an image shows, by descriptors alone.
+
+    Attributes
+    ----------
+    submap_id, keyframe_id : int
+    n_votes : int
+        Features of the image of which a landmark that the keyframe sees is among the nearest.
+    """
+
+    submap_id: int
+    keyframe_id: int
+    n_votes: int
+
+
+class PlaceRecogniser(Protocol):
+    """Remembers landmarks by their descriptors, and says which keyframes an image resembles.
+
+    It proposes and proves nothing: what it finds goes through `dualslam.places.verification`. The same calls in the
+    same order give the same candidates.
+    """
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the index, about."""
+        ...
+
+    def take_in(self, submap: Submap, n_newest_left_out: int = 0) -> int:
+        """Add the landmarks that a submap has gained since the last call; return how many.
+
+        `n_newest_left_out`: keyframes, by insertion, whose own new landmarks have yet to prove themselves.
+        """
+        ...
+
+    def query(
+        self,
+        features: Features,
+        submaps: Mapping[int, Submap],
+        may_be: Callable[[int, int], bool] = lambda submap_id, keyframe_id: True,
+        at_most: int = 3,
+    ) -> list[PlaceCandidate]:
+        """Return the keyframes that an image resembles most, best first, each of another place.
+
+        Parameters
+        ----------
+        features : Features
+            Of the image.
+        submaps : mapping of int to Submap
+            Those that were taken in, as they are now: culled and merged landmarks are followed there.
+        may_be : callable
+            Whether a keyframe (submap id, keyframe id) is asked for; it is asked about those with votes only.
+        at_most : int
+        """
+        ...

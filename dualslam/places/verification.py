@@ -1,0 +1,422 @@
+"""Is this the same place? Pixels decide: what both sides matched, what should be seen and is not, what else would fit.
+
+A candidate of the recogniser and the keyframe that asks each bring the keyframes that see the same landmarks. (1) Wide
+matching between the two groups pairs landmarks; (2) a similarity of these 3D-3D pairs by RANSAC and refinement;
+(3) a search, guided by it, for everything that either side should show in the other's images, which scores the
+similarity by what is *not* found as well; (4) the similarity again, of all pairs, with its covariance, and the gates:
+keyframes on either side, spread over the image, sigmas; (5) the test whether a second similarity fits as well.
+How the maps have drifted has no say: it cannot refute what the pixels prove, nor prove what they do not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.random import Generator
+
+from dualslam.config.settings import LinkingConfig
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
+from dualslam.core.place_matcher import PlaceMatcher, Sighting
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
+from dualslam.map.landmark_views import landmark_covariances
+from dualslam.map.submap import Submap
+from dualslam.places.second_pose import SecondPose, alike, find_second_pose
+
+GROUP = 5
+"""Keyframes on a side: the one that is asked about and the four that see most of the same landmarks."""
+N_MATCHED = 3
+"""Of a side's keyframes, how many are matched with all of the other side's: matching is quadratic."""
+MIN_FIRST_MATCHES = 12
+"""Matches between the two keyframes themselves, the best of the candidate's group: fewer, and no more is tried."""
+MIN_KEYFRAMES = 3
+"""Keyframes on either side that must see the agreeing landmarks: two fix a shape of their own, evidence starts with
+the third."""
+SEARCH_RADIUS_PX = 8.0
+"""About where a landmark should be under a similarity of some tens of pairs: its error, and the maps' own drift."""
+NEAR_FIRST = 4.0
+"""Pairs within twice the gate's distance of the first similarity are its own, not evidence of another: a thing that was
+mapped twice lies a little beside itself."""
+MIN_FOUND = 0.5
+"""Share of what should be seen that must be found, relative to the share that the place's own keyframes show of it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceMatch:
+    """Two places that are one, as the pixels say.
+
+    Attributes
+    ----------
+    place, query : (int, int)
+        Submap and keyframe on either side.
+    S_place_query : (4, 4)
+        ``p_place = S_place_query @ p_query``, in the submaps' frames.
+    covariance : (7, 7)
+        Of ``S_place_query @ exp(xi)``, in the query's frame and unit.
+    landmark_pairs : (I, 2) int64
+        Landmarks of the place and of the query that are one.
+    keyframes_place, keyframes_query : tuple of int
+        Those that see the agreeing landmarks.
+    n_matches, n_inliers : int
+    numbers : dict
+    """
+
+    place: tuple[int, int]
+    query: tuple[int, int]
+    S_place_query: FloatArray
+    covariance: FloatArray
+    landmark_pairs: IntArray
+    keyframes_place: tuple[int, ...]
+    keyframes_query: tuple[int, ...]
+    n_matches: int
+    n_inliers: int
+    numbers: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Side:
+    """One side: a submap, the keyframes about the one that is asked about, and all that these see."""
+
+    submap: Submap
+    keyframes: list[int]
+    landmarks: IntArray
+
+    @property
+    def id(self) -> tuple[int, int]:
+        return self.submap.id, self.keyframes[0]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pairs:
+    """Landmarks of the place and of the query, one to one, with their noise."""
+
+    place: IntArray
+    query: IntArray
+    xyz_place: FloatArray
+    xyz_query: FloatArray
+    cov_place: FloatArray
+    cov_query: FloatArray
+
+    def mahalanobis2(self, S: FloatArray) -> FloatArray:
+        A = S[:3, :3]
+        residual = self.xyz_place - sim3.act(S, self.xyz_query)
+        covariance = self.cov_place + A @ self.cov_query @ A.T
+        return np.asarray((residual * np.linalg.solve(covariance, residual[..., None])[..., 0]).sum(1))
+
+
+class PlaceVerifier:
+    """Verifies candidates.
+
+    Parameters
+    ----------
+    matcher : PlaceMatcher
+    config : LinkingConfig
+        The gates of links: those of places are the same.
+    seed : int
+        The random choices depend on it and on the two keyframes alone, not on what was asked before.
+    """
+
+    def __init__(self, matcher: PlaceMatcher, config: LinkingConfig, seed: int) -> None:
+        self._matcher = matcher
+        self._config = config
+        self._seed = seed
+
+    def verify(self, query: tuple[Submap, int], place: tuple[Submap, int]) -> PlaceMatch | Failure:
+        """Ask whether two keyframes, each with its submap, show one place.
+
+        Parameters
+        ----------
+        query, place : (Submap, int)
+            The submaps may be one.
+        """
+        rng = np.random.default_rng([self._seed, query[1], place[0].id, place[1]])
+        sides = self._sides(query, place)
+        if isinstance(sides, Failure):
+            return sides
+        place_side, query_side = sides
+        proposed = self._match(place_side, query_side)
+        if isinstance(proposed, Failure):
+            return proposed
+        first = self._estimate(proposed, rng)
+        if isinstance(first, Failure):
+            return first
+        searched = self._search(place_side, query_side, first.S_dst_src)
+        pairs = self._place_pairs(
+            place_side.submap, query_side.submap, *_one_to_one([*searched.pairs, *_as_votes(proposed)])
+        )
+        estimate = self._estimate(pairs, rng)
+        if isinstance(estimate, Failure):
+            return estimate
+        looks = self._search(place_side, query_side, estimate.S_dst_src)
+        return self._judge(place_side, query_side, pairs, estimate, looks, rng)
+
+    # --- steps
+
+    def _sides(self, query: tuple[Submap, int], place: tuple[Submap, int]) -> tuple[_Side, _Side] | Failure:
+        query_side, place_side = _side(*query), _side(*place)
+        if query[0] is place[0] and set(query_side.keyframes) & set(place_side.keyframes):
+            return Failure(FailureReason.DEGENERATE, "the two places see the same landmarks already")
+        n = min(len(query_side.keyframes), len(place_side.keyframes))
+        if n < MIN_KEYFRAMES:
+            detail = f"{n} keyframes about a place, {MIN_KEYFRAMES} needed on either side"
+            return Failure(FailureReason.AGREEMENT, detail, {"n_keyframes": float(n)})
+        return place_side, query_side
+
+    def _match(self, place: _Side, query: _Side) -> _Pairs | Failure:
+        """Match keyframes of the one side with those of the other, without a guide."""
+        votes: list[tuple[IntArray, IntArray]] = []
+        most = 0
+        for n, q in enumerate(query.keyframes[:N_MATCHED]):
+            for k in place.keyframes:
+                votes.append(self._match_keyframes(place.submap, k, query.submap, q))
+                most = max(most, len(votes[-1][0]))
+            if n == 0 and most < MIN_FIRST_MATCHES:
+                detail = f"{most} matches with the place, {MIN_FIRST_MATCHES} needed"
+                return Failure(FailureReason.TOO_FEW_MATCHES, detail, {"n_matches": float(most)})
+        return self._place_pairs(place.submap, query.submap, *_one_to_one(votes))
+
+    def _match_keyframes(self, place: Submap, k: int, query: Submap, q: int) -> tuple[IntArray, IntArray]:
+        a, b = np.flatnonzero(place.landmark_of[k] >= 0), np.flatnonzero(query.landmark_of[q] >= 0)
+        if not len(a) or not len(b):
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        found = self._matcher.match_wide(place.keyframes[k].features.take(a), query.keyframes[q].features.take(b))
+        return place.landmark_of[k][a[found.index[:, 0]]], query.landmark_of[q][b[found.index[:, 1]]]
+
+    def _place_pairs(self, place: Submap, query: Submap, in_place: IntArray, in_query: IntArray) -> _Pairs:
+        """Look up where the landmarks of pairs are; those that their views do not fix are left out."""
+        half = 0.5 * self._config.deformation_sigma**2
+        xyz, cov = [], []
+        for submap, ids in ((place, in_place), (query, in_query)):
+            points = submap.landmarks["xyz_mu"][ids]
+            spread2 = ((points - np.median(points, axis=0)) ** 2).sum(1) if len(ids) else np.zeros(0)
+            xyz.append(points)
+            cov.append(landmark_covariances(submap, ids) + half * spread2[:, None, None] * np.eye(3))
+        fixed = np.isfinite(np.stack(cov)).all((0, 2, 3))
+        return _Pairs(in_place[fixed], in_query[fixed], *(part[fixed] for part in (*xyz, *cov)))
+
+    def _estimate(self, pairs: _Pairs, rng: Generator) -> Sim3Estimate | Failure:
+        config = self._config
+        return estimate_sim3_robust(
+            pairs.xyz_query,
+            pairs.xyz_place,
+            pairs.cov_query,
+            pairs.cov_place,
+            rng,
+            min_inliers=config.min_inliers,
+            max_hypotheses=config.max_hypotheses,
+            chi2_gate=config.pair_chi2,
+            scale_bounds=(1.0 / config.max_scale, config.max_scale),
+        )
+
+    def _search(self, place: _Side, query: _Side, S_place_query: FloatArray) -> _Looks:
+        """Look for what each side should show in the images of the other."""
+        S_query_place = sim3.inverse(S_place_query)
+        in_query = [self._look(place, query.submap, q, S_place_query) for q in query.keyframes]
+        in_place = [self._look(query, place.submap, k, S_query_place) for k in place.keyframes]
+        own = [self._look(place, place.submap, k, np.eye(4)) for k in place.keyframes]
+        pairs = [_seen_as(look, query.submap.landmark_of[q]) for look, q in zip(in_query, query.keyframes, strict=True)]
+        for look, k in zip(in_place, place.keyframes, strict=True):
+            theirs, ours = _seen_as(look, place.submap.landmark_of[k])
+            pairs.append((ours, theirs))
+        return _Looks(in_query, own, pairs)
+
+    def _look(self, seen: _Side, looking: Submap, keyframe_id: int, S_seen_looking: FloatArray) -> Sighting:
+        T_seen_cam = sim3.act_on_pose(S_seen_looking, looking.T_submap_kf[keyframe_id])
+        features = looking.keyframes[keyframe_id].features
+        return self._matcher.look(seen.submap, seen.landmarks, se3.inverse(T_seen_cam), features, SEARCH_RADIUS_PX)
+
+    def _judge(
+        self, place: _Side, query: _Side, pairs: _Pairs, estimate: Sim3Estimate, looks: _Looks, rng: Generator
+    ) -> PlaceMatch | Failure:
+        config, S = self._config, estimate.S_dst_src
+        inliers = estimate.inliers
+        n = int(inliers.sum())
+        found, own = looks.found, looks.own_found
+        sigmas = _sigmas(pairs.xyz_query[inliers], S, estimate.covariance, place)
+        keyframes_place = _seeing(place, pairs.place[inliers], config.min_pairs_per_keyframe)
+        keyframes_query = _seeing(query, pairs.query[inliers], config.min_pairs_per_keyframe)
+        spread = min(
+            _spread(place.submap, keyframes_place, pairs.place[inliers]),
+            _spread(query.submap, keyframes_query, pairs.query[inliers]),
+        )
+        numbers = {
+            "n_matches": float(len(pairs.place)),
+            "n_inliers": float(n),
+            "inlier_ratio": n / len(inliers),
+            "found": found,
+            "own_found": own,
+            "n_keyframes_place": float(len(keyframes_place)),
+            "n_keyframes_query": float(len(keyframes_query)),
+            "spread": spread,
+            "scale": float(sim3.scale(S)),
+            **sigmas,
+        }
+        if n <= config.min_majority * len(inliers):
+            return Failure(FailureReason.LOW_INLIER_RATIO, f"{n} of {len(inliers)} pairs agree", numbers)
+        if min(len(keyframes_place), len(keyframes_query)) < MIN_KEYFRAMES:
+            detail = f"{len(keyframes_place)} and {len(keyframes_query)} keyframes agree, {MIN_KEYFRAMES} needed"
+            return Failure(FailureReason.AGREEMENT, detail, numbers)
+        if found < MIN_FOUND * own:
+            detail = f"{found:.0%} of what the place should show is there, {own:.0%} in its own keyframes"
+            return Failure(FailureReason.REPROJECTION, detail, numbers)
+        if spread < config.min_image_spread:
+            return Failure(FailureReason.SPREAD, f"{spread:.0%} of the image is covered", numbers)
+        if sigmas["sigma_scale"] > config.max_scale_sigma:
+            return Failure(FailureReason.SCALE, f"scale known to {sigmas['sigma_scale']:.1%}", numbers)
+        if sigmas["sigma_rot_deg"] > config.max_rotation_sigma_deg:
+            return Failure(FailureReason.DEGENERATE, f"rotation known to {sigmas['sigma_rot_deg']:.2f} deg", numbers)
+        if sigmas["sigma_trans_rel"] > config.max_position_sigma:
+            return Failure(FailureReason.DEGENERATE, f"position known to {sigmas['sigma_trans_rel']:.1%}", numbers)
+        second = self._second_pose(place, query, S, rng)
+        if second is not None:
+            numbers |= {"second_support": float(second.support), "first_support": float(second.first_support)}
+            if second.makes_doubtful:
+                detail = f"a second pose explains {second.support} landmarks, the first {second.first_support}"
+                return Failure(FailureReason.AMBIGUOUS_MODEL, detail, numbers)
+        landmark_pairs = np.stack([pairs.place[inliers], pairs.query[inliers]], 1)
+        return PlaceMatch(
+            place.id,
+            query.id,
+            S,
+            estimate.covariance,
+            landmark_pairs,
+            keyframes_place,
+            keyframes_query,
+            len(inliers),
+            n,
+            numbers,
+        )
+
+    def _second_pose(self, place: _Side, query: _Side, S: FloatArray, rng: Generator) -> SecondPose | None:
+        """Look for another similarity among all that looks alike, in the place and in the keyframe that asks."""
+        ids = query.submap.landmark_of[query.keyframes[0]]
+        asked = np.unique(ids[ids >= 0])
+        descriptors = (
+            s.landmarks["descriptor"][i] for s, i in ((query.submap, asked), (place.submap, place.landmarks))
+        )
+        i, j = alike(*descriptors, self._matcher)
+        cov_query = landmark_covariances(query.submap, asked)
+        cov_place = landmark_covariances(place.submap, place.landmarks)
+        xyz_query = query.submap.landmarks["xyz_mu"][asked]
+        xyz_place = place.submap.landmarks["xyz_mu"][place.landmarks]
+        fixed = np.isfinite(cov_query[i]).all((1, 2)) & np.isfinite(cov_place[j]).all((1, 2))
+        i, j = i[fixed], j[fixed]
+        half = 0.5 * self._config.deformation_sigma**2 * np.eye(3)
+        spread_query = ((xyz_query - np.median(xyz_query, axis=0)) ** 2).sum(1)
+        spread_place = ((xyz_place - np.median(xyz_place, axis=0)) ** 2).sum(1)
+        all_pairs = _Pairs(
+            place.landmarks[j],
+            asked[i],
+            xyz_place[j],
+            xyz_query[i],
+            cov_place[j] + half * spread_place[j, None, None],
+            cov_query[i] + half * spread_query[i, None, None],
+        )
+        return find_second_pose(
+            all_pairs.xyz_query,
+            all_pairs.xyz_place,
+            all_pairs.cov_query,
+            all_pairs.cov_place,
+            i,
+            S,
+            all_pairs.mahalanobis2(S) < NEAR_FIRST * self._config.pair_chi2,
+            rng,
+            min_support=self._config.min_inliers,
+            chi2_gate=self._config.pair_chi2,
+            max_hypotheses=self._config.max_hypotheses,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Looks:
+    """What was looked for: the place's landmarks in the query's images and in its own, and the pairs that came of it."""
+
+    in_query: list[Sighting]
+    in_place: list[Sighting]
+    pairs: list[tuple[IntArray, IntArray]]
+
+    @property
+    def found(self) -> float:
+        """Share of what the place should show that the query's images show: of the middle one of them."""
+        return float(np.median([look.share for look in self.in_query]))
+
+    @property
+    def own_found(self) -> float:
+        """The same in the place's own images, where it is as much as can be had."""
+        return float(np.median([look.share for look in self.in_place]))
+
+
+def _side(submap: Submap, keyframe_id: int) -> _Side:
+    """Return a keyframe with those that see most of its landmarks."""
+    ids = submap.landmark_of[keyframe_id]
+    covisible, shared = submap.covisible(ids[ids >= 0])
+    others = [
+        k
+        for k, n in zip(covisible.tolist(), shared.tolist(), strict=True)
+        if k != keyframe_id and k not in submap.condemned and n >= MIN_FIRST_MATCHES
+    ]
+    keyframes = [keyframe_id, *others[: GROUP - 1]]
+    return _Side(submap, keyframes, submap.landmarks_of_keyframes(keyframes))
+
+
+def _seen_as(look: Sighting, landmark_of: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the landmarks that were looked for and found, and the landmarks that the image's own map has there."""
+    found = look.feature >= 0
+    own = landmark_of[look.feature[found]]
+    return look.landmark_ids[found][own >= 0], own[own >= 0]
+
+
+def _as_votes(pairs: _Pairs) -> list[tuple[IntArray, IntArray]]:
+    return [(pairs.place, pairs.query)]
+
+
+def _one_to_one(votes: list[tuple[IntArray, IntArray]]) -> tuple[IntArray, IntArray]:
+    """Return pairs of landmarks of which either is the other's most frequent partner, ascending."""
+    a, b = (np.concatenate([np.zeros(0, np.int64), *column]) for column in zip(*votes, strict=True))
+    pairs, n = np.unique(np.stack([a, b], 1), axis=0, return_counts=True)
+    order = np.lexsort((pairs[:, 1], pairs[:, 0], -n))
+    taken_a: set[int] = set()
+    taken_b: set[int] = set()
+    kept = []
+    for row in order.tolist():
+        i, j = pairs[row].tolist()
+        if i not in taken_a and j not in taken_b:
+            taken_a.add(i)
+            taken_b.add(j)
+            kept.append(row)
+    chosen = pairs[sorted(kept)]
+    return chosen[:, 0], chosen[:, 1]
+
+
+def _seeing(side: _Side, landmark_ids: IntArray, at_least: int) -> tuple[int, ...]:
+    """Return the keyframes of a side that see so many of the landmarks, ascending."""
+    counts = {k: int(np.isin(side.submap.landmark_of[k], landmark_ids).sum()) for k in side.keyframes}
+    return tuple(sorted(k for k, n in counts.items() if n >= at_least))
+
+
+def _spread(submap: Submap, keyframes: tuple[int, ...], landmark_ids: IntArray) -> float:
+    """Return the share of the image, along the axis where it is less, that landmarks cover in the best keyframe."""
+    best = 0.0
+    for k in keyframes:
+        uv = submap.keyframes[k].features.uv_rect_px
+        seen = uv[np.isin(submap.landmark_of[k], landmark_ids)]
+        covered, there = (np.ptp(np.percentile(pixels, [5, 95], axis=0), axis=0) for pixels in (seen, uv))
+        best = max(best, float((covered / np.maximum(there, 1e-9)).min()))
+    return best
+
+
+def _sigmas(xyz_query: FloatArray, S: FloatArray, covariance: FloatArray, place: _Side) -> dict[str, float]:
+    """Return the sigmas of scale (relative), rotation, and position at the pairs' centre relative to their depth."""
+    at_centre = sim3.adjoint(se3.from_parts(np.eye(3), -np.median(xyz_query, axis=0)))
+    C = at_centre @ covariance @ at_centre.T
+    depth = np.median(
+        np.linalg.norm(sim3.act(S, xyz_query) - place.submap.T_submap_kf[place.keyframes[0]][:3, 3], axis=1)
+    )
+    position = float(sim3.scale(S)) * math.sqrt(np.linalg.eigvalsh(C[3:6, 3:6])[-1])
+    return {
+        "sigma_scale": math.sqrt(C[6, 6]),
+        "sigma_rot_deg": math.degrees(math.sqrt(np.linalg.eigvalsh(C[:3, :3])[-1])),
+        "sigma_trans_rel": position / max(float(depth), 1e-12),
+    }
