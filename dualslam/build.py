@@ -15,9 +15,10 @@ from dualslam.backend.self_calibration import estimate_calibration, find_preferr
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.calibration.lens import Calibration, CalibrationAnswer, CalibrationJob, answer
 from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
+from dualslam.core.camera.corrected import CorrectedCamera
 from dualslam.core.camera.models import Camera
 from dualslam.core.camera.rectification import rectify
-from dualslam.core.errors import ConfigError
+from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend, PreferredCamera, SelfCalibrator, SubmapGraph
 from dualslam.core.threads import spare_cores
@@ -28,15 +29,19 @@ from dualslam.frontends.features.motion_statistics import nearest_search
 from dualslam.frontends.gap.auxiliary_features import AuxiliaryFeatures, BufferedFeatures, OwnFeatures
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry, Route
 from dualslam.frontends.gap.refinding import Refinder
+from dualslam.frontends.place_matcher import FrontendPlaceMatcher
 from dualslam.frontends.registry import check_frontend
 from dualslam.frontends.registry import create_frontend as create_frontend  # part of the Python interface
 from dualslam.frontends.tracking.initialiser import Initialiser
 from dualslam.frontends.tracking.rolling_shutter import RollingShutter
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.health import judge_track
+from dualslam.io.map_store import StoredMap
 from dualslam.lab.disturbances import FaultScript
 from dualslam.map.graph_beside import BesideGraphs, GraphServer
 from dualslam.map.submap import Submap
+from dualslam.places import FaissRecogniser, PlaceVerifier
+from dualslam.places.revisits import PlaceParts
 from dualslam.recovery.direction import recover
 from dualslam.recovery.executor import DeskExecutor, InlineExecutor, RecoveryExecutor
 from dualslam.recovery.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
@@ -76,7 +81,13 @@ def check_config(config: Config) -> None:
                 check_frontend(_auxiliary(attempt))
 
 
-def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | None = None) -> System:
+def build_system(
+    config: Config,
+    camera: Camera,
+    recovery: RecoveryExecutor | None = None,
+    saved: StoredMap | None = None,
+    localise: bool = False,
+) -> System:
     """Build a system from its config.
 
     Parameters
@@ -86,6 +97,11 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
         Lens model and size of the images that `System.step` will be given.
     recovery : RecoveryExecutor, optional
         What takes on the walks back in time, in the place of what the config says: to look at them one by one.
+    saved : StoredMap, optional
+        A map to find frames in and to extend (`load_atlas`); it becomes the system's own. Its camera, as it was found
+        out, is taken as known.
+    localise : bool
+        Find poses in the saved map, and add nothing to it.
 
     Returns
     -------
@@ -99,7 +115,10 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
     check_config(config)
     frontend = create_frontend(config.frontend)
     size_px = (camera.width, camera.height)
-    calibration = new_calibration(config, camera)
+    known = camera if saved is None else _camera_of(saved, camera)
+    if saved is not None:  # its camera is its own: to change it would part what is there from what comes
+        config = config.model_copy(update={"calibration": config.calibration.model_copy(update={"refine": False})})
+    calibration = new_calibration(config, known)
     faults = FaultScript(config.corruptions)
     shutter = RollingShutter(frontend, config.camera, config.seed)
 
@@ -142,9 +161,36 @@ def build_system(config: Config, camera: Camera, recovery: RecoveryExecutor | No
             atlas_solver=atlas_solver(config),
             adjust_bundle=partial(bundle_adjust_arrays, robust_k=config.graph.robust_k),
             graphs=graphs,
+            places=place_parts(config, frontend, size_px),
         ),
         config,
+        saved,
+        localise,
     )
+
+
+def place_parts(config: Config, frontend: Frontend, size_px: tuple[int, int]) -> PlaceParts:
+    """Build what recognises places and verifies them."""
+    matcher = FrontendPlaceMatcher(frontend, size_px)
+    return PlaceParts(
+        FaissRecogniser(frontend.max_distance_strict), PlaceVerifier(matcher, config.linking, config.seed)
+    )
+
+
+def _camera_of(saved: StoredMap, camera: Camera) -> Camera:
+    """Return the camera that made a saved map, where it is the one that is given, perhaps corrected since.
+
+    Raises
+    ------
+    InputError
+        If it is another one: poses in the map would be wrong.
+    """
+    known = saved.camera or camera
+    given = known.base if isinstance(known, CorrectedCamera) else known
+    of_map = [submap.K for submap in saved.atlas.submaps.values()]
+    if given.to_dict() != camera.to_dict() or not any(np.allclose(K, known.K) for K in of_map):
+        raise InputError("The saved map was made with another camera than this source's; give it the same calibration.")
+    return known
 
 
 def atlas_solver(config: Config) -> GtsamAtlasSolver:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -14,12 +15,14 @@ from dualslam.calibration.lens import Calibration
 from dualslam.config.settings import Config
 from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.bundle import BundleAdjuster
+from dualslam.core.camera.models import Camera
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
-from dualslam.core.interfaces import MapStarter, Shutter, SubmapGraph, VisualOdometry
+from dualslam.core.interfaces import MapStarter, Seeker, Shutter, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, Start, Track, View
 from dualslam.health import HealthMonitor, count_signs
+from dualslam.io.map_store import StoredMap
 from dualslam.map.atlas import Link
 from dualslam.map.connections import Connections
 from dualslam.map.frame_records import FrameRecord, FrameResult
@@ -30,6 +33,7 @@ from dualslam.map.split import next_submap
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
 from dualslam.pace import Pace
+from dualslam.places.revisits import PlaceParts, Revisits
 from dualslam.recovery.executor import RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.manager import Recoveries
@@ -52,12 +56,13 @@ class Components:
     new_starter: Callable[[], MapStarter]
     new_graph: Callable[[], SubmapGraph]
     new_odometry: Callable[[Submap, SubmapGraph], VisualOdometry]
-    new_relocaliser: Callable[[Submap, SubmapGraph], VisualOdometry]
+    new_relocaliser: Callable[[Submap, SubmapGraph], Seeker]
     calibration: Calibration
     shutter: Shutter
     recovery: RecoveryExecutor
     atlas_solver: AtlasSolver
     adjust_bundle: BundleAdjuster
+    places: PlaceParts
     desk: Desk
     graphs: BesideGraphs | None = None
 
@@ -84,10 +89,22 @@ class System:
     on_pose : callable or None
         Called with each frame's track as soon as it is posed, before the map grows from it: who steers by the poses
         need not wait for a keyframe.
+    first_id : int
+        Of the frames' own count: 0, or where a saved map's has ended. Everywhere but in `step` and its results a frame
+        goes by its index plus this.
+    saved : StoredMap or None
+        The map that was gone on with.
     """
 
-    def __init__(self, components: Components, config: Config) -> None:
-        record = Record()
+    def __init__(
+        self, components: Components, config: Config, saved: StoredMap | None = None, localise: bool = False
+    ) -> None:
+        """`saved`: a map to go on with, which becomes this system's; `localise`: only to find poses in it."""
+        record = Record() if saved is None else Record(saved.atlas, poses=dict(saved.poses))
+        self.saved, self.first_id = saved, 0 if saved is None else saved.next_id
+        self._world = saved.main[0] if saved is not None and saved.main else None
+        self._localises = localise
+        self._n_without_map = 0
         self.atlas, self.rows, self.poses = record.atlas, record.rows, record.poses
         self.events, self.timer = record.events, record.timer
         self._record = record
@@ -107,6 +124,14 @@ class System:
         self.pace = Pace()
         self.on_pose: Callable[[Track], None] | None = None
         self._posed_at: float | None = None  # on the clock of `time.perf_counter`
+        self._revisits = Revisits(
+            record,
+            components.places,
+            self._connections,
+            components.new_graph,
+            components.new_relocaliser,
+            config,
+        )
         self._recoveries = Recoveries(
             record,
             self.buffer,
@@ -124,6 +149,16 @@ class System:
     def desk(self) -> Desk:
         """Where work beside the tracking is done."""
         return self._parts.desk
+
+    @property
+    def camera(self) -> Camera:
+        """By which features are rectified now."""
+        return self._parts.calibration.camera
+
+    @property
+    def world(self) -> int | None:
+        """The submap in whose frame the saved map's world is; None without one."""
+        return self._world
 
     @property
     def live(self) -> VisualOdometry | None:
@@ -147,6 +182,8 @@ class System:
         FrameResult
         """
         started, self._posed_at = time.perf_counter(), None
+        if self.first_id:
+            frame = replace(frame, index=self.first_id + frame.index)
         self.rows[frame.index] = FrameRecord(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
         # 1. What was found beside the tracking meanwhile comes into the map between two frames.
         self._collect_graphs(frame)
@@ -174,10 +211,10 @@ class System:
         last = next(reversed(self.rows.values()), None)
         if self._parts.graphs is not None and last is not None:
             self._follow_graphs(self._parts.graphs.finish(self.atlas.submaps), last)
-        self._recoveries.finish(self._live, last, interrupted)
+        self._recoveries.finish(self._live, last, interrupted or self._localises)
         if self._parts.graphs is not None and last is not None:
             self._follow_graphs(self._parts.graphs.finish(self.atlas.submaps), last)
-        if self._live is not None:
+        if self._live is not None and not self._localises:
             self._archive(self._live, "end of sequence")
         if last is not None:
             self._connections.settle(last)
@@ -188,6 +225,10 @@ class System:
     def _initialise(self, view: View) -> Track | Failure:
         if self._relocaliser.note(view) and (track := self._relocalise(view)):
             return track
+        if track := self._relocalise_anywhere(view):
+            return track
+        if self._localises:
+            return Failure(FailureReason.TOO_FEW_MATCHES, "the saved map does not show this place")
         shutter = self._parts.shutter
         with self.timer.measure("shutter"):
             readout_s = shutter.readout_s
@@ -200,7 +241,7 @@ class System:
             self._starter.collect(view)
             return Failure(FailureReason.DOUBTFUL_INITIALISATION, "no start is tried while frames are late")
         with self.timer.measure("initialisation"):
-            start = self._starter.add(view, interrupted=self.pace.in_real_time)
+            start = self._starter.add(view, briefly=self.pace.in_real_time)
         if isinstance(start, Failure):
             if start.reason is FailureReason.DOUBTFUL_INITIALISATION:
                 self._record.event(EventKind.INITIALISATION_REFUSED, view, None, reason=start.detail, **start.numbers)
@@ -224,6 +265,38 @@ class System:
         self._recoveries.found_again(relocaliser.submap)
         self.buffer.thaw()
         return track
+
+    def _relocalise_anywhere(self, view: View) -> Track | None:
+        """Go on in whichever submap shows a few frames in a row: at once in a saved map, else where none can start."""
+        self._n_without_map += len(view.features) >= self._config.tracking.min_inliers
+        after = 0 if self.saved is not None else self._config.recovery.relocalise_after
+        if not self.atlas.submaps or after is None or self._n_without_map <= after:
+            return None
+        with self.timer.measure("places"):
+            found = self._revisits.sighted(view, self._parts.K)
+        if found is None:
+            return None
+        self._live, submap = found.odometry, found.odometry.submap
+        self._relocaliser.end()
+        self._n_without_map = 0
+        self._health = HealthMonitor(self._config.health)
+        for track, T_kf_cam in (*found.earlier, (found.track, self._live.relative_pose(found.track))):
+            at = track.view
+            pose = FramePose(at.index, at.timestamp_s, submap.id, found.reference, T_kf_cam)
+            self._record.pose(pose, track.n_matches, track.n_inliers)
+        first = found.earlier[0][0]
+        self._record.event(
+            EventKind.RELOCALISED,
+            view,
+            submap.id,
+            n_inliers=first.n_inliers,
+            other_frame=found.reference,
+            first_frame=first.view.index,
+        )
+        if not self._localises:
+            self._recoveries.found_again(submap)
+            self.buffer.thaw()
+        return found.track
 
     def _correct_shutter(self, view: View) -> View:
         """Take the shutter that was found out of the frames so far; the starter begins anew. Returns the view's own."""
@@ -257,6 +330,7 @@ class System:
         self._live = self._parts.new_odometry(submap, graph)
         self._relocaliser.end()
         self._live.start_at(view.index)
+        self._n_without_map = 0
         self._health = HealthMonitor(self._config.health)
         self._recoveries.start(submap, view)
         self._recoveries.collect(self._live, view)
@@ -270,17 +344,25 @@ class System:
 
     def _track(self, live: VisualOdometry, view: View) -> Track | Failure:
         track = self._track_with(live, view)
+        if track and self._localises:
+            return track
         if track:
             self._lost = []
             self.buffer.thaw()
-            if live.reference_id == view.index:
-                self._calibrations.ask_if_due(live, view, self._recoveries.waiting)
+            if live.reference_id != view.index:
+                return track
+            self._calibrations.ask_if_due(live, view, self._recoveries.waiting)
             if len(live.submap.keyframes) >= self._config.graph.max_keyframes:
                 self._roll_over(live, view)
-            elif live.reference_id == view.index:
+            else:
                 self._recoveries.retry(live.submap, view)
+                self._revisit(live, view)
             return track
         assert isinstance(track, Failure)
+        if self._localises:
+            self._live = None
+            self.rows[view.index].status = FrameStatus.LOST
+            return track
         self._lost.append(view)
         self.rows[view.index].status = FrameStatus.LOST
         if len(self._lost) == 1:
@@ -288,6 +370,15 @@ class System:
         if len(self._lost) > self._config.tracking.max_lost_frames or track.reason is FailureReason.SOLVER:
             self._give_up(live, view, track)
         return track
+
+    def _revisit(self, live: VisualOdometry, view: View) -> None:
+        """Link the live map where its newest keyframe shows a place of old; not while a walk back is under way."""
+        if self._recoveries.is_under_way(live.submap):
+            return
+        with self.timer.measure("places"):
+            report = self._revisits.note_keyframe(live, view)
+        if report is not None:
+            self._recoveries.settle(live)
 
     def _track_with(self, odometry: VisualOdometry, view: View) -> Track | Failure:
         """Pose a frame, judge it, record it, and make it a keyframe where one is due."""
@@ -300,7 +391,9 @@ class System:
             self.on_pose(track)
         if track.wide:
             self._record.event(EventKind.GAP_RELOCALISED, view, odometry.submap.id, n_inliers=track.n_inliers)
-        if odometry.keyframe_due(track) and not self.pace.puts_off(track.n_inliers, self._weak_landmarks):
+        if self._localises:
+            cast(Seeker, odometry).look_about()
+        elif odometry.keyframe_due(track) and not self.pace.puts_off(track.n_inliers, self._weak_landmarks):
             try:
                 with self.timer.measure("mapping"):
                     report = odometry.insert_keyframe(track)
@@ -375,7 +468,8 @@ class System:
         except SolverError:
             log.warning("submap %d is archived as it stands: its graph gives no estimate", submap.id)
         # A submap that rolled over and was lost at once has no frame of its own: its newest keyframe stands for it.
-        last = max([p.index for p in self.poses.values() if p.submap_id == submap.id], default=max(submap.keyframes))
+        posed = [p.index for p in self.poses.values() if p.submap_id == submap.id and p.index in self.rows]
+        last = max(posed, default=max(submap.keyframes))
         self.events.add(
             EventKind.ARCHIVED,
             last,
@@ -396,7 +490,7 @@ class System:
 
     def _roll_over(self, live: VisualOdometry, view: View) -> None:
         """Go on in a new submap that shares its first keyframes with the full one: no failure, and a stiff link."""
-        submap = next_submap(live.submap, len(self.atlas.submaps), self._config.graph.rollover_keyframes)
+        submap = next_submap(live.submap, len(self.atlas.submaps), self._config.graph.rollover_keyframes, view.index)
         graph = self._parts.new_graph()
         try:
             graph.rebuild(submap)
@@ -423,7 +517,7 @@ class System:
             T_submap_cam = self.atlas.submaps[pose.submap_id].resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
         failure = outcome if isinstance(outcome, Failure) else None
         return FrameResult(
-            frame.index,
+            frame.index - self.first_id,
             row.status,
             row.submap_id,
             T_submap_cam,

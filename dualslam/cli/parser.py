@@ -87,6 +87,11 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
     camera = parser.add_argument_group("camera").add_mutually_exclusive_group()
     camera.add_argument("--camera", metavar="FILE", type=Path, help="calibration, instead of the source's own")
     camera.add_argument("--fov", metavar="DEGREES", type=_angle, help="horizontal field of view, without a calibration")
+    saved = parser.add_argument_group("saved map")
+    saved.add_argument(
+        "--map", metavar="DIR", type=Path, help="run folder whose map this run finds its frames in, and extends"
+    )
+    saved.add_argument("--localise", action="store_true", help="find poses in the map of --map, and add nothing to it")
     mode = parser.add_argument_group("mode")
     mode.add_argument(
         "--realtime",

@@ -7,6 +7,7 @@ import argparse
 from dualslam.cli import logs
 from dualslam.cli.configuration import config_of
 from dualslam.cli.console import final_line, progress, stage_table
+from dualslam.core.errors import InputError
 from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import open_source
 
@@ -15,6 +16,8 @@ EXIT_DONE, EXIT_NO_MAP, EXIT_INTERRUPTED = 0, 1, 130
 
 def execute(args: argparse.Namespace) -> int:
     """Run, and say in one line what came of it."""
+    if args.localise and args.map is None:
+        raise InputError("--localise finds poses in a saved map: name its run folder with --map.")
     config = config_of(args)
     sequence = open_source(
         args.source,
@@ -28,7 +31,14 @@ def execute(args: argparse.Namespace) -> int:
     logs.release()
     with progress(sequence, args.quiet) as on_frame:
         outcome = run_to_folder(
-            config, sequence, args.out, overwrite=args.overwrite, realtime=args.realtime, on_frame=on_frame
+            config,
+            sequence,
+            args.out,
+            overwrite=args.overwrite,
+            realtime=args.realtime,
+            on_frame=on_frame,
+            saved_map=args.map,
+            localise=args.localise,
         )
     return conclude(outcome, args)
 

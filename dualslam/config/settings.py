@@ -384,6 +384,20 @@ class AtlasConfig(StrictModel):
     """Whether a connection that the others contradict is rejected; else all of them are obeyed."""
 
 
+class PlacesConfig(StrictModel):
+    """Places that are seen again."""
+
+    enabled: bool = True
+    """Whether places are recognised at all: loops, merges by revisit, frames without a map that are found in one."""
+
+
+class LoopsConfig(StrictModel):
+    """Loops and merges of maps by what is seen again."""
+
+    enabled: bool = True
+    """Whether the live map is linked where it shows what any map, itself among them, has shown before."""
+
+
 class Config(StrictModel):
     """The root of the configuration."""
 
@@ -402,6 +416,8 @@ class Config(StrictModel):
     linking: LinkingConfig = LinkingConfig()
     fusion: FusionConfig = FusionConfig()
     atlas: AtlasConfig = AtlasConfig()
+    places: PlacesConfig = PlacesConfig()
+    loops: LoopsConfig = LoopsConfig()
     calibration: CalibrationConfig = CalibrationConfig()
     corruptions: tuple[Corruption, ...] = ()
     """What the failure lab does to the run on purpose, for example [{kind: blackout, start: 100, length: 10}]."""

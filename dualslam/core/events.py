@@ -33,6 +33,8 @@ class EventKind(StrEnum):
     FUSED = "fused"
     ABSORBED = "absorbed"
     LOOP_CLOSED = "loop_closed"
+    LOOP_REFUSED = "loop_refused"
+    MERGED = "merged"
     ATLAS_SOLVED = "atlas_solved"
     CONNECTION_REJECTED = "connection_rejected"
     CONNECTION_READMITTED = "connection_readmitted"

@@ -307,8 +307,8 @@ class MapStarter(Protocol):
         """Keep a view as a possible first view, without trying to start from it."""
         ...
 
-    def add(self, view: View, interrupted: bool = False) -> Start | Failure:
-        """Take a view in and try to start a map that ends with it; in a `interrupted` with a part of what could be tried."""
+    def add(self, view: View, briefly: bool = False) -> Start | Failure:
+        """Take a view in and try to start a map that ends with it; `briefly`: with a part of what could be tried."""
         ...
 
 
@@ -370,4 +370,16 @@ class VisualOdometry(Protocol):
 
     def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
         """Make the frame a keyframe and solve the graph."""
+        ...
+
+
+class Seeker(VisualOdometry, Protocol):
+    """A front end that finds its submap again wherever it is seen, and goes on from there."""
+
+    def relocalise(self, view: View, keyframe_id: int) -> Track | Failure:
+        """Pose a frame by what a keyframe of the submap and those about it show; go on from there, at rest."""
+        ...
+
+    def look_about(self) -> None:
+        """Go by the keyframe that sees most of what the last frame saw, without making that one a keyframe."""
         ...

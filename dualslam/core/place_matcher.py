@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.types import Features, FloatArray, IntArray, Matches
-from dualslam.map.submap import Submap
+
+if TYPE_CHECKING:
+    from dualslam.map.submap import Submap
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.camera.models import Camera, camera_from_dict
 from dualslam.core.errors import InputError
 from dualslam.io.map_files import (
     Arrays,
@@ -33,10 +34,33 @@ _DAMAGE = (KeyError, ValueError, IndexError, TypeError)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredMap:
-    """What `save_atlas` wrote: the submaps with their links, and where each frame stands."""
+    """What `save_atlas` wrote: the submaps with their links, and where each frame stands.
+
+    Attributes
+    ----------
+    atlas : Atlas
+    poses : dict of int to FramePose
+    camera : Camera or None
+        By which the features are rectified, with what was found out about it; None in maps of before it was kept.
+    """
 
     atlas: Atlas
     poses: dict[int, FramePose]
+    camera: Camera | None = None
+
+    @property
+    def next_id(self) -> int:
+        """The first number that no frame of the map has: the count of frames goes on there."""
+        kept = (k for m in self.atlas.submaps.values() for k in (*m.keyframes, *m.anchors))
+        return 1 + max([*self.poses, *kept], default=-1)
+
+    @property
+    def main(self) -> list[int]:
+        """The linked set of submaps with most posed frames: its first one's frame is the world of the saved run."""
+        count = dict.fromkeys(self.atlas.submaps, 0)
+        for pose in self.poses.values():
+            count[pose.submap_id] += 1
+        return max(self.atlas.components(), key=lambda c: sum(count[m] for m in c), default=[])
 
 
 def submap_path(folder: Path, submap_id: int) -> Path:
@@ -61,7 +85,7 @@ class _Groups(Mapping[str, dict[str, NDArray[Any]]]):
         return len(self._submaps) + len(self.small)
 
 
-def save_atlas(folder: str | Path, atlas: Atlas, poses: dict[int, FramePose]) -> None:
+def save_atlas(folder: str | Path, atlas: Atlas, poses: dict[int, FramePose], camera: Camera | None = None) -> None:
     """Write submaps, links and the frames' poses relative to their keyframes: arrays without pickles."""
     groups = _Groups(atlas.submaps)
     links = atlas.links
@@ -82,7 +106,11 @@ def save_atlas(folder: str | Path, atlas: Atlas, poses: dict[int, FramePose]) ->
         "keyframe": np.array([p.keyframe_id for p in ordered], np.int64),
         "T_kf_cam": np.array([p.T_kf_cam for p in ordered], np.float64).reshape(-1, 4, 4),
     }
-    metadata = {"link_kinds": [str(link.kind) for link in links], "link_keyframes": [link.keyframes for link in links]}
+    metadata: dict[str, Any] = {
+        "link_kinds": [str(link.kind) for link in links],
+        "link_keyframes": [link.keyframes for link in links],
+        "camera": None if camera is None else camera.to_dict(),
+    }
     save_map(folder, groups, metadata)
 
 
@@ -107,9 +135,10 @@ def load_atlas(folder: str | Path) -> StoredMap:
         columns = (frames[name].tolist() for name in ("index", "timestamp_s", "submap", "keyframe"))
         rows = zip(*columns, frames["T_kf_cam"], strict=True)
         poses = {index: FramePose(index, t, m, k, T_kf_cam) for index, t, m, k, T_kf_cam in rows}
+        camera = camera_from_dict(metadata["camera"]) if metadata.get("camera") else None
     except _DAMAGE as error:
         raise InputError(f"{folder} is no map of this version, or is damaged: {error}.") from error
-    return StoredMap(atlas, poses)
+    return StoredMap(atlas, poses, camera)
 
 
 def load_joints(folder: str | Path) -> tuple[list[int], Atlas]:

@@ -7,8 +7,11 @@ import numpy as np
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 
-def next_submap(full: Submap, submap_id: int, n_shared: int) -> Submap:
+def next_submap(full: Submap, submap_id: int, n_shared: int, newest_id: int | None = None) -> Submap:
     """Start a submap from the newest keyframes of a full one, in the same coordinates.
+
+    Where the newest keyframe does not see what those inserted before it see (the map was full when it was found again),
+    from those that do.
 
     Parameters
     ----------
@@ -16,6 +19,8 @@ def next_submap(full: Submap, submap_id: int, n_shared: int) -> Submap:
     submap_id : int
     n_shared : int
         How many of the newest keyframes (in order of insertion) both submaps hold.
+    newest_id : int, optional
+        The keyframe that was inserted last.
 
     Returns
     -------
@@ -25,6 +30,12 @@ def next_submap(full: Submap, submap_id: int, n_shared: int) -> Submap:
         the identity.
     """
     shared = list(full.keyframes)[-n_shared:]
+    if newest_id is not None:
+        ids = full.landmark_of[newest_id]
+        covisible = full.covisible(ids[ids >= 0])[0].tolist()
+        if np.isin(shared, covisible).sum() < min(len(shared), len(covisible)) / 2:
+            wanted = {newest_id, *covisible[:n_shared]}
+            shared = [k for k in full.keyframes if k in wanted]
     twin = Submap(submap_id, full.K, full.landmarks["descriptor"][0])
     for k in shared:
         twin.add_keyframe(full.keyframes[k], full.T_submap_kf[k])

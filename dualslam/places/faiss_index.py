@@ -173,4 +173,4 @@ def _same_place(submaps: Mapping[int, Submap], a: PlaceCandidate, b: PlaceCandid
         return a.keyframe_id == b.keyframe_id  # one frame that two submaps hold
     own, other = (submaps[a.submap_id].landmark_of[c.keyframe_id] for c in (a, b))
     own, other = own[own >= 0], other[other >= 0]
-    return np.isin(own, other).sum() >= SAME_PLACE * min(len(own), len(other))
+    return bool(np.isin(own, other).sum() >= SAME_PLACE * min(len(own), len(other)))

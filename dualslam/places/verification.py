@@ -20,7 +20,7 @@ from dualslam.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
 from dualslam.core.place_matcher import PlaceMatcher, Sighting
-from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
+from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 from dualslam.places.second_pose import SecondPose, alike, find_second_pose
@@ -151,6 +151,29 @@ class PlaceVerifier:
             return estimate
         looks = self._search(place_side, query_side, estimate.S_dst_src)
         return self._judge(place_side, query_side, pairs, estimate, looks, rng)
+
+    def check_pose(
+        self, submap: Submap, keyframe_id: int, T_cam_submap: FloatArray, features: Features
+    ) -> Failure | None:
+        """Refuse a frame's pose where the image does not show what the place, seen from there, should show.
+
+        Parameters
+        ----------
+        submap : Submap
+        keyframe_id : int
+            By which the place was recognised.
+        T_cam_submap : (4, 4)
+        features : Features
+            Of the frame.
+        """
+        place = _side(submap, keyframe_id)
+        look = self._matcher.look(submap, place.landmarks, T_cam_submap, features, SEARCH_RADIUS_PX)
+        own = float(np.median([self._look(place, submap, k, np.eye(4)).share for k in place.keyframes]))
+        numbers = {"found": look.share, "own_found": own, "n_visible": float(len(look.feature))}
+        if look.share < MIN_FOUND * own:
+            detail = f"{look.share:.0%} of what the place should show is there, {own:.0%} in its own keyframes"
+            return Failure(FailureReason.REPROJECTION, detail, numbers)
+        return None
 
     # --- steps
 
@@ -293,10 +316,8 @@ class PlaceVerifier:
         """Look for another similarity among all that looks alike, in the place and in the keyframe that asks."""
         ids = query.submap.landmark_of[query.keyframes[0]]
         asked = np.unique(ids[ids >= 0])
-        descriptors = (
-            s.landmarks["descriptor"][i] for s, i in ((query.submap, asked), (place.submap, place.landmarks))
-        )
-        i, j = alike(*descriptors, self._matcher)
+        theirs, ours = query.submap.landmarks["descriptor"], place.submap.landmarks["descriptor"]
+        i, j = alike(theirs[asked], ours[place.landmarks], self._matcher)
         cov_query = landmark_covariances(query.submap, asked)
         cov_place = landmark_covariances(place.submap, place.landmarks)
         xyz_query = query.submap.landmarks["xyz_mu"][asked]
@@ -331,7 +352,7 @@ class PlaceVerifier:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Looks:
-    """What was looked for: the place's landmarks in the query's images and in its own, and the pairs that came of it."""
+    """What was looked for: the place's landmarks in the query's images and in its own; the resulting pairs."""
 
     in_query: list[Sighting]
     in_place: list[Sighting]

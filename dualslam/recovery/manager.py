@@ -107,6 +107,10 @@ class Recoveries:
         self._retries.start_of(submap, min(submap.keyframes))
         self._retries.leave_open(submap.id, 0, self._calibration.camera)
 
+    def settle(self, live: VisualOdometry) -> None:
+        """Let no walk look any more for what has become one map with the live one."""
+        self._settle(live.submap.id, live)
+
     def start(self, submap: Submap, newest: View, now: FrameStamp | None = None) -> None:
         """Start the walk back from a new submap: over the frames without a pose, then on into the lost submaps.
 

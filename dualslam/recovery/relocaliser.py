@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from dualslam.config.settings import Config
-from dualslam.core.interfaces import SubmapGraph, VisualOdometry
+from dualslam.core.interfaces import Seeker, SubmapGraph, VisualOdometry
 from dualslam.core.types import View
 from dualslam.health import judge_track
 from dualslam.map.submap import Submap
@@ -21,7 +21,7 @@ class Relocaliser:
     config : Config
     """
 
-    def __init__(self, new_relocaliser: Callable[[Submap, SubmapGraph], VisualOdometry], config: Config) -> None:
+    def __init__(self, new_relocaliser: Callable[[Submap, SubmapGraph], Seeker], config: Config) -> None:
         self._new_frontend = new_relocaliser
         self._config = config
         self._after = config.recovery.relocalise_after if config.recovery.enabled else None

@@ -13,6 +13,7 @@ import numpy as np
 
 from dualslam.config.settings import Config
 from dualslam.core.events import EventKind
+from dualslam.core.geometry import sim3
 from dualslam.core.types import FrameStatus
 from dualslam.io.run_folder import FrameRow, PosedFrames
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
@@ -52,9 +53,11 @@ def trajectories_of(system: System) -> Trajectories:
     """Compose the poses of all frames, each from its own keyframe, by the map as it is now."""
     count = dict.fromkeys(system.atlas.submaps, 0)
     for pose in system.poses.values():
-        count[pose.submap_id] += 1
+        count[pose.submap_id] += pose.index in system.rows
     components = system.atlas.components()
     largest = max(components, key=lambda c: sum(count[m] for m in c), default=[])
+    if system.world is not None:  # the saved map is the main one, whatever this run has besides
+        largest = next(c for c in components if system.world in c)
     unlinked = {m: _posed(system, [m]) for m in count if m not in largest and count[m]}
     return Trajectories(largest, _posed(system, largest), unlinked)
 
@@ -72,11 +75,11 @@ def frame_rows(
     in_main = set(main.index.tolist())
     rows = [
         FrameRow(
-            row.index,
+            row.index - system.first_id,
             row.timestamp_s,
             row.status,
             row.submap_id,
-            row.index in in_main,
+            row.index - system.first_id in in_main,
             row.n_matches,
             row.n_inliers,
             row.latency_ms if latencies_ms is None else latencies_ms[n],
@@ -107,6 +110,9 @@ def summarise(
         "failures": len(system.events.of_kind(EventKind.FAILED)),
         "recoveries": sum(link.kind is LinkKind.RECOVERY for link in system.atlas.believed),
         "relocalised": len(system.events.of_kind(EventKind.RELOCALISED)),
+        "loops": len(system.events.of_kind(EventKind.LOOP_CLOSED)),
+        "merges": len(system.events.of_kind(EventKind.MERGED)),
+        "first_id": system.first_id,
         "recoveries_failed": len(system.events.of_kind(EventKind.RECOVERY_FAILED)),
         "submaps": len(system.atlas.submaps),
         "links": len(system.atlas.believed),
@@ -170,8 +176,13 @@ def versions() -> dict[str, str]:
 
 def _posed(system: System, submap_ids: list[int]) -> PosedFrames:
     S_world_submap = system.atlas.S_world_submap(submap_ids) if submap_ids else {}
-    composed = compose(system.poses.values(), system.atlas, S_world_submap)
-    return PosedFrames(np.asarray(composed.index, np.int64), composed.timestamp_s, composed.T_world_cam)
+    if system.world in S_world_submap:
+        S_world_first = sim3.inverse(S_world_submap[system.world])
+        S_world_submap = {m: S_world_first @ S for m, S in S_world_submap.items()}
+    own = (pose for pose in system.poses.values() if pose.index in system.rows)
+    composed = compose(own, system.atlas, S_world_submap)
+    index = np.asarray(composed.index, np.int64) - system.first_id
+    return PosedFrames(index, composed.timestamp_s, composed.T_world_cam)
 
 
 def _beside(system: System) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame
-from dualslam.io.map_store import save_atlas
+from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.run_folder import RunFolder, RunRecord
 from dualslam.io.sequence import Selection
 from dualslam.io.trajectory_files import Trajectory
@@ -63,6 +63,8 @@ def run_to_folder(
     realtime: bool = False,
     on_frame: Callable[[FrameResult], None] | None = None,
     build: Callable[[Config, Camera], System] | None = None,
+    saved_map: str | Path | None = None,
+    localise: bool = False,
 ) -> Outcome:
     """Run on a sequence and write a run folder. What an interrupted run, or one that crashed, has found is kept.
 
@@ -78,6 +80,10 @@ def run_to_folder(
         Called with each frame's result.
     build : callable, optional
         Makes the system of a config and a camera; `build_system` if it is not given.
+    saved_map : path, optional
+        Run folder whose map this run finds its frames in, and extends. It is read and never written.
+    localise : bool
+        Find poses in it, and add nothing.
 
     Raises
     ------
@@ -87,7 +93,13 @@ def run_to_folder(
     """
     given = _given(sequence, realtime)
     sequence = corrupted(sequence, config.corruptions)
-    system = (build or build_system)(config, sequence.camera)
+    if saved_map is not None and Path(out).resolve() == Path(saved_map).resolve():
+        raise InputError(f"{out} holds the map that is to be gone on with; give another folder to write to.")
+    if saved_map is not None:
+        saved = load_atlas(saved_map)
+        system = build_system(config, sequence.camera, saved=saved, localise=localise)
+    else:
+        system = (build or build_system)(config, sequence.camera)
     with RunFolder(out, overwrite=overwrite) as folder:
         folder.write_config(dump_config(config))
         n_events = 0
@@ -142,7 +154,7 @@ def _write_results(
     folder.write(RunRecord(rows, trajectories.main, trajectories.unlinked, summary))
     if truth is not None:
         folder.write_truth(truth_of_frames(truth, rows))
-    save_atlas(folder.map_path, system.atlas, system.poses)
+    save_atlas(folder.map_path, system.atlas, system.poses, system.camera)
     folder.write_report(report_page(read_run(folder.path)))
     return summary
 
@@ -166,5 +178,5 @@ class _Watched:
 def _write_new_events(system: System, folder: RunFolder, n_written: int) -> int:
     if len(system.events) > n_written:
         for event in islice(system.events, n_written, None):
-            folder.append_event(event)
+            folder.append_event(replace(event, frame=event.frame - system.first_id))
     return len(system.events)

@@ -90,17 +90,17 @@ class Initialiser:
         """Keep a view as a possible first view, without trying to start from it."""
         self._views = [*self._views[-self._config.max_views :], view]
 
-    def add(self, view: View, interrupted: bool = False) -> Start | Failure:
+    def add(self, view: View, briefly: bool = False) -> Start | Failure:
         """Take a view in and try to start from it and an earlier one, the nearest first.
 
-        `interrupted`: with one earlier view only, the next in turn with the next view.
+        `briefly`: with one earlier view only, the next in turn with the next view.
         """
         self.collect(view)
         best = Failure(FailureReason.TOO_FEW_MATCHES, "one view")
         if len(view.features) < self._config.min_matches:
             return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image")
         lags = [lag for lag in LAGS if lag < len(self._views)]
-        if interrupted and lags:
+        if briefly and lags:
             self._turn %= len(lags)
             lags, self._turn = lags[self._turn : self._turn + 1], self._turn + 1
         for lag in lags:

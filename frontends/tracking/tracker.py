@@ -182,6 +182,24 @@ class Tracker:
         nothing = np.full(len(view.features), NO_LANDMARK, np.int64)
         return self._pose_from_local_map(view, grid, T_cam_submap, nothing, T_cam_submap, wide=True)
 
+    def relocalise(self, view: View, keyframe_id: int) -> Track | Failure:
+        """Pose a frame by a keyframe of the submap and those that see the same; go on from there, at rest."""
+        features = view.features
+        if len(features) < self._config.min_inliers:
+            return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features in the image")
+        ids = self._submap.landmark_of[keyframe_id]
+        covisible, _ = self._submap.covisible(ids[ids >= 0])
+        about = [keyframe_id, *(k for k in covisible.tolist() if k != keyframe_id)]
+        found = self._pose_from_wide_matches(view, about[: self._config.wide_keyframes])
+        if isinstance(found, Failure):
+            return found
+        self._local = self._local_map(found[1][found[1] >= 0])
+        grid = FeatureGrid.build(features.uv_rect_px)
+        track = self._pose_from_local_map(view, grid, *found, found[0], wide=True)
+        if not isinstance(track, Failure):
+            self.start(track)
+        return track
+
     def take(self, track: Track) -> None:
         """Go on from a track."""
         self._accept(track)
@@ -228,10 +246,12 @@ class Tracker:
         rows, feature = prediction.rows[matches.index[:, 0]], matches.index[:, 1]
         return self._refine(view, T_predicted, ids[rows], local.xyz_mu[rows], feature)
 
-    def _pose_from_wide_matches(self, view: View) -> tuple[FloatArray, IntArray] | Failure:
+    def _pose_from_wide_matches(
+        self, view: View, keyframe_ids: list[int] | None = None
+    ) -> tuple[FloatArray, IntArray] | Failure:
         """Match the whole image against one keyframe after the other, pose by PnP."""
         submap, best = self._submap, Failure(FailureReason.TOO_FEW_MATCHES, "no keyframe matched")
-        for k in self._wide_keyframes(view.index):
+        for k in self._wide_keyframes(view.index) if keyframe_ids is None else keyframe_ids:
             has_landmark = np.flatnonzero(submap.landmark_of[k] >= 0)
             matches = self._frontend.match_wide(submap.keyframes[k].features.take(has_landmark), view.features)
             if len(matches) < MIN_CONSENSUS:

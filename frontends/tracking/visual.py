@@ -111,6 +111,21 @@ class VisualFrontEnd:
         """Pose a frame by the submap's landmarks, from a pose that is near its own; `take` goes on from there."""
         return self._tracker.track_near(view, T_cam_submap)
 
+    def relocalise(self, view: View, keyframe_id: int) -> Track | Failure:
+        """Pose a frame by what a keyframe of the submap and those about it show; go on from there, at rest."""
+        self.start_at(keyframe_id)
+        return self._tracker.relocalise(view, keyframe_id)
+
+    def look_about(self) -> None:
+        """Go by the keyframe that sees most of what the last frame saw, without making that one a keyframe."""
+        last = self._tracker.last
+        if last is None:
+            return
+        covisible, _ = self.submap.covisible(last.landmark_ids[last.landmark_ids >= 0])
+        if len(covisible):
+            self._reference_id = int(covisible[0])
+        self._tracker.refresh()
+
     def take(self, track: Track) -> None:
         """Go on from a track."""
         self._tracker.take(track)

@@ -17,7 +17,7 @@ import numpy as np
 from dualslam.config.corruption import INTERNAL_KINDS, Corruption, CorruptionKind
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import so3
-from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry
+from dualslam.core.interfaces import KeyframeReport, Seeker, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, Track, View
 from dualslam.map.submap import Submap
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
@@ -54,12 +54,12 @@ class FaultScript:
         return disturbed
 
     def around_odometry(
-        self, new_odometry: Callable[[Submap, SubmapGraph], VisualOdometry]
-    ) -> Callable[[Submap, SubmapGraph], VisualOdometry]:
+        self, new_odometry: Callable[[Submap, SubmapGraph], Seeker]
+    ) -> Callable[[Submap, SubmapGraph], Seeker]:
         """Return the function that makes the front end of a submap, with faults in what it makes."""
         if not self._faults:
             return new_odometry
-        return lambda submap, graph: cast(VisualOdometry, _FaultyOdometry(new_odometry(submap, graph), self))
+        return lambda submap, graph: cast(Seeker, _FaultyOdometry(new_odometry(submap, graph), self))
 
     def around_inline(self, executor: RecoveryExecutor) -> RecoveryExecutor:
         """Return what runs recoveries in this process, with one of them taken away where the script says so."""

@@ -183,7 +183,7 @@ def test_in_a_hurry_one_pair_is_tried_at_a_time_and_the_map_that_starts_is_right
     starts = []
     for view in world.views():
         n_tried = len(lags)
-        start = starter.add(view, interrupted=True)
+        start = starter.add(view, briefly=True)
         assert len(lags) <= n_tried + 1
         if start:
             starts.append(start)

@@ -1,0 +1,372 @@
+"""Loops, merges by revisit, and relocalisation in any submap: when a place is asked for and believed, what follows.
+
+One verified pair is provisional. It is believed once keyframes (or, without a map, frames) that follow it say the same;
+it is dropped where they do not. What is believed becomes a link, and the atlas does the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dualslam.config.settings import Config
+from dualslam.core.events import EventKind
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.interfaces import Seeker, SubmapGraph, VisualOdometry
+from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
+from dualslam.health import judge_track
+from dualslam.map.atlas import Link, LinkKind
+from dualslam.map.atlas_report import AtlasReport
+from dualslam.map.connections import Connections
+from dualslam.map.record import FrameStamp, Record
+from dualslam.map.submap import Submap
+from dualslam.places.recogniser import PlaceRecogniser
+from dualslam.places.verification import PlaceMatch, PlaceVerifier
+
+ASK_EVERY = 2
+"""Keyframes between two searches, where nothing is provisional: neighbours show the same."""
+RECENT = 20
+"""Keyframes before and after that are no revisit: what is seen there is tracked, or was a moment ago."""
+N_SECONDS = 2
+"""Keyframes (or frames) that must say the same as the first: three with it, where evidence begins for a link too."""
+MAX_MISSES = 3
+"""Keyframes that may not second before the provisional pair is dropped."""
+REST = 10
+"""Keyframes after a link between two submaps before another is looked for between them."""
+YOUNG = 5
+"""Newest keyframes of the live submap whose own landmarks are not remembered yet: half of them will be culled."""
+SAME_WITHIN = 0.1
+"""Where two similarities put the camera, of the scene's depth, within which they say the same: twice the 5 % that makes
+a link a wrong one."""
+SAME_TURN_RAD = float(np.radians(6.0))
+"""The same for its rotation: twice 3 degrees."""
+_SILENT = (FailureReason.TOO_FEW_MATCHES, FailureReason.TOO_FEW_INLIERS)
+"""Refusals of what only looked alike to the recogniser: they are no events."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceParts:
+    """What places are recognised and verified by; made by the composition root."""
+
+    recogniser: PlaceRecogniser
+    verifier: PlaceVerifier
+
+
+@dataclass(slots=True)
+class _Provisional:
+    """A verified pair that waits for others to say the same."""
+
+    match: PlaceMatch
+    seconds: int = 0
+    misses: int = 0
+
+
+@dataclass(slots=True)
+class _Seeker:
+    """A front end that has posed a frame in an archived submap, and those that it has posed since."""
+
+    odometry: Seeker
+    keyframe_id: int
+    tracks: list[tuple[Track, FloatArray]] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Relocalised:
+    """A map that frames without one were found in.
+
+    Attributes
+    ----------
+    odometry : VisualOdometry
+        Goes on there.
+    earlier : list of (Track, (4, 4))
+        The frames before the newest that it has posed, with their poses relative to the keyframe `reference`.
+    track : Track
+        The newest frame's.
+    reference : int
+    """
+
+    odometry: Seeker
+    earlier: list[tuple[Track, FloatArray]]
+    track: Track
+    reference: int
+
+
+class Revisits:
+    """Asks for places, keyframe by keyframe, and links what is seen again.
+
+    Parameters
+    ----------
+    record : Record
+    parts : PlaceParts
+    connections : Connections
+    new_graph : callable
+    new_relocaliser : callable
+        Makes a front end of an archived submap.
+    config : Config
+    """
+
+    def __init__(
+        self,
+        record: Record,
+        parts: PlaceParts,
+        connections: Connections,
+        new_graph: Callable[[], SubmapGraph],
+        new_relocaliser: Callable[[Submap, SubmapGraph], Seeker],
+        config: Config,
+    ) -> None:
+        self._record = record
+        self._recogniser = parts.recogniser
+        self._verifier = parts.verifier
+        self._connections = connections
+        self._new_graph = new_graph
+        self._new_frontend = new_relocaliser
+        self._config = config
+        self._provisional: _Provisional | None = None
+        self._n_asked = 0
+        self._linked_at: dict[tuple[int, int], int] = {}  # counted in `_n_asked`, by pairs of submaps
+        self._frontend: _Seeker | None = None
+
+    # --- keyframes of the live map
+
+    def note_keyframe(self, live: VisualOdometry, view: View) -> AtlasReport | None:
+        """Look whether the live map's newest keyframe shows a place of old, and link it where that is sure.
+
+        Returns
+        -------
+        AtlasReport or None
+            Of the link that was made.
+        """
+        if not (self._config.places.enabled and self._config.loops.enabled):
+            return None
+        self._frontend = None
+        self._n_asked += 1
+        if self._provisional is None and self._n_asked % ASK_EVERY:
+            return None
+        submap, keyframe_id = live.submap, live.reference_id
+        self._take_in(submap)
+        match = self._find(submap, keyframe_id, view)
+        return self._weigh(match, live, view)
+
+    def _find(self, submap: Submap, keyframe_id: int, now: FrameStamp) -> PlaceMatch | None:
+        """Return the verified place that a keyframe shows, where there is one and nothing contradicts it."""
+        submaps = self._record.atlas.submaps
+        features = submap.keyframes[keyframe_id].features
+        candidates = self._recogniser.query(features, submaps, self._may_be(submap, keyframe_id))
+        found: list[PlaceMatch] = []
+        refused: tuple[int, int, Failure] | None = None
+        for candidate in candidates:
+            place = submaps[candidate.submap_id], candidate.keyframe_id
+            match = self._verifier.verify((submap, keyframe_id), place)
+            if not isinstance(match, Failure):
+                found.append(match)
+            elif match.reason not in _SILENT and refused is None:
+                refused = candidate.submap_id, candidate.keyframe_id, match
+        if not found:
+            if refused is not None:  # the best of them: one event for a keyframe
+                self._refused(now, submap.id, *refused)
+            return None
+        best = max(found, key=lambda m: m.n_inliers)
+        for other in found:
+            if other is not best and self._contradict(best, other):
+                detail = f"keyframes {best.place[1]} and {other.place[1]} show the place as well, elsewhere"
+                why = Failure(FailureReason.AMBIGUOUS_MODEL, detail)
+                self._refused(now, submap.id, best.place[0], best.place[1], why)
+                self._provisional = None
+                return None
+        return best
+
+    def _may_be(self, submap: Submap, keyframe_id: int) -> Callable[[int, int], bool]:
+        """Return which keyframes would be a revisit: not those that are tracked, or were a moment ago."""
+        ids = submap.landmark_of[keyframe_id]
+        seen_now = set(submap.covisible(ids[ids >= 0])[0].tolist())
+        arrived = sorted({k for m in self._record.atlas.submaps.values() for k in m.keyframes})
+        at = arrived.index(keyframe_id)
+        recent = {*arrived[max(at - RECENT, 0) : at + RECENT + 1], *seen_now}
+        resting = {
+            other for (one, other), n in self._linked_at.items() if one == submap.id and self._n_asked - n < REST
+        }
+
+        def may_be(m: int, k: int) -> bool:
+            if m in resting or k in recent:
+                return False
+            return m == submap.id or k not in submap.keyframes
+
+        return may_be
+
+    def _weigh(self, match: PlaceMatch | None, live: VisualOdometry, view: View) -> AtlasReport | None:
+        """Second what is provisional, or begin anew; link once enough keyframes say the same."""
+        waiting, submap = self._provisional, live.submap
+        if waiting is not None and waiting.match.query[0] != submap.id:
+            waiting = self._provisional = None
+        if match is None:
+            if waiting is not None:
+                waiting.misses += 1
+                if waiting.misses > MAX_MISSES:
+                    why = Failure(FailureReason.UNCONFIRMED, f"seconded {waiting.seconds} times, {N_SECONDS} needed")
+                    self._refused(view, submap.id, *waiting.match.place, why)
+                    self._provisional = None
+            return None
+        if waiting is None or match.place[0] != waiting.match.place[0] or not self._agree(waiting.match, match):
+            self._provisional = _Provisional(match)
+            return None
+        waiting.match = match
+        waiting.seconds += 1
+        if waiting.seconds < N_SECONDS:
+            return None
+        self._provisional = None
+        return self._link(match, waiting.seconds, live, view)
+
+    def _link(self, match: PlaceMatch, seconds: int, live: VisualOdometry, view: View) -> AtlasReport | None:
+        """Hand a link to the atlas; say what came of it."""
+        atlas = self._record.atlas
+        (a, keyframe_a), (b, keyframe_b) = match.place, match.query
+        together = any(a in component and b in component for component in atlas.components())
+        kind = LinkKind.LOOP if together else LinkKind.MERGE
+        link = Link(a, b, match.S_place_query, match.covariance, kind, (), keyframe_a, keyframe_b, doubtful=False)
+        verdict = self._connections.judge(link)
+        self._linked_at[(b, a)] = self._n_asked
+        report = self._connections.connect([link], view)
+        if not report:
+            assert report.failure is not None
+            self._refused(view, b, a, keyframe_a, report.failure)
+            return None
+        if a == b:
+            self._merge_duplicates(atlas.submaps[a], match)
+            live.adopt(live.graph, live.submap)  # its last frame holds ids that are no more
+        chi2 = None if isinstance(verdict, Failure) or not verdict.redundant else verdict.chi2
+        self._record.event(
+            EventKind.LOOP_CLOSED if together else EventKind.MERGED,
+            view,
+            b,
+            other_submap=a,
+            other_frame=keyframe_a,
+            keyframe=keyframe_b,
+            seconds=seconds,
+            matches=match.n_matches,
+            inliers=match.n_inliers,
+            chi2_drift=chi2,
+            moved=max([*report.placed.values(), *report.bent.values()], default=0.0),
+            **{name: value for name, value in match.numbers.items() if name not in ("n_matches", "n_inliers")},
+        )
+        return report
+
+    def _merge_duplicates(self, submap: Submap, match: PlaceMatch) -> None:
+        """Let landmarks of the loop be one: then the loop is in the observations, too."""
+        current = submap.current_ids(match.landmark_pairs.ravel()).reshape(-1, 2)
+        current = current[(current >= 0).all(axis=1)]
+        submap.merge_landmarks(current[:, 0], current[:, 1])
+
+    def _agree(self, first: PlaceMatch, second: PlaceMatch) -> bool:
+        """Whether two matches between the same submaps put the newer keyframe at one place."""
+        submap = self._record.atlas.submaps[second.query[0]]
+        T_q = submap.T_submap_kf[second.query[1]]
+        place = self._record.atlas.submaps[second.place[0]]
+        ids = place.landmark_of[second.place[1]]
+        T_place = place.T_submap_kf[second.place[1]]
+        depth = float(np.median(place.depths(ids[ids >= 0], se3.inverse(T_place))))
+        poses = [sim3.act_on_pose(match.S_place_query, T_q) for match in (first, second)]
+        return _same_pose(poses[0], poses[1], SAME_WITHIN * depth)
+
+    def _contradict(self, one: PlaceMatch, other: PlaceMatch) -> bool:
+        """Whether two matches of one keyframe put it at two places of one map."""
+        if one.place[0] == other.place[0]:
+            return not self._agree(one, other)
+        atlas = self._record.atlas
+        component = next(c for c in atlas.components() if one.place[0] in c)
+        if other.place[0] not in component:
+            return False  # two maps that are not joined may well show one place
+        S_world = atlas.S_world_submap(component)
+        T_q = atlas.submaps[one.query[0]].T_submap_kf[one.query[1]]
+        centres = [sim3.act_on_pose(S_world[m.place[0]] @ m.S_place_query, T_q)[:3, 3] for m in (one, other)]
+        place = atlas.submaps[one.place[0]]
+        ids = place.landmark_of[one.place[1]]
+        depth = float(np.median(place.depths(ids[ids >= 0], se3.inverse(place.T_submap_kf[one.place[1]]))))
+        return bool(np.linalg.norm(centres[0] - centres[1]) > float(sim3.scale(S_world[one.place[0]])) * depth)
+
+    def _refused(self, now: FrameStamp, submap_id: int, other_submap: int, other_frame: int, why: Failure) -> None:
+        self._record.event(
+            EventKind.LOOP_REFUSED,
+            now,
+            submap_id,
+            other_submap=other_submap,
+            other_frame=other_frame,
+            reason=str(why.reason),
+            detail=why.detail,
+            **why.numbers,
+        )
+
+    def _take_in(self, live: Submap | None) -> None:
+        for submap in self._record.atlas.submaps.values():
+            self._recogniser.take_in(submap, YOUNG if submap is live else 0)
+
+    # --- frames without a map
+
+    def sighted(self, view: View, K: FloatArray) -> Relocalised | None:
+        """Show a frame without a map to all submaps; return where it goes on once others have said the same.
+
+        `K`: (3, 3) intrinsics of the frame; submaps of other ones are not looked at.
+        """
+        if not self._config.places.enabled:
+            return None
+        if self._frontend is not None:
+            if relocalised := self._follow(self._frontend, view):
+                return relocalised
+            if self._frontend is not None:
+                return None
+        self._take_in(None)
+        self._frontend = self._relocalise(view, K)
+        return None
+
+    def _follow(self, relocaliser: _Seeker, view: View) -> Relocalised | None:
+        """Let the front end that has posed the last frame pose this one."""
+        track = judge_track(relocaliser.odometry.track(view), self._config.health)
+        if isinstance(track, Failure) or track.wide:
+            self._frontend = None
+            return None
+        if len(relocaliser.tracks) < N_SECONDS:
+            relocaliser.tracks.append((track, relocaliser.odometry.relative_pose(track)))
+            return None
+        self._frontend = None
+        return Relocalised(relocaliser.odometry, relocaliser.tracks, track, relocaliser.odometry.reference_id)
+
+    def _relocalise(self, view: View, K: FloatArray) -> _Seeker | None:
+        """Pose a frame in the submap that it shows, by pixels alone."""
+        submaps = {m: submap for m, submap in self._record.atlas.submaps.items() if (submap.K == K).all()}
+        found: list[tuple[_Seeker, Track]] = []
+        for candidate in self._recogniser.query(view.features, submaps):
+            submap = submaps[candidate.submap_id]
+            odometry = self._new_frontend(submap, self._new_graph())
+            track = judge_track(odometry.relocalise(view, candidate.keyframe_id), self._config.health)
+            if isinstance(track, Failure):
+                continue
+            why = self._verifier.check_pose(submap, candidate.keyframe_id, track.T_cam_submap, view.features)
+            if why is not None:
+                self._refused(view, candidate.submap_id, candidate.submap_id, candidate.keyframe_id, why)
+                continue
+            pose = odometry.relative_pose(track)
+            found.append((_Seeker(odometry, candidate.keyframe_id, [(track, pose)]), track))
+        if not found:
+            return None
+        best, track = max(found, key=lambda item: item[1].n_inliers)
+        for other, contender in found:
+            submap = best.odometry.submap
+            if other.odometry.submap is not submap:
+                continue
+            ids = track.landmark_ids[track.landmark_ids >= 0]
+            depth = float(np.median(submap.depths(ids, track.T_cam_submap)))
+            here, there = se3.inverse(track.T_cam_submap), se3.inverse(contender.T_cam_submap)
+            if not _same_pose(here, there, SAME_WITHIN * depth):
+                detail = f"keyframes {best.keyframe_id} and {other.keyframe_id} show the place as well, elsewhere"
+                why = Failure(FailureReason.AMBIGUOUS_MODEL, detail)
+                self._refused(view, submap.id, submap.id, best.keyframe_id, why)
+                return None
+        return best
+
+
+def _same_pose(T_a: FloatArray, T_b: FloatArray, within: float) -> bool:
+    """Whether two poses, camera to map, are one: within a distance and `SAME_TURN_RAD`."""
+    apart = se3.inverse(T_a) @ T_b
+    turn = float(np.arccos(np.clip((np.trace(apart[:3, :3]) - 1) / 2, -1, 1)))
+    return bool(np.linalg.norm(apart[:3, 3]) < within and turn < SAME_TURN_RAD)
