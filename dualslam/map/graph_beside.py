@@ -117,7 +117,7 @@ class BesideGraph:
         Told, whenever there is something to send, of which submap.
     """
 
-    def __init__(self, graph_id: int, window: Window, register: Callable[[int, BesideGraph], None]) -> None:
+    def __init__(self, graph_id: int, window: Window, register: Callable[[Submap, BesideGraph], None]) -> None:
         self.id = graph_id
         self.is_behind = False
         self.rebuild_asked: bool | None = None  # near the optimum, or not
@@ -157,7 +157,7 @@ class BesideGraph:
 
     def _ask(self, submap: Submap) -> None:
         self.is_behind = True
-        self._register(submap.id, self)
+        self._register(submap, self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,6 +184,7 @@ class BesideGraphs:
         self._ids = count()
         self._graphs: dict[int, BesideGraph] = {}  # by the submap's id: the one that it has now
         self._under_way: tuple[int, BesideGraph] | None = None
+        self._answered: dict[int, frozenset[int]] = {}  # by the submap's id: the keyframes that its estimate knows
         self.n_rebuilt = 0
 
     def new_graph(self) -> SubmapGraph:
@@ -191,9 +192,8 @@ class BesideGraphs:
         return BesideGraph(next(self._ids), self._window, self._note)
 
     def lag(self, submap: Submap) -> int:
-        """Count the keyframes of a submap that its graph does not know yet."""
-        graph = self._graphs.get(submap.id)
-        return 0 if graph is None else len(submap.keyframes.keys() - set(graph.mirror.keyframe_ids))
+        """Count the keyframes of a submap that no answer of its graph has known yet."""
+        return len(submap.keyframes.keys() - self._answered.get(submap.id, submap.keyframes.keys()))
 
     def collect(self, submaps: Mapping[int, Submap]) -> Iterator[Moved]:
         """Put what has come back into its submap, and send what has changed since, if nothing is under way."""
@@ -226,8 +226,9 @@ class BesideGraphs:
                 if (moved := self._take(ended.result, submaps)) is not None:
                     yield moved
 
-    def _note(self, submap_id: int, graph: BesideGraph) -> None:
-        self._graphs[submap_id] = graph
+    def _note(self, submap: Submap, graph: BesideGraph) -> None:
+        self._graphs[submap.id] = graph
+        self._answered.setdefault(submap.id, frozenset(submap.keyframes))
 
     def _send(self, submaps: Mapping[int, Submap]) -> None:
         if self._under_way is not None:
@@ -255,6 +256,7 @@ class BesideGraphs:
             return None  # the submap has another graph by now, or is to be made anew from what it has become
         submap, estimate = submaps[submap_id], result.estimate
         graph.noise2 = estimate.noise2
+        self._answered[submap_id] = frozenset(estimate.keyframe_ids.tolist())
         before = apply_late(submap, *estimate.values)
         rows = estimate.outlier_rows[submap.observations["alive"][estimate.outlier_rows]]
         submap.remove_outliers(rows)

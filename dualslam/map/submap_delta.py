@@ -119,11 +119,6 @@ class SubmapMirror:
         self._landmark_alive = np.zeros(0, bool)
         self._is_new = True
 
-    @property
-    def keyframe_ids(self) -> list[int]:
-        """Those that the replica holds."""
-        return list(self._features)
-
     def delta(self, submap: Submap) -> SubmapDelta:
         """Return what brings the replica up to date with a submap, and take it as done."""
         obs, lm = submap.observations, submap.landmarks

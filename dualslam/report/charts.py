@@ -84,7 +84,7 @@ def beside_table(run: RunData) -> Markup:
     beside = run.summary.get("beside") or {}
     if not beside:
         return join(None)
-    head = ("", "jobs", "failed", "waited at once", "longest", "CPU")
+    head = ("", "jobs", "failed", "waited at once", "longest", "CPU", "peak memory")
     rows = [
         tag(
             "tr",
@@ -94,6 +94,7 @@ def beside_table(run: RunData) -> Markup:
             tag("td", str(queue["max_waiting"]), cls="num"),
             tag("td", duration(1e3 * queue["longest_s"]), cls="num"),
             tag("td", f"{number(queue['cpu_s'])} s", cls="num"),
+            tag("td", f"{number(queue['peak_rss_mb'], 4)} MB", cls="num"),
         )
         for kind, queue in beside.items()
     ]

@@ -14,6 +14,7 @@ import numpy as np
 from dualslam.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
+from dualslam.core.memory import peak_rss_mb
 from dualslam.core.types import FrameStatus
 from dualslam.io.run_folder import FrameRow, PosedFrames
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
@@ -138,6 +139,7 @@ def summarise(
             event.data["seconds"] for event in system.events.of_kind(EventKind.LINKED) if "seconds" in event.data
         ],
         "peak_rss_mb": report.peak_rss_mb,
+        "peak_rss_own_mb": peak_rss_mb(),
         "peak_buffer_mb": system.buffer.peak_bytes / MB,
         "stages_cpu_s": {name: stage.seconds for name, stage in system.timer.stages.items()},
         "stages_calls": {name: stage.calls for name, stage in system.timer.stages.items()},

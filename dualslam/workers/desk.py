@@ -27,7 +27,7 @@ from queue import Empty, SimpleQueue
 from threading import Event, Thread
 from typing import Any
 
-from dualslam.core.memory import keep_freed_memory
+from dualslam.core.memory import keep_freed_memory, peak_rss_mb
 from dualslam.core.types import Failure, FailureReason
 from dualslam.workers.jobs import Ended, Handlers, JobKind
 from dualslam.workers.transport import Channel
@@ -51,6 +51,7 @@ MAX_WAITING = 8
 class _Answer:
     result: Any | Failure
     cpu_s: float = 0.0
+    peak_rss_mb: float = 0.0
 
 
 class Worker:
@@ -150,7 +151,7 @@ def serve(connection: Connection, make_handlers: MakeHandlers, niceness: int = 0
         began_s = time.process_time()
         result = handlers[kind](work)
         try:
-            channel.send(_Answer(result, time.process_time() - began_s))
+            channel.send(_Answer(result, time.process_time() - began_s, peak_rss_mb()))
         except BrokenPipeError:  # nobody waits for it any more
             return
         del work, result  # as they go with the next job, what they held may go
@@ -225,6 +226,8 @@ class QueueStatistics:
         The same, all jobs together.
     cpu_s : float
         Of the processes.
+    peak_rss_mb : float
+        Highest resident memory that a process had had when it ended one: all that is done in a lane is in it.
     """
 
     n_done: int = 0
@@ -233,6 +236,7 @@ class QueueStatistics:
     longest_s: float = 0.0
     wall_s: float = 0.0
     cpu_s: float = 0.0
+    peak_rss_mb: float = 0.0
 
 
 class WorkerDesk:
@@ -330,6 +334,8 @@ class WorkerDesk:
             queue.idle.append(_replaced(task.worker, queue.lane) if lost else task.worker)
             wall_s = time.monotonic() - task.job.submitted_s
             self._end(task.job.kind, Ended(task.job.work, answer.result, answer.cpu_s, wall_s))
+            statistics = self.statistics[task.job.kind]
+            statistics.peak_rss_mb = max(statistics.peak_rss_mb, answer.peak_rss_mb)
         self._hand_out(queue)
 
     def _end(self, kind: JobKind, ended: Ended) -> None:
