@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -18,7 +19,7 @@ from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.camera.corrected import CorrectedCamera
 from dualslam.core.camera.models import Camera
 from dualslam.core.camera.rectification import rectify
-from dualslam.core.errors import ConfigError, InputError
+from dualslam.core.errors import ConfigError
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend, PreferredCamera, SelfCalibrator, SubmapGraph
 from dualslam.core.threads import spare_cores
@@ -49,6 +50,8 @@ from dualslam.recovery.reverse_tracking import Attempt, RecoveryJob, RecoveryPar
 from dualslam.system import Components, System
 from dualslam.workers.desk import Lane, WorkerDesk
 from dualslam.workers.jobs import Handlers, InlineDesk, JobKind
+
+log = logging.getLogger(__name__)
 
 ADJUST_ITERATIONS = 20
 FEATURE_THREADS = 2
@@ -116,7 +119,8 @@ def build_system(
     frontend = create_frontend(config.frontend)
     size_px = (camera.width, camera.height)
     known = camera if saved is None else _camera_of(saved, camera)
-    if saved is not None:  # its camera is its own: to change it would part what is there from what comes
+    is_known = saved is not None and known is saved.camera
+    if is_known:  # its camera is its own: to change it would part what is there from what comes
         config = config.model_copy(update={"calibration": config.calibration.model_copy(update={"refine": False})})
     calibration = new_calibration(config, known)
     faults = FaultScript(config.corruptions)
@@ -180,17 +184,14 @@ def place_parts(config: Config, frontend: Frontend, size_px: tuple[int, int]) ->
 def _camera_of(saved: StoredMap, camera: Camera) -> Camera:
     """Return the camera that made a saved map, where it is the one that is given, perhaps corrected since.
 
-    Raises
-    ------
-    InputError
-        If it is another one: poses in the map would be wrong.
+    Where it is another one, the given: frames are not looked for in submaps of other intrinsics.
     """
     known = saved.camera or camera
     given = known.base if isinstance(known, CorrectedCamera) else known
-    of_map = [submap.K for submap in saved.atlas.submaps.values()]
-    if given.to_dict() != camera.to_dict() or not any(np.allclose(K, known.K) for K in of_map):
-        raise InputError("The saved map was made with another camera than this source's; give it the same calibration.")
-    return known
+    if given.to_dict() == camera.to_dict():
+        return known
+    log.warning("the saved map was made with another camera: single frames cannot be posed in it")
+    return camera
 
 
 def atlas_solver(config: Config) -> GtsamAtlasSolver:

@@ -131,6 +131,7 @@ class System:
             components.new_graph,
             components.new_relocaliser,
             config,
+            merges=config.recovery.enabled or saved is not None,
         )
         self._recoveries = Recoveries(
             record,
@@ -269,7 +270,8 @@ class System:
     def _relocalise_anywhere(self, view: View) -> Track | None:
         """Go on in whichever submap shows a few frames in a row: at once in a saved map, else where none can start."""
         self._n_without_map += len(view.features) >= self._config.tracking.min_inliers
-        after = 0 if self.saved is not None else self._config.recovery.relocalise_after
+        recovery = self._config.recovery
+        after = 0 if self.saved is not None else recovery.relocalise_after if recovery.enabled else None
         if not self.atlas.submaps or after is None or self._n_without_map <= after:
             return None
         with self.timer.measure("places"):
@@ -291,7 +293,7 @@ class System:
             submap.id,
             n_inliers=first.n_inliers,
             other_frame=found.reference,
-            first_frame=first.view.index,
+            frames=len(found.earlier) + 1,
         )
         if not self._localises:
             self._recoveries.found_again(submap)

@@ -37,12 +37,18 @@ class FrontendPlaceMatcher:
         return self._frontend.match_wide(a, b)
 
     def look(
-        self, submap: Submap, landmark_ids: IntArray, T_cam_submap: FloatArray, features: Features, radius_px: float
+        self,
+        submap: Submap,
+        landmark_ids: IntArray,
+        T_cam_submap: FloatArray,
+        K: FloatArray,
+        features: Features,
+        radius_px: float,
     ) -> Sighting:
         """Look for landmarks of a submap in an image, about where they should be under a pose."""
         frontend = self._frontend
         local = LocalMap.of_landmarks(submap, landmark_ids)
-        seen = local.predict(T_cam_submap, submap.K, self._size_px, frontend.scale_factor, frontend.n_octaves)
+        seen = local.predict(T_cam_submap, K, self._size_px, frontend.scale_factor, frontend.n_octaves)
         feature = np.full(len(seen.rows), -1, np.int64)
         if len(features) and len(seen.rows):
             matches = match_projected(

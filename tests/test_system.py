@@ -245,6 +245,7 @@ def test_rolling_over_loses_nothing(world: PointWorld) -> None:
         "graph": {"max_keyframes": 20, "rollover_keyframes": 6},
         "keyframes": {"max_parallax_deg": 1.0},
         "mapping": {"redundant_ratio": 1.0},
+        "loops": {"enabled": False},
     }
     system = run(world, **settings)
     assert len(system.atlas.submaps) > 1

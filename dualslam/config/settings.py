@@ -395,7 +395,8 @@ class LoopsConfig(StrictModel):
     """Loops and merges of maps by what is seen again."""
 
     enabled: bool = True
-    """Whether the live map is linked where it shows what any map, itself among them, has shown before."""
+    """Whether the live map is linked where it shows what any map, itself among them, has shown before. Without
+    recovery (`recovery.enabled`) a lost map of the same run stays apart all the same."""
 
 
 class Config(StrictModel):

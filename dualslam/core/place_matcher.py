@@ -50,10 +50,16 @@ class PlaceMatcher(Protocol):
         ...
 
     def look(
-        self, submap: Submap, landmark_ids: IntArray, T_cam_submap: FloatArray, features: Features, radius_px: float
+        self,
+        submap: Submap,
+        landmark_ids: IntArray,
+        T_cam_submap: FloatArray,
+        K: FloatArray,
+        features: Features,
+        radius_px: float,
     ) -> Sighting:
         """Look for landmarks of a submap in an image, about where they should be under a pose.
 
-        `radius_px`: at the finest octave.
+        `K`: (3, 3) intrinsics of the image; `radius_px`: at the finest octave.
         """
         ...

@@ -42,6 +42,10 @@ SAME_WITHIN = 0.1
 a link a wrong one."""
 SAME_TURN_RAD = float(np.radians(6.0))
 """The same for its rotation: twice 3 degrees."""
+MAX_DRIFT, MAX_DRIFT_DEG, MAX_DRIFT_LOG_SCALE = 0.5, 60.0, float(np.log(3.0))
+"""What a map that was never lost between two places can have drifted at most: a share of the way, a turn, a scale. Half
+the way is what lies between two copies of a thing that stand next to each other; the largest drift that was seen on a
+real sequence is 47 % in scale."""
 _SILENT = (FailureReason.TOO_FEW_MATCHES, FailureReason.TOO_FEW_INLIERS)
 """Refusals of what only looked alike to the recogniser: they are no events."""
 
@@ -105,6 +109,8 @@ class Revisits:
     new_relocaliser : callable
         Makes a front end of an archived submap.
     config : Config
+    merges : bool
+        Whether maps that are not joined yet may be.
     """
 
     def __init__(
@@ -115,8 +121,10 @@ class Revisits:
         new_graph: Callable[[], SubmapGraph],
         new_relocaliser: Callable[[Submap, SubmapGraph], Seeker],
         config: Config,
+        merges: bool = True,
     ) -> None:
         self._record = record
+        self._merges = merges
         self._recogniser = parts.recogniser
         self._verifier = parts.verifier
         self._connections = connections
@@ -160,6 +168,8 @@ class Revisits:
             place = submaps[candidate.submap_id], candidate.keyframe_id
             match = self._verifier.verify((submap, keyframe_id), place)
             if not isinstance(match, Failure):
+                match = self._plausible(match)
+            if not isinstance(match, Failure):
                 found.append(match)
             elif match.reason not in _SILENT and refused is None:
                 refused = candidate.submap_id, candidate.keyframe_id, match
@@ -188,8 +198,10 @@ class Revisits:
             other for (one, other), n in self._linked_at.items() if one == submap.id and self._n_asked - n < REST
         }
 
+        joined = set(self._component(submap.id))
+
         def may_be(m: int, k: int) -> bool:
-            if m in resting or k in recent:
+            if m in resting or k in recent or (m not in joined and not self._merges):
                 return False
             return m == submap.id or k not in submap.keyframes
 
@@ -274,7 +286,7 @@ class Revisits:
         if one.place[0] == other.place[0]:
             return not self._agree(one, other)
         atlas = self._record.atlas
-        component = next(c for c in atlas.components() if one.place[0] in c)
+        component = self._component(one.place[0])
         if other.place[0] not in component:
             return False  # two maps that are not joined may well show one place
         S_world = atlas.S_world_submap(component)
@@ -284,6 +296,48 @@ class Revisits:
         ids = place.landmark_of[one.place[1]]
         depth = float(np.median(place.depths(ids[ids >= 0], se3.inverse(place.T_submap_kf[one.place[1]]))))
         return bool(np.linalg.norm(centres[0] - centres[1]) > float(sim3.scale(S_world[one.place[0]])) * depth)
+
+    def _plausible(self, match: PlaceMatch) -> PlaceMatch | Failure:
+        """Refuse what no drift explains: a map that goes on from one place to the other has not lost that much.
+
+        These are the bounds of what drift can be at all, and not of what the chain says of its own: pixels that prove
+        the place are believed over any chi-square. A street of identical houses is refused here, as each house is a
+        whole way off from the next.
+        """
+        (a, k_a), (b, k_b) = match.place, match.query
+        component = self._component(b)
+        if a not in component:
+            return match
+        submaps, S_world = self._record.atlas.submaps, self._record.atlas.S_world_submap(component)
+        S_a_b = sim3.inverse(S_world[a]) @ S_world[b]
+        T_b_cam = submaps[b].T_submap_kf[k_b]
+        by_chain, by_pixels = sim3.act_on_pose(S_a_b, T_b_cam), sim3.act_on_pose(match.S_place_query, T_b_cam)
+        log_scale = float(np.log(sim3.scale(match.S_place_query) / sim3.scale(S_a_b)))
+        way = self._way(component, S_world, k_a, k_b) / float(sim3.scale(S_world[a]))
+        apart = float(np.linalg.norm(by_chain[:3, 3] - by_pixels[:3, 3]))
+        numbers = {"drift_rot_deg": float(np.degrees(_turn(by_chain, by_pixels))), "drift_log_scale": log_scale}
+        numbers |= {"drift": apart / max(way, 1e-12)}
+        match.numbers.update(numbers)
+        if numbers["drift_rot_deg"] > MAX_DRIFT_DEG or abs(log_scale) > MAX_DRIFT_LOG_SCALE or apart > MAX_DRIFT * way:
+            detail = (
+                f"the map would have drifted by {numbers['drift']:.0%} of the way, {numbers['drift_rot_deg']:.0f} deg"
+            )
+            return Failure(FailureReason.CONTRADICTION, detail, match.numbers)
+        return match
+
+    def _component(self, submap_id: int) -> list[int]:
+        return next(c for c in self._record.atlas.components() if submap_id in c)
+
+    def _way(self, component: list[int], S_world: dict[int, FloatArray], first: int, last: int) -> float:
+        """Return how far the camera went between two keyframes, in the unit of the world."""
+        first, last = min(first, last), max(first, last)
+        centres: dict[int, FloatArray] = {}
+        for m in component:
+            for k, T in self._record.atlas.submaps[m].T_submap_kf.items():
+                if first <= k <= last and k not in centres:
+                    centres[k] = sim3.act(S_world[m], T[None, :3, 3])[0]
+        ordered = np.array([centres[k] for k in sorted(centres)])
+        return float(np.linalg.norm(np.diff(ordered, axis=0), axis=1).sum())
 
     def _refused(self, now: FrameStamp, submap_id: int, other_submap: int, other_frame: int, why: Failure) -> None:
         self._record.event(
@@ -365,8 +419,11 @@ class Revisits:
         return best
 
 
+def _turn(T_a: FloatArray, T_b: FloatArray) -> float:
+    """Return the angle between two poses, radians."""
+    return float(np.arccos(np.clip((np.trace(T_a[:3, :3].T @ T_b[:3, :3]) - 1) / 2, -1, 1)))
+
+
 def _same_pose(T_a: FloatArray, T_b: FloatArray, within: float) -> bool:
     """Whether two poses, camera to map, are one: within a distance and `SAME_TURN_RAD`."""
-    apart = se3.inverse(T_a) @ T_b
-    turn = float(np.arccos(np.clip((np.trace(apart[:3, :3]) - 1) / 2, -1, 1)))
-    return bool(np.linalg.norm(apart[:3, 3]) < within and turn < SAME_TURN_RAD)
+    return bool(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3]) < within and _turn(T_a, T_b) < SAME_TURN_RAD)

@@ -167,7 +167,7 @@ class PlaceVerifier:
             Of the frame.
         """
         place = _side(submap, keyframe_id)
-        look = self._matcher.look(submap, place.landmarks, T_cam_submap, features, SEARCH_RADIUS_PX)
+        look = self._matcher.look(submap, place.landmarks, T_cam_submap, submap.K, features, SEARCH_RADIUS_PX)
         own = float(np.median([self._look(place, submap, k, np.eye(4)).share for k in place.keyframes]))
         numbers = {"found": look.share, "own_found": own, "n_visible": float(len(look.feature))}
         if look.share < MIN_FOUND * own:
@@ -248,7 +248,9 @@ class PlaceVerifier:
     def _look(self, seen: _Side, looking: Submap, keyframe_id: int, S_seen_looking: FloatArray) -> Sighting:
         T_seen_cam = sim3.act_on_pose(S_seen_looking, looking.T_submap_kf[keyframe_id])
         features = looking.keyframes[keyframe_id].features
-        return self._matcher.look(seen.submap, seen.landmarks, se3.inverse(T_seen_cam), features, SEARCH_RADIUS_PX)
+        return self._matcher.look(
+            seen.submap, seen.landmarks, se3.inverse(T_seen_cam), looking.K, features, SEARCH_RADIUS_PX
+        )
 
     def _judge(
         self, place: _Side, query: _Side, pairs: _Pairs, estimate: Sim3Estimate, looks: _Looks, rng: Generator

@@ -1,0 +1,106 @@
+"""Votes of landmarks find the keyframes that show a place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dualslam.core.types import Features, Keyframe
+from dualslam.map.submap import Submap
+from dualslam.places import FaissRecogniser
+from dualslam.places.cells import N_CELLS, shipped_cells
+from tests.places.worlds import N_LAP, driven_lap, lap
+
+MAX_BITS = 50.0
+
+
+def test_the_cells_are_shipped() -> None:
+    cells = shipped_cells()
+    assert cells.shape == (N_CELLS, 32)
+    assert cells.dtype == np.uint8
+    assert len(np.unique(cells, axis=0)) == N_CELLS
+
+
+def test_a_frame_finds_the_keyframes_that_stood_where_it_stands() -> None:
+    submap = driven_lap().atlas.submaps[0]
+    recogniser = FaissRecogniser(MAX_BITS)
+    assert recogniser.take_in(submap) > 500
+    assert recogniser.take_in(submap) == 0
+    assert len(recogniser) * 32 < recogniser.nbytes < len(recogniser) * 100
+    first_lap = [k for k in submap.keyframes if k < N_LAP // 2]
+    for i in (N_LAP + 3, N_LAP + 12, N_LAP + 20):
+        best = recogniser.query(lap().features(i), {0: submap}, lambda m, k: k in first_lap)[0]
+        assert best.submap_id == 0
+        assert abs(best.keyframe_id - (i - N_LAP)) <= 10
+
+
+def test_the_same_calls_give_the_same_candidates() -> None:
+    submap = driven_lap().atlas.submaps[0]
+    answers = []
+    for _ in range(2):
+        recogniser = FaissRecogniser(MAX_BITS)
+        recogniser.take_in(submap, n_newest_left_out=5)
+        recogniser.take_in(submap)
+        answers.append([recogniser.query(lap().features(i), {0: submap}) for i in (5, 40, 80)])
+    assert answers[0] == answers[1]
+    assert all(answers[0])
+
+
+def test_candidates_are_of_different_places() -> None:
+    submap = driven_lap().atlas.submaps[0]
+    recogniser = FaissRecogniser(MAX_BITS)
+    recogniser.take_in(submap)
+    found = recogniser.query(lap().features(30), {0: submap})
+    keyframes = [candidate.keyframe_id for candidate in found]
+    assert len(keyframes) == len(set(keyframes))
+    ids = [set(submap.landmark_of[k][submap.landmark_of[k] >= 0].tolist()) for k in keyframes]
+    for n, own in enumerate(ids):
+        for other in ids[:n]:
+            assert len(own & other) < 0.3 * min(len(own), len(other))
+
+
+def test_culled_landmarks_have_no_vote_and_condemned_keyframes_are_not_proposed() -> None:
+    submap = driven_lap().atlas.submaps[0].copy()
+    recogniser = FaissRecogniser(MAX_BITS)
+    recogniser.take_in(submap)
+    best = recogniser.query(lap().features(30), {0: submap})[0]
+    submap.condemn([best.keyframe_id])
+    assert best not in recogniser.query(lap().features(30), {0: submap})
+    submap.remove_landmarks(np.flatnonzero(submap.landmarks["alive"]))
+    assert recogniser.query(lap().features(30), {0: submap}) == []
+
+
+def test_nothing_is_found_in_an_empty_index_or_image() -> None:
+    submap = driven_lap().atlas.submaps[0]
+    recogniser = FaissRecogniser(MAX_BITS)
+    assert recogniser.query(lap().features(30), {0: submap}) == []
+    recogniser.take_in(submap)
+    nothing = lap().features(30).take(np.zeros(0, np.int64))
+    assert recogniser.query(nothing, {0: submap}) == []
+
+
+@pytest.mark.parametrize(("dtype", "length"), [(np.float32, 128), (np.uint8, 16)])
+def test_other_descriptors_are_searched_exhaustively(dtype: type, length: int) -> None:
+    rng = np.random.default_rng(0)
+    n = 40
+    if dtype is np.uint8:
+        words = rng.integers(0, 256, (3, n, length), np.uint8)
+    else:
+        words = rng.normal(size=(3, n, length)).astype(np.float32)
+        words /= np.linalg.norm(words, axis=2, keepdims=True)
+    submap = Submap(0, np.eye(3), words[0, 0])
+    for k in range(3):
+        features = _features(words[k])
+        submap.add_keyframe(Keyframe(k, float(k), features), np.eye(4))
+        ids = submap.add_landmarks(rng.normal(size=(n, 3)), words[k], np.ones(n), k)
+        submap.add_observations(k, np.arange(n), ids)
+    recogniser = FaissRecogniser(0.5 if dtype is np.float32 else 20.0)
+    recogniser.take_in(submap)
+    for k in range(3):
+        assert [(c.keyframe_id, c.n_votes) for c in recogniser.query(_features(words[k]), {0: submap})] == [(k, n)]
+
+
+def _features(descriptors: np.ndarray) -> Features:
+    n = len(descriptors)
+    zero, uv = np.zeros(n), np.zeros((n, 2))
+    return Features(uv, uv, zero + 1, zero + 1, np.zeros(n, np.int64), zero, descriptors)
