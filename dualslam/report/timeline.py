@@ -25,10 +25,11 @@ MIN_LABEL_PERCENT = 3.0
 _MARKS = {
     "initialised": ("○", "mark", "a map begins"),
     "reinitialised": ("○", "mark", "a new map begins"),
-    "gap_relocalised": ("↺", "mark quiet", "found again by wide matching"),
+    "gap_relocalised": ("↺", "mark quiet", "found again"),
     "rolled_over": ("→", "mark quiet", "a full submap hands over to the next"),
     "linked": ("◆", "mark good", "two submaps are linked"),
     "loop_closed": ("◆", "mark good", "a loop is closed"),
+    "merged": ("◆", "mark good", "two maps are joined by what both have seen"),
     "interrupted": ("■", "mark bad", "the run was interrupted"),
 }
 
