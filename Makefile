@@ -1,9 +1,10 @@
-# make setup | demo | test | check | docs | bench | accuracy | lock | clean
+# make setup | demo | test | test-all | check | docs | bench | accuracy | lock | clean
 # A fresh clone needs python3 (3.11 to 3.13, choose with PYTHON=python3.12), its venv and pip modules, and make.
 
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+JOBS ?= auto
 STAMP := $(VENV)/installed.stamp
 KORNIA_STAMP := $(VENV)/kornia.stamp
 
@@ -13,7 +14,7 @@ export OPENBLAS_NUM_THREADS = 1
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 unexport PYTHONPATH
 
-.PHONY: setup demo test check docs format bench accuracy lock clean
+.PHONY: setup demo test test-all check docs format bench accuracy lock clean
 .DEFAULT_GOAL := setup
 
 setup: $(STAMP)
@@ -33,8 +34,13 @@ $(KORNIA_STAMP): $(STAMP) requirements/kornia.lock
 demo: setup
 	$(BIN)/dualslam demo --out runs/demo --overwrite
 
-test: $(KORNIA_STAMP)
-	$(BIN)/python -m pytest $(ARGS)
+# What is fast, on all cores: some minutes on two. Needs no torch.
+test: setup
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(ARGS)
+
+# Everything: slow tests, the kornia front end, the notebooks; and real sequences where DUALSLAM_DATA names their folder.
+test-all: $(KORNIA_STAMP)
+	$(BIN)/python -m pytest tests notebooks -m "slow or not slow" -n $(JOBS) --dist worksteal $(ARGS)
 
 check: setup
 	$(BIN)/ruff check .

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from dualslam.pace import BEHIND_S, MAX_LAG_KEYFRAMES, MAX_PUT_OFF, Pace
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
 
@@ -45,6 +47,7 @@ def test_what_would_be_lost_without_new_landmarks_gets_them() -> None:
     assert pace.puts_off(MANY, WEAK)
 
 
+@pytest.mark.slow
 def test_a_system_that_is_behind_makes_fewer_keyframes_and_keeps_its_track() -> None:
     world = PointWorld(cloud(), hand_held(60))
     dense = {"keyframes": {"max_parallax_deg": 1.0}, "mapping": {"redundant_ratio": 1.0}}

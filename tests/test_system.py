@@ -73,6 +73,7 @@ def test_the_frames_before_the_start_are_posed_by_walking_back() -> None:
     assert_right(indices, T, world)
 
 
+@pytest.mark.slow
 def test_a_start_that_comes_late_poses_frames_older_than_the_buffer_keeps() -> None:
     still, moving = 40, path(30, np.array([0.08, 0, 0]), np.zeros(3))
     T = np.concatenate([np.repeat(moving[:1], still, axis=0), moving])
@@ -170,6 +171,7 @@ def test_a_lost_map_that_is_seen_again_before_another_starts_is_gone_on_with() -
     assert system.rows[69].status is FrameStatus.TRACKED
 
 
+@pytest.mark.slow
 def test_it_may_be_lost_again() -> None:
     once, T = turning_back(25), turning_back(25).T_world_cam
     world = PointWorld(once.xyz, np.concatenate([T, np.repeat(T[30:31], 12, 0)]))
@@ -180,6 +182,7 @@ def test_it_may_be_lost_again() -> None:
     assert [(loss.submap, loss.relocalised, loss.recovered) for loss in losses] == [(0, True, True), (0, False, False)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{"enabled": False}, {"enabled": True, "relocalise_after": None}])
 def test_it_is_not_looked_for_where_that_is_not_wanted(settings: dict[str, object]) -> None:
     system = run(turning_back(25), recovery=settings)

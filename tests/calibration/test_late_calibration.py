@@ -56,6 +56,7 @@ def in_time() -> System:
     return run(polls=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("polls", [3, 15])
 def test_a_late_answer_is_as_good_as_one_in_time(in_time: System, polls: int) -> None:
     late = run(polls)
@@ -73,6 +74,7 @@ def test_a_late_answer_is_as_good_as_one_in_time(in_time: System, polls: int) ->
         assert np.sqrt((measured**2).mean()) < 1.3 * np.sqrt((expected**2).mean()) + 1e-3
 
 
+@pytest.mark.slow
 def test_an_answer_for_a_map_that_was_lost_meanwhile_changes_nothing(in_time: System) -> None:
     asked = in_time.events.of_kind(EventKind.CALIBRATED)[0].frame
     system = run(polls=40, n_frames=asked + 60, blind=range(asked + 5, asked + 30))

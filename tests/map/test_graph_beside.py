@@ -109,6 +109,7 @@ def test_a_graph_that_answers_late_is_as_good_as_one_in_time(world: PointWorld, 
     assert graphs.lag(system.atlas.submaps[0]) == 0
 
 
+@pytest.mark.slow
 def test_two_maps_are_linked_whose_graphs_answer_late() -> None:
     world = PointWorld(cloud(), hand_held(90), covered=frozenset(range(35, 50)))
     system = run(beside(world, 2, recovery={"enabled": True}), world)

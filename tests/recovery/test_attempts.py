@@ -86,6 +86,7 @@ class TestOrder:
         assert first.data["verdict"] == "its image is no longer buffered"
         assert linked.data["attempt"] == "live"
 
+    @pytest.mark.slow
     def test_the_next_starts_where_the_first_did(self) -> None:
         alone = events_of(["live"])[-1].data
         second = events_of(["sift", "live"])[-1].data
@@ -157,6 +158,7 @@ class TestRetry:
         assert [event.frame for event in started[2:]] == [89]
         assert not system.atlas.links
 
+    @pytest.mark.slow
     def test_what_is_linked_is_not_looked_for_again(self) -> None:
         system = self.run(n_failing=0)
         assert len(system.events.of_kind(EventKind.RECOVERY_STARTED)) == 1

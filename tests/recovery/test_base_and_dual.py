@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from dualslam.build import build_system
 from dualslam.config.files import config_from_dict
 from dualslam.core.events import EventKind
@@ -11,6 +13,7 @@ N = 50
 DARK = {"kind": "blackout", "start": 30, "length": 5}
 
 
+@pytest.mark.slow
 def test_while_no_map_is_lost_both_are_the_same() -> None:
     """Also where landmarks are found again in the images, beyond frames that tracking gets over by itself."""
     world = make_sequence("street", N, 3, 320, 240, events=[DARK])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from dualslam.core.events import EventKind
 from dualslam.core.types import FrameStatus
@@ -24,6 +25,7 @@ def run(n_frames: int, **settings: object) -> tuple[System, PointWorld]:
     return system, world
 
 
+@pytest.mark.slow
 def test_a_lost_map_gives_its_frames_to_a_larger_one_that_has_posed_them_all() -> None:
     system, world = run(110)
     assert [len(c) for c in system.atlas.components()] == [1, 1]
@@ -42,6 +44,7 @@ def test_a_lost_map_gives_its_frames_to_a_larger_one_that_has_posed_them_all() -
     assert not system.atlas.links
 
 
+@pytest.mark.slow
 def test_a_lost_map_that_holds_more_than_the_new_one_keeps_its_frames() -> None:
     system, _ = run(75)
     system.finish()

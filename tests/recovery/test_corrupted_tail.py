@@ -42,7 +42,9 @@ def run(degrees: float, seed: int) -> tuple[System, PointWorld]:
     return system, world
 
 
-@pytest.fixture(scope="module", params=[(6.0, 1), (15.0, 2)], ids=["6 deg", "15 deg"])
+@pytest.fixture(
+    scope="module", params=[(6.0, 1), pytest.param((15.0, 2), marks=pytest.mark.slow)], ids=["6 deg", "15 deg"]
+)
 def corrupted(request: pytest.FixtureRequest) -> tuple[System, PointWorld]:
     return run(*request.param)
 

@@ -122,6 +122,7 @@ class TestBound:
         assert 1 < len(stretch) < n - self.newest - LOST_AT
         assert max(np.diff(stretch)) <= 2 * (n - self.newest - LOST_AT) / len(stretch) + 1
 
+    @pytest.mark.slow
     def test_then_whole_frames_and_what_surrounds_the_stretch_stays(self) -> None:
         n = 2000
         buffer = overflown(n, 30, NOISE)

@@ -90,7 +90,7 @@ def world() -> PointWorld:
     return PointWorld(cloud(), hand_held(90), covered=COVERED)
 
 
-@pytest.mark.parametrize("polls", [1, 12, 30])
+@pytest.mark.parametrize("polls", [12, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 30))])
 def test_the_live_map_has_grown_meanwhile(world: PointWorld, polls: int) -> None:
     system = run(world, polls)
     (ended,) = system.events.of_kind(EventKind.RECOVERY_ENDED)
@@ -103,6 +103,7 @@ def test_the_live_map_has_grown_meanwhile(world: PointWorld, polls: int) -> None
     assert not system.events.of_kind(EventKind.GAP_RELOCALISED)
 
 
+@pytest.mark.slow
 def test_the_live_map_has_rolled_over_meanwhile() -> None:
     world = PointWorld(cloud(), hand_held(110), covered=COVERED)
     settings = {
@@ -124,6 +125,7 @@ def twice_lost() -> PointWorld:
     return PointWorld(cloud(), hand_held(120), covered=COVERED | frozenset(range(68, 80)))
 
 
+@pytest.mark.slow
 def test_the_live_map_has_been_lost_meanwhile(twice_lost: PointWorld) -> None:
     """The result goes into the archived map, before the next one starts."""
     system = run(twice_lost, 25, **DENSE)
@@ -135,6 +137,7 @@ def test_the_live_map_has_been_lost_meanwhile(twice_lost: PointWorld) -> None:
     assert_one_right_map(system, twice_lost, twice_lost.covered)
 
 
+@pytest.mark.slow
 def test_two_walks_overlap(twice_lost: PointWorld) -> None:
     """The second starts from a copy of the lost map that the first one's result is not in yet."""
     system = run(twice_lost, 33, **DENSE)
@@ -157,6 +160,7 @@ def prediction_errors(world: PointWorld, polls: int) -> tuple[System, dict[int, 
     return system, errors
 
 
+@pytest.mark.slow
 def test_tracking_goes_on_with_no_jump_that_the_motion_model_could_not_explain(world: PointWorld) -> None:
     _, undisturbed = prediction_errors(world, 1000)
     usual = np.max([undisturbed[i] for i in range(60, 90)], axis=0)
@@ -179,6 +183,7 @@ def miscalibrated(f: float, covered: range, settings: dict[str, object]) -> tupl
     return system, world
 
 
+@pytest.mark.slow
 def test_the_camera_has_been_refined_meanwhile() -> None:
     """What the walk saw by the old camera is merged by the pixels of the new one, and fits the map as it is now."""
     settings = {
@@ -207,6 +212,7 @@ def test_the_camera_has_been_refined_meanwhile() -> None:
     assert rotation.max() < ROTATION_RAD
 
 
+@pytest.mark.slow
 def test_maps_of_a_wrong_camera_are_linked_after_both_have_been_calibrated() -> None:
     settings = {
         "calibration": {"first_keyframes": 20, "max_observations": 6000},

@@ -62,6 +62,7 @@ def room() -> tuple[Case, LinkEstimate, RefinedOverlap]:
     return case, link, refinement
 
 
+@pytest.mark.slow
 def test_a_refined_seam_has_a_truer_link() -> None:
     """Over rooms and streets: the larger overlap, measured in one map, tells the scale better than the smaller one."""
     before, after = [], []

@@ -134,6 +134,7 @@ def test_the_walk_never_reads_the_old_map(recovered: tuple[System, PointWorld]) 
     assert not any(np.array_equal(se3.inverse(new.T_submap_kf[k]), se3.inverse(old.T_submap_kf[k])) for k in shared)
 
 
+@pytest.mark.slow
 def test_three_maps_chain() -> None:
     """Two black-outs: each new map is linked with the one before it, and all frames end in one true trajectory."""
     covered = frozenset((*range(35, 50), *range(100, 114)))

@@ -111,6 +111,7 @@ class TestFramesBeforeTheStart:
         assert again.newest_id == N_BEHIND
         assert not again.lost
 
+    @pytest.mark.slow
     def test_the_same_in_a_sequence_that_is_read_backwards(self) -> None:
         forwards = away_first()
         world = PointWorld(forwards.xyz, forwards.T_world_cam[::-1])
@@ -121,6 +122,7 @@ class TestFramesBeforeTheStart:
         assert len(watched.jobs) == 2
         assert_right(system, world, range(N_BEHIND + N_SWEEP))
 
+    @pytest.mark.slow
     def test_poses_that_were_there_stay_but_for_what_the_graph_moves(self) -> None:
         """They keep their keyframe, or a neighbour of it, and the map's shape."""
         world = away_first()
@@ -173,6 +175,7 @@ class TestFramesBeforeTheStart:
             system.step(frame)
         assert len(watched.jobs) == 1
 
+    @pytest.mark.slow
     def test_the_same_seed_gives_the_same_poses_bit_for_bit(self) -> None:
         found = []
         for _ in range(2):
@@ -287,6 +290,7 @@ class TestSchedule:
         assert schedule.take_if_due(submap, 11, replace(CAMERA, fx=451.0))
 
 
+@pytest.mark.slow
 def test_a_walk_reads_no_frame_that_is_older_than_the_lost_map() -> None:
     """The lost map has rolled over: older frames are another's, and no link can come of them."""
     covered = frozenset(range(100, 115))

@@ -61,6 +61,7 @@ def test_what_is_no_run_is_named(pair: list[Path], tmp_path: Path, capsys: pytes
     assert not (tmp_path / "x.html").exists()
 
 
+@pytest.mark.slow
 def test_without_truth_the_maps_are_laid_on_the_first(make_run: MakeRun) -> None:
     runs = [read_run(make_run(truth=False, lost=lost, name="phone")) for lost in ((), (5, 6, 7), ())]
     found = Outline(comparison_page(runs))

@@ -271,6 +271,7 @@ def test_pictures_of_an_earlier_run_go_with_it(make_run: MakeRun) -> None:
     assert not (folder / "groundtruth.txt").exists()
 
 
+@pytest.mark.slow
 def test_a_page_stays_small_however_much_happens(broken_run: RunData) -> None:
     failed = next(e for e in broken_run.events if e["event"] == "failed")
     found = outline(replace(broken_run, events=[failed | {"submap": m} for m in range(900)]))

@@ -39,6 +39,7 @@ def trial(spec: BenchSpec) -> Trial:
     return trial
 
 
+@pytest.mark.slow
 def test_a_trial_is_a_run_folder_and_a_line(spec: BenchSpec, trial: Trial, tmp_path: Path) -> None:
     record = run_trial(trial, str(tmp_path))
     assert record.outcome is TrialOutcome.DONE, record.error

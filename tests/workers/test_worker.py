@@ -108,6 +108,7 @@ def test_a_recovery_out_of_time_gives_what_it_has(job: RecoveryJob) -> None:
     assert attempt.data["verdict"] == "out of time"
 
 
+@pytest.mark.slow
 def test_a_job_can_be_pickled_and_is_left_as_it_was(job: RecoveryJob) -> None:
     before = job.submap.copy()
     here = run_recovery(job, MAKE_PARTS())
@@ -119,6 +120,7 @@ def test_a_job_can_be_pickled_and_is_left_as_it_was(job: RecoveryJob) -> None:
         assert np.array_equal(column, job.submap.landmarks[name])
 
 
+@pytest.mark.slow
 def test_a_worker_finds_what_would_be_found_inline_and_stays_warm(desk: WorkerDesk, job: RecoveryJob) -> None:
     pids = desk.pids
     for _ in range(2):
@@ -143,6 +145,7 @@ def test_a_worker_that_is_killed_costs_its_job_only(desk: WorkerDesk, job: Recov
     assert isinstance(wait_for(desk), RecoveryResult)
 
 
+@pytest.mark.slow
 def test_a_worker_that_died_while_idle_is_replaced(desk: WorkerDesk, job: RecoveryJob) -> None:
     (pid,) = desk.pids
     assert pid is not None

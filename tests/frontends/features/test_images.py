@@ -30,7 +30,10 @@ def run(sequence: SyntheticSequence) -> System:
 
 @pytest.mark.parametrize(
     ("scene", "n_frames", "size", "share"),
-    [("street", 40, SIZE, 0.02), ("room", 50, {"width": 640, "height": 480}, 0.02)],
+    [
+        ("street", 40, SIZE, 0.02),
+        pytest.param("room", 50, {"width": 640, "height": 480}, 0.02, marks=pytest.mark.slow),
+    ],
     ids=["street", "room"],
 )
 def test_trajectory_is_right(scene: str, n_frames: int, size: dict[str, int], share: float) -> None:
@@ -47,7 +50,7 @@ def test_trajectory_is_right(scene: str, n_frames: int, size: dict[str, int], sh
     assert rotation.max() < 0.02
 
 
-@pytest.mark.parametrize("kind", [Spoil.BLACKOUT, Spoil.WIPE])
+@pytest.mark.parametrize("kind", [Spoil.BLACKOUT, pytest.param(Spoil.WIPE, marks=pytest.mark.slow)])
 def test_no_map_starts_while_nothing_is_seen(kind: Spoil) -> None:
     hidden = range(20, 45)
     sequence = make_sequence("street", 60, seed=1, events=[ScriptedEvent(kind, hidden.start, len(hidden))], **SIZE)

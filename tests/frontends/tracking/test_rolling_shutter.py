@@ -178,6 +178,7 @@ def first(system: System, kind: EventKind) -> Event:
     return next(event for event in system.events if event.event is kind)
 
 
+@pytest.mark.slow
 def test_a_turn_alone_starts_no_map() -> None:
     """With a shutter that is taken for a global one the shifts of the rows pass for parallax."""
     system, T_true = run_over_a_turn()

@@ -190,6 +190,7 @@ def test_where_truth_is_there_in_parts_the_path_is_the_estimates() -> None:
         assert path_m == pytest.approx(length, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_recovery_of_the_real_system_is_read_from_its_events() -> None:
     world = PointWorld(cloud(), hand_held(70), covered=frozenset(range(35, 50)))
     system = system_in(world, recovery={"enabled": True, "attempts": ["live"]})

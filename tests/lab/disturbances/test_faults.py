@@ -110,6 +110,7 @@ def clean_to_faulty_deg(clean: System, faulty: System, i: int) -> float:
     return float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))))
 
 
+@pytest.mark.slow
 def test_a_corrupted_run_can_be_made_again_from_its_config(tmp_path: Path) -> None:
     source = "synthetic:room,frames=45,seed=2"
     corruptions = (
@@ -128,7 +129,7 @@ def test_a_corrupted_run_can_be_made_again_from_its_config(tmp_path: Path) -> No
     assert (tmp_path / "clean" / "trajectory.txt").read_bytes() != texts[0]
 
 
-@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("workers", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_killed_worker_costs_its_recovery_and_nothing_else(workers: int) -> None:
     world = PointWorld(cloud(), hand_held(70), covered=frozenset(range(35, 50)))
     system = system_in(world, recovery={"enabled": True, "workers": workers})
