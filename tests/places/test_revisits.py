@@ -1,0 +1,111 @@
+"""The live system closes loops, joins maps that share no frame, and finds itself in a map of old; never wrongly."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from dualslam.core.events import EventKind
+from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.map.atlas import LinkKind
+from dualslam.run.results import trajectories_of
+from dualslam.system import System
+from dualslam.testing.point_world import PointWorld, pose_errors
+from tests.places.worlds import N_LAP, N, driven_lap, lap, ring, run, wall
+
+ROLLING = {"graph": {"max_keyframes": 25, "rollover_keyframes": 6}}
+
+
+@cache
+def closed_lap() -> System:
+    return run(lap())
+
+
+def errors(system: System) -> FloatArray:
+    main = trajectories_of(system).main
+    return pose_errors(main.T_world_cam, ring(N)[main.index])[0]
+
+
+def test_a_loop_within_a_submap_is_closed_once_others_have_seconded_it() -> None:
+    system = closed_lap()
+    loops = system.events.of_kind(EventKind.LOOP_CLOSED)
+    assert loops
+    assert {link.kind for link in system.atlas.believed} == {LinkKind.LOOP}
+    for loop in loops:
+        assert loop.submap == loop.data["other_submap"] == 0
+        assert loop.data["seconds"] == 2
+        assert abs(loop.frame - N_LAP - loop.data["other_frame"]) < 25, "what is seen now was seen a lap ago"
+    assert not trajectories_of(system).unlinked
+    assert system.rows[N - 1].status is FrameStatus.TRACKED
+
+
+def test_landmarks_of_the_loop_become_one() -> None:
+    submap = closed_lap().atlas.submaps[0]
+    last = max(submap.keyframes)
+    seen_by, _ = submap.covisible(submap.landmark_of[last][submap.landmark_of[last] >= 0])
+    assert seen_by.min() < N_LAP // 2
+
+
+def test_a_loop_takes_drift_back() -> None:
+    assert errors(closed_lap()).max() < errors(driven_lap()).max()
+
+
+def test_a_loop_across_submaps_that_rolled_over() -> None:
+    system = run(lap(), **ROLLING)
+    assert len(system.atlas.submaps) > 2
+    loops = system.events.of_kind(EventKind.LOOP_CLOSED)
+    assert loops
+    assert all(loop.data["other_submap"] < loop.submap for loop in loops)
+    assert len(trajectories_of(system).main) == N
+
+
+@pytest.mark.parametrize("settings", [{"loops": {"enabled": False}}, {"places": {"enabled": False}}])
+def test_switched_off_nothing_is_asked(settings: dict[str, object]) -> None:
+    system = run(lap(), n=N_LAP + 5, **settings)
+    assert not system.atlas.links
+    assert not system.events.of_kind(EventKind.LOOP_CLOSED, EventKind.LOOP_REFUSED)
+
+
+def test_the_same_run_twice_is_the_same_to_the_bit() -> None:
+    again = trajectories_of(run(lap())).main
+    assert np.array_equal(again.T_world_cam, trajectories_of(closed_lap()).main.T_world_cam)
+
+
+@cache
+def two_maps() -> System:
+    """Lost for so long that nothing of the first map is left in the buffer; the second comes to where the first began."""
+    world = lap(N + 12, covered=frozenset(range(60, 80)))
+    return run(world, recovery={"enabled": True}, buffer={"duration_s": 0.3})
+
+
+def test_maps_that_share_no_frame_are_merged_by_sight() -> None:
+    system = two_maps()
+    (merged,) = system.events.of_kind(EventKind.MERGED)
+    assert (merged.submap, merged.data["other_submap"]) == (1, 0)
+    assert LinkKind.MERGE in {link.kind for link in system.atlas.believed}
+    main = trajectories_of(system).main
+    assert main.index[0] == 0
+    assert main.index[-1] == N + 11
+    size = np.linalg.norm(np.ptp(ring(N)[:, :3, 3], axis=0))
+    assert pose_errors(main.T_world_cam, ring(N + 12)[main.index])[0].max() < 0.05 * size
+
+
+def test_without_recovery_a_lost_map_stays_apart() -> None:
+    system = run(lap(N + 12, covered=frozenset(range(60, 80))), recovery={"enabled": False})
+    assert len(system.atlas.components()) == 2
+
+
+def test_frames_without_a_map_are_found_in_any_submap() -> None:
+    """A walk; a long look at bare walls; then a place of long ago, where the camera stands, so that no map can start."""
+    there = ring(N_LAP)
+    T = np.concatenate([there[:70], np.repeat(there[10:11], 40, axis=0)])
+    world = PointWorld(wall(), T, covered=frozenset(range(70, 85)))
+    system = run(world, recovery={"enabled": True, "relocalise_after": 5}, graph=ROLLING["graph"])
+    found = [e for e in system.events.of_kind(EventKind.GAP_RELOCALISED, EventKind.RELOCALISED) if e.frame >= 85]
+    assert found
+    assert system.rows[109].status is FrameStatus.TRACKED
+    main = trajectories_of(system).main
+    assert main.index[-1] == 109
+    assert np.linalg.norm(main.T_world_cam[-1, :3, 3] - main.T_world_cam[10, :3, 3]) < 0.05

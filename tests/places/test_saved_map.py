@@ -1,0 +1,124 @@
+"""A run that goes on in the map of another: it finds itself there, in its frame and unit, and changes nothing of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dualslam.build import build_system
+from dualslam.config.settings import Config
+from dualslam.core.events import EventKind
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.umeyama import umeyama
+from dualslam.core.types import Frame, View
+from dualslam.io.map_store import StoredMap, load_atlas, save_atlas
+from dualslam.run.results import frame_rows, trajectories_of
+from dualslam.system import System
+from dualslam.testing.point_world import CAMERA, PointWorld
+from tests.places.worlds import N_LAP, lap, ring, run, wall
+
+N_FIRST = 70
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map of the first part of a lap."""
+    system = run(lap(), n=N_FIRST)
+    system.finish()
+    folder = tmp_path_factory.mktemp("first") / "map"
+    save_atlas(folder, system.atlas, system.poses, system.camera)
+    return folder
+
+
+@cache
+def second_world() -> PointWorld:
+    """Another day: the camera comes from the middle of the first run's way, and goes beyond its end."""
+    T = ring(N_LAP)[30:100] @ se3.from_parts(np.eye(3), np.array([0.05, 0.02, 0.05]))
+    return PointWorld(wall(), T, seed=0)
+
+
+def go_on(folder: Path, world: PointWorld, localise: bool = False, n: int | None = None) -> System:
+    config = Config.model_validate({"camera": {"model_sigma_px": 0.0}, "calibration": {"refine": False}})
+    system = build_system(config, CAMERA, saved=load_atlas(folder), localise=localise)
+
+    def view_of(frame: Frame) -> View:
+        return replace(world.view(frame.index - system.first_id), index=frame.index)
+
+    system._parts = replace(system._parts, view_of=view_of)
+    for frame in world.frames()[:n]:
+        system.step(frame)
+    system.finish()
+    return system
+
+
+def truth_in_first(saved: StoredMap, index: np.ndarray) -> np.ndarray:
+    """True centres of the second run's frames, in the saved map's frame and unit."""
+    system_T = {p.index: saved.atlas.submaps[0].resolve_anchor(p.keyframe_id, p.T_kf_cam) for p in saved.poses.values()}
+    own = sorted(system_T)
+    a = np.array([system_T[i][:3, 3] for i in own])
+    b = ring(N_LAP)[own][:, :3, 3]
+    S = umeyama(b, a).S_dst_src  # type: ignore[union-attr]
+    return second_world().T_world_cam[index][:, :3, 3] @ S[:3, :3].T + S[:3, 3]
+
+
+def test_localise_finds_every_frame_that_the_map_shows_and_adds_nothing(first: Path) -> None:
+    saved = load_atlas(first)
+    system = go_on(first, second_world(), localise=True)
+    assert system.first_id == saved.next_id == N_FIRST
+    main = trajectories_of(system).main
+    assert main.index[:30].tolist() == list(range(30)), "from the first frame on, by the source's own count"
+    error = np.linalg.norm(main.T_world_cam[:30, :3, 3] - truth_in_first(saved, main.index[:30]), axis=1)
+    assert error.max() < 0.05
+    assert list(system.atlas.submaps) == list(saved.atlas.submaps)
+    for m, submap in saved.atlas.submaps.items():
+        now = system.atlas.submaps[m]
+        assert list(now.keyframes) == list(submap.keyframes)
+        assert np.array_equal(now.landmarks["xyz_mu"], submap.landmarks["xyz_mu"])
+        assert len(now.observations) == len(submap.observations)
+    assert [row.index for row in frame_rows(system, main)] == list(range(70))
+
+
+def test_a_map_is_extended_in_its_own_frame_and_numbers_go_on(first: Path) -> None:
+    saved = load_atlas(first)
+    system = go_on(first, second_world())
+    main = trajectories_of(system).main
+    assert main.index.tolist() == list(range(70))
+    error = np.linalg.norm(main.T_world_cam[:, :3, 3] - truth_in_first(saved, main.index), axis=1)
+    assert error.max() < 0.3
+    old = {k for m in saved.atlas.submaps.values() for k in (*m.keyframes, *m.anchors)}
+    new = {k for m in system.atlas.submaps.values() for k in m.keyframes} - old
+    assert new
+    assert min(new) >= N_FIRST
+    assert saved.poses.keys() <= system.poses.keys(), "where the first run's frames were is still known"
+
+
+def test_the_folder_is_not_changed(first: Path) -> None:
+    before = {path.name: path.read_bytes() for path in first.iterdir()}
+    go_on(first, second_world(), n=20)
+    assert {path.name: path.read_bytes() for path in first.iterdir()} == before
+
+
+def test_another_world_is_not_found(first: Path) -> None:
+    other = PointWorld(wall(seed=5), ring(N_LAP)[:40], seed=9)
+    localised = go_on(first, other, localise=True)
+    assert not len(trajectories_of(localised).main)
+    extended = go_on(first, other)
+    found = trajectories_of(extended)
+    assert not len(found.main)
+    assert found.unlinked
+    assert not extended.events.of_kind(EventKind.MERGED, EventKind.LOOP_CLOSED, EventKind.GAP_RELOCALISED)
+
+
+def test_a_mirrored_world_is_not_found(first: Path) -> None:
+    mirrored = PointWorld(wall() * (-1, 1, 1), ring(N_LAP)[:40], seed=0)
+    assert not len(trajectories_of(go_on(first, mirrored, localise=True)).main)
+
+
+def test_the_camera_is_kept_with_the_map(first: Path) -> None:
+    camera = load_atlas(first).camera
+    assert camera is not None
+    assert camera.to_dict() == CAMERA.to_dict()
