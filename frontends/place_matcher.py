@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.interfaces import Frontend
-from dualslam.core.place_matcher import Sighting
+from dualslam.core.place_matcher import CELLS, Sighting
 from dualslam.core.types import Features, FloatArray, IntArray, Matches
 from dualslam.frontends.features.matching import FeatureGrid, match_projected
 from dualslam.frontends.tracking.local_map import LocalMap
@@ -61,4 +61,5 @@ class FrontendPlaceMatcher:
                 octave=seen.octave,
             )
             feature[matches.index[:, 0]] = matches.index[:, 1]
-        return Sighting(local.landmark_ids[seen.rows], feature)
+        part = np.clip(seen.uv_px / self._size_px * CELLS, 0, CELLS - 1).astype(np.int64)
+        return Sighting(local.landmark_ids[seen.rows], feature, CELLS * part[:, 1] + part[:, 0])

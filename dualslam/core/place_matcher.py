@@ -13,6 +13,11 @@ from dualslam.core.types import Features, FloatArray, IntArray, Matches
 if TYPE_CHECKING:
     from dualslam.map.submap import Submap
 
+CELLS = 4
+"""Parts of an image along either axis."""
+MIN_IN_CELL = 5
+"""Landmarks that a part must be expected to show to have a say."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
@@ -24,15 +29,25 @@ class Sighting:
         In the image, in front of the camera, and from a like side and distance as they were seen from.
     feature : (V,) int64
         The feature that each is found at, or -1.
+    cell : (V,) int64
+        The part of the image, of `CELLS` x `CELLS`, in which it should be seen.
     """
 
     landmark_ids: IntArray
     feature: IntArray
+    cell: IntArray
 
     @property
     def share(self) -> float:
-        """Share of what should be seen that is found; 0 where nothing should."""
-        return float((self.feature >= 0).mean()) if len(self.feature) else 0.0
+        """Share of what should be seen that is found, in the middle one of the image's parts; 0 where nothing should.
+
+        A thing that is there in two places (a poster) fills some parts, and nothing is found in the others; a place
+        that is seen from elsewhere, or by other light, shows less of itself everywhere.
+        """
+        n = np.bincount(self.cell, minlength=CELLS * CELLS)
+        found = np.bincount(self.cell[self.feature >= 0], minlength=CELLS * CELLS)
+        counts = n >= MIN_IN_CELL
+        return float(np.median(found[counts] / n[counts])) if counts.any() else 0.0
 
 
 class PlaceMatcher(Protocol):

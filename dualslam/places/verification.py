@@ -39,8 +39,10 @@ SEARCH_RADIUS_PX = 8.0
 NEAR_FIRST = 4.0
 """Pairs within twice the gate's distance of the first similarity are its own, not evidence of another: a thing that was
 mapped twice lies a little beside itself."""
-MIN_FOUND = 0.5
-"""Share of what should be seen that must be found, relative to the share that the place's own keyframes show of it."""
+MIN_FOUND = 0.3
+"""Share of what should be seen that must be found, in the middle part of the image, relative to the share that the
+place's own keyframes show of it. Images that show something else come to 0.01 to 0.04 (25 pairs each of `kitti_03` and
+`hololens_000`); the same place from elsewhere to 0.4 and more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

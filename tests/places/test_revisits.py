@@ -75,7 +75,7 @@ def test_the_same_run_twice_is_the_same_to_the_bit() -> None:
 
 @cache
 def two_maps() -> System:
-    """Lost for so long that nothing of the first map is left in the buffer; the second comes to where the first began."""
+    """Lost for so long that nothing of the first map is buffered; the second comes to where the first began."""
     world = lap(N + 12, covered=frozenset(range(60, 80)))
     return run(world, recovery={"enabled": True}, buffer={"duration_s": 0.3})
 
@@ -98,7 +98,7 @@ def test_without_recovery_a_lost_map_stays_apart() -> None:
 
 
 def test_frames_without_a_map_are_found_in_any_submap() -> None:
-    """A walk; a long look at bare walls; then a place of long ago, where the camera stands, so that no map can start."""
+    """A walk; a look at bare walls; then a place of long ago, where the camera stands, so that no map can start."""
     there = ring(N_LAP)
     T = np.concatenate([there[:70], np.repeat(there[10:11], 40, axis=0)])
     world = PointWorld(wall(), T, covered=frozenset(range(70, 85)))
