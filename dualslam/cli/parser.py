@@ -10,10 +10,11 @@ from typing import NoReturn
 
 from dualslam import __version__
 
+WORLDS = ("street", "room", "circuit", "eight", "terrace")
 SOURCE_HELP = (
     "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours), a folder of images or a video file with --camera or "
-    "--fov, a webcam's number, or an embedded world: synthetic:street or synthetic:room, with options as in "
-    "synthetic:street,frames=300,seed=1,events=FILE"
+    "--fov, a webcam's number, or an embedded world: synthetic:street, room, circuit, eight, terrace, with options as "
+    "in synthetic:street,frames=300,seed=1,events=FILE"
 )
 
 
@@ -133,7 +134,7 @@ def _add_view(commands: argparse._SubParsersAction[_Parser]) -> None:
 
 def _add_render(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser, _ = _command(commands, "render", "Render a synthetic world as a sequence folder with ground truth.")
-    parser.add_argument("world", metavar="WORLD", choices=("street", "room"), help="street or room")
+    parser.add_argument("world", metavar="WORLD", choices=WORLDS, help=", ".join(WORLDS))
     _add_output(parser)
     parser.add_argument("--frames", metavar="N", type=_positive, default=300, help="how many (default: 300)")
     parser.add_argument("--seed", metavar="N", type=_count, default=0, help="which world and path (default: 0)")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.types import FloatArray, Frame, IntArray
+from dualslam.lab.synthetic.circuit import make_circuit, make_eight, make_terrace
 from dualslam.lab.synthetic.events import ScriptedEvent, disturbance, parse_events, yaw_offset_rad
 from dualslam.lab.synthetic.path import Drive, Walk, pose
 from dualslam.lab.synthetic.render import Renderer
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 # A smear of motion blur is the average of images about three pixels apart, within these bounds on their number.
 _N_SUBFRAMES = (9, 33)
-SCENES = ("street", "room")
+SCENES = ("street", "room", "circuit", "eight", "terrace")
 
 
 class CameraPath(Protocol):
@@ -158,8 +159,9 @@ def make_sequence(
 
     Parameters
     ----------
-    scene : {"street", "room"}
-        A drive of about 9 m/s between houses, or a hand-held camera in a furnished room.
+    scene : {"street", "room", "circuit", "eight", "terrace"}
+        A drive of about 9 m/s between houses, or a hand-held camera in a furnished room; a block of houses driven round
+        and round, a figure of eight, and a straight street of houses that are all the same.
     n_frames : int
     seed : int
         Of the world, the path and the noise: the same seed gives the same images, bit for bit.
@@ -179,7 +181,7 @@ def make_sequence(
     """
     if scene not in SCENES:
         raise ConfigError(f"synthetic scene {scene!r} is unknown; use one of {', '.join(SCENES)}")
-    rate_hz = float(rate_hz) if rate_hz is not None else (10.0 if scene == "street" else 30.0)
+    rate_hz = float(rate_hz) if rate_hz is not None else (30.0 if scene == "room" else 10.0)
     limits = {"n_frames": (1, 100_000), "seed": (0, 2**63), "width": (32, 4096), "height": (32, 4096)}
     for name, (low, high) in limits.items():
         value = locals()[name]
@@ -193,8 +195,16 @@ def make_sequence(
     duration_s = n_frames / rate_hz
     rng = np.random.default_rng([seed, 0xCA4])
     path: CameraPath
-    if scene == "street":
-        world, road = make_street(seed, 10.0 * duration_s + 30)
+    if scene != "room":
+        length_m = 10.0 * duration_s + 30
+        if scene == "circuit":
+            world, road = make_circuit(seed)
+        elif scene == "eight":
+            world, road = make_eight(seed)
+        elif scene == "terrace":
+            world, road = make_terrace(seed, length_m)
+        else:
+            world, road = make_street(seed, length_m)
         path, focal = Drive(road, rng, duration_s, speed_m_s=10.0), 0.72
         sensor = Sensor(seed, width, height, blur_px=0.45)
     else:

@@ -14,7 +14,7 @@ from dualslam.lab.synthetic.surfaces import Scene, Surface, box, wall
 
 _TILE_M = 16.0
 _AHEAD_M = 170.0
-_BEHIND_M = 12.0
+BEHIND_M = 12.0
 
 
 def make_street(seed: int, length_m: float) -> tuple[Scene, Road]:
@@ -32,12 +32,12 @@ def make_street(seed: int, length_m: float) -> tuple[Scene, Road]:
     """
     rng = np.random.default_rng([seed, 0x57E3])
     road = Road(rng, length_m + _AHEAD_M)
-    surfaces = _ground(rng, road)
+    surfaces = ground(rng, road)
     for side in (-1.0, 1.0):
-        surfaces += _houses(rng, road, side)
-        surfaces += _back_row(rng, road, side)
-        surfaces += _furniture(rng, road, side)
-    surfaces += _horizon()
+        surfaces += houses(rng, road, side)
+        surfaces += back_row(rng, road, side)
+        surfaces += furniture(rng, road, side)
+    surfaces += horizon()
     return Scene(tuple(surfaces), background=240, seed=seed), road
 
 
@@ -49,16 +49,16 @@ def _flat(
     return Surface(np.array([x, y, z]), *sides, material, texels_per_m)  # type: ignore[arg-type]
 
 
-def _ground(rng: np.random.Generator, road: Road) -> list[Surface]:
+def ground(rng: np.random.Generator, road: Road) -> list[Surface]:
     """Tile the plane around the road; beyond, one coarse field a finger's breadth lower."""
-    s = np.arange(-_BEHIND_M, road.length_m, 0.5)
+    s = np.arange(-BEHIND_M, road.length_m, 0.5)
     line = road.centre(s)
     decals = []
     kinds = (("patch", 0.05, 0.5, 1.8), ("cover", 0.05, 0.33, 0.36), ("shadow", 0.05, 1.5, 4), ("crack", 0.15, 1, 3))
     for kind, per_m, low, high in (*kinds, ("litter", 0.1, 0.3, 1.5)):
         for _ in range(int(per_m * road.length_m)):
             reach = PAVEMENT_END_M if kind in ("litter", "shadow", "crack") else ROAD_HALF_WIDTH_M - 0.5
-            x, z = road.beside(rng.uniform(-_BEHIND_M, road.length_m), rng.uniform(-reach, reach))
+            x, z = road.beside(rng.uniform(-BEHIND_M, road.length_m), rng.uniform(-reach, reach))
             decals.append(Decal(kind, float(x), float(z), float(rng.uniform(low, high)), int(rng.integers(1 << 31))))
     surfaces = []
     reach = 9.0 + _TILE_M / 2
@@ -89,10 +89,10 @@ def _field(p: Painter) -> None:
     p.fill(98, rough=14, smooth=14)
 
 
-def _houses(rng: np.random.Generator, road: Road, side: float) -> list[Surface]:
+def houses(rng: np.random.Generator, road: Road, side: float) -> list[Surface]:
     """Line one side of the road with houses of different width, height and setback, with gaps between them."""
     surfaces: list[Surface] = []
-    s = -_BEHIND_M + rng.uniform(0, 6)
+    s = -BEHIND_M + rng.uniform(0, 6)
     while s < road.length_m - 14:
         width, height = rng.uniform(7, 15), rng.uniform(4.5, 11.5)
         setback = PAVEMENT_END_M + rng.choice((0.6, 1.5, 3.5, 6.0)) + rng.uniform(0, 1)
@@ -182,7 +182,7 @@ def _house(
     return faces
 
 
-def _back_row(rng: np.random.Generator, road: Road, side: float) -> list[Surface]:
+def back_row(rng: np.random.Generator, road: Road, side: float) -> list[Surface]:
     """Return taller blocks and big trees that look over the houses and through their gaps."""
     surfaces: list[Surface] = []
     for s in np.arange(0, road.length_m - 30, 21.0):
@@ -210,10 +210,10 @@ def _tree(rng: np.random.Generator, foot: FloatArray, height: float, spread: flo
     return surfaces
 
 
-def _furniture(rng: np.random.Generator, road: Road, side: float) -> list[Surface]:
+def furniture(rng: np.random.Generator, road: Road, side: float) -> list[Surface]:
     """Return what stands between the road and the houses."""
     surfaces: list[Surface] = []
-    s = -_BEHIND_M + rng.uniform(2, 8)
+    s = -BEHIND_M + rng.uniform(2, 8)
     while s < road.length_m - 6:
         kerb = ROAD_HALF_WIDTH_M + rng.uniform(0.5, 0.9)
         foot, heading = road.beside(s, side * kerb), float(road.heading(s))
@@ -278,7 +278,7 @@ def _car(rng: np.random.Generator, middle: FloatArray, heading: float) -> list[S
     return surfaces + box(middle - back, yaw, (length * 0.52, 1.45, 0.55), 0.12 + height, glass, 75)
 
 
-def _horizon() -> list[Surface]:
+def horizon() -> list[Surface]:
     """Return the clouds overhead and a ring of hills, both at infinity."""
     reach = 26.0
     sky = Surface(

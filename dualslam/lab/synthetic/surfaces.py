@@ -42,6 +42,8 @@ class Surface:
         True where it is seen from behind too; otherwise only against ``cross(side_s, side_t)``.
     infinite : bool
         True for the sky and what lies on the horizon: moves with the camera, has no depth.
+    texture : int, optional
+        Number of the picture, the same for surfaces that look alike; by default each has its own.
     """
 
     origin: FloatArray
@@ -53,6 +55,7 @@ class Surface:
     cutout: bool = False
     two_sided: bool = False
     infinite: bool = False
+    texture: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,7 +150,7 @@ class TextureStore:
 
     def _paint(self, index: int) -> Texture:
         surface = self._scene.surfaces[index]
-        rng = np.random.default_rng([self._scene.seed, index])
+        rng = np.random.default_rng([self._scene.seed, index if surface.texture is None else surface.texture])
         size_m = (float(np.linalg.norm(surface.side_s)), float(np.linalg.norm(surface.side_t)))
         painter = Painter(rng, self._bank, size_m, surface.texels_per_m * self._detail)
         surface.material(painter)
