@@ -48,6 +48,8 @@ class FakeSystem:
         self.pace = Pace()
         self.desk = InlineDesk({})
         self.n_finished = 0
+        self.first_id = 0
+        self.world = self.saved = self.camera = None
         self.was_interrupted = False
         self._truth, self._lost, self._before_step = truth, lost, before_step
         self._submap: Submap | None = None
