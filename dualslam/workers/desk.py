@@ -118,14 +118,17 @@ class Worker:
     def _carry(self) -> None:
         """Carry jobs to the process and results back, until told to stop or the process is gone."""
         with self._connection:
-            channel = Channel(self._connection, first=0)
+            channel = Channel(self._connection, gives=True)
             try:
                 channel.receive()  # that it is ready
                 self._ready.set()
                 while (job := self._jobs.get()) is not None:
                     channel.send(job)
                     self._results.put(channel.receive())
-            except (EOFError, OSError):
+            except (EOFError, OSError, LookupError):
+                # LookupError: it names what is gone here, which is a mistake of ours, and costs no more than a job.
+                self._process.join(STOP_S)
+                self._process.kill()
                 self._process.join()
                 detail = f"the {self._name} process ended with exit code {self._process.exitcode}"
                 self._results.put(_Answer(Failure(FailureReason.WORKER, detail)))
@@ -138,7 +141,7 @@ def serve(connection: Connection, make_handlers: MakeHandlers, niceness: int = 0
     if niceness:
         os.nice(niceness)
     keep_freed_memory()
-    handlers, channel = make_handlers(), Channel(connection, first=1)
+    handlers, channel = make_handlers(), Channel(connection, gives=False)
     try:
         channel.send(None)
     except BrokenPipeError:

@@ -5,9 +5,10 @@ must come to its turn a thousand times beside the one that tracks. So the struct
 large arrays is written from where it lies, and many pieces go with one call of the system, which holds no lock.
 
 Features and images never change, and most of a job is made of those that the one before held already: the frames in the
-buffer, the keyframes of a map. Each goes through a `Channel` once. The other end keeps it as long as this one does, and
-what comes back names it only, so that a result is what has changed. An object stays the same object at the other end,
-job after job: what was found in an image is known when it comes again.
+buffer, the keyframes of a map. Each goes through a `Channel` once. The worker keeps it as long as the process that
+tracks does, and what comes back names it only, so that a result is what has changed. An object stays the same object in
+the worker, job after job: what was found in an image is known when it comes again. The other way nothing is kept: what
+a worker has made is whole in its result.
 """
 
 from __future__ import annotations
@@ -41,17 +42,18 @@ class Channel:
     Parameters
     ----------
     connection : Connection
-    first, step : int
-        Of the numbers that this end gives to what it sends once: the two ends must not give the same.
+    gives : bool
+        Whether this end gives jobs, and says what is kept; the other one does them, and keeps.
     """
 
-    def __init__(self, connection: Connection, first: int = 0, step: int = 2) -> None:
+    def __init__(self, connection: Connection, gives: bool) -> None:
         self._connection = connection
-        self._numbers = count(first, step)
+        self._gives = gives
+        self._numbers = count()
         self._number_of: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
-        self._ours: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()
-        self._theirs: dict[int, Any] = {}
-        self._gone: list[int] = []  # ours that nobody here holds any more
+        self._given: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()
+        self._kept: dict[int, Any] = {}
+        self._gone: list[int] = []  # given, and held by nobody here any more
 
     def send(self, thing: Any) -> int:
         """Send what can be pickled; blocks until all of it is under way, and returns how many bytes it was.
@@ -89,30 +91,26 @@ class Channel:
         head, body, *large = _read(fd, sizes)
         n_fresh = len(large) - n_own
         fresh, gone = pickle.loads(head, buffers=large[:n_fresh])
-        for number, thing in fresh.items():
-            self._theirs[number] = thing
-            self._number_of[thing] = number
+        for number, kept in fresh.items():
+            self._kept[number] = kept
+            self._number_of[kept] = number
         thing = _Unpickler(io.BytesIO(body), self, buffers=large[n_fresh:]).load()
         for number in gone:
-            self._theirs.pop(number, None)
+            del self._kept[number]
         return thing
 
-    def _number(self, thing: Any, fresh: dict[int, Any]) -> int:
-        """Return the number of what goes once, and put it among the fresh ones if it has never gone."""
+    def number(self, thing: Any, fresh: dict[int, Any]) -> int | None:
+        """Return the number of what goes once, put among the fresh ones if it has never gone; None: it goes whole."""
         number = self._number_of.get(thing)
-        if number is None:
+        if number is None and self._gives:
             number = self._number_of[thing] = next(self._numbers)
-            self._ours[number] = fresh[number] = thing
+            self._given[number] = fresh[number] = thing
             weakref.finalize(thing, self._gone.append, number).atexit = False
         return number
 
-    def _named(self, number: int) -> Any:
-        thing = self._theirs.get(number)
-        if thing is None:
-            thing = self._ours.get(number)
-        if thing is None:
-            raise pickle.UnpicklingError(f"object {number} is gone at this end")
-        return thing
+    def named(self, number: int) -> Any:
+        """Return what has this number."""
+        return self._given[number] if self._gives else self._kept[number]
 
 
 class _Pickler(pickle.Pickler):
@@ -121,7 +119,7 @@ class _Pickler(pickle.Pickler):
         self._channel, self._fresh = channel, fresh
 
     def persistent_id(self, obj: Any) -> int | None:
-        return self._channel._number(obj, self._fresh) if isinstance(obj, ONCE) else None
+        return self._channel.number(obj, self._fresh) if isinstance(obj, ONCE) else None
 
 
 class _Unpickler(pickle.Unpickler):
@@ -130,7 +128,7 @@ class _Unpickler(pickle.Unpickler):
         self._channel = channel
 
     def persistent_load(self, pid: Any) -> Any:
-        return self._channel._named(pid)
+        return self._channel.named(pid)
 
 
 def _beside(large: list[memoryview]) -> Callable[[pickle.PickleBuffer], bool]:
