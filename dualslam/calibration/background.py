@@ -129,7 +129,7 @@ class Calibrations:
         before = live.submap.copy()
         live.submap.take_over(merged)
         live.adopt(graph, before)
-        self._buffer.map(self._calibration.rectified)
+        self._buffer.map_later(self._calibration.rectified)
         self._connections.follow(before, live.submap, now)
         return [m for m in sorted(lost) if self._change_lost(m, job, answer, now)]
 

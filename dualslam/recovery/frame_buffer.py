@@ -49,12 +49,15 @@ class FrameBuffer:
         self._views: deque[View] = deque()
         self._frozen = False
         self._before_loss: int | None = None  # the newest frame that came before it
+        self._stale: set[int] = set()  # frames that are still to be changed
+        self._change: Callable[[View], View] = _as_it_is
 
     def __len__(self) -> int:
         return len(self._views)
 
     def __iter__(self) -> Iterator[View]:
         """From the oldest to the newest."""
+        self.settle()
         return iter(self._views)
 
     @property
@@ -85,11 +88,38 @@ class FrameBuffer:
 
     def map(self, change: Callable[[View], View]) -> None:
         """Put what `change` makes of it into the place of each view."""
+        self.settle()
         self._views = deque(change(view) for view in self._views)
         self.nbytes = sum(view.nbytes for view in self._views)
 
+    def map_later(self, change: Callable[[View], View]) -> None:
+        """Do the same in slices (`settle`), and what is left as soon as somebody looks.
+
+        `change` makes the same of a view whether or not it has changed it before; it takes the place of one that has
+        not come to its end yet.
+        """
+        self._change, self._stale = change, {view.index for view in self._views}
+
+    def settle(self, n_at_most: int | None = None) -> None:
+        """Change so many views of those that are still to be changed, the newest first; by default all."""
+        if not self._stale:
+            return
+        n_left = len(self._stale) if n_at_most is None else n_at_most
+        for place in range(len(self._views) - 1, -1, -1):
+            view = self._views[place]
+            if n_left == 0:
+                return
+            if view.index in self._stale:
+                changed = self._change(view)
+                self.nbytes += changed.nbytes - view.nbytes
+                self._views[place] = changed
+                self._stale.remove(view.index)
+                n_left -= 1
+        self._stale.clear()  # the rest has been let go of
+
     def backwards_from(self, index: int) -> Iterator[View]:
         """Yield the views that came before frame `index`, the latest first."""
+        self.settle()
         seen = False
         for view in reversed(self._views):
             if seen:
@@ -143,6 +173,10 @@ class FrameBuffer:
         start = next((i + 1 for i, view in enumerate(views) if view.index == self._before_loss), 0)
         recent = next((i for i, view in enumerate(views) if self._age_s(view) <= self._duration_s), len(views))
         return range(start, max(start, recent))
+
+
+def _as_it_is(view: View) -> View:
+    return view
 
 
 def _without_image(view: View) -> View | None:

@@ -46,6 +46,36 @@ class TestGreyImage:
 
 
 class TestFrameBuffer:
+    def test_a_change_in_slices_is_whole_as_soon_as_somebody_looks(self) -> None:
+        buffer, changed = FrameBuffer(100.0, 10.0), []
+
+        def change(v: View) -> View:
+            changed.append(v.index)
+            return replace(v, turn_rad=np.ones(3))
+
+        for i in range(10):
+            buffer.append(view(i))
+        buffer.map_later(change)
+        assert changed == []
+        buffer.settle(3)
+        assert changed == [9, 8, 7]
+        buffer.append(view(10))  # it is as it should be already
+        assert [v.index for v in buffer if v.turn_rad is None] == [10]
+        assert sorted(changed) == list(range(10))
+        buffer.settle()
+        assert len(changed) == 10
+        assert buffer.nbytes == sum(v.nbytes for v in buffer)
+
+    def test_what_is_let_go_of_meanwhile_is_not_changed(self) -> None:
+        buffer, changed = FrameBuffer(1.0, 10.0), []
+        for i in range(9):
+            buffer.append(view(i))
+        buffer.map_later(lambda v: changed.append(v.index) or v)  # type: ignore[func-returns-value]
+        for i in range(9, 14):
+            buffer.append(view(i))
+        assert indices(buffer) == list(range(5, 14))
+        assert sorted(changed) == [5, 6, 7, 8]
+
     def test_it_keeps_the_last_seconds(self) -> None:
         buffer = FrameBuffer(1.0, 10.0)
         for i in range(50):
