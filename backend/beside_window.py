@@ -16,36 +16,36 @@ from dualslam.config.settings import GraphConfig
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.errors import SolverError
 from dualslam.core.interfaces import GraphEstimate
-from dualslam.core.types import BoolArray, IntArray
+from dualslam.core.types import BoolArray, Failure, FailureReason, IntArray
 from dualslam.map.submap import Submap
 
-N_FREE, N_FIXED = 3, 8
-"""Keyframes that are adjusted, and others that hold them: those that see most of the same points."""
+N_FIXED = 8
+"""Keyframes that hold those that are adjusted: those that see most of the same points."""
 N_ITERATIONS = 3
 MIN_JUDGED_VIEWS = 3
 """Two views fit almost any pair of poses: their residuals say nothing."""
 
 
-def adjust_window(submap: Submap, config: GraphConfig) -> GraphEstimate:
-    """Adjust the newest keyframes of a submap; the submap is not changed.
-
-    The gauge's keyframes stay where they are. Where the solver fails, everything does.
+def adjust_window(submap: Submap, keyframe_ids: list[int], config: GraphConfig) -> GraphEstimate | Failure:
+    """Adjust some keyframes of a submap; the submap is not changed.
 
     Parameters
     ----------
     submap : Submap
+    keyframe_ids : list of int
+        The newest first. Those of the gauge stay where they are.
     config : GraphConfig
 
     Returns
     -------
-    GraphEstimate
+    GraphEstimate or Failure
         Of the keyframes and landmarks that were adjusted.
     """
     start = time.thread_time()
-    free = [k for k in list(submap.keyframes)[-N_FREE:] if k not in submap.gauge]
+    free = [k for k in keyframe_ids if k not in submap.gauge]
     landmarks = submap.landmarks_of_keyframes(free)
     if not free or not len(landmarks):
-        return _nothing(start)
+        return Failure(FailureReason.TOO_FEW_MATCHES, "nothing to adjust")
     others, _ = submap.covisible(landmarks)
     fixed = [k for k in others.tolist() if k not in free][:N_FIXED]
     keyframes = np.array([*free, *fixed], np.int64)
@@ -69,11 +69,11 @@ def adjust_window(submap: Submap, config: GraphConfig) -> GraphEstimate:
     )
     try:
         found = bundle_adjust_arrays(problem, config.robust_k, N_ITERATIONS)
-    except SolverError:
-        return _nothing(start)
+    except SolverError as error:
+        return Failure(FailureReason.SOLVER, str(error))
     n_views = np.bincount(point, minlength=len(landmarks))[point]
     noise2 = residual_variance(found.chi2, n_views, config.least_noise**2)
-    judged: BoolArray = (n_views >= MIN_JUDGED_VIEWS) & (kf == free[-1])
+    judged: BoolArray = (n_views >= MIN_JUDGED_VIEWS) & (kf == free[0])
     outliers: IntArray = rows[judged & (found.chi2 > config.outlier_chi2 * noise2)]
     newest = found.chi2[judged]
     chi2 = float(np.minimum(newest, config.insert_sigmas**2).mean() / 2) if len(newest) else float("nan")
@@ -89,9 +89,3 @@ def adjust_window(submap: Submap, config: GraphConfig) -> GraphEstimate:
         rebuilt=False,
         seconds=time.thread_time() - start,
     )
-
-
-def _nothing(start: float) -> GraphEstimate:
-    none, nan = np.zeros(0, np.int64), float("nan")
-    seconds = time.thread_time() - start
-    return GraphEstimate(none, np.zeros((0, 4, 4)), none, np.zeros((0, 3)), none, nan, 1.0, False, seconds)

@@ -145,7 +145,7 @@ def build_system(
         # Built here in any case: a mistake in the config is told at once, not by a worker.
         parts = recovery_parts(config, size_px, frontend=frontend)
     desk = worker_desk(config, size_px, faults) if workers else InlineDesk(calibration_handlers(config))
-    graphs = BesideGraphs(desk, lambda submap: adjust_window(submap, config.graph)) if workers else None
+    graphs = BesideGraphs(desk, partial(adjust_window, config=config.graph)) if workers else None
     if recovery is None:
         recovery = DeskExecutor(desk) if workers else faults.around_inline(InlineExecutor(parts))
 

@@ -26,7 +26,7 @@ from dualslam.io.map_store import StoredMap
 from dualslam.map.atlas import Link
 from dualslam.map.connections import Connections
 from dualslam.map.frame_records import FrameRecord, FrameResult
-from dualslam.map.graph_beside import BesideGraphs, Moved
+from dualslam.map.graph_beside import N_FREE, N_FREE_BEHIND, BesideGraphs, Moved
 from dualslam.map.propagation import propagate_links
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.split import next_submap
@@ -424,6 +424,7 @@ class System:
         graphs = self._parts.graphs
         if graphs is None:
             return
+        graphs.n_free = N_FREE_BEHIND if self.pace.behind else N_FREE
         with self.timer.measure("graph (late)"):
             if self._live is not None and not self.pace.may_lag(graphs.lag(self._live.submap)):
                 self._follow_graphs(graphs.wait(self.atlas.submaps), now)

@@ -29,8 +29,10 @@ from dualslam.workers.jobs import Desk, JobKind
 
 log = logging.getLogger(__name__)
 
-Window = Callable[[Submap], GraphEstimate]
-"""Adjusts the newest keyframes of a submap and what they see; the submap is not changed."""
+Window = Callable[[Submap, list[int]], GraphEstimate | Failure]
+"""Adjusts some keyframes of a submap, the newest first, and what they see; the submap is not changed."""
+N_FREE, N_FREE_BEHIND = 3, 1
+"""Keyframes that the window moves: those that the tracking goes on from; fewer while it has something to catch up on."""
 
 PAUSE_S = 1e-3
 """Between two looks at whether a graph has been solved, where a run waits for it."""
@@ -117,7 +119,12 @@ class BesideGraph:
         Told, whenever there is something to send, of which submap.
     """
 
-    def __init__(self, graph_id: int, window: Window, register: Callable[[Submap, BesideGraph], None]) -> None:
+    def __init__(
+        self,
+        graph_id: int,
+        window: Callable[[Submap], GraphEstimate | Failure],
+        register: Callable[[Submap, BesideGraph], None],
+    ) -> None:
         self.id = graph_id
         self.is_behind = False
         self.rebuild_asked: bool | None = None  # near the optimum, or not
@@ -131,6 +138,8 @@ class BesideGraph:
         self._ask(submap)
         start = time.thread_time()
         estimate = self._window(submap)
+        if isinstance(estimate, Failure):  # the graph will tell
+            estimate = self.full_estimate(submap)
         return replace(estimate, seconds=time.thread_time() - start)
 
     def rebuild(self, submap: Submap, near_optimum: bool = False) -> GraphEstimate:
@@ -176,6 +185,11 @@ class BesideGraphs:
     ----------
     desk : Desk
     window : Window
+
+    Attributes
+    ----------
+    n_free : int
+        Newest keyframes that the window moves.
     """
 
     def __init__(self, desk: Desk, window: Window) -> None:
@@ -185,11 +199,14 @@ class BesideGraphs:
         self._graphs: dict[int, BesideGraph] = {}  # by the submap's id: the one that it has now
         self._under_way: tuple[int, BesideGraph] | None = None
         self._answered: dict[int, frozenset[int]] = {}  # by the submap's id: the keyframes that its estimate knows
-        self.n_rebuilt = 0
+        self.n_free = N_FREE
 
     def new_graph(self) -> SubmapGraph:
         """Make the graph of a submap."""
-        return BesideGraph(next(self._ids), self._window, self._note)
+        return BesideGraph(next(self._ids), self._adjust, self._note)
+
+    def _adjust(self, submap: Submap) -> GraphEstimate | Failure:
+        return self._window(submap, list(submap.keyframes)[: -self.n_free - 1 : -1])
 
     def lag(self, submap: Submap) -> int:
         """Count the keyframes of a submap that no answer of its graph has known yet."""
@@ -261,5 +278,4 @@ class BesideGraphs:
         rows = estimate.outlier_rows[submap.observations["alive"][estimate.outlier_rows]]
         submap.remove_outliers(rows)
         graph.is_behind = graph.is_behind or len(rows) > 0
-        self.n_rebuilt += estimate.rebuilt
         return Moved(submap, before, estimate.rebuilt)

@@ -6,6 +6,7 @@ import os
 import pickle
 import signal
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -69,7 +70,7 @@ def beside(world: PointWorld, polls: int, **settings: object) -> System:
     desk = LateDesk(InlineDesk(graph_handlers(system._config)), polls)
     from dualslam.backend.beside_window import adjust_window
 
-    graphs = BesideGraphs(desk, lambda submap: adjust_window(submap, system._config.graph))
+    graphs = BesideGraphs(desk, partial(adjust_window, config=system._config.graph))
     system._parts = replace(system._parts, new_graph=graphs.new_graph, graphs=graphs)
     system._recoveries._new_graph = graphs.new_graph
     system._calibrations._new_graph = graphs.new_graph
