@@ -8,12 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.backend.observability import MIN_DEPTH_MU, compute_depth_sigmas, compute_residuals, take_mask
+from dualslam.backend.selection import Candidates, choose_factors
 from dualslam.config.settings import GraphConfig
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.submap import Submap
 from dualslam.map.tables import Table
 
 OUTSIDE = -1
+SMALL_MAP = 20
+"""Keyframes up to which all that a graph can bear are factors: in a small map every observation counts, and none costs
+much. At the next keyframe the choice is made anew."""
+ALL = 1 << 30
+BUDGET, MOST_RATIO = 3000, 2.5
+"""Factors of all keyframes that see what the newest ones see, about: with fewer such keyframes each has more of them,
+up to so many times `GraphConfig.factors_per_keyframe`."""
+N_NEWEST, MIN_SHARED = 3, 15
+"""Keyframes that are the newest, and landmarks by which another sees what they see."""
 LEAVE_RATIO = 2.0
 """A landmark leaves the graph at this many times the uncertainty at which it may enter, so that it does not flutter."""
 
@@ -25,7 +35,9 @@ class Plan:
     Attributes
     ----------
     entering, leaving : (R,) int64
-        Observation rows whose factors are added, and removed.
+        Observation rows that are admitted from now on, and no more.
+    adding, removing : (R,) int64
+        Rows whose factors are added, and removed: those of the admitted that are chosen (`dualslam.backend.selection`).
     refused : (R,) int64
         Live rows that fit so badly that they are not let in.
     new_landmarks : (L,) int64
@@ -36,6 +48,8 @@ class Plan:
 
     entering: IntArray
     leaving: IntArray
+    adding: IntArray
+    removing: IntArray
     refused: IntArray
     new_landmarks: IntArray
     new_keyframes: IntArray
@@ -44,13 +58,13 @@ class Plan:
 
 
 class FactorIndex:
-    """Row by row, the factor index of each observation; it grows with the submap's table.
+    """Row by row, what becomes of each observation; it grows with the submap's table.
 
     Attributes
     ----------
     rows : Table
-        ``factor`` (index in the solver, or `OUTSIDE`), ``uv_px`` (2), ``sigma_px``: one row per observation row. Pixels
-        never change, so they are looked up once.
+        ``admitted`` (whether the graph can bear it), ``factor`` (index in the solver, or `OUTSIDE`), ``uv_px`` (2),
+        ``sigma_px``: one row per observation row. Pixels never change, so they are looked up once.
     keyframes : set of int
         Those whose pose is in the graph.
     banned : set of int
@@ -59,16 +73,21 @@ class FactorIndex:
 
     def __init__(self, config: GraphConfig) -> None:
         self._config = config
-        self.rows = Table(factor=(np.int64, ()), uv_px=(np.float64, (2,)), sigma_px=(np.float64, ()))
+        self.rows = Table(
+            admitted=(np.bool_, ()), factor=(np.int64, ()), uv_px=(np.float64, (2,)), sigma_px=(np.float64, ())
+        )
         self.keyframes: set[int] = set()
         self.banned: set[int] = set()
         self._n_planned = 0
+        self._chosen_with = self._per_keyframe = ALL
 
     def clear(self) -> None:
         """Forget what is in the graph (not the pixels, not the bans)."""
         self.rows["factor"][:] = OUTSIDE
+        self.rows["admitted"][:] = False
         self.keyframes = set()
         self._n_planned = 0
+        self._chosen_with = self._per_keyframe = ALL
 
     def plan(
         self,
@@ -78,6 +97,7 @@ class FactorIndex:
         caution: float = 1.0,
         strict: bool = True,
         suspects: IntArray | None = None,
+        choose: bool = True,
     ) -> Plan:
         """Compare the submap with the graph; nothing changes until `commit`.
 
@@ -94,12 +114,14 @@ class FactorIndex:
             Hold the observations of new landmarks to `GraphConfig.enter_sigmas`; False before a batch optimisation.
         suspects : (S,) int64, optional
             Landmarks to look at again although nothing of theirs changed.
+        choose : bool
+            Whether a part of what is admitted becomes factors; False: all of it.
         """
         self._take_new_rows(submap)
         obs = submap.observations
         kf, lm, alive = obs["kf"], obs["landmark"], obs["alive"]
         n_landmarks = len(submap.landmarks)
-        inside = self.rows["factor"] >= 0
+        inside = self.rows["admitted"]
         died = inside & ~alive
         # A landmark is looked at again where it got an observation (touched) or lost one.
         fresh = self._n_planned + np.flatnonzero(alive[self._n_planned :])
@@ -122,14 +144,19 @@ class FactorIndex:
         entering[row[candidate & fits & certain[lm[row]]]] = True
         refused = row[candidate & ~fits]
         leaving[row[~candidate & ~fits]] = True  # behind the camera after all: such a factor has no derivative
-        new_landmarks = np.flatnonzero(take_mask(lm[entering], n_landmarks) & ~known)
+        admitted = (inside & ~leaving) | entering
 
+        factors = self.rows["factor"] >= 0
+        chosen = self._choose(submap, admitted, factors, choose)
+        new_landmarks = np.flatnonzero(take_mask(lm[chosen], n_landmarks) & ~take_mask(lm[factors], n_landmarks))
         live = np.array(sorted(submap.keyframes), np.int64)
         here = np.array(sorted(self.keyframes), np.int64)
-        weak = self._weak_keyframes((inside & ~leaving) | entering, kf, lm, live)
+        weak = self._weak_keyframes(chosen, kf, lm, live)
         return Plan(
             np.flatnonzero(entering),
             np.flatnonzero(leaving),
+            np.flatnonzero(chosen & ~factors),
+            np.flatnonzero(factors & ~chosen),
             refused,
             new_landmarks,
             np.setdiff1d(live, here, assume_unique=True),
@@ -137,13 +164,53 @@ class FactorIndex:
             weak,
         )
 
-    def commit(self, plan: Plan, factor_of_entering: IntArray) -> None:
+    def commit(self, plan: Plan, factor_of_adding: IntArray) -> None:
         """Take over that the solver has accepted a plan, and the factor indices that it gave."""
-        self.rows["factor"][plan.leaving] = OUTSIDE
-        self.rows["factor"][plan.entering] = factor_of_entering
+        self.rows["admitted"][plan.leaving] = False
+        self.rows["admitted"][plan.entering] = True
+        self.rows["factor"][plan.removing] = OUTSIDE
+        self.rows["factor"][plan.adding] = factor_of_adding
         self.keyframes.update(plan.new_keyframes.tolist())
         self.keyframes.difference_update(plan.gone_keyframes.tolist())
         self._n_planned = len(self.rows)
+        self._chosen_with = self._per_keyframe
+
+    def _choose(self, submap: Submap, admitted: BoolArray, factors: BoolArray, a_part: bool) -> BoolArray:
+        """Return which of the admitted rows are to be factors."""
+        obs, config = submap.observations, self._config
+        keyframes = np.array(list(submap.keyframes), np.int64)
+        self._per_keyframe = self._factors_per_keyframe(submap, admitted, keyframes) if a_part else ALL
+        if 2 * self._per_keyframe <= self._chosen_with:
+            factors = np.zeros_like(factors)
+        young = len(keyframes) <= config.young_keyframes
+        return choose_factors(
+            # The image's middle is about where the principal point is.
+            Candidates(obs["kf"], obs["landmark"], self.rows["uv_px"], 2 * float(submap.K[0, 2])),
+            admitted,
+            factors,
+            keyframes,
+            len(submap.landmarks),
+            self._per_keyframe,
+            config.factors_per_landmark if self._per_keyframe < ALL else ALL,
+            2 if young else config.min_views,
+        )
+
+    def _factors_per_keyframe(self, submap: Submap, admitted: BoolArray, keyframes: IntArray) -> int:
+        """Return how many factors a keyframe may have: fewer, the more keyframes see what the newest ones see.
+
+        They are what an update takes apart: on a road a dozen, in a room that is looked at again and again most of the
+        map. An answer holds until another is half of it or less.
+        """
+        config, obs = self._config, submap.observations
+        if len(keyframes) <= SMALL_MAP:
+            return ALL
+        kf, lm = obs["kf"][: len(admitted)][admitted], obs["landmark"][: len(admitted)][admitted]
+        seen = take_mask(lm[np.isin(kf, keyframes[-N_NEWEST:])], len(submap.landmarks))
+        beside = int(np.count_nonzero(np.bincount(kf[seen[lm]]) >= MIN_SHARED))
+        wanted = max(
+            config.factors_per_keyframe, min(int(MOST_RATIO * config.factors_per_keyframe), BUDGET // max(beside, 1))
+        )
+        return wanted if 2 * wanted <= self._chosen_with else self._chosen_with
 
     def _take_new_rows(self, submap: Submap) -> None:
         obs, n = submap.observations, len(self.rows)

@@ -32,9 +32,9 @@ from dualslam.backend import convert
 from dualslam.backend.bayes_tree import BayesTree, UpdateStatistics, parse_bayes_tree
 from dualslam.core.types import FloatArray, IntArray
 
-POSE_THRESHOLDS = (0.0005, 0.0025)
+POSE_THRESHOLDS = (0.0015, 0.0075)
 """Relinearise a pose that moved by more: rotation in rad, translation in submap units (median initial depth 1)."""
-POINT_THRESHOLD_MU = 0.005
+POINT_THRESHOLD_MU = 0.02
 N_LAST = 30
 """So many of the newest poses are eliminated last."""
 GTSAM_ERRORS = (RuntimeError, ValueError, IndexError)

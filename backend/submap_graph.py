@@ -21,12 +21,14 @@ from dualslam.backend.factor_index import OUTSIDE, FactorIndex, Plan
 from dualslam.backend.factors import baseline_factor, insert_projections, pose_prior, relative_pose
 from dualslam.backend.gauge import Gauge, choose_gauge
 from dualslam.backend.noise import PixelNoise, residual_variance
-from dualslam.backend.observability import compute_residuals, find_components
+from dualslam.backend.observability import compute_residuals, find_components, take_mask
+from dualslam.backend.point_refinement import refine_points, triangulation_covariances
 from dualslam.backend.solver import N_LAST, IncrementalSolver, SolverFailure, optimise_batch
 from dualslam.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
+from dualslam.core.geometry import so3
 from dualslam.core.interfaces import GraphEstimate
-from dualslam.core.types import FloatArray, IntArray
+from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.submap import RelativePose, Submap
 
 logger = logging.getLogger(__name__)
@@ -37,6 +39,9 @@ REBUILD_ATTEMPTS = 8
 RELINEARISE_EVERY = 3
 MISFIT_CHI2 = 1.2
 """Each third update relinearises, and each that follows one whose newest observations fit worse than this."""
+REFINED_KEYFRAMES = 3
+"""After each update points beside the graph are refined that so many of the newest keyframes see; after a reading of
+everything, all."""
 FAR_MU = 200.0
 """A point this far from its camera (the median initial depth is 1) is looked at again before the next solution."""
 
@@ -54,6 +59,24 @@ class _Changes:
     new_relative: list[tuple[int, RelativePose]]
     kept_relative: dict[int, tuple[RelativePose, int]]
     order: IntArray  # of the projections
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Optimum:
+    """What a batch solution makes of a submap: poses by keyframe, and all points (those not in it as they were)."""
+
+    poses: Mapping[int, FloatArray]
+    xyz_mu: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Views:
+    """Of points beside the graph: rows, the poses of their keyframes, and which of the poses and points each is of."""
+
+    row: IntArray
+    T_submap_kf: FloatArray
+    pose: IntArray
+    point: IntArray
 
 
 class ISam2SubmapGraph:
@@ -134,7 +157,7 @@ class ISam2SubmapGraph:
             If that cannot be done.
         """
         iterations = self._config.merge_iterations if near_optimum else self._config.rebuild_iterations
-        return self._remake(submap, time.thread_time(), rebuilt=True, iterations=iterations)
+        return self._remake(submap, time.thread_time(), True, iterations, with_all=True)
 
     def full_estimate(self, submap: Submap) -> GraphEstimate:
         """Return the estimate of every keyframe and landmark in the graph as of the last update, without solving."""
@@ -168,16 +191,53 @@ class ISam2SubmapGraph:
         SolverError
             If the solver cannot tell.
         """
-        covariances = np.full((len(landmark_ids), 3, 3), np.nan)
+        ids = np.asarray(landmark_ids, np.int64)
+        covariances = np.full((len(ids), 3, 3), np.nan)
         if self._solver is None:
             return covariances
-        for i, j in enumerate(np.asarray(landmark_ids).tolist()):
+        for i, j in enumerate(ids.tolist()):
             if not self._solver.has(j):
                 continue
             try:
                 covariances[i] = self._solver.covariance(j)
             except SolverFailure as failure:
                 raise SolverError(f"no covariance of landmark {j}: {failure}; rebuild the graph") from failure
+        return covariances
+
+    def triangulated_covariances(self, submap: Submap, landmark_ids: IntArray) -> FloatArray:
+        """Return (L, 3, 3) covariances of points beside the graph, in the submap's frame; NaN for those that are not.
+
+        That of the views of a point, the poses held, and that of the pose of the newest of them, with which the point
+        moves. Points that are variables have theirs from `point_covariances`.
+
+        Raises
+        ------
+        SolverError
+            If the solver cannot tell a pose's.
+        """
+        ids = np.asarray(landmark_ids, np.int64)
+        covariances = np.full((len(ids), 3, 3), np.nan)
+        obs, inside = submap.observations, np.flatnonzero(self._factor_index.rows["admitted"])
+        in_graph = take_mask(
+            obs["landmark"][np.flatnonzero(self._factor_index.rows["factor"] >= 0)], len(submap.landmarks)
+        )
+        wanted = np.intersect1d(ids, self._beside(submap, inside, in_graph, None))
+        if len(wanted) == 0:
+            return covariances
+        views, xyz = self._views_of(submap, wanted, inside, {}), submap.landmarks["xyz_mu"][wanted]
+        sigma = self._factor_index.rows["sigma_px"][views.row]
+        found = triangulation_covariances(submap.K, views.T_submap_kf, views.pose, xyz, views.point, sigma)
+        newest = np.full(len(wanted), -1)
+        np.maximum.at(newest, views.point, obs["kf"][views.row])
+        for k in np.unique(newest).tolist():
+            T, P, of = submap.T_submap_kf[k], self.pose_covariance(k), np.flatnonzero(newest == k)
+            arm = (xyz[of] - T[:3, 3]) @ T[:3, :3]
+            J = np.concatenate((-so3.hat(arm), np.broadcast_to(np.eye(3), (len(of), 3, 3))), axis=2)
+            J = T[:3, :3] @ J
+            found[of] += J @ P @ J.transpose(0, 2, 1)
+        place = np.searchsorted(wanted, ids).clip(max=len(wanted) - 1)
+        mine = wanted[place] == ids
+        covariances[mine] = found[place[mine]]
         return covariances
 
     # --- for those who want to look inside
@@ -202,7 +262,7 @@ class ISam2SubmapGraph:
     def _changes(self, submap: Submap, plan: Plan, poses: Mapping[int, FloatArray], xyz_mu: FloatArray) -> _Changes:
         """Translate a plan into factors and values; new variables start from `poses` and `xyz_mu`."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        remove = self._factor_index.rows["factor"][plan.leaving].tolist()
+        remove = self._factor_index.rows["factor"][plan.removing].tolist()
 
         def pose_now(k: int) -> FloatArray:
             known = self._solver is not None and k in self._factor_index.keyframes
@@ -235,7 +295,7 @@ class ISam2SubmapGraph:
         for k, r in new_relative:
             graph.push_back(relative_pose(k, r))
 
-        obs, rows, e = submap.observations, self._factor_index.rows, plan.entering
+        obs, rows, e = submap.observations, self._factor_index.rows, plan.adding
         K = convert.to_cal3_s2(submap.K)
         order = insert_projections(
             graph, obs["kf"][e], obs["landmark"][e], rows["uv_px"][e], rows["sigma_px"][e], K, self._noise
@@ -271,46 +331,63 @@ class ISam2SubmapGraph:
     def _n_rows(self, submap: Submap, plan: Plan, keyframe_id: int) -> int:
         kf = submap.observations["kf"]
         inside = np.count_nonzero((self._factor_index.rows["factor"] >= 0) & (kf == keyframe_id))
-        change = np.count_nonzero(kf[plan.entering] == keyframe_id) - np.count_nonzero(kf[plan.leaving] == keyframe_id)
+        change = np.count_nonzero(kf[plan.adding] == keyframe_id) - np.count_nonzero(kf[plan.removing] == keyframe_id)
         return int(inside + change)
 
     # --- reading
 
-    def _read(self, submap: Submap, start: float, plan: Plan | None, everything: bool, rebuilt: bool) -> GraphEstimate:
+    def _read(
+        self,
+        submap: Submap,
+        start: float,
+        plan: Plan | None,
+        everything: bool,
+        rebuilt: bool,
+        optimum: _Optimum | None = None,
+    ) -> GraphEstimate:
         """Read the estimate of the window's keyframes (or everything's), and how the window's observations fit.
 
         The window is the last `GraphConfig.read_window` keyframes and those just added to. Without a plan, and after a
-        rebuild, it is the whole submap.
+        rebuild, it is the whole submap. `optimum`: of all that the graph can bear, to be told in place of its own.
         """
         assert self._solver is not None
         obs, rows = submap.observations, self._factor_index.rows
         kf, lm = obs["kf"][: len(rows)], obs["landmark"][: len(rows)]
         entering = plan.entering if plan is not None else np.zeros(0, np.int64)
-        inside = np.flatnonzero(rows["factor"] >= 0)
+        # Rows of keyframes that were culled since the last plan are dead, but not out yet.
+        inside = np.flatnonzero(rows["admitted"] & obs["alive"][: len(rows)])
+        in_graph = take_mask(lm[rows["factor"] >= 0], len(submap.landmarks))
         keyframes, row = np.array(sorted(self._factor_index.keyframes), np.int64), inside
         window = 0 if rebuilt or plan is None else self._config.read_window
         if window and len(keyframes) > window:
             recent = np.union1d(np.array(list(submap.keyframes)[-window:], np.int64), kf[entering])
-            active = np.zeros(int(max(kf.max(initial=0), recent.max())) + 1, bool)
-            active[recent] = True
-            row = inside[active[kf[inside]]]
+            row = inside[take_mask(recent, int(max(kf.max(initial=0), recent.max())) + 1)[kf[inside]]]
             keyframes = keyframes if everything else recent
         else:
             everything = True
-        seen = np.zeros(len(submap.landmarks), bool)
-        seen[lm[inside if everything else row]] = True
-        landmarks = np.flatnonzero(seen)
-        T, xyz = self._solver.estimate(keyframes, landmarks, everything)
+        seen = take_mask(lm[inside if everything else row], len(submap.landmarks))
+        if everything:
+            seen |= in_graph
+        landmarks = np.flatnonzero(seen & in_graph)
+        if optimum is None:
+            T, xyz_graph = self._solver.estimate(keyframes, landmarks, everything)
+        else:
+            T, xyz_graph = np.array([optimum.poses[k] for k in keyframes.tolist()]), optimum.xyz_mu[landmarks]
+        poses = dict(zip(keyframes.tolist(), T, strict=True))
+        newest = None if everything else list(submap.keyframes)[-REFINED_KEYFRAMES:]
+        beside = self._beside(submap, inside, in_graph, newest)
+        xyz = (submap.landmarks["xyz_mu"] if optimum is None else optimum.xyz_mu).copy()
+        xyz[landmarks] = xyz_graph
+        xyz[beside] = self._refined(submap, poses, xyz, beside, inside)
+        landmarks = np.union1d(landmarks, beside)
 
-        point, pose = (np.cumsum(seen) - 1)[lm[row]], np.searchsorted(keyframes, kf[row])
-        res = compute_residuals(submap.K, T, pose, xyz[point], rows["uv_px"][row], rows["sigma_px"][row])
+        pose = np.searchsorted(keyframes, kf[row])
+        res = compute_residuals(submap.K, T, pose, xyz[lm[row]], rows["uv_px"][row], rows["sigma_px"][row])
         chi2 = res.chi2
         # The solver threw these points away. Linearised there, they would be the death of it: they go before that.
         self._suspects = np.unique(lm[row[np.isinf(chi2) | (res.depth_mu > FAR_MU)]])
-        newest = chi2[np.isin(row, entering, assume_unique=True)]
-        chi2_newest = (
-            float(np.minimum(newest, self._config.insert_sigmas**2).mean() / 2) if len(newest) else float("nan")
-        )
+        fresh = chi2[np.isin(row, entering, assume_unique=True)]
+        chi2_newest = float(np.minimum(fresh, self._config.insert_sigmas**2).mean() / 2) if len(fresh) else float("nan")
         self._misfit = chi2_newest > MISFIT_CHI2
         n_views = np.bincount(lm[inside])[lm[row]]
         noise2 = residual_variance(chi2, n_views, self._config.least_noise**2)
@@ -319,13 +396,37 @@ class ISam2SubmapGraph:
             keyframe_ids=keyframes,
             T_submap_kf=T,
             landmark_ids=landmarks,
-            xyz_mu=xyz,
+            xyz_mu=xyz[landmarks],
             outlier_rows=np.union1d(outliers, plan.refused) if plan is not None else outliers,
             chi2_newest=chi2_newest,
             noise2=noise2,
             rebuilt=rebuilt,
             seconds=time.thread_time() - start,
         )
+
+    def _beside(self, submap: Submap, inside: IntArray, in_graph: BoolArray, newest: list[int] | None) -> IntArray:
+        """Return the admitted landmarks that are no variables: those that keyframes see, or all."""
+        kf, lm = submap.observations["kf"][inside], submap.observations["landmark"][inside]
+        if newest is not None:
+            lm = lm[np.isin(kf, newest)]
+        return np.flatnonzero(take_mask(lm, len(in_graph)) & ~in_graph)
+
+    def _refined(
+        self, submap: Submap, poses: Mapping[int, FloatArray], xyz_mu: FloatArray, ids: IntArray, inside: IntArray
+    ) -> FloatArray:
+        """Return landmarks that are no variables as their views have them; `poses` are those that were read now."""
+        views = self._views_of(submap, ids, inside, poses)
+        rows, k = self._factor_index.rows, self._config.robust_k
+        uv, sigma = rows["uv_px"][views.row], rows["sigma_px"][views.row]
+        return refine_points(submap.K, views.T_submap_kf, views.pose, xyz_mu[ids], views.point, uv, sigma, k)
+
+    def _views_of(self, submap: Submap, ids: IntArray, inside: IntArray, poses: Mapping[int, FloatArray]) -> _Views:
+        obs = submap.observations
+        row = inside[take_mask(ids, len(submap.landmarks))[obs["landmark"][inside]]]
+        row = row[obs["alive"][row]]
+        keyframes, pose = np.unique(obs["kf"][row], return_inverse=True)
+        T = [poses[k] if k in poses else submap.T_submap_kf[k] for k in keyframes.tolist()]
+        return _Views(row, np.array(T).reshape(-1, 4, 4), pose, np.searchsorted(ids, obs["landmark"][row]))
 
     # --- starting again
 
@@ -343,8 +444,13 @@ class ISam2SubmapGraph:
         elif convert.keyframe_of(failure.key) in submap.keyframes:
             self._forced_holds.add(convert.keyframe_of(failure.key))
 
-    def _remake(self, submap: Submap, start: float, rebuilt: bool, iterations: int | None = None) -> GraphEstimate:
-        """Make the graph from the submap's arrays, more cautiously with each attempt that fails."""
+    def _remake(
+        self, submap: Submap, start: float, rebuilt: bool, iterations: int | None = None, with_all: bool = False
+    ) -> GraphEstimate:
+        """Make the graph from the submap's arrays, more cautiously with each attempt that fails.
+
+        `with_all`: the batch solution that it is seeded with takes all observations that can be borne, and is returned.
+        """
         if not submap.keyframes:
             raise SolverError(f"submap {submap.id} has no keyframes: there is nothing to solve")
         message = ""
@@ -353,8 +459,9 @@ class ISam2SubmapGraph:
             if attempt >= REBUILD_ATTEMPTS // 2:
                 self._forced_holds.update(submap.keyframes)
             try:
-                plan = self._seed(submap, iterations or self._config.rebuild_iterations, caution=1.0 + 0.5 * attempt)
-                return self._read(submap, start, plan, True, rebuilt)
+                caution = 1.0 + 0.5 * attempt
+                plan, optimum = self._seed(submap, iterations or self._config.rebuild_iterations, caution, with_all)
+                return self._read(submap, start, plan, True, rebuilt, optimum if with_all else None)
             except SolverFailure as failure:
                 message = str(failure)
                 logger.info("graph of submap %d, attempt %d to make it: %s", submap.id, attempt + 1, failure)
@@ -362,11 +469,11 @@ class ISam2SubmapGraph:
         self._reset()
         raise SolverError(f"graph of submap {submap.id} could not be made in {REBUILD_ATTEMPTS} attempts: {message}")
 
-    def _seed(self, submap: Submap, iterations: int, caution: float) -> Plan:
+    def _seed(self, submap: Submap, iterations: int, caution: float, with_all: bool) -> tuple[Plan, _Optimum]:
         """Batch-optimise what the submap holds, and seed a fresh iSAM2 with the result."""
         poses: Mapping[int, FloatArray] = submap.T_submap_kf
         xyz = submap.landmarks["xyz_mu"]
-        plan = self._factor_index.plan(submap, poses, xyz, caution, strict=False)
+        plan = self._factor_index.plan(submap, poses, xyz, caution, strict=False, choose=not with_all)
         self._hold_loose_pieces(submap, plan)
         batch = self._changes(submap, plan, poses, xyz)
         optimum = optimise_batch(batch.graph, batch.values, plan.new_keyframes, plan.new_landmarks, iterations)
@@ -379,11 +486,11 @@ class ISam2SubmapGraph:
         solver = IncrementalSolver()
         self._solve(solver, submap, plan, self._changes(submap, plan, poses, xyz))
         self._solver = solver
-        return plan
+        return plan, _Optimum(poses, xyz)
 
     def _hold_loose_pieces(self, submap: Submap, plan: Plan) -> None:
         """Hold the keyframes of every piece of the graph that is not connected to the gauge."""
-        obs, e = submap.observations, plan.entering
+        obs, e = submap.observations, plan.adding
         ids, label = find_components(obs["kf"][e], obs["landmark"][e])
         if len(ids) == 0 or label.max() == 0:
             return

@@ -10,10 +10,10 @@ from functools import partial
 import numpy as np
 
 from dualslam.backend.atlas_solver import GtsamAtlasSolver
-from dualslam.backend.beside_window import adjust_window
 from dualslam.backend.local_ba import bundle_adjust, bundle_adjust_arrays
 from dualslam.backend.self_calibration import estimate_calibration, find_preferred_camera
 from dualslam.backend.submap_graph import ISam2SubmapGraph
+from dualslam.backend.window import WindowSolver as NumpyWindowSolver
 from dualslam.calibration.lens import Calibration, CalibrationAnswer, CalibrationJob, answer
 from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.camera.corrected import CorrectedCamera
@@ -21,7 +21,7 @@ from dualslam.core.camera.models import Camera
 from dualslam.core.camera.rectification import rectify
 from dualslam.core.errors import ConfigError
 from dualslam.core.grey_image import GreyImage
-from dualslam.core.interfaces import Frontend, PreferredCamera, SelfCalibrator, SubmapGraph
+from dualslam.core.interfaces import Frontend, PreferredCamera, SelfCalibrator, SubmapGraph, WindowSolver
 from dualslam.core.threads import spare_cores
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, IntArray, View
 from dualslam.frontends.features.image_features import ImageFeatures
@@ -138,14 +138,14 @@ def build_system(
 
     def odometry(submap: Submap, graph: SubmapGraph, n_covering: int = 0) -> VisualFrontEnd:
         refinder = Refinder(submap, frontend, calibrated, sigma_px)
-        return VisualFrontEnd(frontend, config, submap, graph, size_px, refinder, n_covering)
+        return VisualFrontEnd(frontend, config, submap, graph, size_px, refinder, n_covering, window_solver(config))
 
     workers = config.recovery.workers
     if recovery is None:
         # Built here in any case: a mistake in the config is told at once, not by a worker.
         parts = recovery_parts(config, size_px, frontend=frontend)
     desk = worker_desk(config, size_px, faults) if workers else InlineDesk(calibration_handlers(config))
-    graphs = BesideGraphs(desk, partial(adjust_window, config=config.graph)) if workers else None
+    graphs = BesideGraphs(desk, window_solver(config)) if workers else None
     if recovery is None:
         recovery = DeskExecutor(desk) if workers else faults.around_inline(InlineExecutor(parts))
 
@@ -197,6 +197,11 @@ def _camera_of(saved: StoredMap, camera: Camera) -> Camera:
 def atlas_solver(config: Config) -> GtsamAtlasSolver:
     """Build what solves the graph over all submaps."""
     return GtsamAtlasSolver(config.atlas.robust, config.graph.robust_k)
+
+
+def window_solver(config: Config) -> WindowSolver:
+    """Build what poses new keyframes between the updates of a submap's graph."""
+    return NumpyWindowSolver(config.graph.robust_k, config.graph.outlier_chi2, config.graph.least_noise)
 
 
 def self_calibrator(config: Config) -> SelfCalibrator:
@@ -288,7 +293,7 @@ def recovery_parts(
         for view in sorted(job.own, key=lambda view: view.index, reverse=True):  # those next to the walk stay
             refinder.remember(view)
         n_covering = 0 if job.lost else config.recovery.covering_keyframes
-        return VisualFrontEnd(frontend, config, submap, graph, size_px, refinder, n_covering)
+        return VisualFrontEnd(frontend, config, submap, graph, size_px, refinder, n_covering, window_solver(config))
 
     matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
     return RecoveryParts(

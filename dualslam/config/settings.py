@@ -281,6 +281,15 @@ class GraphConfig(StrictModel):
     """Observations of a landmark that is in the graph are refused only beyond this; the robust kernel has the rest."""
     min_ties: int = Field(6, ge=3)
     """Keyframes tied to the graph by fewer landmarks are held at their pose by a loose prior, until they have more."""
+    factors_per_keyframe: int = Field(60, ge=20)
+    """Observations of a keyframe that become factors of the graph, about, chosen from those that it could bear: spread
+    over the image, long tracks first. Points of the others follow the poses. An update's cost grows with it; where few
+    other keyframes see the same points (on a road), it is up to 2.5 times as many."""
+    factors_per_landmark: int = Field(6, ge=3)
+    """Views of a landmark that become factors, spread over its track; more where a keyframe would be short of them."""
+    update_every: int = Field(1, ge=1, le=10)
+    """Keyframes at which the graph is solved, once a map is past its first: a window of neighbours poses those between,
+    and these, too, before anything is mapped from them."""
     read_window: int = Field(20, ge=0)
     """Keyframes (the last inserted ones, and their landmarks) whose estimate is read after each update; 0 reads all."""
     read_all_every: int = Field(10, ge=1)

@@ -136,6 +136,17 @@ class GraphEstimate:
         return self.keyframe_ids, self.T_submap_kf, self.landmark_ids, self.xyz_mu
 
 
+class WindowSolver(Protocol):
+    """Poses a new keyframe by a small bundle: what tracking goes on from until the graph has looked at it."""
+
+    def __call__(self, submap: Submap, free_keyframes: list[int]) -> GraphEstimate | Failure:
+        """Adjust a few keyframes, the newest first, and the points that the newest sees; the submap is not changed.
+
+        Keyframes of the submap's gauge stay where they are. `GraphEstimate.outlier_rows` are of the newest keyframe.
+        """
+        ...
+
+
 class SubmapGraph(Protocol):
     """The factor graph of one submap. The submap's arrays are the record, the graph follows them."""
 
@@ -276,8 +287,8 @@ class KeyframeReport:
     mapping : MappingReport
     posed : GraphEstimate
         With the keyframe's matches alone, before anything was placed from its pose.
-    grown : GraphEstimate
-        With what was then added.
+    grown : GraphEstimate, optional
+        With what was then added; None where the graph takes it in later.
     culled_keyframe : int, optional
     solver_failed : bool
         It threw and had to be made anew.
@@ -285,19 +296,19 @@ class KeyframeReport:
 
     mapping: MappingReport
     posed: GraphEstimate
-    grown: GraphEstimate
+    grown: GraphEstimate | None
     culled_keyframe: int | None
     solver_failed: bool = False
 
     @property
     def rebuilt(self) -> bool:
         """Whether the graph was made anew, for whatever reason."""
-        return self.posed.rebuilt or self.grown.rebuilt
+        return self.posed.rebuilt or (self.grown is not None and self.grown.rebuilt)
 
     @property
     def graph_seconds(self) -> float:
-        """Time that the graph took."""
-        return self.posed.seconds + self.grown.seconds
+        """Time that the window and the graph took."""
+        return self.posed.seconds + (self.grown.seconds if self.grown is not None else 0.0)
 
 
 class MapStarter(Protocol):

@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 Window = Callable[[Submap, list[int]], GraphEstimate | Failure]
 """Adjusts some keyframes of a submap, the newest first, and what they see; the submap is not changed."""
 N_FREE, N_FREE_BEHIND = 3, 1
-"""Keyframes that the window moves: those that the tracking goes on from; fewer while it has something to catch up on."""
+"""Keyframes that the window moves: those that the tracking goes on from; fewer while it has to catch up."""
 
 PAUSE_S = 1e-3
 """Between two looks at whether a graph has been solved, where a run waits for it."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from dualslam.config.settings import Config
 from dualslam.core.geometry import se3
-from dualslam.core.interfaces import Frontend, GraphEstimate, KeyframeReport, SubmapGraph
+from dualslam.core.interfaces import Frontend, GraphEstimate, KeyframeReport, SubmapGraph, WindowSolver
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.tracking.keyframing import keyframe_due
@@ -23,13 +23,16 @@ from dualslam.map.submap_change import change_of_frame
 
 CULL_BEHIND = 2  # the newest keyframes are not judged redundant: the next ones may need them
 N_CULL_CANDIDATES = 10  # of the covisible keyframes, the nearest in what they see
+N_FREE = 3  # newest keyframes that the window moves
+YOUNG_MAP = 10  # keyframes up to which the graph poses each: two or three say little about a fourth
+MIN_WINDOW_MATCHES = 40  # landmarks of a keyframe below which a window of its neighbours may be led astray
 
 
 class VisualFrontEnd:
     """Tracks frames against a submap and extends it by keyframes.
 
     `refinder`: finds landmarks across gaps in the images themselves; without it features alone tie the keyframes there.
-    `n_covering`: see `Tracker`.
+    `n_covering`: see `Tracker`. `window`: poses new keyframes between the graph's updates; without it the graph does.
     """
 
     def __init__(
@@ -41,6 +44,7 @@ class VisualFrontEnd:
         size_px: tuple[int, int],
         refinder: Refinder | None = None,
         n_covering: int = 0,
+        window: WindowSolver | None = None,
     ) -> None:
         self.submap = submap
         self.graph = graph
@@ -48,6 +52,9 @@ class VisualFrontEnd:
         self._tracker = Tracker(frontend, config.tracking, submap, size_px, config.seed, n_covering)
         self._mapper = Mapper(frontend, config.mapping, submap, size_px)
         self._refinder = refinder
+        self._window = window
+        self._since_graph = 0  # keyframes that the graph has not seen yet
+        self._careful = True  # the next keyframe is the graph's to pose
         self._after_gap = False
         self._apart: frozenset[int] = frozenset()  # keyframes across the last gap, where few landmarks bridge it
         self._reference_id = -1
@@ -78,6 +85,7 @@ class VisualFrontEnd:
 
     def adopt(self, graph: SubmapGraph, before: Submap) -> None:
         """Go on with another graph of the same submap, whose poses and points have moved since it was `before`."""
+        self._careful |= graph is not self.graph
         self.graph = graph
         self._tracker.follow(change_of_frame(before, self.submap, [self._reference_id]))
 
@@ -149,13 +157,14 @@ class VisualFrontEnd:
         return keyframe_due(track, self.submap, self._reference_id, self._config.keyframes)
 
     def insert_keyframe(self, track: Track, pose_is_given: bool = False) -> KeyframeReport | Failure:
-        """Make the frame a keyframe: pose it by the graph, extend the map from there, solve again.
+        """Make the frame a keyframe: pose it by its matches, extend the map from there, solve.
 
         `pose_is_given`: its pose and covariance come from elsewhere, and count beside the landmarks that it sees.
 
         What a pose places, it places to its own liking: new landmarks of a wrong one confirm it, and outvote the old
-        ones in the next frames. The graph therefore poses the keyframe by its matches before any is made. Where it
-        refuses most of the matches, the frame's pose is wrong: the map is left without it.
+        ones in the next frames. The keyframe is therefore posed by its matches before any is made: by a window of its
+        neighbours, or by the whole graph where these could be led astray. Where most of the matches are refused, the
+        frame's pose is wrong: the map is left without it.
         """
         if pose_is_given:
             known = RelativePose(self._reference_id, self.relative_pose(track), track.covariance)
@@ -164,25 +173,45 @@ class VisualFrontEnd:
         self._mapper.observe(track)
         matched = self._rows_of(track.view.index)
         rebuild = self._rebuild_due(track)
-        posed = self._solve()
+        posed = self._pose(track, len(matched), pose_is_given)
         n_refused = int(np.isin(matched, posed.outlier_rows).sum())
         if n_refused > self._config.health.max_refused * len(matched):
             self._withdraw(track.view.index)
             detail = f"the map contradicts {n_refused} of {len(matched)} matches of keyframe {track.view.index}"
             return Failure(FailureReason.CHI_SQUARE, detail, {"n_refused": float(n_refused)})
         mapping = self._mapper.grow(track, self._apart, posed.noise2)
-        grown = self._solve(rebuild)
+        grown = self._graph_step(rebuild)
         self._meet(track.view.index)
         culled = self._cull_keyframe()
         self._tracker.refresh()
-        return KeyframeReport(mapping, posed, grown, culled, posed.rebuilt or (grown.rebuilt and not rebuild))
+        failed = posed.rebuilt or (grown is not None and grown.rebuilt and not rebuild)
+        return KeyframeReport(mapping, posed, grown, culled, failed)
+
+    def _pose(self, track: Track, n_matched: int, pose_is_given: bool) -> GraphEstimate:
+        """Pose the new keyframe, and drop what contradicts it."""
+        careful = self._careful or pose_is_given or track.wide or self._window is None
+        if not careful and len(self.submap.keyframes) > YOUNG_MAP and n_matched >= MIN_WINDOW_MATCHES:
+            assert self._window is not None
+            posed = self._window(self.submap, [track.view.index, *reversed(self._path[1 - N_FREE :])])
+            if not isinstance(posed, Failure):
+                return self._taken(posed)
+        self._careful = False
+        return self._solve()
+
+    def _graph_step(self, rebuild: bool) -> GraphEstimate | None:
+        """Let the graph take in what has come since its last update, where that is due."""
+        self._since_graph += 1
+        young = len(self.submap.keyframes) <= YOUNG_MAP
+        due = rebuild or young or self._window is None or self._since_graph >= self._config.graph.update_every
+        return self._solve(rebuild) if due else None
 
     def _note_gap(self, track: Track | Failure) -> None:
         """Keyframes beyond frames that found no pose, or one by wide matching alone, are to be tied to those before."""
         if isinstance(track, Failure):
-            self._after_gap = True
+            self._after_gap = self._careful = True
             return
         if track.wide:
+            self._careful = True
             bridged = np.count_nonzero(track.landmark_ids >= 0) >= self._config.keyframes.weak_landmarks
             self._apart = frozenset() if bridged else frozenset(self.submap.keyframes)
         if self._refinder is not None and (track.wide or self._after_gap):
@@ -206,6 +235,11 @@ class VisualFrontEnd:
     def _solve(self, rebuild: bool = False) -> GraphEstimate:
         """Bring the graph up to date with the submap, and the submap with its estimate."""
         estimate = self.graph.rebuild(self.submap) if rebuild else self.graph.update(self.submap)
+        self._since_graph = 0
+        return self._taken(estimate)
+
+    def _taken(self, estimate: GraphEstimate) -> GraphEstimate:
+        """Give an estimate to the submap, and drop what it contradicts."""
         self.submap.apply_estimate(*estimate.values)
         self.submap.remove_outliers(estimate.outlier_rows)
         return estimate

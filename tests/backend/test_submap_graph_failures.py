@@ -162,7 +162,7 @@ def test_a_real_gtsam_exception_is_survived(monkeypatch):
     grow(feeder, graph, rest[:6])
     submap = feeder.submap
     T = submap.T_submap_kf[5]
-    bad = add_landmark(submap, T[:3, 3] + T[:3, :3] @ [0.1, 0.0, -1.0], [4, 5])
+    bad = add_landmark(submap, T[:3, 3] + T[:3, :3] @ [0.1, 0.0, -1.0], [3, 4, 5])
     real = module.FactorIndex._judge
     calls = []
 

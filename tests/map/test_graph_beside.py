@@ -6,12 +6,11 @@ import os
 import pickle
 import signal
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 
-from dualslam.build import build_system, graph_handlers
+from dualslam.build import build_system, graph_handlers, window_solver
 from dualslam.config.settings import Config
 from dualslam.core.types import FailureReason, FrameStatus
 from dualslam.map.graph_beside import BesideGraph, BesideGraphs, GraphServer
@@ -68,9 +67,7 @@ def beside(world: PointWorld, polls: int, **settings: object) -> System:
     """A system whose graphs are solved inline, but come back late, by way of a delta as to another process."""
     system = system_in(world, **settings)
     desk = LateDesk(InlineDesk(graph_handlers(system._config)), polls)
-    from dualslam.backend.beside_window import adjust_window
-
-    graphs = BesideGraphs(desk, partial(adjust_window, config=system._config.graph))
+    graphs = BesideGraphs(desk, window_solver(system._config))
     system._parts = replace(system._parts, new_graph=graphs.new_graph, graphs=graphs)
     system._recoveries._new_graph = graphs.new_graph
     system._calibrations._new_graph = graphs.new_graph

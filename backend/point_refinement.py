@@ -1,0 +1,134 @@
+"""Points that are no variables of the graph: refined by their views with the poses held, and how sure they are then."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dualslam.backend.observability import MIN_DEPTH_MU
+from dualslam.core.types import FloatArray, IntArray
+
+STEPS = 2
+"""Gauss-Newton steps: from where the last ones left it a point moves as little as its poses did."""
+DAMPING = 1e-6
+"""Relative to the trace of a point's information: keeps the depth of one seen along a single line where it is."""
+
+
+def projection_jacobian(
+    K: FloatArray, R_submap_kf: FloatArray, xyz_cam: FloatArray, sigma_px: FloatArray
+) -> FloatArray:
+    """Return (R, 2, 3): the whitened derivative of pixels by points in the submap.
+
+    Parameters
+    ----------
+    K : (3, 3)
+    R_submap_kf : (R, 3, 3)
+    xyz_cam : (R, 3)
+        In front of the camera.
+    sigma_px : (R,)
+    """
+    x, y, z = xyz_cam.T
+    w = 1 / (z * sigma_px)
+    J = np.zeros((len(z), 2, 3))
+    J[:, 0, 0], J[:, 0, 1] = K[0, 0] * w, K[0, 1] * w
+    J[:, 0, 2] = -(K[0, 0] * x + K[0, 1] * y) * w / z
+    J[:, 1, 1], J[:, 1, 2] = K[1, 1] * w, -K[1, 1] * y * w / z
+    return np.asarray(J @ R_submap_kf.transpose(0, 2, 1), np.float64)
+
+
+def sum_by(index: IntArray, values: FloatArray, n: int) -> FloatArray:
+    """Return (n, ...): the sum of the rows of each index."""
+    flat = values.reshape(len(values), -1)
+    sums = np.empty((n, flat.shape[1]))
+    for column in range(flat.shape[1]):
+        sums[:, column] = np.bincount(index, flat[:, column], n)
+    return sums.reshape(n, *values.shape[1:])
+
+
+def huber(chi2: FloatArray, k: float) -> tuple[FloatArray, FloatArray]:
+    """Return weights and losses (as GTSAM: half the square within `k`) of squared whitened residuals."""
+    r = np.sqrt(chi2)
+    inside = r <= k
+    weight = np.where(inside, 1.0, k / np.maximum(r, 1e-12))
+    return weight, np.where(inside, chi2 / 2, k * (r - k / 2))
+
+
+def refine_points(
+    K: FloatArray,
+    T_submap_kf: FloatArray,
+    pose: IntArray,
+    xyz_mu: FloatArray,
+    point: IntArray,
+    uv_px: FloatArray,
+    sigma_px: FloatArray,
+    robust_k: float,
+) -> FloatArray:
+    """Return (P, 3) points that fit their views better, robustly; one that would not gain stays where it is.
+
+    Parameters
+    ----------
+    K : (3, 3)
+    T_submap_kf : (F, 4, 4)
+    pose, point : (R,) int64
+        Rows of `T_submap_kf` and `xyz_mu` of each observation.
+    xyz_mu : (P, 3)
+    uv_px : (R, 2), sigma_px : (R,)
+    robust_k : float
+        Huber threshold in sigmas.
+    """
+    n = len(xyz_mu)
+    if n == 0 or len(pose) == 0:
+        return xyz_mu
+    R, t = T_submap_kf[pose, :3, :3], T_submap_kf[pose, :3, 3]
+    best = xyz_mu.copy()
+    xyz = best
+    cost = np.full(n, np.inf)
+    for step in range(STEPS + 1):
+        xyz_cam = np.einsum("rji,rj->ri", R, xyz[point] - t)
+        front = xyz_cam[:, 2] > MIN_DEPTH_MU
+        safe = np.where(front[:, None], xyz_cam, [0.0, 0.0, 1.0])
+        uv = safe[:, :2] / safe[:, 2:]
+        r = np.column_stack((K[0, 0] * uv[:, 0] + K[0, 1] * uv[:, 1] + K[0, 2], K[1, 1] * uv[:, 1] + K[1, 2])) - uv_px
+        r /= sigma_px[:, None]
+        weight, loss = huber(np.einsum("ri,ri->r", r, r), robust_k)
+        loss[~front] = 1e12
+        now = np.bincount(point, loss, n)
+        better = (now < cost) & np.isfinite(xyz).all(axis=1)
+        best = np.where(better[:, None], xyz, best)
+        cost = np.where(better, now, cost)
+        if step == STEPS:
+            break
+        weight[~front] = 0.0
+        J = projection_jacobian(K, R, safe, sigma_px)
+        weighted = J * weight[:, None, None]
+        H = sum_by(point, weighted.transpose(0, 2, 1) @ J, n)
+        b = sum_by(point, np.einsum("rai,ra->ri", weighted, r), n)
+        H += (DAMPING * np.trace(H, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
+        xyz = xyz - np.linalg.solve(H, b[:, :, None])[:, :, 0]
+    return best
+
+
+def triangulation_covariances(
+    K: FloatArray,
+    T_submap_kf: FloatArray,
+    pose: IntArray,
+    xyz_mu: FloatArray,
+    point: IntArray,
+    sigma_px: FloatArray,
+) -> FloatArray:
+    """Return (P, 3, 3): the covariance of each point by its views alone, the poses taken as known; NaN without a depth.
+
+    Parameters
+    ----------
+    K, T_submap_kf, pose, xyz_mu, point, sigma_px
+        As in `refine_points`.
+    """
+    R, t = T_submap_kf[pose, :3, :3], T_submap_kf[pose, :3, 3]
+    xyz_cam = np.einsum("rji,rj->ri", R, xyz_mu[point] - t)
+    front = xyz_cam[:, 2] > MIN_DEPTH_MU
+    J = projection_jacobian(K, R[front], xyz_cam[front], sigma_px[front])
+    information = sum_by(point[front], J.transpose(0, 2, 1) @ J, len(xyz_mu))
+    covariances = np.full((len(xyz_mu), 3, 3), np.nan)
+    values = np.linalg.eigvalsh(information)
+    known = values[:, 0] > 1e-9 * values[:, 2]
+    covariances[known] = np.linalg.inv(information[known])
+    return covariances

@@ -1,0 +1,207 @@
+"""Which of the observations that a graph could bear become its factors: pure numpy, no solver.
+
+An update's cost is that of the cliques which iSAM2 takes apart and puts together again, each landmark one of them. All
+observations of a hand-held map are an order of magnitude more than its poses need, therefore a part of them is chosen,
+spread over the images, long tracks first. What is left out stays in the submap, follows the poses
+(`dualslam.backend.point_refinement`) and is tested for outliers like all others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.core.types import BoolArray, FloatArray, IntArray
+
+CELLS_ACROSS = 16
+"""Cells of an image's width by which observations are spread, as in the choice of what a keyframe observes."""
+FIRST_VIEWS = 3
+"""Views that a landmark which lost some is given back: a third one has a say where two fit almost any pair of poses."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """All rows of a submap's observation table, as the selection looks at them.
+
+    Attributes
+    ----------
+    kf, landmark : (R,) int64
+    uv_px : (R, 2) float64
+    width_px : float
+        Of the image, about.
+    """
+
+    kf: IntArray
+    landmark: IntArray
+    uv_px: FloatArray
+    width_px: float
+
+
+def rank_in_runs(key: IntArray) -> IntArray:
+    """Return for each entry of a sorted array its place among those equal to it."""
+    start = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1]))) if len(key) else np.zeros(0, np.int64)
+    lengths = np.diff(np.append(start, len(key)))
+    return np.asarray(np.arange(len(key)) - np.repeat(start, lengths), np.int64)
+
+
+def spread_evenly(rank: IntArray, n: IntArray, quota: IntArray) -> BoolArray:
+    """Return which of runs of `n` are taken so that `quota` are, evenly spread, the first and the last among them."""
+    steps = np.maximum(n - 1, 1)
+    hops = np.maximum(np.minimum(quota, n) - 1, 1)
+    taken = (rank * hops) // steps != ((rank - 1) * hops) // steps
+    return np.asarray((rank == 0) | (taken & (quota > 1)), bool)
+
+
+def choose_factors(
+    candidates: Candidates,
+    admitted: BoolArray,
+    factors: BoolArray,
+    keyframes: IntArray,
+    n_landmarks: int,
+    per_keyframe: int,
+    max_views: int,
+    min_views: int,
+) -> BoolArray:
+    """Return which rows are to be factors.
+
+    A landmark that was chosen stays as long as two of its views are admitted. Keyframes short of `per_keyframe` are
+    filled, in the order given: first from chosen landmarks that lack views, then from others, which bring views spread
+    evenly over their track, at last from chosen ones beyond their cap. Each time the least occupied cell of the image
+    comes first, and the longest track (in time: the few that bridge a gap are long).
+
+    Parameters
+    ----------
+    candidates : Candidates
+    admitted : (R,) bool
+        Rows that the graph can bear.
+    factors : (R,) bool
+        Rows that are factors now.
+    keyframes : (K,) int64
+    n_landmarks : int
+    per_keyframe, max_views : int
+        Factors that a keyframe should have, about, and views of a landmark.
+    min_views : int
+        Views that a landmark must bring.
+    """
+    kf, landmark = candidates.kf, candidates.landmark
+    chosen = factors & admitted
+    views = np.bincount(landmark[chosen], minlength=n_landmarks)
+    _top_up(candidates, admitted, chosen, factors, views, min_views)
+    n_known = np.bincount(landmark[admitted], minlength=n_landmarks)
+    live = np.zeros(int(kf.max(initial=-1)) + 1, np.int64)
+    live[: len(live)] = np.bincount(kf[chosen], minlength=len(live))[: len(live)]
+    row = np.flatnonzero(admitted & ~chosen)
+    row = row[np.argsort(kf[row], kind="stable")]
+    starts = np.searchsorted(kf[row], keyframes, "left")
+    ends = np.searchsorted(kf[row], keyframes, "right")
+    short = [i for i, k in enumerate(keyframes.tolist()) if starts[i] < ends[i] and live[k] < per_keyframe]
+    if not short:
+        return chosen
+    span = _spans(kf, landmark, admitted, n_landmarks)
+    by_landmark = np.flatnonzero(admitted)
+    by_landmark = by_landmark[np.lexsort((kf[by_landmark], landmark[by_landmark]))]
+    first_of = np.searchsorted(landmark[by_landmark], np.arange(n_landmarks + 1))
+    for i in short:
+        k = int(keyframes[i])
+        here = row[starts[i] : ends[i]]
+        here = here[~chosen[here]]
+        cells = _Cells(candidates, np.flatnonzero(chosen & (kf == k)))
+        for stage in range(3):
+            wanted = per_keyframe - len(cells)
+            if wanted <= 0:
+                break
+            of = landmark[here]
+            if stage == 0:
+                able = (views[of] > 0) & (views[of] < max_views)
+            elif stage == 1:
+                able = (views[of] == 0) & (n_known[of] >= min_views)
+            else:
+                able = views[of] > 0
+            taken = cells.take(here[able], span[of[able]], wanted)
+            if stage == 1:
+                taken = _with_views(taken, landmark, by_landmark, first_of, max_views)
+            chosen[taken] = True
+            np.add.at(views, landmark[taken], 1)
+            here = here[~chosen[here]]
+    return chosen
+
+
+class _Cells:
+    """How occupied the cells of one keyframe's image are."""
+
+    def __init__(self, candidates: Candidates, rows: IntArray) -> None:
+        self._candidates = candidates
+        self._occupied: dict[int, int] = {}
+        self._n = 0
+        self._add(self._cell(rows))
+
+    def __len__(self) -> int:
+        return self._n
+
+    def _cell(self, rows: IntArray) -> IntArray:
+        at = np.clip(self._candidates.uv_px[rows] * (CELLS_ACROSS / self._candidates.width_px), 0, 4 * CELLS_ACROSS)
+        column, row = at.astype(np.int64).T
+        return np.asarray(row * (4 * CELLS_ACROSS + 1) + column, np.int64)
+
+    def _add(self, cells: IntArray) -> None:
+        for cell, n in zip(*(a.tolist() for a in np.unique(cells, return_counts=True)), strict=True):
+            self._occupied[cell] = self._occupied.get(cell, 0) + n
+        self._n += len(cells)
+
+    def take(self, rows: IntArray, span: IntArray, n: int) -> IntArray:
+        """Take up to `n` of the rows: the least occupied cell first, in it the longest track (ties: the older row)."""
+        if len(rows) == 0:
+            return rows
+        cell = self._cell(rows)
+        order = np.lexsort((rows, -span, cell))
+        level = np.array([self._occupied.get(c, 0) for c in cell[order].tolist()], np.int64)
+        level += rank_in_runs(cell[order])
+        first = order[np.lexsort((rows[order], -span[order], level))[:n]]
+        self._add(cell[first])
+        return rows[first]
+
+
+def _top_up(
+    candidates: Candidates,
+    admitted: BoolArray,
+    chosen: BoolArray,
+    factors: BoolArray,
+    views: IntArray,
+    min_views: int,
+) -> None:
+    """Give landmarks that lost views others in their stead, and drop those that are left with fewer than two."""
+    landmark = candidates.landmark
+    lost = np.unique(landmark[factors & ~chosen])
+    lost = lost[views[lost] < max(min_views, FIRST_VIEWS)]
+    if len(lost) == 0:
+        return
+    mark = np.zeros(len(views), bool)
+    mark[lost] = True
+    row = np.flatnonzero(admitted & mark[landmark])
+    row = row[np.lexsort((candidates.kf[row], landmark[row]))]
+    n = np.bincount(landmark[row], minlength=len(views))
+    taken = spread_evenly(rank_in_runs(landmark[row]), n[landmark[row]], np.full(len(row), FIRST_VIEWS))
+    chosen[row[taken]] = True
+    few = mark & (n < 2)
+    chosen[few[landmark]] = False
+    views[lost] = np.bincount(landmark[chosen], minlength=len(views))[lost]
+
+
+def _spans(kf: IntArray, landmark: IntArray, admitted: BoolArray, n_landmarks: int) -> IntArray:
+    first = np.full(n_landmarks, np.iinfo(np.int64).max)
+    last = np.full(n_landmarks, np.iinfo(np.int64).min)
+    np.minimum.at(first, landmark[admitted], kf[admitted])
+    np.maximum.at(last, landmark[admitted], kf[admitted])
+    return np.where(last >= first, last - first, 0)
+
+
+def _with_views(taken: IntArray, landmark: IntArray, by_landmark: IntArray, first_of: IntArray, n: int) -> IntArray:
+    """Return the rows taken and, of the same landmarks, views spread evenly over the track, `n` or one more in all."""
+    ids = landmark[taken]
+    lengths = first_of[ids + 1] - first_of[ids]
+    owner = np.repeat(np.arange(len(ids)), lengths)
+    rank = np.arange(len(owner)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    rows = by_landmark[first_of[ids][owner] + rank]
+    spread = spread_evenly(rank, lengths[owner], np.full(len(owner), n))
+    return np.union1d(taken, rows[spread])

@@ -1,0 +1,235 @@
+"""A small bundle that poses a new keyframe: numpy, Schur complement, a few milliseconds, and no state.
+
+It is the first of two levels of solving: tracking and mapping go on from it at once, and the submap's iSAM2
+(`dualslam.backend.submap_graph`), the second one, takes in what has come since its last update later, several keyframes at once
+if need be. Free are the newest keyframes and the points that the newest of all sees; other keyframes that see these
+points hold them in place.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.backend.noise import residual_variance
+from dualslam.backend.observability import MIN_DEPTH_MU
+from dualslam.backend.point_refinement import huber, projection_jacobian, sum_by
+from dualslam.backend.selection import rank_in_runs, spread_evenly
+from dualslam.core.geometry import se3, so3
+from dualslam.core.interfaces import GraphEstimate
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
+from dualslam.map.submap import Submap
+
+MAX_VIEWS = 8
+"""Views of a point that count, spread evenly over its track: they bound the cost, whatever the map's age."""
+ITERATIONS = 4
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-7, 1e2
+"""Levenberg-Marquardt, relative to the diagonal."""
+CONVERGED = 1e-4
+"""Relative decrease of the cost below which to stop."""
+NEWEST_CHI2_CAP = 625.0
+"""As `GraphConfig.insert_sigmas`: one wild match does not make the newest keyframe's mean."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """What is adjusted. Observations are sorted by point.
+
+    Attributes
+    ----------
+    K : (3, 3)
+    T_submap_kf : (F, 4, 4)
+        The free ones first.
+    n_free : int
+    xyz_mu : (P, 3)
+    pose, point : (R,) int64
+        Rows of `T_submap_kf` and `xyz_mu` of each observation.
+    uv_px : (R, 2), sigma_px : (R,)
+    """
+
+    K: FloatArray
+    T_submap_kf: FloatArray
+    n_free: int
+    xyz_mu: FloatArray
+    pose: IntArray
+    point: IntArray
+    uv_px: FloatArray
+    sigma_px: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    T: FloatArray
+    xyz: FloatArray
+    xyz_cam: FloatArray
+    residuals: FloatArray  # (R, 2), whitened
+    weight: FloatArray
+    chi2: FloatArray  # infinite behind the camera
+    cost: float
+
+
+class WindowSolver:
+    """The `dualslam.core.interfaces.WindowSolver` in numpy.
+
+    Parameters
+    ----------
+    robust_k : float
+        Huber threshold in sigmas.
+    outlier_chi2, least_noise : float
+        As in `GraphConfig`.
+    """
+
+    def __init__(self, robust_k: float, outlier_chi2: float, least_noise: float) -> None:
+        self._robust_k = robust_k
+        self._outlier_chi2 = outlier_chi2
+        self._least_noise = least_noise
+
+    def __call__(self, submap: Submap, free_keyframes: list[int]) -> GraphEstimate | Failure:
+        """Adjust a few keyframes, the newest first, and the points that the newest sees; the submap is not changed.
+
+        Keyframes of the submap's gauge stay, whoever names them.
+        """
+        start = time.thread_time()
+        newest = free_keyframes[0]
+        free = [k for k in free_keyframes if k not in submap.gauge and k in submap.keyframes]
+        if newest not in free:
+            return Failure(FailureReason.SOLVER, f"keyframe {newest} is the gauge's: it does not move")
+        ids = submap.landmarks_of_keyframes([newest])
+        row, keyframes, window = _window(submap, free, ids)
+        if len(keyframes) == len(free):
+            return Failure(FailureReason.TOO_FEW_MATCHES, f"nothing but its neighbours holds keyframe {newest}")
+        before = _evaluate(window, window.T_submap_kf, window.xyz_mu, self._robust_k)
+        after = adjust_window(window, self._robust_k)
+        if not (np.isfinite(after.T).all() and after.cost <= before.cost):
+            return Failure(FailureReason.SOLVER, "the window has no optimum")
+        n_views = np.bincount(window.point, minlength=len(ids))[window.point]
+        noise2 = residual_variance(after.chi2, n_views, self._least_noise**2)
+        mine = window.pose == 0
+        chi2 = np.minimum(after.chi2[mine], NEWEST_CHI2_CAP)
+        sound = np.isfinite(after.xyz).all(axis=1) & (
+            sum_by(window.point, np.isinf(after.chi2)[:, None], len(ids))[:, 0] == 0
+        )
+        return GraphEstimate(
+            keyframe_ids=np.array(free, np.int64),
+            T_submap_kf=after.T[: window.n_free],
+            landmark_ids=ids[sound],
+            xyz_mu=after.xyz[sound],
+            outlier_rows=np.sort(row[mine & (after.chi2 > self._outlier_chi2 * noise2)]),
+            chi2_newest=float(chi2.mean() / 2) if len(chi2) else float("nan"),
+            noise2=noise2,
+            rebuilt=False,
+            seconds=time.thread_time() - start,
+        )
+
+
+def _window(submap: Submap, free: list[int], landmark_ids: IntArray) -> tuple[IntArray, IntArray, Window]:
+    """Return the rows that count, their keyframes (the free ones first), and the window."""
+    obs = submap.observations
+    row = submap.rows_of_landmarks(landmark_ids)
+    kf, point = obs["kf"][row], np.searchsorted(landmark_ids, obs["landmark"][row])
+    is_free = np.isin(kf, free)
+    order = np.lexsort((kf, is_free, point))  # the free views of each point last
+    row, kf, point, is_free = row[order], kf[order], point[order], is_free[order]
+    n_free = np.bincount(point[is_free], minlength=len(landmark_ids))
+    n_held = np.bincount(point[~is_free], minlength=len(landmark_ids))
+    quota = np.maximum(MAX_VIEWS - n_free, 2)[point]
+    kept = is_free | spread_evenly(rank_in_runs(point), n_held[point], quota)
+    row, kf, point = row[kept], kf[kept], point[kept]
+    keyframes = np.array([*free, *np.setdiff1d(kf, free).tolist()], np.int64)
+    by_id = np.argsort(keyframes)
+    uv, sigma = submap.observed_pixels(row)
+    pose = by_id[np.searchsorted(keyframes[by_id], kf)]
+    T, xyz = submap.keyframe_poses(keyframes), submap.landmarks["xyz_mu"][landmark_ids]
+    return row, keyframes, Window(submap.K, T, len(free), xyz, pose, point, uv, sigma)
+
+
+def adjust_window(window: Window, robust_k: float, iterations: int = ITERATIONS) -> _State:
+    """Run Levenberg-Marquardt on the free poses and all points, the points eliminated first.
+
+    Poses move by ``T exp(xi)``, xi = (rotation, translation).
+    """
+    n_free, n_points = window.n_free, len(window.xyz_mu)
+    mine = np.flatnonzero(window.pose < n_free)
+    pose, point = window.pose[mine], window.point[mine]
+    pair = pose * n_points + point  # a keyframe sees a point once
+    state = _evaluate(window, window.T_submap_kf, window.xyz_mu, robust_k)
+    damping = FIRST_DAMPING
+    for _ in range(iterations):
+        safe = np.where(np.isfinite(state.chi2)[:, None], state.xyz_cam, [0.0, 0.0, 1.0])
+        R = state.T[window.pose, :3, :3]
+        J = projection_jacobian(window.K, R, safe, window.sigma_px)
+        weighted = J * state.weight[:, None, None]
+        V = sum_by(window.point, weighted.transpose(0, 2, 1) @ J, n_points)
+        g_point = sum_by(window.point, np.einsum("rai,ra->ri", weighted, state.residuals), n_points)
+        # By the pose: in the camera, a point moves by [p]x omega - v.
+        J_cam = J[mine] @ R[mine]
+        J_pose = np.concatenate((J_cam @ so3.hat(safe[mine]), -J_cam), axis=2)
+        J_pose_w = J_pose * state.weight[mine, None, None]
+        U = sum_by(pose, J_pose_w.transpose(0, 2, 1) @ J_pose, n_free)
+        g_pose = sum_by(pose, np.einsum("rai,ra->ri", J_pose_w, state.residuals[mine]), n_free)
+        W = np.zeros((n_free * n_points, 6, 3))
+        W[pair] = J_pose_w.transpose(0, 2, 1) @ J[mine]
+        W = W.reshape(n_free, n_points, 6, 3).transpose(1, 0, 2, 3).reshape(n_points, 6 * n_free, 3)
+        moved = _step(state, U, V, W, g_pose, g_point, damping)
+        new = _evaluate(window, *moved, robust_k)
+        if new.cost < state.cost:
+            gain, state = state.cost - new.cost, new
+            damping = max(damping / 10, LEAST_DAMPING)
+            if gain < CONVERGED * state.cost:
+                break
+        else:
+            damping = min(damping * 100, MOST_DAMPING)
+    return state
+
+
+def _step(
+    state: _State,
+    U: FloatArray,
+    V: FloatArray,
+    W: FloatArray,
+    g_pose: FloatArray,
+    g_point: FloatArray,
+    damping: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Return poses and points moved by one damped step."""
+    n_free = len(U)
+    V = V + damping * V * np.eye(3) + 1e-9 * (1 + np.trace(V, axis1=1, axis2=2))[:, None, None] * np.eye(3)
+    V_inverse = np.linalg.inv(V)
+    WV = W @ V_inverse
+    S = np.zeros((6 * n_free, 6 * n_free))
+    for i in range(n_free):
+        S[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = U[i] + damping * U[i] * np.eye(6)
+    S -= np.tensordot(WV, W, axes=([0, 2], [0, 2]))
+    rhs = -g_pose.ravel() + np.einsum("pij,pj->i", WV, g_point)
+    try:
+        xi = np.linalg.solve(S + 1e-9 * np.trace(S) * np.eye(len(S)), rhs)
+    except np.linalg.LinAlgError:
+        return state.T, state.xyz
+    dx = -np.einsum("pij,pj->pi", V_inverse, g_point + np.einsum("pji,j->pi", W, xi))
+    T = state.T.copy()
+    T[:n_free] = T[:n_free] @ se3.exp(xi.reshape(n_free, 6))
+    return T, state.xyz + dx
+
+
+def _evaluate(window: Window, T: FloatArray, xyz: FloatArray, robust_k: float) -> _State:
+    R, t = T[window.pose, :3, :3], T[window.pose, :3, 3]
+    xyz_cam = np.einsum("rji,rj->ri", R, xyz[window.point] - t)
+    front = xyz_cam[:, 2] > MIN_DEPTH_MU
+    safe = np.where(front[:, None], xyz_cam, [0.0, 0.0, 1.0])
+    x, y = (safe[:, :2] / safe[:, 2:]).T
+    K = window.K
+    residuals = np.column_stack((K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2])) - window.uv_px
+    residuals /= window.sigma_px[:, None]
+    chi2 = np.einsum("ri,ri->r", residuals, residuals)
+    weight, loss = huber(chi2, robust_k)
+    return _State(
+        T,
+        xyz,
+        xyz_cam,
+        residuals,
+        np.where(front, weight, 0.0),
+        np.where(front, chi2, np.inf),
+        float(np.where(front, loss, huber(np.array([1e6]), robust_k)[1]).sum()),
+    )
