@@ -36,8 +36,8 @@ SAME_GAUGE = 1e-6
 class Views(Protocol):
     """Buffered views, which change to another camera with the maps."""
 
-    def map(self, change: Callable[[View], View]) -> None:
-        """Change each view."""
+    def map_later(self, change: Callable[[View], View]) -> None:
+        """Change each view, at the latest when somebody looks at it."""
         ...
 
 
