@@ -105,7 +105,7 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
         "--workers",
         metavar="N",
         type=_count,
-        help="processes that recover beside the tracking (recovery.workers; with --realtime the default is 1)",
+        help="processes for long work beside the tracking, and one for its graph (with --realtime the default is 1)",
     )
 
 

@@ -229,8 +229,9 @@ class RecoveryConfig(StrictModel):
     """Healthy keyframes of a lost map that a walk holds when its last try to link them is made: ten times what a link
     must stand on. A walk that fits none of so many is bent, and going on bends it further."""
     workers: int = Field(0, ge=0, le=16)
-    """Processes in which walks back run beside the tracking, which never waits for them (`--workers`). 0: inline, in
-    the tracking process, which waits: the only way in which the same seed gives the same trajectory."""
+    """Processes for long work beside the tracking, which never waits for it (`--workers`): walks back and
+    self-calibration. With any there is one more, which solves the live map's graph. 0: inline, in the tracking process,
+    which waits: the only way in which the same seed gives the same trajectory."""
     time_limit_s: float = Field(120.0, gt=0)
     """Time after which a worker counts as hung, and its recovery as failed. A walk over a full buffer of 10 s takes
     about a tenth of it on a free core."""
