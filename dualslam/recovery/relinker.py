@@ -80,6 +80,8 @@ class Relinker:
     def _is_due(self, old_id: int, n_shared: int) -> bool:
         if n_shared < self._config.min_shared_keyframes:
             return False
+        if n_shared == self._tried_with.get(old_id):  # over keyframes that an earlier walk has left
+            return False
         if n_shared > EACH_KEYFRAME and n_shared < GROWTH * self._tried_with.get(old_id, 0):
             return False
         self._tried_with[old_id] = n_shared

@@ -63,3 +63,18 @@ def test_a_keyframe_that_the_lost_map_does_not_hold_is_no_reason_to_try() -> Non
         raise AssertionError
 
     assert not list(Relinker(new, {0: old}, {0: ONSET}, never, RecoveryConfig()).attempts(11))
+
+
+def test_over_keyframes_that_an_earlier_walk_has_left_it_tries_once() -> None:
+    old, new = holding(0, range(100)), holding(1, range(88, 110))
+    asked: list[int] = []
+
+    def refuse(old: Submap, new: Submap, onset: int | None) -> Failure:
+        asked.append(len(old.keyframes.keys() & new.keyframes.keys()))
+        return Failure(FailureReason.AGREEMENT, "no")
+
+    relinker = Relinker(new, {0: old}, {0: ONSET}, refuse, RecoveryConfig())
+    for k in range(99, 84, -1):
+        new.keyframes[k] = None  # type: ignore[assignment]
+        list(relinker.attempts(k))
+    assert asked == [12, 14]  # then at new ones, as ever
