@@ -197,7 +197,7 @@ class BesideGraphs:
         self._window = window
         self._ids = count()
         self._graphs: dict[int, BesideGraph] = {}  # by the submap's id: the one that it has now
-        self._under_way: tuple[int, BesideGraph] | None = None
+        self._under_way: tuple[int, BesideGraph, FloatArray] | None = None  # submap's id, its graph and its intrinsics
         self._answered: dict[int, frozenset[int]] = {}  # by the submap's id: the keyframes that its estimate knows
         self.n_free = N_FREE
 
@@ -257,12 +257,12 @@ class BesideGraphs:
         submap, graph = submaps[max(waiting)], self._graphs[max(waiting)]
         near, graph.rebuild_asked = graph.rebuild_asked, None
         graph.is_behind = False
-        self._under_way = submap.id, graph
+        self._under_way = submap.id, graph, submap.K
         self._desk.submit(JobKind.GRAPH, GraphJob(graph.id, graph.mirror.delta(submap), near is not None, bool(near)))
 
     def _take(self, result: GraphAnswer | Failure, submaps: Mapping[int, Submap]) -> Moved | None:
         assert self._under_way is not None
-        (submap_id, graph), self._under_way = self._under_way, None
+        (submap_id, graph, K), self._under_way = self._under_way, None
         if isinstance(result, Failure):
             log.warning("graph of submap %d: %s; it is made anew", submap_id, result.detail)
             graph.mirror, graph.rebuild_asked = SubmapMirror(), False
@@ -272,6 +272,9 @@ class BesideGraphs:
         if self._graphs.get(submap_id) is not graph or graph.rebuild_asked is not None:
             return None  # the submap has another graph by now, or is to be made anew from what it has become
         submap, estimate = submaps[submap_id], result.estimate
+        if (submap.K != K).any():  # its camera was changed meanwhile, with one that it is to be linked with
+            graph.is_behind = True
+            return None
         graph.noise2 = estimate.noise2
         self._answered[submap_id] = frozenset(estimate.keyframe_ids.tolist())
         before = apply_late(submap, *estimate.values)

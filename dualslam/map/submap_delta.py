@@ -117,10 +117,17 @@ class SubmapMirror:
         self._relative: dict[int, RelativePose] = {}
         self._row_alive = np.zeros(0, bool)
         self._landmark_alive = np.zeros(0, bool)
-        self._is_new = True
+        self._K: FloatArray | None = None
 
     def delta(self, submap: Submap) -> SubmapDelta:
-        """Return what brings the replica up to date with a submap, and take it as done."""
+        """Return what brings the replica up to date with a submap, and take it as done.
+
+        Where the camera has changed, all pixels have: the replica is made anew.
+        """
+        is_new = self._K is None or bool((self._K != submap.K).any())
+        if is_new:
+            self._features, self._relative = {}, {}
+            self._row_alive, self._landmark_alive = np.zeros(0, bool), np.zeros(0, bool)
         obs, lm = submap.observations, submap.landmarks
         n_rows, n_points = len(self._row_alive), len(self._landmark_alive)
         added = [k for k, kf in submap.keyframes.items() if self._features.get(k) is not kf.features]
@@ -134,7 +141,7 @@ class SubmapMirror:
         new_rows = slice(n_rows, len(obs))
         made = SubmapDelta(
             submap_id=submap.id,
-            is_whole=self._is_new,
+            is_whole=is_new,
             K=submap.K,
             gauge=submap.gauge,
             keyframes=tuple(_slim(submap.keyframes[k]) for k in added),
@@ -152,7 +159,7 @@ class SubmapMirror:
             landmark=obs["landmark"][new_rows].copy(),
             alive=obs["alive"][new_rows].copy(),
         )
-        self._is_new = False
+        self._K = submap.K.copy()
         self._features = {k: kf.features for k, kf in submap.keyframes.items()}
         self._relative = dict(submap.relative_poses)
         self._row_alive, self._landmark_alive = obs["alive"].copy(), lm["alive"].copy()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from dualslam.build import build_system, graph_handlers, window_solver
+from dualslam.calibration.lens import change_camera
 from dualslam.config.settings import Config
 from dualslam.core.types import FailureReason, FrameStatus
 from dualslam.map.graph_beside import BesideGraph, BesideGraphs, GraphServer
@@ -22,6 +23,7 @@ from dualslam.testing.late_desk import LateDesk
 from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, pose_errors, system_in
 from dualslam.workers.desk import WorkerDesk
 from dualslam.workers.jobs import InlineDesk, JobKind
+from tests.backend.test_self_calibration import wrong_camera
 from tests.map.test_submap import assert_consistent
 
 DENSE = {"keyframes": {"max_parallax_deg": 2.0}}
@@ -61,6 +63,17 @@ def test_a_replica_follows_a_map_that_grows_and_is_culled() -> None:
         np.testing.assert_array_equal(replica.T_submap_kf[k], submap.T_submap_kf[k])
     whole = len(pickle.dumps(SubmapMirror().delta(submap)))
     assert np.median(sizes) < 0.5 * whole
+
+
+def test_with_another_camera_a_replica_is_made_anew() -> None:
+    world = PointWorld(cloud(), hand_held(25))
+    submap, mirror = run(system_in(world), world).atlas.submaps[0], SubmapMirror()
+    replica = mirror.delta(submap).apply(None)
+    assert not mirror.delta(submap).is_whole
+    change_camera(submap, wrong_camera(1.05))
+    again = mirror.delta(submap)
+    assert again.is_whole
+    assert_follows(again.apply(replica), submap)
 
 
 def beside(world: PointWorld, polls: int, **settings: object) -> System:
