@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.backend.observability import take_mask
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 CELLS_ACROSS = 16
@@ -88,22 +89,22 @@ def choose_factors(
     chosen = factors & admitted
     views = np.bincount(landmark[chosen], minlength=n_landmarks)
     _top_up(candidates, admitted, chosen, factors, views, min_views)
+    # Only what keyframes that are short see is looked at closer: the tables are long.
     n_known = np.bincount(landmark[admitted], minlength=n_landmarks)
-    live = np.zeros(int(kf.max(initial=-1)) + 1, np.int64)
-    live[: len(live)] = np.bincount(kf[chosen], minlength=len(live))[: len(live)]
-    row = np.flatnonzero(admitted & ~chosen)
-    row = row[np.argsort(kf[row], kind="stable")]
-    starts = np.searchsorted(kf[row], keyframes, "left")
-    ends = np.searchsorted(kf[row], keyframes, "right")
-    short = [i for i, k in enumerate(keyframes.tolist()) if starts[i] < ends[i] and live[k] < per_keyframe]
-    if not short:
+    free = admitted & ~chosen & ((views > 0) | (n_known >= min_views))[landmark]
+    size = max(int(kf.max(initial=-1)), int(keyframes.max(initial=-1))) + 1
+    has = np.bincount(kf[chosen], minlength=size)[keyframes]
+    short = keyframes[(has < per_keyframe) & (np.bincount(kf[free], minlength=size)[keyframes] > 0)]
+    if len(short) == 0:
         return chosen
-    span = _spans(kf, landmark, admitted, n_landmarks)
-    by_landmark = np.flatnonzero(admitted)
+    row = np.flatnonzero(free & take_mask(short, size)[kf])
+    row = row[np.argsort(kf[row], kind="stable")]
+    by_landmark = np.flatnonzero(admitted & take_mask(landmark[row], n_landmarks)[landmark])
     by_landmark = by_landmark[np.lexsort((kf[by_landmark], landmark[by_landmark]))]
-    first_of = np.searchsorted(landmark[by_landmark], np.arange(n_landmarks + 1))
-    for i in short:
-        k = int(keyframes[i])
+    first_of = np.concatenate(([0], np.cumsum(np.bincount(landmark[by_landmark], minlength=n_landmarks))))
+    span = _spans(kf[by_landmark], first_of)
+    starts, ends = np.searchsorted(kf[row], short, "left"), np.searchsorted(kf[row], short, "right")
+    for i, k in enumerate(short.tolist()):
         here = row[starts[i] : ends[i]]
         here = here[~chosen[here]]
         cells = _Cells(candidates, np.flatnonzero(chosen & (kf == k)))
@@ -115,7 +116,7 @@ def choose_factors(
             if stage == 0:
                 able = (views[of] > 0) & (views[of] < max_views)
             elif stage == 1:
-                able = (views[of] == 0) & (n_known[of] >= min_views)
+                able = views[of] == 0
             else:
                 able = views[of] > 0
             taken = cells.take(here[able], span[of[able]], wanted)
@@ -188,12 +189,13 @@ def _top_up(
     views[lost] = np.bincount(landmark[chosen], minlength=len(views))[lost]
 
 
-def _spans(kf: IntArray, landmark: IntArray, admitted: BoolArray, n_landmarks: int) -> IntArray:
-    first = np.full(n_landmarks, np.iinfo(np.int64).max)
-    last = np.full(n_landmarks, np.iinfo(np.int64).min)
-    np.minimum.at(first, landmark[admitted], kf[admitted])
-    np.maximum.at(last, landmark[admitted], kf[admitted])
-    return np.where(last >= first, last - first, 0)
+def _spans(kf: IntArray, first_of: IntArray) -> IntArray:
+    """Return each landmark's length of track, in frames; `kf` of its views lie from its `first_of` to the next one's."""
+    n = np.diff(first_of)
+    spans = np.zeros(len(n), np.int64)
+    seen = n > 0
+    spans[seen] = kf[first_of[1:][seen] - 1] - kf[first_of[:-1][seen]]
+    return spans
 
 
 def _with_views(taken: IntArray, landmark: IntArray, by_landmark: IntArray, first_of: IntArray, n: int) -> IntArray:
