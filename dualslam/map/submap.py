@@ -232,23 +232,33 @@ class Submap:
 
     def merge_landmarks(self, keep: IntArray, drop: IntArray) -> None:
         """Make each ``drop[i]`` one with ``keep[i]``: its observations move over, save where both are in a keyframe."""
-        rows_of = self._rows_by_landmark([self.current_id(j) for j in (*keep.tolist(), *drop.tolist())])
+        if len(keep) == 0:
+            return
+        views = self._views_by_landmark([self.current_id(j) for j in (*keep.tolist(), *drop.tolist())])
+        lm, n_rows = self.landmarks, len(self.observations)
+        died: list[int] = []
+        moved: list[tuple[int, int, int]] = []  # the tables are written once, in the order of the merges
         for kept, dropped in zip(keep.tolist(), drop.tolist(), strict=True):
             kept, dropped = self.current_id(kept), self.current_id(dropped)
             if kept == dropped:
                 continue
-            obs, rows = self.observations, rows_of[dropped]
-            kf, feature = obs["kf"][rows], obs["feature"][rows]
-            taken = set(obs["kf"][rows_of[kept]].tolist())
-            self.remove_observations(rows)
-            free = np.array([k not in taken for k in kf.tolist()], bool)
-            moved = self.add_observations(kf[free], feature[free], np.full(int(free.sum()), kept))
-            rows_of[kept] = np.concatenate((rows_of[kept], moved))
-            lm = self.landmarks
+            taken = {k for _, k, _ in views[kept]}
+            for row, k, feature in views[dropped]:
+                died.append(row)
+                if k in taken:
+                    self.landmark_of[k][feature] = NO_LANDMARK
+                else:
+                    self.landmark_of[k][feature] = kept
+                    views[kept].append((n_rows + len(moved), k, feature))
+                    moved.append((k, feature, kept))
             lm["alive"][dropped] = False
             lm["replaced_by"][dropped] = kept
             lm["n_visible"][kept] += lm["n_visible"][dropped]
             lm["n_found"][kept] += lm["n_found"][dropped]
+        if moved:
+            kf, features, landmarks = (np.array(column, np.int64) for column in zip(*moved, strict=True))
+            self.observations.append(len(moved), kf=kf, feature=features, landmark=landmarks, alive=True)
+        self.observations["alive"][died] = False
 
     def current_id(self, landmark_id: int) -> int:
         """Follow `replaced_by` to the landmark that stands for `landmark_id` now (it may be dead)."""
@@ -304,13 +314,14 @@ class Submap:
         wanted = self._mask(landmark_ids)
         return np.flatnonzero(self.observations["alive"] & wanted[self.observations["landmark"]])
 
-    def _rows_by_landmark(self, landmark_ids: list[int]) -> dict[int, IntArray]:
-        """Return the live observation rows of each landmark, ascending."""
-        rows = self.rows_of_landmarks(np.array(landmark_ids, np.int64))
-        rows = rows[np.argsort(self.observations["landmark"][rows], kind="stable")]
-        ids, starts = np.unique(self.observations["landmark"][rows], return_index=True)
-        found = dict(zip(ids.tolist(), np.split(rows, starts[1:]), strict=False))
-        return {j: found.get(j, rows[:0]) for j in landmark_ids}
+    def _views_by_landmark(self, landmark_ids: list[int]) -> dict[int, list[tuple[int, int, int]]]:
+        """Return row, keyframe and feature of each landmark's live observations, by ascending row."""
+        rows, obs = self.rows_of_landmarks(np.array(landmark_ids, np.int64)), self.observations
+        views: dict[int, list[tuple[int, int, int]]] = {j: [] for j in landmark_ids}
+        columns = (rows, obs["kf"][rows], obs["feature"][rows], obs["landmark"][rows])
+        for row, k, feature, j in zip(*(column.tolist() for column in columns), strict=True):
+            views[j].append((row, k, feature))
+        return views
 
     def n_observations(self, landmark_ids: IntArray) -> IntArray:
         """Return how many keyframes see each landmark."""
