@@ -20,6 +20,7 @@ from dualslam.map.submap import NO_LANDMARK, Submap
 FUSE_RADIUS_PX = 3.0  # about 3 sigma of a well-posed landmark's pixel at the finest octave
 CELLS_ACROSS = 16  # cells of the image's width by which observations are spread
 YOUNG_KEYFRAMES = 3  # a landmark is on probation for this many keyframes
+N_GRIDS = 24  # keyframes whose grid of features is kept
 N_OTHERS = 3  # views by others that make an observation redundant
 
 
@@ -60,6 +61,7 @@ class Mapper:
         self._size_px = size_px
         self._young: list[tuple[int, IntArray]] = []  # keyframe count at birth, landmark ids
         self._n_inserted = 0
+        self._grids: dict[int, tuple[Features, FeatureGrid]] = {}  # of the keyframes searched last
         self._gate_chi2 = config.reprojection_chi2  # as it is for the keyframe that grows
 
     def observe(self, track: Track) -> None:
@@ -151,7 +153,7 @@ class Mapper:
         )
         matches = match_projected(
             frontend,
-            FeatureGrid.build(features.uv_rect_px),
+            self._grid(k, features),
             features,
             prediction.uv_px,
             FUSE_RADIUS_PX * frontend.scale_factor**prediction.octave,
@@ -173,6 +175,16 @@ class Mapper:
         submap.merge_landmarks(np.where(swap, ids, there), np.where(swap, there, ids))
         return int(free.sum()), len(ids)
 
+    def _grid(self, k: int, features: Features) -> FeatureGrid:
+        """Return the grid of a keyframe's features: neighbours are searched again and again."""
+        known = self._grids.pop(k, None)
+        if known is None or known[0] is not features:
+            known = (features, FeatureGrid.build(features.uv_rect_px))
+        self._grids[k] = known
+        while len(self._grids) > N_GRIDS:
+            del self._grids[next(iter(self._grids))]
+        return known[1]
+
     def _triangulate(self, k: int, neighbours: list[int], candidates: BoolArray) -> IntArray:
         """Triangulate the keyframe's free features against several older keyframes."""
         created = [self._triangulate_pair(k, other, candidates) for other in neighbours]
@@ -185,7 +197,8 @@ class Mapper:
         rows_b = np.flatnonzero(submap.landmark_of[other] == NO_LANDMARK)
         T_submap_a, T_submap_b = submap.T_submap_kf[k], submap.T_submap_kf[other]
         baseline = float(np.linalg.norm(T_submap_a[:3, 3] - T_submap_b[:3, 3]))
-        if not self._wide_enough(other, baseline) or len(rows_a) == 0 or len(rows_b) == 0:
+        depth = self._median_depth(other)
+        if not self._wide_enough(depth, baseline) or len(rows_a) == 0 or len(rows_b) == 0:
             return np.zeros(0, np.int64)
         T_b_a = se3.inverse(T_submap_b) @ T_submap_a
         matches = match_epipolar(
@@ -195,7 +208,7 @@ class Mapper:
             rows_a,
             rows_b,
             fundamental_from_pose(submap.K, T_b_a),
-            octave_tolerance=self._octave_tolerance(other, baseline),
+            octave_tolerance=self._octave_tolerance(depth, baseline),
         )
         fa, fb = matches.index[:, 0], matches.index[:, 1]
         points = triangulate_two_view(a.uv_rect_px[fa], b.uv_rect_px[fb], submap.K, T_submap_a, T_submap_b)
@@ -213,13 +226,13 @@ class Mapper:
         submap.add_observations(k, fa, ids)
         return ids
 
-    def _wide_enough(self, other: int, baseline_mu: float) -> bool:
+    def _wide_enough(self, depth_mu: float, baseline_mu: float) -> bool:
         """Whether the baseline can give the scene's median depth the smallest parallax that is asked for."""
-        return baseline_mu > 0.5 * np.radians(self._config.min_parallax_deg) * self._median_depth(other)
+        return baseline_mu > 0.5 * np.radians(self._config.min_parallax_deg) * depth_mu
 
-    def _octave_tolerance(self, other: int, baseline_mu: float) -> int:
+    def _octave_tolerance(self, depth_mu: float, baseline_mu: float) -> int:
         """Octaves between two views of a point: one, and as many as going so far towards the scene brings in scale."""
-        growth = np.log1p(baseline_mu / max(self._median_depth(other), 1e-12)) / np.log(self._frontend.scale_factor)
+        growth = np.log1p(baseline_mu / max(depth_mu, 1e-12)) / np.log(self._frontend.scale_factor)
         return 1 + int(growth)
 
     def _median_depth(self, k: int) -> float:
@@ -265,10 +278,17 @@ class Mapper:
 
     def redundant_keyframe(self, candidates: list[int]) -> int | None:
         """Return the first candidate whose landmarks are nearly all seen by three others at the same or finer scale."""
+        n_seen = self._submap.n_observations(np.arange(len(self._submap.landmarks)))
         for k in candidates:
-            if self._is_redundant(k):
+            ids = self._submap.landmark_of[k]
+            # Seen by too few others at whatever scale: no need to look at scales.
+            enough = n_seen[ids[ids >= 0]] > N_OTHERS
+            if (len(enough) == 0 or self._are_nearly_all(enough)) and self._is_redundant(k):
                 return k
         return None
+
+    def _are_nearly_all(self, seen: BoolArray) -> bool:
+        return float(seen.mean()) > self._config.redundant_ratio
 
     def _is_redundant(self, k: int) -> bool:
         submap = self._submap
@@ -290,4 +310,4 @@ class Mapper:
         landmark = obs["landmark"][rows]
         octave = np.concatenate(octaves) if octaves else landmark
         as_fine = np.bincount(landmark[octave <= own[landmark] + 1], minlength=len(submap.landmarks))
-        return float((as_fine[ids] >= N_OTHERS).mean()) > self._config.redundant_ratio
+        return self._are_nearly_all(as_fine[ids] >= N_OTHERS)
