@@ -242,6 +242,11 @@ class ISam2SubmapGraph:
 
     # --- for those who want to look inside
 
+    @property
+    def factor_rows(self) -> IntArray:
+        """Rows of the submap's observation table that are factors; their landmarks are variables, as the poses are."""
+        return np.flatnonzero(self._factor_index.rows["factor"] >= 0)
+
     def bayes_tree(self) -> BayesTree:
         """Return the incremental solver's Bayes tree as it is now.
 

@@ -358,3 +358,73 @@ def test_a_relative_pose_outlasts_a_change_of_gauge():
     true = feeder.scene.T_true[e.keyframe_ids].copy()
     true[:, :3, 3] *= 2.0
     assert abs(pose_errors(e.T_submap_kf, true)[0].max() / off - 2.0) < 0.2
+
+
+@pytest.fixture
+def spare(monkeypatch):
+    """As few factors as in a map of which most keyframes see the same."""
+    monkeypatch.setattr("dualslam.backend.factor_index.BUDGET", 1)
+
+
+@pytest.mark.usefixtures("spare")
+def test_a_part_of_the_factors_poses_nearly_as_all_do_and_the_others_follow():
+    feeder, graph, rest = start(n=40, per_view=250, config=GraphConfig(factors_per_keyframe=60))
+    estimates = grow(feeder, graph, rest)
+    assert not any(e.rebuilt for e in estimates)
+    submap, rows = feeder.submap, graph.factor_rows
+    admitted = np.count_nonzero(graph._factor_index.rows["admitted"])
+    assert len(rows) < 0.8 * admitted
+    per_keyframe = np.bincount(submap.observations["kf"][rows], minlength=40)
+    assert (per_keyframe > 50).all()
+    everything = ISam2SubmapGraph(GraphConfig(**EVERY_FACTOR)).rebuild(submap.copy())
+    e = graph.full_estimate(submap)
+    t_part, _ = pose_errors(e.T_submap_kf, feeder.scene.T_true[e.keyframe_ids])
+    t_all, _ = pose_errors(everything.T_submap_kf, feeder.scene.T_true[everything.keyframe_ids])
+    assert t_part.max() < 2 * t_all.max() + 0.01
+    # Points beside the graph are where their views have them, as sure as those in it.
+    variables = np.unique(submap.observations["landmark"][rows])
+    beside = ~np.isin(e.landmark_ids, variables)
+    assert np.count_nonzero(beside) > 100
+    truth = feeder.scene.xyz_true[feeder.point_of_landmark()[e.landmark_ids]]
+    off = np.linalg.norm(e.xyz_mu - truth, axis=1)
+    assert np.median(off[beside]) < 2 * np.median(off[~beside]) + 0.005
+
+
+@pytest.mark.usefixtures("spare")
+def test_the_choice_is_made_anew_where_a_map_is_past_its_first_keyframes():
+    feeder, graph, rest = start(n=26, per_view=250, config=GraphConfig())
+    grow(feeder, graph, rest[:16])
+    rows = graph._factor_index.rows
+    assert (rows["factor"] >= 0)[rows["admitted"]].mean() > 0.98
+    (e,) = grow(feeder, graph, rest[16:17])
+    assert not e.rebuilt
+    assert (rows["factor"] >= 0)[rows["admitted"]].mean() < 0.95
+    assert not any(x.rebuilt for x in grow(feeder, graph, rest[17:]))
+
+
+@pytest.mark.usefixtures("spare")
+def test_points_beside_the_graph_have_a_covariance_by_triangulation():
+    feeder, graph, rest = start(n=30, per_view=250, config=GraphConfig(factors_per_keyframe=40))
+    grow(feeder, graph, rest)
+    submap = feeder.submap
+    e = graph.full_estimate(submap)
+    apply(submap, e)
+    variables = np.unique(submap.observations["landmark"][graph.factor_rows])
+    beside = np.setdiff1d(e.landmark_ids, variables)
+    C = graph.triangulated_covariances(submap, np.concatenate([beside, variables[:5]]))
+    assert np.isnan(C[len(beside) :]).all()
+    assert np.isnan(graph.point_covariances(beside)).all()
+    C = C[: len(beside)]
+    assert np.isfinite(C).all()
+    truth = feeder.scene.xyz_true[feeder.point_of_landmark()[beside]]
+    off = submap.landmarks["xyz_mu"][beside] - truth
+    chi2 = np.einsum("pi,pij,pj->p", off, np.linalg.inv(C), off)
+    assert 0.5 < np.median(chi2) / 2.37 < 3.0  # 2.37: the median of chi-square with 3 degrees of freedom
+
+
+def test_keyframes_have_more_factors_where_few_see_the_same():
+    """This corridor is a road: each stretch is seen from a handful of keyframes."""
+    feeder, graph, rest = start(n=30, per_view=250, config=GraphConfig(factors_per_keyframe=40))
+    grow(feeder, graph, rest)
+    per_keyframe = np.bincount(feeder.submap.observations["kf"][graph.factor_rows], minlength=30)
+    assert np.median(per_keyframe) >= 2.5 * 40
