@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.backend.edge_covariance import edge_covariances
+from dualslam.backend.refit import refit_points
 from dualslam.backend.sim3_graph import Sim3Edge, Sim3Prior, Sim3Solution, optimise_sim3
 from dualslam.core.atlas_problem import AtlasProblem, AtlasSolution
 from dualslam.core.errors import SolverError
@@ -31,6 +32,10 @@ SETTLED_COST = 1e-9
 MAX_PASSES = 4
 """What is believed decides what the others are asked; it settled in two rounds in every trial."""
 MAX_ITERATIONS = 100
+ODOMETRY = ("within", "rollover")
+"""Kinds of edges that say how a camera went, and not where it has been before."""
+MEDIAN_CHI2 = 6.35
+"""With 7 degrees of freedom."""
 OUTLIER_CHI2 = 18.48
 """The 0.99 quantile of chi-square with 7 degrees of freedom: the price of a rejection."""
 LEAST_REDUNDANCY = 1e-6
@@ -62,12 +67,13 @@ class GtsamAtlasSolver:
         graph = _Graph(problem)
         all_edges = np.ones(len(problem.edges), bool)
         doubtful = np.array([e.doubtful for e in problem.edges], bool)
+        drift = graph.take_in_drift(doubtful)
         believed, chi2 = all_edges, np.full(len(problem.edges), np.nan)
         if self._robust and doubtful.any():
             believed, chi2 = graph.choose(doubtful)
         solution = graph.optimise(believed)
         found = np.array([solution.S_world_node[i] for i in range(len(problem.S_world_node))])
-        return AtlasSolution(found, believed, chi2, solution.cost_before, solution.cost_after)
+        return AtlasSolution(found, believed, chi2, solution.cost_before, solution.cost_after, drift)
 
     def relative_covariance(self, problem: AtlasProblem, first: int, second: int) -> FloatArray:
         """Return the (7, 7) covariance of ``inv(S_world_first) @ S_world_second``, all edges believed.
@@ -81,6 +87,7 @@ class GtsamAtlasSolver:
         label = graph.pieces(everything)
         if label[first] != label[second]:
             raise SolverError("nothing ties the two keyframes: they have no relative covariance")
+        graph.take_in_drift(np.array([e.doubtful for e in problem.edges], bool))
         return graph.optimise(everything).relative_covariances([(first, second)])[0]
 
     def edge_covariances(
@@ -95,6 +102,10 @@ class GtsamAtlasSolver:
         SolverError
         """
         return edge_covariances(submap, pairs, self._robust_k, held)
+
+    def refit_points(self, submap: Submap) -> FloatArray:
+        """Return (L, 3) a submap's landmarks as their views have them by the poses as they are."""
+        return refit_points(submap, self._robust_k)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,6 +144,29 @@ class _Graph:
             if here:
                 _join(parent, e.first, e.second)
         return np.array([_root(parent, i) for i in range(len(parent))], np.int64)
+
+    # --- how far odometry is to be believed
+
+    def take_in_drift(self, doubtful: BoolArray) -> float:
+        """Inflate what submaps say of themselves by what sure connections show of it; return the ratio of sigmas.
+
+        Where a connection that is beyond doubt closes a cycle, the way round has drifted by its innovation. The chain
+        that contradicts it was surer of itself than it had a right to be, there and elsewhere: with a lens that is not
+        quite right errors add up as no covariance of pixels says. The lower median of what such connections show is
+        taken, so that one of them that is wrong after all does not make everything seem possible.
+        """
+        odometry = np.array([e.kind in ODOMETRY for e in self.problem.edges], bool)
+        sure = ~odometry & ~doubtful
+        believed = ~doubtful | self._base(doubtful)
+        tested = np.flatnonzero(sure & ~self._bridges(believed, sure)) if sure.any() else np.zeros(0, np.int64)
+        if not len(tested):
+            return 1.0
+        C, r = self._innovations(self.optimise(believed), believed, tested)
+        chi2 = np.sort(np.einsum("ei,ei->e", r, np.linalg.solve(C, r[..., None])[..., 0]))
+        ratio2 = max(1.0, float(chi2[(len(chi2) - 1) // 2]) / MEDIAN_CHI2)
+        for i in np.flatnonzero(odometry).tolist():
+            self.edges[i] = replace(self.edges[i], covariance=ratio2 * self.edges[i].covariance)
+        return float(np.sqrt(ratio2))
 
     # --- what to believe
 

@@ -75,6 +75,9 @@ class AtlasSolution:
         its ends, or it is not doubtful.
     cost_before, cost_after : float
         Half the sum of squared whitened residuals of the believed edges.
+    drift : float
+        By how much larger than claimed the errors within submaps are, as connections show that are not doubtful; 1
+        where none closes a cycle. All sigmas within submaps have been taken that many times.
     """
 
     S_world_node: FloatArray
@@ -82,6 +85,7 @@ class AtlasSolution:
     chi2: FloatArray
     cost_before: float
     cost_after: float
+    drift: float = 1.0
 
 
 class AtlasSolver(Protocol):
@@ -117,4 +121,8 @@ class AtlasSolver(Protocol):
         ------
         SolverError
         """
+        ...
+
+    def refit_points(self, submap: Submap) -> FloatArray:
+        """Return (L, 3) a submap's landmarks as their views have them by the poses as they are; cannot fail."""
         ...

@@ -33,6 +33,8 @@ class AtlasReport:
         Edges by kind, rejected ones left out.
     cost_before, cost_after : float
         Half the sum of squared whitened residuals.
+    drift : float
+        Errors within submaps over what they claim, as sure connections show (the largest of the linked sets).
     bent : dict of int to float
         By submap: farthest move of a keyframe within its submap's frame, in the submap's unit; those that moved.
     placed : dict of int to float
@@ -48,6 +50,7 @@ class AtlasReport:
     factors: dict[str, int] = field(default_factory=dict)
     cost_before: float = 0.0
     cost_after: float = 0.0
+    drift: float = 1.0
     bent: dict[int, float] = field(default_factory=dict)
     placed: dict[int, float] = field(default_factory=dict)
     seconds: float = 0.0
@@ -144,6 +147,7 @@ def together(reports: Sequence[AtlasReport]) -> AtlasReport:
         factors=factors,
         cost_before=sum(r.cost_before for r in reports),
         cost_after=sum(r.cost_after for r in reports),
+        drift=max((r.drift for r in reports), default=1.0),
         bent={m: bend for r in reports for m, bend in r.bent.items()},
         placed={m: gone for r in reports for m, gone in r.placed.items()},
     )

@@ -129,9 +129,9 @@ class Connections:
                 self._solve(set(component), (), now)
 
     def judge(self, link: Link) -> LinkVerdict | Failure:
-        """Return what `connect` would say of a connection; nothing is changed."""
+        """Return what `connect` would say of a connection if it were doubtful; nothing is changed."""
         try:
-            skeleton = self._skeleton({link.a, link.b}, (link,))
+            skeleton = self._skeleton({link.a, link.b}, (replace(link, doubtful=True),))
             if skeleton.is_tree:
                 return LinkVerdict(True, False, float("nan"))
             solution = self._solver.solve(skeleton.problem)
@@ -288,6 +288,7 @@ class Connections:
                 self._record.poses[pose.index] = pose
             atlas.warps[m] = warp.after(atlas.warps[m]) if m in atlas.warps else warp
             atlas.held[m] = hold(submap, *solved.holds[m], atlas.held.get(m, frozenset()))
+            submap.landmarks["xyz_mu"][:] = self._solver.refit_points(submap)
             self._covariances.bent(submap, warp)
         if solved.moves is not None:
             for m in skeleton.component:
@@ -312,6 +313,7 @@ class Connections:
             factors=count_kinds(e for e, kept in zip(solved.edges, solved.solution.believed, strict=True) if kept),
             cost_before=solved.solution.cost_before,
             cost_after=solved.solution.cost_after,
+            drift=solved.solution.drift,
             bent={move.submap_id: move.bend_mu for move in moves if move.bent},
             placed=placed_by(skeleton, solved.solution) if solved.moves is not None else {},
         )
@@ -325,6 +327,7 @@ class Connections:
             factors=report.factors,
             cost_before=report.cost_before,
             cost_after=report.cost_after,
+            drift=report.drift,
             rejected=[{"submap": link.b, **named(link)} for link in report.rejected],
             bent={str(m): bend for m, bend in report.bent.items()},
             largest_bend=max(report.bent.values(), default=0.0),

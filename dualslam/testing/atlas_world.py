@@ -9,6 +9,7 @@ import numpy as np
 
 from dualslam.backend.atlas_solver import GtsamAtlasSolver
 from dualslam.backend.local_ba import bundle_adjust_arrays
+from dualslam.backend.refit import refit_points
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.config.settings import GraphConfig
 from dualslam.core.geometry import se3, sim3
@@ -212,4 +213,7 @@ def lap_in_submaps(n: int = 130, every: int = 50, robust: bool = True, **options
         world.add(k)
         if len(world.submap.keyframes) >= every and k < n - 10:
             world.roll_over()
+    for submap in world.atlas.submaps.values():
+        for _ in range(4):
+            submap.landmarks["xyz_mu"][:] = refit_points(submap, 0.8)
     return world

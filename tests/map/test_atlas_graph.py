@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -127,7 +128,7 @@ def test_a_false_connection_with_a_tiny_sigma_is_rejected_and_moves_nothing(clos
     # Asked again, it is rejected again, and adds nothing: what is solved once more stays.
     world.connections.settle(world.now)
     for was, now in zip(before, state(world), strict=True):
-        np.testing.assert_allclose(was, now, atol=1e-3)
+        np.testing.assert_allclose(was, now, atol=5e-3)
 
 
 def test_without_doubt_it_is_obeyed() -> None:
@@ -195,6 +196,24 @@ def test_the_same_again_to_the_bit() -> None:
         runs.append(state(world))
     for a, b in zip(*runs, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_what_is_beyond_doubt_shows_how_far_odometry_is_to_be_believed() -> None:
+    drift = 8 * np.array([1e-3] * 3 + [2e-3] * 3 + [4e-3])
+    world = lap_in_submaps(seed=1, drift=drift)
+    before = rms(world.errors())
+    late, sure = world.loop((0, 9), (2, 128)), replace(world.loop(*CLOSED), doubtful=False)
+    alone = world.connections.judge(late)
+    assert alone
+    assert not alone.accepted  # by a chain that thinks it knows better
+    report = world.connections.connect([sure], world.now)
+    assert report.drift > 2
+    assert not report.rejected
+    assert rms(world.errors()) < 0.7 * before
+    late = world.loop((0, 9), (2, 128))
+    far, wrong = (world.loop((0, 40), (2, 100), off=off) for off in (None, 3 * WRONG))
+    verdicts = [world.connections.judge(link) for link in (late, far, wrong)]
+    assert [bool(v) and v.accepted for v in verdicts] == [True, True, False]  # type: ignore[union-attr]
 
 
 # --- the transaction
