@@ -58,6 +58,23 @@ def test_the_link_stands_on_what_was_healthy_and_is_true(corrupted: tuple[System
     assert max(link.keyframes) < FORCED.start
 
 
+def test_what_is_not_to_be_relied_on_is_marked(corrupted: tuple[System, PointWorld]) -> None:
+    system, _ = corrupted
+    (link,) = system.atlas.links
+    old, new = system.atlas.submaps[link.a], system.atlas.submaps[link.b]
+    forced = {k for k in FORCED if k in old.keyframes}
+    assert forced <= old.condemned
+    assert old.condemned.isdisjoint(link.keyframes)
+    assert not new.condemned
+    marked = old.landmarks["condemned"]
+    healthy = old.landmarks_of_keyframes([k for k in old.keyframes if k not in old.condemned])
+    assert not marked[healthy].any()
+    assert marked.any() == bool(old.condemned)
+    (fused,) = system.events.of_kind(EventKind.FUSED)
+    assert fused.data["condemned_keyframes"] == len(old.condemned)
+    assert fused.data["condemned_landmarks"] == marked.sum()
+
+
 def test_the_onset_is_suspected_before_the_loss(corrupted: tuple[System, PointWorld]) -> None:
     system, _ = corrupted
     failed = system.events.of_kind(EventKind.FAILED)[0]
