@@ -68,8 +68,8 @@ def test_what_is_not_to_be_relied_on_is_marked(corrupted: tuple[System, PointWor
     assert not new.condemned
     marked = old.landmarks["condemned"]
     healthy = old.landmarks_of_keyframes([k for k in old.keyframes if k not in old.condemned])
+    assert len(healthy)
     assert not marked[healthy].any()
-    assert marked.any() == bool(old.condemned)
     (fused,) = system.events.of_kind(EventKind.FUSED)
     assert fused.data["condemned_keyframes"] == len(old.condemned)
     assert fused.data["condemned_landmarks"] == marked.sum()
