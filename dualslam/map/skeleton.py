@@ -33,6 +33,8 @@ radians, way in depths of the scene). Chosen on `tum_fr1_rpy`, `hololens_000` an
 keyframes: RMS errors over what the factors say are 0.8 to 2.2 where the camera is exact, 2.4 to 18 on the sequences.
 With these numbers they are 0.03 to 0.3, and 0.7 to 2.5 (a submap with a broken stretch: to 5)."""
 
+TORN_CHI2 = 24.3
+"""The 0.999 quantile of chi-square with 7 degrees of freedom."""
 SAME_TURN_RAD, SAME_WAY, SAME_SEEN = 0.02, 0.05, 0.2
 """Changes of an edge, and of how much its keyframes see, up to which its covariance is that of before."""
 
@@ -232,11 +234,24 @@ def _within(
     S = submap.keyframe_poses(knots)
     if submap.id in atlas.warps:
         S = sim3.inverse(atlas.warps[submap.id].at(knots)) @ S
+    T = submap.keyframe_poses(knots)
     edges = []
     for (i, j), covariance in zip(places, C, strict=True):
         S_i_j = sim3.inverse(S[i]) @ S[j]
+        if j > i + 1 and _is_torn(S_i_j, sim3.inverse(T[i]) @ T[j], covariance):
+            continue
         edges.append(AtlasEdge(first + i, first + j, S_i_j, covariance, WITHIN))
     return edges
+
+
+def _is_torn(own: FloatArray, now: FloatArray, covariance: FloatArray) -> bool:
+    """Whether two places were bent together that nothing tied at the time.
+
+    What they share now came of that: landmarks of a loop that became one. The loop's own factor says it, and a tie
+    that had the bend taken out of it would deny it.
+    """
+    off = sim3.log(sim3.inverse(own) @ now)
+    return bool(off @ np.linalg.solve(covariance, off) > TORN_CHI2)
 
 
 def _inflated(submap: Submap, pairs: list[tuple[int, int]], covariances: FloatArray) -> FloatArray:
