@@ -43,10 +43,9 @@ from dualslam.map.graph_beside import BesideGraphs, GraphServer
 from dualslam.map.submap import Submap
 from dualslam.places import FaissRecogniser, PlaceVerifier
 from dualslam.places.revisits import PlaceParts
-from dualslam.recovery.direction import recover
 from dualslam.recovery.executor import DeskExecutor, InlineExecutor, RecoveryExecutor
 from dualslam.recovery.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
-from dualslam.recovery.reverse_tracking import Attempt, RecoveryJob, RecoveryParts
+from dualslam.recovery.reverse_tracking import Attempt, RecoveryJob, RecoveryParts, run_recovery
 from dualslam.system import Components, System
 from dualslam.workers.desk import Lane, WorkerDesk
 from dualslam.workers.jobs import Handlers, InlineDesk, JobKind
@@ -249,7 +248,7 @@ def walk_handlers(config: Config, size_px: tuple[int, int], n_threads: int) -> H
     """Build what a worker for long work does: walks back and calibrations."""
     budget_s = WORKER_BUDGET * config.recovery.time_limit_s
     parts = recovery_parts(config, size_px, budget_s, n_threads=n_threads)
-    return {JobKind.WALK: lambda job: recover(job, parts), **calibration_handlers(config)}
+    return {JobKind.WALK: lambda job: run_recovery(job, parts), **calibration_handlers(config)}
 
 
 def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript) -> WorkerDesk:

@@ -25,6 +25,7 @@ from dualslam.health import HealthMonitor, count_signs
 from dualslam.io.map_store import StoredMap
 from dualslam.map.atlas import Link
 from dualslam.map.connections import Connections
+from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameRecord, FrameResult
 from dualslam.map.graph_beside import N_FREE, N_FREE_BEHIND, BesideGraphs, Moved
 from dualslam.map.propagation import propagate_links
@@ -92,9 +93,8 @@ class System:
     on_pose : callable or None
         Called with each frame's track as soon as it is posed, before the map grows from it: who steers by the poses
         need not wait for a keyframe.
-    first_id : int
-        Of the frames' own count: 0, or where a saved map's has ended. Everywhere but in `step` and its results a frame
-        goes by its index plus this.
+    numbers : FrameNumbers
+        The frames' own count, by which all here goes but the frames that `step` is given and its results.
     saved : StoredMap or None
         The map that was gone on with.
     """
@@ -104,7 +104,7 @@ class System:
     ) -> None:
         """`saved`: a map to go on with, which becomes this system's; `localise`: only to find poses in it."""
         record = Record() if saved is None else Record(saved.atlas, poses=dict(saved.poses))
-        self.saved, self.first_id = saved, 0 if saved is None else saved.next_id
+        self.saved, self.numbers = saved, FrameNumbers(0 if saved is None else saved.next_id)
         self._world = saved.main[0] if saved is not None and saved.main else None
         self._localises = localise
         self._n_without_map = 0
@@ -186,8 +186,7 @@ class System:
         FrameResult
         """
         started, self._posed_at = time.perf_counter(), None
-        if self.first_id:
-            frame = replace(frame, index=self.first_id + frame.index)
+        source, frame = frame, replace(frame, index=self.numbers.number(frame.index))
         self.rows[frame.index] = FrameRecord(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
         # 1. What was found beside the tracking meanwhile comes into the map between two frames.
         self._collect_graphs(frame)
@@ -196,10 +195,11 @@ class System:
         self.buffer.settle(SETTLED_A_FRAME)
         # 2. Features, into the buffer that a walk back in time will read.
         with self.timer.measure("features"):
-            view = self._parts.view_of(frame)
+            view = self._parts.view_of(source)
         if isinstance(view, Failure):
             outcome: Track | Failure = self._unusable(frame, view)
         else:
+            view = replace(view, index=frame.index)
             self.buffer.append(view)
             # 3. Without a live submap, look for the lost one, or try to start one; with one, track.
             outcome = self._initialise(view) if self._live is None else self._track(self._live, view)
@@ -524,7 +524,7 @@ class System:
             T_submap_cam = self.atlas.submaps[pose.submap_id].resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
         failure = outcome if isinstance(outcome, Failure) else None
         return FrameResult(
-            frame.index - self.first_id,
+            self.numbers.index_of(frame.index),
             row.status,
             row.submap_id,
             T_submap_cam,

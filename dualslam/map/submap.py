@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -402,23 +402,6 @@ class Submap:
         twin.gauge, twin.condemned = self.gauge, set(self.condemned)
         twin.landmarks = Table.from_columns(self.landmarks.columns())
         twin.observations = Table.from_columns(self.observations.columns())
-        return twin
-
-    def renumbered(self, number_of: Callable[[int], int]) -> Submap:
-        """Return a copy with other ids for its keyframes; landmarks and rows keep theirs."""
-        twin = self.copy()
-        twin.keyframes = {number_of(k): replace(kf, id=number_of(k)) for k, kf in twin.keyframes.items()}
-        twin.T_submap_kf = {number_of(k): T for k, T in twin.T_submap_kf.items()}
-        twin.landmark_of = {number_of(k): ids for k, ids in twin.landmark_of.items()}
-        twin.anchors = {number_of(k): Anchor(number_of(a.keyframe_id), a.T_kf_cam) for k, a in twin.anchors.items()}
-        twin.relative_poses = {
-            number_of(k): replace(known, keyframe_id=number_of(known.keyframe_id))
-            for k, known in twin.relative_poses.items()
-        }
-        twin.gauge = (number_of(self.gauge[0]), number_of(self.gauge[1]))
-        twin.condemned = {number_of(k) for k in self.condemned}
-        for column in (twin.observations["kf"], twin.landmarks["first_kf"]):
-            column[:] = [number_of(k) for k in column.tolist()]
         return twin
 
     def take_over(self, changed: Submap) -> None:

@@ -10,7 +10,7 @@ from dualslam.map.record import FrameStamp, Record
 from dualslam.recovery.reverse_tracking import RecoveredFrame
 
 
-def bypass(record: Record, recovered_frames: Collection[RecoveredFrame], new_id: int, handover: int, order: int) -> int:
+def bypass(record: Record, recovered_frames: Collection[RecoveredFrame], new_id: int, handover: int) -> int:
     """Let the newest part of a linked old map take its poses from the new one; return of how many frames.
 
     Parameters
@@ -21,13 +21,11 @@ def bypass(record: Record, recovered_frames: Collection[RecoveredFrame], new_id:
         The submap that walked.
     handover : int
         The newest keyframe that agrees in both maps: what is beyond it changes.
-    order : int
-        1 where the frames' numbers ascend with time, as it is read; -1 where they descend.
     """
     poses, n_bypassed = record.poses, 0
     for frame in recovered_frames:
         i = frame.pose.index
-        if order * i <= order * handover or poses[i].submap_id == new_id:
+        if i <= handover or poses[i].submap_id == new_id:
             continue
         record.pose(frame.pose)
         record.rows[i].status = FrameStatus.BYPASSED
@@ -35,13 +33,13 @@ def bypass(record: Record, recovered_frames: Collection[RecoveredFrame], new_id:
     return n_bypassed
 
 
-def drop_corrupted(record: Record, old_id: int, since: int, order: int) -> int:
+def drop_corrupted(record: Record, old_id: int, since: int) -> int:
     """Take the pose from frames of the corrupted tail that the walk has skipped: that of the old map may be wrong.
 
-    They keep their row. `since` is in the order of reading: a frame's number times `order`.
+    They keep their row.
     """
     poses = record.poses
-    corrupted = [i for i, pose in poses.items() if pose.submap_id == old_id and order * i >= since]
+    corrupted = [i for i, pose in poses.items() if pose.submap_id == old_id and i >= since]
     for i in corrupted:
         del poses[i]
         record.rows[i].status, record.rows[i].submap_id = FrameStatus.BYPASSED, None
@@ -49,15 +47,14 @@ def drop_corrupted(record: Record, old_id: int, since: int, order: int) -> int:
 
 
 def condemn_tail(
-    record: Record, recovered_frames: Collection[RecoveredFrame], old_id: int, handover: int, since: int, order: int
+    record: Record, recovered_frames: Collection[RecoveredFrame], old_id: int, handover: int, since: int
 ) -> int:
     """Mark the keyframes of a linked old map that are not to be relied on any more; return how many.
 
-    Those beyond the handover that the new map has posed, and all of the corrupted tail (`since`, times `order` as in
-    `drop_corrupted`).
+    Those beyond the handover that the new map has posed, and all of the corrupted tail, from `since` on.
     """
     submap, own = record.atlas.submaps[old_id], {frame.pose.index for frame in recovered_frames}
-    tail = {k for k in submap.keyframes if order * k >= since or (order * k > order * handover and k in own)}
+    tail = {k for k in submap.keyframes if k >= since or (k > handover and k in own)}
     submap.condemn(tail)
     return len(submap.condemned)
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from dualslam.core.types import Failure
-from dualslam.recovery.direction import recover
-from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryParts, RecoveryResult
+from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryParts, RecoveryResult, run_recovery
 from dualslam.workers.jobs import Desk, JobKind
 
 Outcome = tuple[RecoveryJob, RecoveryResult | Failure]
@@ -37,7 +36,7 @@ class InlineExecutor:
 
     def submit(self, job: RecoveryJob) -> None:
         """Run the job."""
-        self._done.append((job, recover(job, self._parts)))
+        self._done.append((job, run_recovery(job, self._parts)))
 
     def poll(self) -> list[Outcome]:
         """Return what has run since the last call."""

@@ -24,7 +24,6 @@ from dualslam.map.solving import solve
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 from dualslam.recovery.bypass import absorb, bypass, condemn_tail, drop_corrupted
-from dualslam.recovery.direction import reads_backwards
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.merge import Merged, merge_recovery
@@ -355,16 +354,13 @@ class Recoveries:
             seconds=seconds,
             **(link.numbers | {"scale": float(sim3.scale(S_old_new))}),
         )
-        order = -1 if reads_backwards(job) else 1  # times a frame's number: ascends with time, as it is read
         onset = job.onsets[found.old_id]
-        corrupted_since = order * onset
-        if link.change_point is not None:
-            corrupted_since = min(corrupted_since, order * link.change_point)
-        n_bypassed = bypass(record, recovered_frames, new_id, agreeing[-1], order)
-        n_dropped = drop_corrupted(record, found.old_id, corrupted_since, order)
-        n_condemned = condemn_tail(record, recovered_frames, found.old_id, agreeing[-1], corrupted_since, order)
+        corrupted_since = onset if link.change_point is None else min(onset, link.change_point)
+        n_bypassed = bypass(record, recovered_frames, new_id, agreeing[-1])
+        n_dropped = drop_corrupted(record, found.old_id, corrupted_since)
+        n_condemned = condemn_tail(record, recovered_frames, found.old_id, agreeing[-1], corrupted_since)
         for frame in recovered_frames:
-            if order * frame.pose.index >= order * onset and self._was_lost(frame.pose.index, found.old_id):
+            if frame.pose.index >= onset and self._was_lost(frame.pose.index, found.old_id):
                 record.rows[frame.pose.index].status = FrameStatus.RECOVERED
         refinement = found.refinement
         numbers = (

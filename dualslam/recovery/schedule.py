@@ -31,9 +31,8 @@ class RetrySchedule:
         return self._starts.setdefault(submap.id, newest_id)
 
     def n_live(self, submap: Submap, now: int) -> int:
-        """Count the keyframes from the start to frame `now`, in either direction: not those that walks have added."""
-        first, last = sorted((self._starts[submap.id], now))
-        return sum(first <= k <= last for k in submap.keyframes)
+        """Count the keyframes from the start to frame `now`: not those that walks have added."""
+        return sum(self._starts[submap.id] <= k <= now for k in submap.keyframes)
 
     def leave_open(self, submap_id: int, n_live: int, camera: Camera) -> None:
         """Note that a walk which knew so many live keyframes, and this camera, has left something to find."""

@@ -14,6 +14,7 @@ from dualslam.core.types import Failure, FloatArray, FrameStatus, IntArray
 from dualslam.io.map_files import METADATA, load_arrays
 from dualslam.io.map_store import submap_path
 from dualslam.io.run_folder import EVENTS, MAP, SUMMARY, FrameRow
+from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.report.placement import align
 from dualslam.report.run_data import CONDEMNED, PosedRows, RunData, are_shown, linked_submaps
 from dualslam.report.statuses import WITHOUT_POSE
@@ -152,7 +153,8 @@ def _map_parts(run: RunData, rows: Sequence[FrameRow], submap: int | None) -> tu
         component, S_world_submap = linked_submaps(folder, {row.submap for row in rows if row.in_main_map})
     else:
         component, S_world_submap = [submap] if (folder / METADATA).is_file() else [], {submap: np.eye(4)}
-    row_of = {row.index: i for i, row in enumerate(rows)}
+    number_of = FrameNumbers(run.summary.get("first_id", 0), run.summary.get("first_index")).number_of
+    row_of = {number_of(row.index): i for i, row in enumerate(rows)}
     keyframes, landmarks = [], []
     for m in component:
         arrays, S = load_arrays(submap_path(folder, m), _ARRAYS, (CONDEMNED,)), S_world_submap[m]

@@ -76,11 +76,11 @@ def frame_rows(
     in_main = set(main.index.tolist())
     rows = [
         FrameRow(
-            row.index - system.first_id,
+            system.numbers.index_of(row.index),
             row.timestamp_s,
             row.status,
             row.submap_id,
-            row.index - system.first_id in in_main,
+            system.numbers.index_of(row.index) in in_main,
             row.n_matches,
             row.n_inliers,
             row.latency_ms if latencies_ms is None else latencies_ms[n],
@@ -90,8 +90,7 @@ def frame_rows(
     late = [FrameRow(i, t, FrameStatus.DROPPED, None, False, 0, 0, 0.0) for i, t in dropped]
     if not late:
         return rows
-    backwards = len(rows) > 1 and rows[-1].index < rows[0].index
-    return sorted(rows + late, key=lambda row: row.index, reverse=backwards)
+    return sorted(rows + late, key=lambda row: system.numbers.number_of(row.index))
 
 
 def summarise(
@@ -113,7 +112,8 @@ def summarise(
         "relocalised": len(system.events.of_kind(EventKind.RELOCALISED)),
         "loops": len(system.events.of_kind(EventKind.LOOP_CLOSED)),
         "merges": len(system.events.of_kind(EventKind.MERGED)),
-        "first_id": system.first_id,
+        "first_id": system.numbers.first_id,
+        "first_index": system.numbers.first_index,
         "recoveries_failed": len(system.events.of_kind(EventKind.RECOVERY_FAILED)),
         "submaps": len(system.atlas.submaps),
         "links": len(system.atlas.believed),
@@ -183,7 +183,7 @@ def _posed(system: System, submap_ids: list[int]) -> PosedFrames:
         S_world_submap = {m: S_world_first @ S for m, S in S_world_submap.items()}
     own = (pose for pose in system.poses.values() if pose.index in system.rows)
     composed = compose(own, system.atlas, S_world_submap)
-    index = np.asarray(composed.index, np.int64) - system.first_id
+    index = np.array([system.numbers.index_of(i) for i in composed.index.tolist()], np.int64)
     return PosedFrames(index, composed.timestamp_s, composed.T_world_cam)
 
 

@@ -178,5 +178,7 @@ class _Watched:
 def _write_new_events(system: System, folder: RunFolder, n_written: int) -> int:
     if len(system.events) > n_written:
         for event in islice(system.events, n_written, None):
-            folder.append_event(replace(event, frame=event.frame - system.first_id))
+            numbers = system.numbers
+            told = replace(event, frame=numbers.index_of(event.frame), data=numbers.in_source(event.data))
+            folder.append_event(told)
     return len(system.events)

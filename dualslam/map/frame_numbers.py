@@ -1,0 +1,71 @@
+"""The frames' own count, by which all of the system goes: it ascends as they come.
+
+A source may be read from its end, and a saved map may be gone on with, whose frames have numbers already. Here alone
+that is known: inside, the older of two frames is the one with the smaller number; rows and files tell a frame by its
+index in the source.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+FRAMES_IN_EVENTS = (
+    "agreeing_keyframes",
+    "change_point",
+    "first_view",
+    "keyframe",
+    "lost_since",
+    "onset",
+    "other_frame",
+    "suspected_since",
+    "torn",
+)
+"""What belongs to events and is frames: one or a list."""
+
+
+class FrameNumbers:
+    """Numbers of the frames of one source.
+
+    A number is as far from the first frame's as their indices are: frames that were left out leave a gap. Read from its
+    beginning, a source's frames have their index, on top of `first_id`.
+
+    Parameters
+    ----------
+    first_id : int
+        0, or where a saved map's count has ended.
+    first_index : int, optional
+        The index of the first frame, if it is known.
+    """
+
+    def __init__(self, first_id: int = 0, first_index: int | None = None) -> None:
+        self.first_id = first_id
+        self.first_index = first_index
+        self._index_of: dict[int, int] = {}
+
+    def number(self, index: int) -> int:
+        """Return the number of a frame, by its index; the first that is asked for is the first frame."""
+        if self.first_index is None:
+            self.first_index = index
+        number = self.number_of(index)
+        self._index_of[number] = index
+        return number
+
+    def number_of(self, index: int) -> int:
+        """Return the number that a frame has or would have, once there is a first one."""
+        first = index if self.first_index is None else self.first_index
+        return self.first_id + first + abs(index - first)
+
+    def index_of(self, number: int) -> int:
+        """Return the index in the source of a frame; for one of a saved map what its number says, below 0."""
+        return self._index_of.get(number, number - self.first_id)
+
+    def in_source(self, data: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what belongs to an event with its frames told by their index."""
+
+        def told(value: Any) -> Any:
+            if isinstance(value, list | tuple):
+                return [told(each) for each in value]
+            return value if value is None else type(value)(self.index_of(int(value)))
+
+        return {name: told(value) if name in FRAMES_IN_EVENTS else value for name, value in data.items()}
