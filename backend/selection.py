@@ -190,7 +190,7 @@ def _top_up(
 
 
 def _spans(kf: IntArray, first_of: IntArray) -> IntArray:
-    """Return each landmark's length of track, in frames; `kf` of its views lie from its `first_of` to the next one's."""
+    """Return each landmark's length of track, in frames; `kf` of its views lie between two entries of `first_of`."""
     n = np.diff(first_of)
     spans = np.zeros(len(n), np.int64)
     seen = n > 0

@@ -37,7 +37,9 @@ from dualslam.frontends.tracking.two_view_hypotheses import propose_relative_pos
 LAGS = (2, 4, 8, 16, 32, 64)  # frames back that are tried as the first view
 N_WITNESSES = 3  # frames between the two views that must agree
 NEAR = 0.5  # share of the points that a start needs at least which must be near: on a road these fix the motion
-RUNNER_UP = 0.75  # another pose that explains this share of the winner's points makes the start ambiguous
+RUNNER_UP = 0.75  # a pose that explains less than this share of what the best one does is out of the question,
+UNEXPLAINED_TIMES, UNEXPLAINED_MORE = 2, 20  # and so is one that leaves more than twice as many, and a layer's worth
+AT_INFINITY_SIGMAS = 3.0  # a match whose parallax is less than so much noise says nothing of the sign of its depth
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +52,7 @@ class _Pair:
     T_b_a: FloatArray
     xyz: FloatArray
     good: BoolArray
+    n_explained: int  # matches that fit the pose, wherever their points are: at infinity, too
     parallax_deg: float  # median
     n_near: int  # points with at least the parallax that is asked for
 
@@ -142,8 +145,8 @@ class Initialiser:
             uv_a, uv_b, sigma, self._K, self._size_px, self._config.homography_ratio, self._seed
         )
         pairs = [self._evaluate(a, b, matches, T_b_a) for T_b_a in hypotheses.T_b_a]
-        pairs.sort(key=lambda p: -int(p.good.sum()))
-        best = pairs[0]
+        contenders = _contenders(pairs, len(matches))
+        best = max(contenders, key=lambda p: int(p.good.sum()))
         n_good = int(best.good.sum())
         numbers = {
             "n_matches": float(len(matches)),
@@ -156,9 +159,8 @@ class Initialiser:
         if best.n_near < NEAR * self._config.min_points:
             detail = f"median parallax {best.parallax_deg:.2f} deg, {best.n_near} near points"
             return Failure(FailureReason.LOW_PARALLAX, detail, numbers)
-        for other in pairs[1:]:
-            if int(other.good.sum()) > RUNNER_UP * n_good and _direction_angle_deg(best.T_b_a, other.T_b_a) > 10:
-                return Failure(FailureReason.AMBIGUOUS_MODEL, "two poses explain the views alike", numbers)
+        if any(_direction_angle_deg(best.T_b_a, other.T_b_a) > 10 for other in contenders):
+            return Failure(FailureReason.AMBIGUOUS_MODEL, "two poses explain the views alike", numbers)
         return best
 
     def _evaluate(self, a: View, b: View, matches: Matches, T_b_a: FloatArray) -> _Pair:
@@ -166,18 +168,19 @@ class Initialiser:
         points = triangulate_two_view(
             a.features.uv_rect_px[fa], b.features.uv_rect_px[fb], self._K, np.eye(4), se3.inverse(T_b_a)
         )
-        good = (
-            (points.depth_a > 0)
-            & (points.depth_b > 0)
-            & (points.error2_a < CHI2_2DOF_95 * a.features.sigma_px[fa] ** 2)
-            & (points.error2_b < CHI2_2DOF_95 * b.features.sigma_px[fb] ** 2)
+        uv_a, uv_b, sigma_b = a.features.uv_rect_px[fa], b.features.uv_rect_px[fb], b.features.sigma_px[fb]
+        fits = (points.error2_a < CHI2_2DOF_95 * a.features.sigma_px[fa] ** 2) & (
+            points.error2_b < CHI2_2DOF_95 * sigma_b**2
         )
+        good = fits & (points.depth_a > 0) & (points.depth_b > 0)
+        moved_px = np.linalg.norm(_turned(uv_a, self._K, T_b_a) - uv_b, axis=1)
+        n_explained = int((good | (fits & (moved_px < AT_INFINITY_SIGMAS * sigma_b))).sum())
         angle = np.degrees(np.arccos(np.clip(points.cos_parallax[good], -1, 1)))
         # Points without parallax are no points of the map: their depth is anything.
         good[good] = angle > 0.5 * self._config.min_parallax_deg
         parallax = float(np.median(angle)) if len(angle) else 0.0
         n_near = int((angle >= self._config.min_parallax_deg).sum())
-        return _Pair(a, b, matches, T_b_a, points.xyz, good, parallax, n_near)
+        return _Pair(a, b, matches, T_b_a, points.xyz, good, n_explained, parallax, n_near)
 
     # --- witnesses and bundle adjustment
 
@@ -303,6 +306,23 @@ def direction_sigma_deg(problem: BundleProblem, T_w_cam: FloatArray, xyz: FloatA
     across = np.eye(3) - np.outer(along[3:], along[3:])
     variance = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
     return float(np.degrees(np.sqrt(max(variance, 0.0)) / np.linalg.norm(t_cam)))
+
+
+def _contenders(pairs: list[_Pair], n_matches: int) -> list[_Pair]:
+    """Return the pairs whose pose explains nearly as many matches as any.
+
+    Points without parallax are no points of a map, and yet they speak for a pose: beside a near plane, the pose that
+    takes a turn for parallax has more points, and the true one explains as many matches.
+    """
+    most = max(pair.n_explained for pair in pairs)
+    bound = UNEXPLAINED_TIMES * (n_matches - most) + UNEXPLAINED_MORE
+    return [p for p in pairs if p.n_explained >= RUNNER_UP * most and n_matches - p.n_explained <= bound]
+
+
+def _turned(uv_a: FloatArray, K: FloatArray, T_b_a: FloatArray) -> FloatArray:
+    """Return where pixels of the first view are in the second if they show what is infinitely far."""
+    rays = np.column_stack([uv_a, np.ones(len(uv_a))]) @ (K @ T_b_a[:3, :3] @ np.linalg.inv(K)).T
+    return np.asarray(rays[:, :2] / np.where(np.abs(rays[:, 2:]) > 1e-9, rays[:, 2:], np.nan))
 
 
 def _direction_angle_deg(T_1: FloatArray, T_2: FloatArray) -> float:

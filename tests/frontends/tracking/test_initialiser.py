@@ -71,6 +71,23 @@ def test_near_points_start_a_map_however_many_are_far() -> None:
     assert translation.max() < TRANSLATION * np.linalg.norm(T_true[-1, :3, 3] - T_true[0, :3, 3])
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_far_has_its_say_beside_a_near_plane(seed: int) -> None:
+    """As where a drone takes off from a bench: a pose that takes the turn for parallax has more points."""
+    rng = np.random.default_rng(seed)
+    bench = np.column_stack([rng.uniform(-1.2, 1.2, 500), rng.uniform(0.1, 0.9, 500), np.zeros(500)])
+    bench[:, 2] = 2.0 - 0.9 * bench[:, 1]
+    hall = np.column_stack([rng.uniform(-60, 60, 300), rng.uniform(-45, 0, 300), rng.uniform(60, 90, 300)])
+    world = PointWorld(np.vstack([bench, hall]), path(24, [0.002, -0.006, 0.004], [0.003, 0.001, 0.0]), seed=seed)
+    start, _ = feed(world.views())
+    if start is None:
+        return
+    T_true = world.T_world_cam[[view.index for view in start.views]]
+    translation, rotation = pose_errors(start.T_first_cam, T_true)
+    assert rotation.max() < ROTATION_RAD
+    assert translation.max() < TRANSLATION * np.linalg.norm(T_true[-1, :3, 3] - T_true[0, :3, 3])
+
+
 @pytest.mark.parametrize("turn_rad", [[0, 0, 0], [0, 0.02, 0], [0.01, 0.01, 0.01]], ids=["still", "pan", "all axes"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_no_start_without_a_baseline(turn_rad: FloatArray, seed: int) -> None:
