@@ -16,6 +16,7 @@ from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.backend.window import WindowSolver as NumpyWindowSolver
 from dualslam.calibration.lens import Calibration, CalibrationAnswer, CalibrationJob, answer
 from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
+from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.camera.corrected import CorrectedCamera
 from dualslam.core.camera.models import Camera
 from dualslam.core.camera.rectification import rectify
@@ -152,7 +153,7 @@ def build_system(
         Components(
             view_of=faults.around_views(corrected_view_of),
             new_starter=lambda: Initialiser(
-                frontend, bundle_adjust_arrays, config.initialiser, calibration.camera.K, size_px, config.seed
+                frontend, _adjuster(config), config.initialiser, calibration.camera.K, size_px, config.seed
             ),
             new_graph=graphs.new_graph if graphs is not None else lambda: ISam2SubmapGraph(config.graph),
             new_odometry=faults.around_odometry(odometry),
@@ -162,7 +163,7 @@ def build_system(
             recovery=recovery,
             desk=desk,
             atlas_solver=atlas_solver(config),
-            adjust_bundle=partial(bundle_adjust_arrays, robust_k=config.graph.robust_k),
+            adjust_bundle=_adjuster(config),
             graphs=graphs,
             places=place_parts(config, frontend, size_px),
         ),
@@ -352,9 +353,7 @@ def _attempt_by(
         reverse_tracker, features = live(job, submap, graph), features_for(job.camera)
         overlap_id = max((k for lost in job.lost.values() for k in lost.keyframes), default=job.newest_id)
         route = Route(job.own, job.views, overlap_id)
-        return PnpOdometry(
-            reverse_tracker, auxiliary, features, route, bundle_adjust_arrays, config, size_px, tracks_live
-        )
+        return PnpOdometry(reverse_tracker, auxiliary, features, route, _adjuster(config), config, size_px, tracks_live)
 
     return Attempt(attempt.name, new_odometry)
 
@@ -384,6 +383,11 @@ def view_of(frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: fl
         )
     features = rectify(frontend.extract(frame.image), camera, model_sigma_px)
     return View(frame.index, frame.timestamp_s, features, GreyImage.of(to_grey(frame.image)))
+
+
+def _adjuster(config: Config) -> BundleAdjuster:
+    """Batch bundle adjustment under the robust kernel of the graphs that its results go into."""
+    return partial(bundle_adjust_arrays, robust_k=config.graph.robust_k)
 
 
 def adjust_submap(submap: Submap, robust_k: float) -> None:
