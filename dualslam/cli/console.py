@@ -56,12 +56,16 @@ def final_line(outcome: Outcome) -> str:
     ]
     if s["recoveries"]:
         parts.append(_count(s["recoveries"], "recovery", "recoveries"))
+    n_apart = s["posed_in_all_submaps"] - s["posed"]
+    if s["first_id"] and n_apart:
+        parts.append(f"{_count(n_apart, 'frame')} posed in submaps that are not joined to the saved map")
     if s["dropped"]:
         parts.append(f"{s['dropped']} frames dropped")
     if s.get("ate_rmse_m") is not None:
         parts.append(f"ATE {s['ate_rmse_m']:.3g} m")
     parts.append(f"{s['fps']:.1f} frames/s")
-    lead = "interrupted: " if s["interrupted"] else "" if outcome.has_map else "no map: "
+    nothing = "not found in the saved map: " if s["first_id"] else "no map: "
+    lead = "interrupted: " if s["interrupted"] else "" if outcome.has_map else nothing
     return f"{lead}{', '.join(parts)}; results in {outcome.out}"
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from dualslam.cli.console import FINISHING, progress
+from dualslam.cli.console import FINISHING, final_line, progress
 from dualslam.core.types import FrameStatus
 from dualslam.map.frame_records import FrameResult
 from dualslam.run.sources import open_source
@@ -46,3 +48,25 @@ def test_nobody_watches(monkeypatch: pytest.MonkeyPatch, watched: bool, quiet: b
     with progress(open_source(SOURCE), quiet) as on_frame:
         assert on_frame is None
     assert not screen.getvalue()
+
+
+def test_frames_that_the_saved_map_does_not_show_are_told(tmp_path: Path) -> None:
+    summary = {
+        "coverage": 0.0,
+        "posed": 0,
+        "frames": 300,
+        "posed_in_all_submaps": 280,
+        "submaps": 2,
+        "failures": 0,
+        "recoveries": 0,
+        "dropped": 0,
+        "fps": 20.0,
+        "interrupted": False,
+        "first_id": 500,
+    }
+    outcome = SimpleNamespace(summary=summary, has_map=False, out=tmp_path)
+    line = final_line(outcome)  # type: ignore[arg-type]
+    assert line.startswith("not found in the saved map: coverage 0.0 %")
+    assert "280 frames posed in submaps that are not joined to the saved map" in line
+    outcome.summary["first_id"] = 0
+    assert final_line(outcome).startswith("no map: ")  # type: ignore[arg-type]
