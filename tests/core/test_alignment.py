@@ -202,10 +202,13 @@ def test_robust_is_deterministic_and_equivariant() -> None:
     assert xi @ np.linalg.solve(a.covariance, xi) < 1e-4
 
 
-def test_unknown_covariances_are_never_inliers() -> None:
-    """NaN rows are left out and the masks keep their length."""
+@pytest.mark.parametrize(
+    "unknown", [np.nan, np.inf, 1e140 * np.eye(3), np.diag([1e-4, 1e-4, 1e14])], ids=["nan", "inf", "overflow", "ray"]
+)
+def test_unknown_covariances_are_never_inliers(unknown: object) -> None:
+    """Their rows are left out and the masks keep their length."""
     maps = two_maps(3)
-    maps.cov_src[40:45] = np.nan
+    maps.cov_src[40:45] = unknown
     result = link(maps)
     assert isinstance(result, Sim3Estimate)
     assert result.inliers.shape == (100,)

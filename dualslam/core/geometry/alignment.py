@@ -27,6 +27,8 @@ COVARIANCE_INFLATION = 1.5
 MAX_ROTATION_SIGMA_RAD = 0.2
 """A rotation known no better is not known: the inliers lie along a line as far as their covariances can tell."""
 MAX_LOG_SCALE_SIGMA = 0.3
+UNKNOWN = 100.0
+"""A point that is uncertain by so many times the extent of all tells nothing, and its covariance inverts badly."""
 BATCH = 64
 """Hypotheses scored at a time."""
 N_REFINED = 5
@@ -124,7 +126,8 @@ def estimate_sim3_robust(
     src, dst : (N, 3)
         Matched points, each in its map's frame and unit.
     cov_src, cov_dst : (N, 3, 3)
-        Their covariances. Pairs with a value that is not finite are never inliers.
+        Their covariances. Pairs with a value that is not finite are never inliers, nor is a point that is known no
+        better than to `UNKNOWN` times the extent of all.
     rng : numpy.random.Generator
         The only source of randomness.
     min_inliers : int
@@ -146,6 +149,7 @@ def estimate_sim3_robust(
     """
     finite = np.isfinite(np.concatenate([src, dst, cov_src.reshape(-1, 9), cov_dst.reshape(-1, 9)], 1)).all(1)
     rows = np.flatnonzero(finite)
+    rows = rows[_is_known(src[rows], cov_src[rows]) & _is_known(dst[rows], cov_dst[rows])]
     n = len(rows)
     if n < max(min_inliers, 3):
         return Failure(FailureReason.TOO_FEW_MATCHES, f"{n} matches, {min_inliers} needed", {"n": float(n)})
@@ -155,6 +159,12 @@ def estimate_sim3_robust(
         return Failure(FailureReason.DEGENERATE, f"no triplet of {n} matches spans a plane", {"n": float(n)})
     S = _best_refined(problem, hypotheses, chi2_gate)
     return _judge(problem, S, rows, len(src), n_tried, chi2_gate, min_inliers, scale_bounds)
+
+
+def _is_known(xyz: FloatArray, cov: FloatArray) -> BoolArray:
+    """Whether points are known to something like the extent of all of them."""
+    extent2 = float(np.median(((xyz - np.median(xyz, axis=0)) ** 2).sum(1))) if len(xyz) else 0.0
+    return np.asarray(cov.trace(axis1=1, axis2=2) <= UNKNOWN**2 * extent2) | (extent2 == 0.0)
 
 
 def _best_refined(problem: _Sim3Problem, hypotheses: FloatArray, gate: float) -> FloatArray:
@@ -286,7 +296,9 @@ def _judge(
 
 def _inverse_hessian(H: FloatArray) -> FloatArray | None:
     """Return the inflated inverse of a Hessian, None where it is singular."""
-    scale = 1.0 / np.sqrt(np.maximum(H.diagonal(), 1e-300))
+    if not (H.diagonal() > 0).all():
+        return None
+    scale = 1.0 / np.sqrt(H.diagonal())
     eigenvalues, vectors = np.linalg.eigh(H * scale * scale[:, None])
     if not eigenvalues[0] > 1e-12:
         return None
