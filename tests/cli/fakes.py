@@ -12,6 +12,7 @@ from dualslam.core.events import EventKind, EventLog
 from dualslam.core.stage_timer import StageTimer
 from dualslam.core.types import Features, FloatArray, Frame, FrameStatus, Keyframe
 from dualslam.map.atlas import Atlas
+from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameRecord, FrameResult
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
@@ -48,7 +49,7 @@ class FakeSystem:
         self.pace = Pace()
         self.desk = InlineDesk({})
         self.n_finished = 0
-        self.first_id = 0
+        self.numbers = FrameNumbers()
         self.world = self.saved = self.camera = None
         self.was_interrupted = False
         self._truth, self._lost, self._before_step = truth, lost, before_step
@@ -78,7 +79,8 @@ class FakeSystem:
 
     def _result(self, frame: Frame, status: FrameStatus) -> FrameResult:
         submap_id = None if self._submap is None else self._submap.id
-        self.rows[frame.index] = FrameRecord(frame.index, frame.timestamp_s, status, submap_id, 100, 90, 5.0)
+        number = self.numbers.number(frame.index)
+        self.rows[number] = FrameRecord(number, frame.timestamp_s, status, submap_id, 100, 90, 5.0)
         return FrameResult(frame.index, status, submap_id, None, 100, 90, 5.0, None)
 
 

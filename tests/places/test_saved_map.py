@@ -46,7 +46,7 @@ def go_on(folder: Path, world: PointWorld, localise: bool = False, n: int | None
     system = build_system(config, CAMERA, saved=load_atlas(folder), localise=localise)
 
     def view_of(frame: Frame) -> View:
-        return replace(world.view(frame.index - system.first_id), index=frame.index)
+        return world.view(frame.index)
 
     system._parts = replace(system._parts, view_of=view_of)
     for frame in world.frames()[:n]:
@@ -68,7 +68,7 @@ def truth_in_first(saved: StoredMap, index: np.ndarray) -> np.ndarray:
 def test_localise_finds_every_frame_that_the_map_shows_and_adds_nothing(first: Path) -> None:
     saved = load_atlas(first)
     system = go_on(first, second_world(), localise=True)
-    assert system.first_id == saved.next_id == N_FIRST
+    assert system.numbers.first_id == saved.next_id == N_FIRST
     main = trajectories_of(system).main
     assert main.index[:30].tolist() == list(range(30)), "from the first frame on, by the source's own count"
     error = np.linalg.norm(main.T_world_cam[:30, :3, 3] - truth_in_first(saved, main.index[:30]), axis=1)

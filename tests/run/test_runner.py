@@ -65,7 +65,7 @@ def in_real_time(indices: list[int], work_s: dict[int, float]) -> tuple[list[int
     report = run_sequence(system, Frames(indices), realtime=True, clock=clock, sleep=clock.sleep)  # type: ignore[arg-type]
     assert report.n_frames == len(indices)
     assert [row.index for row in frame_rows(system, _no_poses(), report.dropped)] == indices  # type: ignore[arg-type]
-    return list(system.rows), [i for i, _ in report.dropped], clock
+    return [system.numbers.index_of(i) for i in system.rows], [i for i, _ in report.dropped], clock
 
 
 def _no_poses() -> object:
