@@ -72,7 +72,15 @@ def propose_relative_poses(
     score_h = _score(homography_transfer_error(H_b_a, uv_a_px, uv_b_px).mean(axis=1) / variance, CHI2_2DOF_95)
     share = score_h / max(score_e + score_h, 1e-12)
     candidates = [_unit_baseline(T_b_a)]
-    candidates += _poses_by_turn(uv_a_px, uv_b_px, sigma_px, K, np.random.default_rng(seed))
+    # Refined, what is of one basin with another comes to the same, and no longer looks like a second answer.
+    refinement = {"loss_type": "TRUNCATED", "loss_scale": 2.0 * sigma, "max_iterations": 25}
+    for by_turn in _poses_by_turn(uv_a_px, uv_b_px, sigma_px, K, np.random.default_rng(seed)):
+        start = poselib.CameraPose()
+        start.R, start.t = by_turn[:3, :3], by_turn[:3, 3]
+        refined, _ = poselib.refine_relative_pose(uv_a_px, uv_b_px, start, camera, camera, refinement)
+        T = np.eye(4)
+        T[:3] = refined.Rt
+        candidates.append(_unit_baseline(T))
     if share > homography_ratio:
         candidates += [_unit_baseline(T) for T in decompose_homography(H_b_a, K).T_b_a]
     return Hypotheses(candidates, share)
