@@ -184,7 +184,7 @@ def _posed(system: System, submap_ids: list[int]) -> PosedFrames:
     own = (pose for pose in system.poses.values() if pose.index in system.rows)
     composed = compose(own, system.atlas, S_world_submap)
     index = np.array([system.numbers.index_of(i) for i in composed.index.tolist()], np.int64)
-    order = np.argsort(index)
+    order = np.argsort(index, kind="stable")  # a source that was read from its end: files ascend all the same
     return PosedFrames(index[order], composed.timestamp_s[order], composed.T_world_cam[order])
 
 

@@ -59,18 +59,19 @@ class FakeSystem:
         self._before_step(frame)
         with self.timer.measure("tracking"):
             pass
+        number = self.numbers.number(frame.index)
         if frame.image is None or frame.index in self._lost:
             if self._submap is not None:
-                self.events.add(EventKind.FAILED, frame.index, frame.timestamp_s, self._submap.id)
+                self.events.add(EventKind.FAILED, number, frame.timestamp_s, self._submap.id)
             self._submap = None
             return self._result(frame, FrameStatus.LOST)
         T_world_cam = self._truth[frame.index]
         if self._submap is None:
             self._submap = Submap(len(self.atlas.submaps), np.eye(3), np.zeros(32, np.uint8))
             self.atlas.add(self._submap)
-            self.events.add(EventKind.INITIALISED, frame.index, frame.timestamp_s, self._submap.id)
-        self._submap.add_keyframe(Keyframe(frame.index, frame.timestamp_s, NO_FEATURES), T_world_cam)
-        self.poses[frame.index] = FramePose(frame.index, frame.timestamp_s, self._submap.id, frame.index, np.eye(4))
+            self.events.add(EventKind.INITIALISED, number, frame.timestamp_s, self._submap.id)
+        self._submap.add_keyframe(Keyframe(number, frame.timestamp_s, NO_FEATURES), T_world_cam)
+        self.poses[number] = FramePose(number, frame.timestamp_s, self._submap.id, number, np.eye(4))
         return self._result(frame, FrameStatus.TRACKED)
 
     def finish(self, interrupted: bool = False) -> None:

@@ -275,6 +275,13 @@ class TestSchedule:
         assert not schedule.take_if_due(grown, 20, CAMERA)
         assert schedule.take_if_due(grown, 20, CAMERA, last_chance=True) == due
 
+    def test_keyframes_are_counted_from_the_start_to_now(self) -> None:
+        schedule = RetrySchedule((3,))
+        submap = submap_with([8, 9, 10, 14, 17])
+        schedule.start_of(submap, 10)
+        assert schedule.n_live(submap, 14) == 2
+        assert schedule.n_live(submap, 17) == 3
+
     def test_another_camera_is_a_reason(self) -> None:
         schedule = RetrySchedule(())
         submap = submap_with([10, 11])
