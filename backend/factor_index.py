@@ -14,6 +14,21 @@ from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.submap import Submap
 from dualslam.map.tables import Table
 
+MAX_DEPTH_SIGMA = 0.25
+"""A landmark enters the graph once its views fix its distance to this relative standard deviation (0.25 is about half
+a degree of parallax at 1 px and a focal length of 700 px); it leaves at twice that."""
+MIN_VIEWS = 3
+"""Keyframes that must see a landmark before it enters the graph: two views fit almost any pair of poses."""
+YOUNG_KEYFRAMES = 5
+"""Up to so many keyframes two views are enough, or there would be no graph to start with."""
+ENTER_SIGMAS = 6.0
+"""Observations of a landmark that is new to the graph must fit within so many sigmas: two views of which one is wrong
+throw their point behind a camera, and the solver fails."""
+INSERT_SIGMAS = 25.0
+"""Observations of a landmark that is in the graph are refused only beyond this; the robust kernel has the rest."""
+MIN_TIES = 6
+"""Keyframes tied to the graph by fewer landmarks are held at their pose by a loose prior, until they have more."""
+
 OUTSIDE = -1
 SMALL_MAP = 20
 """Keyframes up to which all that a graph can bear are factors: in a small map every observation counts, and none costs
@@ -43,7 +58,7 @@ class Plan:
     new_landmarks : (L,) int64
     new_keyframes, gone_keyframes : (K,) int64
     weak_keyframes : (K,) int64
-        All keyframes that the graph, as it will be, ties to fewer than `GraphConfig.min_ties` well-seen landmarks.
+        All keyframes that the graph, as it will be, ties to fewer than `MIN_TIES` well-seen landmarks.
     """
 
     entering: IntArray
@@ -111,7 +126,7 @@ class FactorIndex:
         caution : float
             Above 1 landmarks are asked for that much more certainty.
         strict : bool
-            Hold the observations of new landmarks to `GraphConfig.enter_sigmas`; False before a batch optimisation.
+            Hold the observations of new landmarks to `ENTER_SIGMAS`; False before a batch optimisation.
         suspects : (S,) int64, optional
             Landmarks to look at again although nothing of theirs changed.
         choose : bool
@@ -135,7 +150,7 @@ class FactorIndex:
         allowed = touched.copy()
         allowed[list(self.banned)] = False
         row = np.flatnonzero(alive & np.where(inside, lost[lm], allowed[lm]))
-        gate = np.where(known | (not strict), self._config.insert_sigmas, self._config.enter_sigmas)
+        gate = np.where(known | (not strict), INSERT_SIGMAS, ENTER_SIGMAS)
         fits, certain = self._judge(submap, poses, xyz_mu, row, inside, known, known & ~lost, gate, caution)
 
         leaving = died | (inside & known[lm] & ~certain[lm] & lost[lm])
@@ -182,7 +197,7 @@ class FactorIndex:
         self._per_keyframe = self._factors_per_keyframe(submap, admitted, keyframes) if a_part else ALL
         if 2 * self._per_keyframe <= self._chosen_with:
             factors = np.zeros_like(factors)
-        young = len(keyframes) <= config.young_keyframes
+        young = len(keyframes) <= YOUNG_KEYFRAMES
         return choose_factors(
             # The image's middle is about where the principal point is.
             Candidates(obs["kf"], obs["landmark"], self.rows["uv_px"], 2 * float(submap.K[0, 2])),
@@ -192,7 +207,7 @@ class FactorIndex:
             len(submap.landmarks),
             self._per_keyframe,
             config.factors_per_landmark if self._per_keyframe < ALL else ALL,
-            2 if young else config.min_views,
+            2 if young else MIN_VIEWS,
         )
 
     def _factors_per_keyframe(self, submap: Submap, admitted: BoolArray, keyframes: IntArray) -> int:
@@ -243,11 +258,11 @@ class FactorIndex:
         certain = trusted.copy()
         names, index = np.unique(point[asked], return_inverse=True)
         sigmas = compute_depth_sigmas(submap.K, T, pose[asked], res.xyz_cam[asked], sigma[asked], index, len(names))
-        limit = self._config.max_depth_sigma / caution * np.where(known[names], LEAVE_RATIO, 1.0)
+        limit = MAX_DEPTH_SIGMA / caution * np.where(known[names], LEAVE_RATIO, 1.0)
         # Two views of a point fit whatever the poses are along their epipolar lines: it is the third that has a say.
         n_views = np.bincount(index, minlength=len(names))
-        young = len(submap.keyframes) <= self._config.young_keyframes
-        enough = n_views >= np.where(known[names] | young, 2, self._config.min_views)
+        young = len(submap.keyframes) <= YOUNG_KEYFRAMES
+        enough = n_views >= np.where(known[names] | young, 2, MIN_VIEWS)
         certain[names] = (sigmas < limit) & enough
         return fits, certain
 
@@ -256,4 +271,4 @@ class FactorIndex:
         k, j = kf[inside], lm[inside]
         held = np.bincount(j)[j] >= 3 if len(j) else np.zeros(0, bool)
         ties = np.bincount(k[held], minlength=int(live.max(initial=0)) + 1)
-        return live[ties[live] < self._config.min_ties]
+        return live[ties[live] < MIN_TIES]

@@ -5,7 +5,16 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
+from dualslam.core.chi_square import CHI2_99
 from dualslam.core.types import FloatArray, IntArray
+
+OUTLIER_CHI2 = CHI2_99[2]
+"""Squared residual, in the residuals' own variance, above which an observation is an outlier: chi-square, 2 degrees of
+freedom, 99 %, since what is dropped here is dropped for good."""
+LEAST_NOISE = 0.6
+"""Standard deviation, in the pixels' sigmas, that gates take residuals to have at least. Landmarks of four views and
+more have 0.25 to 0.5 (the error of a lens model is much the same in neighbouring views), those of fewer, seen from
+further apart, some more. 1: gates are never tighter than the pixels' sigmas."""
 
 GAUGE_SIGMA = 1e-5
 """Sigma of the priors that fix a gauge (rad, and submap units): tight, yet far from the limits of a double."""

@@ -36,6 +36,23 @@ from dualslam.core.interfaces import CalibrationEstimate, PreferredCamera
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
 
+PRINCIPAL_POINT_SIGMA = 0.015
+"""Prior of the principal point, relative to the image's width: what lenses are off the middle."""
+K1_SIGMA = 0.03
+"""Prior of the radial distortion that is left in the rectified image: the displacement at 45 degrees from the axis (or
+at the image's corner, if that is farther out), relative to the radius."""
+K2_SIGMA = 0.03
+"""The same for the term with the fourth power of the radius."""
+FAR_SIGMA_RATIO = 0.4
+"""The same bound where the given focal length is far off, by more than `far_sigmas`: there an answer of 2 % is better
+than none."""
+FAR_SIGMAS = 6.0
+"""Standard deviations that count as far. The worst answer seen was off by five of its own: they are too small along
+the valley in which focal length and k1 make up for each other."""
+MIN_DISTANCE2 = 20.5
+"""Squared Mahalanobis distance from the present calibration above which the new one is taken: chi-square, 5 degrees of
+freedom, 99.9 %."""
+
 MIN_VIEWS = 3
 """Keyframes of the window that must see a landmark: two views have little to say beyond their own relative pose."""
 MAX_DEPTH_SIGMA = 0.3
@@ -126,7 +143,7 @@ def find_preferred_camera(
         float(answer.off[0]),
         math.sqrt(answer.covariance[0, 0]),
         answer.distance2,
-        answer.distance2 > config.min_distance2,
+        answer.distance2 > MIN_DISTANCE2,
         keyframe_ids,
         now,
         preferred,
@@ -168,7 +185,7 @@ def estimate_correction(
         LensCorrection.of_vector(answer.correction),
         answer.covariance,
         answer.distance2,
-        answer.distance2 > config.min_distance2,
+        answer.distance2 > MIN_DISTANCE2,
         answer.best.cost_before,
         answer.best.cost_after,
         len(problem.T_submap_kf),
@@ -176,8 +193,8 @@ def estimate_correction(
         time.perf_counter() - start,
     )
     sigma = math.sqrt(answer.covariance[0, 0])
-    far = abs(float(answer.off[0])) > config.far_sigmas * math.sqrt(answer.of_difference[0, 0])
-    if sigma > (config.far_sigma_ratio if far else config.max_sigma_ratio) * answer.prior[0]:
+    far = abs(float(answer.off[0])) > FAR_SIGMAS * math.sqrt(answer.of_difference[0, 0])
+    if sigma > (FAR_SIGMA_RATIO if far else config.max_sigma_ratio) * answer.prior[0]:
         return Failure(FailureReason.DEGENERATE, "the motion does not fix the focal length", estimate.numbers)
     if (np.abs(answer.correction) > MAX_PRIOR_SIGMAS * answer.prior).any():
         return Failure(FailureReason.SCALE, "the calibration would be too far from the given one", estimate.numbers)
@@ -316,8 +333,8 @@ def prior_sigmas(problem: BundleProblem, width_px: int, config: CalibrationConfi
     K = problem.K
     xy = (problem.uv_px - K[:2, 2]) / (K[0, 0], K[1, 1])
     r2 = max(1.0, float((xy * xy).sum(1).max(initial=0.0)))
-    centre = config.principal_point_sigma * width_px
-    return np.array([config.log_focal_sigma, centre, centre, config.k1_sigma / r2, config.k2_sigma / (r2 * r2)])
+    centre = PRINCIPAL_POINT_SIGMA * width_px
+    return np.array([config.log_focal_sigma, centre, centre, K1_SIGMA / r2, K2_SIGMA / (r2 * r2)])
 
 
 def _rotation_steps(submap: Submap, ids: IntArray) -> FloatArray:

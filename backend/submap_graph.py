@@ -17,10 +17,10 @@ import numpy as np
 
 from dualslam.backend import convert
 from dualslam.backend.bayes_tree import BayesTree, UpdateStatistics
-from dualslam.backend.factor_index import OUTSIDE, FactorIndex, Plan
+from dualslam.backend.factor_index import INSERT_SIGMAS, MIN_TIES, OUTSIDE, FactorIndex, Plan
 from dualslam.backend.factors import baseline_factor, insert_projections, pose_prior, relative_pose
 from dualslam.backend.gauge import Gauge, choose_gauge
-from dualslam.backend.noise import PixelNoise, residual_variance
+from dualslam.backend.noise import LEAST_NOISE, OUTLIER_CHI2, PixelNoise, residual_variance
 from dualslam.backend.observability import compute_residuals, find_components, take_mask
 from dualslam.backend.point_refinement import refine_points, triangulation_covariances
 from dualslam.backend.solver import N_LAST, IncrementalSolver, SolverFailure, optimise_batch
@@ -30,6 +30,16 @@ from dualslam.core.geometry import so3
 from dualslam.core.interfaces import GraphEstimate
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.submap import RelativePose, Submap
+
+READ_WINDOW = 20
+"""Keyframes (the last inserted ones, and their landmarks) whose estimate is read after each update; 0 reads all."""
+READ_ALL_EVERY = 10
+"""Each so-many-th update reads the whole estimate."""
+REBUILD_ITERATIONS = 8
+"""Batch iterations at most when a graph is made anew."""
+MERGE_ITERATIONS = 2
+"""The same when the parts of a submap are solved already, and tracking waits: merging what a walk back found (39
+keyframes of KITTI 03) two reach the cost of eight to 0.4 %, in half the time."""
 
 logger = logging.getLogger(__name__)
 
@@ -90,12 +100,12 @@ class ISam2SubmapGraph:
     -----
     Reading was measured at 400 keyframes and 10,000 landmarks (CPU time, best case): the variables of 20 keyframes by
     their keys 0.25 ms, all of them 3.5 ms, half of it the solver's walk and half the copy into numpy; how 5,000
-    observations fit, 1.2 ms. `update` therefore reads `GraphConfig.read_window` keyframes and the landmarks that they
-    see, and everything each `GraphConfig.read_all_every`-th time, so that no array of the submap is staler than that.
+    observations fit, 1.2 ms. `update` therefore reads `READ_WINDOW` keyframes and the landmarks that they
+    see, and everything each `READ_ALL_EVERY`-th time, so that no array of the submap is staler than that.
     """
 
-    def __init__(self, config: GraphConfig) -> None:
-        self._config = config
+    def __init__(self, config: GraphConfig, rebuild_iterations: int = REBUILD_ITERATIONS) -> None:
+        self._robust_k, self._rebuild_iterations = config.robust_k, rebuild_iterations
         self._noise = PixelNoise(config.robust_k)
         self._factor_index = FactorIndex(config)
         self._forced_holds: set[int] = set()
@@ -135,7 +145,7 @@ class ISam2SubmapGraph:
             changes = self._changes(submap, plan, submap.T_submap_kf, submap.landmarks["xyz_mu"])
             self._solve(self._solver, submap, plan, changes)
             self._n_updates += 1
-            everything = self._n_updates % self._config.read_all_every == 0
+            everything = self._n_updates % READ_ALL_EVERY == 0
             return self._read(submap, start, plan, everything, rebuilt=False)
         except SolverFailure as failure:
             logger.info("graph of submap %d: %s; rebuilding it", submap.id, failure)
@@ -156,7 +166,7 @@ class ISam2SubmapGraph:
         SolverError
             If that cannot be done.
         """
-        iterations = self._config.merge_iterations if near_optimum else self._config.rebuild_iterations
+        iterations = MERGE_ITERATIONS if near_optimum else self._rebuild_iterations
         return self._remake(submap, time.thread_time(), True, iterations, with_all=True)
 
     def full_estimate(self, submap: Submap) -> GraphEstimate:
@@ -284,11 +294,7 @@ class ISam2SubmapGraph:
         known = {k: r for k, r in submap.relative_poses.items() if {k, r.keyframe_id} <= submap.keyframes.keys()}
         wanted = ((weak | self._forced_holds) & submap.keyframes.keys()) - known.keys()
         wanted.discard(gauge.first)
-        if (
-            gauge.second is not None
-            and gauge.second in wanted
-            and self._n_rows(submap, plan, gauge.second) >= self._config.min_ties
-        ):
+        if gauge.second is not None and gauge.second in wanted and self._n_rows(submap, plan, gauge.second) >= MIN_TIES:
             wanted.discard(gauge.second)  # the baseline gives it its scale, so that landmarks of two views tie it
         remove += [factor for k, factor in self._holds.items() if k not in wanted]
         new_holds = sorted(wanted - self._holds.keys())
@@ -327,11 +333,7 @@ class ISam2SubmapGraph:
         factors = np.empty(len(changes.order), np.int64)
         factors[changes.order] = indices[projections:]
         self._factor_index.commit(plan, factors)
-        steps = [solver.statistics]
-        for _ in range(self._config.extra_iterations):
-            solver.iterate(newest)
-            steps.append(solver.statistics)
-        self.statistics = tuple(steps)
+        self.statistics = (solver.statistics,)
 
     def _n_rows(self, submap: Submap, plan: Plan, keyframe_id: int) -> int:
         kf = submap.observations["kf"]
@@ -352,7 +354,7 @@ class ISam2SubmapGraph:
     ) -> GraphEstimate:
         """Read the estimate of the window's keyframes (or everything's), and how the window's observations fit.
 
-        The window is the last `GraphConfig.read_window` keyframes and those just added to. Without a plan, and after a
+        The window is the last `READ_WINDOW` keyframes and those just added to. Without a plan, and after a
         rebuild, it is the whole submap. `optimum`: of all that the graph can bear, to be told in place of its own.
         """
         assert self._solver is not None
@@ -363,7 +365,7 @@ class ISam2SubmapGraph:
         inside = np.flatnonzero(rows["admitted"] & obs["alive"][: len(rows)])
         in_graph = take_mask(lm[rows["factor"] >= 0], len(submap.landmarks))
         keyframes, row = np.array(sorted(self._factor_index.keyframes), np.int64), inside
-        window = 0 if rebuilt or plan is None else self._config.read_window
+        window = 0 if rebuilt or plan is None else READ_WINDOW
         if window and len(keyframes) > window:
             recent = np.union1d(np.array(list(submap.keyframes)[-window:], np.int64), kf[entering])
             row = inside[take_mask(recent, int(max(kf.max(initial=0), recent.max())) + 1)[kf[inside]]]
@@ -392,11 +394,11 @@ class ISam2SubmapGraph:
         # The solver threw these points away. Linearised there, they would be the death of it: they go before that.
         self._suspects = np.unique(lm[row[np.isinf(chi2) | (res.depth_mu > FAR_MU)]])
         fresh = chi2[np.isin(row, entering, assume_unique=True)]
-        chi2_newest = float(np.minimum(fresh, self._config.insert_sigmas**2).mean() / 2) if len(fresh) else float("nan")
+        chi2_newest = float(np.minimum(fresh, INSERT_SIGMAS**2).mean() / 2) if len(fresh) else float("nan")
         self._misfit = chi2_newest > MISFIT_CHI2
         n_views = np.bincount(lm[inside])[lm[row]]
-        noise2 = residual_variance(chi2, n_views, self._config.least_noise**2)
-        outliers = row[chi2 > self._config.outlier_chi2 * noise2]
+        noise2 = residual_variance(chi2, n_views, LEAST_NOISE**2)
+        outliers = row[chi2 > OUTLIER_CHI2 * noise2]
         return GraphEstimate(
             keyframe_ids=keyframes,
             T_submap_kf=T,
@@ -421,7 +423,7 @@ class ISam2SubmapGraph:
     ) -> FloatArray:
         """Return landmarks that are no variables as their views have them; `poses` are those that were read now."""
         views = self._views_of(submap, ids, inside, poses)
-        rows, k = self._factor_index.rows, self._config.robust_k
+        rows, k = self._factor_index.rows, self._robust_k
         uv, sigma = rows["uv_px"][views.row], rows["sigma_px"][views.row]
         return refine_points(submap.K, views.T_submap_kf, views.pose, xyz_mu[ids], views.point, uv, sigma, k)
 
@@ -465,7 +467,7 @@ class ISam2SubmapGraph:
                 self._forced_holds.update(submap.keyframes)
             try:
                 caution = 1.0 + 0.5 * attempt
-                plan, optimum = self._seed(submap, iterations or self._config.rebuild_iterations, caution, with_all)
+                plan, optimum = self._seed(submap, iterations or self._rebuild_iterations, caution, with_all)
                 return self._read(submap, start, plan, True, rebuilt, optimum if with_all else None)
             except SolverFailure as failure:
                 message = str(failure)

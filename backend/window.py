@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.backend.noise import residual_variance
+from dualslam.backend.noise import LEAST_NOISE, OUTLIER_CHI2, residual_variance
 from dualslam.backend.observability import MIN_DEPTH_MU
 from dualslam.backend.point_refinement import huber, projection_jacobian, sum_by
 from dualslam.backend.selection import rank_in_runs, spread_evenly
@@ -30,7 +30,7 @@ FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-7, 1e2
 CONVERGED = 1e-4
 """Relative decrease of the cost below which to stop."""
 NEWEST_CHI2_CAP = 625.0
-"""As `GraphConfig.insert_sigmas`: one wild match does not make the newest keyframe's mean."""
+"""As `dualslam.backend.factor_index.INSERT_SIGMAS`: one wild match does not make the newest keyframe's mean."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,14 +77,10 @@ class WindowSolver:
     ----------
     robust_k : float
         Huber threshold in sigmas.
-    outlier_chi2, least_noise : float
-        As in `GraphConfig`.
     """
 
-    def __init__(self, robust_k: float, outlier_chi2: float, least_noise: float) -> None:
+    def __init__(self, robust_k: float) -> None:
         self._robust_k = robust_k
-        self._outlier_chi2 = outlier_chi2
-        self._least_noise = least_noise
 
     def __call__(self, submap: Submap, free_keyframes: list[int]) -> GraphEstimate | Failure:
         """Adjust a few keyframes, the newest first, and the points that the newest sees; the submap is not changed.
@@ -105,7 +101,7 @@ class WindowSolver:
         if not (np.isfinite(after.T).all() and after.cost <= before.cost):
             return Failure(FailureReason.SOLVER, "the window has no optimum")
         n_views = np.bincount(window.point, minlength=len(ids))[window.point]
-        noise2 = residual_variance(after.chi2, n_views, self._least_noise**2)
+        noise2 = residual_variance(after.chi2, n_views, LEAST_NOISE**2)
         mine = window.pose == 0
         chi2 = np.minimum(after.chi2[mine], NEWEST_CHI2_CAP)
         sound = np.isfinite(after.xyz).all(axis=1) & (
@@ -116,7 +112,7 @@ class WindowSolver:
             T_submap_kf=after.T[: window.n_free],
             landmark_ids=ids[sound],
             xyz_mu=after.xyz[sound],
-            outlier_rows=np.sort(row[mine & (after.chi2 > self._outlier_chi2 * noise2)]),
+            outlier_rows=np.sort(row[mine & (after.chi2 > OUTLIER_CHI2 * noise2)]),
             chi2_newest=float(chi2.mean() / 2) if len(chi2) else float("nan"),
             noise2=noise2,
             rebuilt=False,

@@ -46,6 +46,7 @@ from dualslam.places import FaissRecogniser, PlaceVerifier
 from dualslam.places.revisits import PlaceParts
 from dualslam.recovery.executor import DeskExecutor, InlineExecutor, RecoveryExecutor
 from dualslam.recovery.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
+from dualslam.recovery.linking.gates import DESCRIPTOR_RADIUS_PX
 from dualslam.recovery.reverse_tracking import Attempt, RecoveryJob, RecoveryParts, run_recovery
 from dualslam.system import Components, System
 from dualslam.workers.desk import Lane, WorkerDesk
@@ -201,7 +202,7 @@ def atlas_solver(config: Config) -> GtsamAtlasSolver:
 
 def window_solver(config: Config) -> WindowSolver:
     """Build what poses new keyframes between the updates of a submap's graph."""
-    return NumpyWindowSolver(config.graph.robust_k, config.graph.outlier_chi2, config.graph.least_noise)
+    return NumpyWindowSolver(config.graph.robust_k)
 
 
 def self_calibrator(config: Config) -> SelfCalibrator:
@@ -295,7 +296,7 @@ def recovery_parts(
         n_covering = 0 if job.lost else config.recovery.covering_keyframes
         return VisualFrontEnd(frontend, config, submap, graph, size_px, refinder, n_covering, window_solver(config))
 
-    matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, config.linking.descriptor_radius_px)
+    matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, DESCRIPTOR_RADIUS_PX)
     return RecoveryParts(
         attempts=_attempts(config, frontend, live, size_px, n_threads),
         posing=Attempt("live", live),

@@ -14,10 +14,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.config.settings import HealthConfig
+from dualslam.core.chi_square import CHI2_9999
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import KeyframeReport
 from dualslam.core.support import find_lack_of_support
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track
+
+MAJORITY = 0.5
+"""Early sign: share of the matches below which those that disagree could hold another pose."""
+JUMP_CHI2 = CHI2_9999[6]
+"""Early sign: squared Mahalanobis distance of a pose from the motion model's, under the pose's covariance and the
+motion model's own error as the last frames show it, above its level there: chi-square, 6 degrees of freedom, 99.99
+% (what drivers and hands do has heavier tails than a Gaussian)."""
+SIGN_SIGMAS = 3.09
+"""Early sign: standard deviations of a chi-square over its degrees of freedom, above its level as a rule (one-sided
+99.9 %)."""
+MAX_KEYFRAME_CHI2 = 2.0
+"""Early sign: chi-square of the graph's newest factors over its degrees of freedom, relative to that level. They hold
+outliers that no one has sorted out yet, and no quantile is known for them."""
+LEVEL_FRAMES = 60
+"""Healthy frames on which the level of the chi-square and the error of the motion model are measured."""
+SIGN_WEIGHT = 4
+"""Healthy frames that outweigh one with a sign: the stretch in which the signs outweigh, up to the loss, is suspected
+to be corrupted. Signs on up to one healthy frame in five then add up to nothing."""
 
 MEMORY_FRAMES = 300
 """Verdicts that are kept: no suspected stretch reaches back farther than the frame buffer."""
@@ -78,9 +97,9 @@ class HealthMonitor:
     def __init__(self, config: HealthConfig) -> None:
         self._config = config
         self._frames: deque[FrameHealth] = deque(maxlen=MEMORY_FRAMES)
-        self._chi2: deque[float] = deque(maxlen=config.level_frames)
-        self._jump: deque[float] = deque(maxlen=config.level_frames)
-        self._innovation: deque[FloatArray] = deque(maxlen=config.level_frames)
+        self._chi2: deque[float] = deque(maxlen=LEVEL_FRAMES)
+        self._jump: deque[float] = deque(maxlen=LEVEL_FRAMES)
+        self._innovation: deque[FloatArray] = deque(maxlen=LEVEL_FRAMES)
 
     def judge(self, track: Track | Failure, index: int) -> Track | Failure:
         """Return the track if the map explains it, else why not, and remember either (`index`: the frame's)."""
@@ -116,7 +135,7 @@ class HealthMonitor:
             self._frames[-1] = replace(newest, signs=(*newest.signs, report.reason), failed=True, numbers=numbers)
             return
         chi2 = report.posed.chi2_newest
-        if chi2 > self._config.max_keyframe_chi2 * _level(self._chi2, 1.0):
+        if chi2 > MAX_KEYFRAME_CHI2 * _level(self._chi2, 1.0):
             signs.append(FailureReason.CHI_SQUARE)
         if report.solver_failed:
             signs.append(FailureReason.SOLVER)
@@ -138,7 +157,7 @@ class HealthMonitor:
         for i, frame in enumerate(self._frames):
             if total == 0:
                 began = i
-            total = total + self._config.sign_weight if frame.signs else max(total - 1, 0)
+            total = total + SIGN_WEIGHT if frame.signs else max(total - 1, 0)
         return list(self._frames)[began:] if total else []
 
     # --- signs
@@ -148,12 +167,12 @@ class HealthMonitor:
         signs = []
         if track.n_inliers < 2 * config.min_inliers:
             signs.append(FailureReason.TOO_FEW_INLIERS)
-        if track.n_inliers < config.majority * track.n_matches:
+        if track.n_inliers < MAJORITY * track.n_matches:
             signs.append(FailureReason.LOW_INLIER_RATIO)
-        if jump2 > config.jump_chi2 * _level(self._jump, TAIL_CHI2_6DOF, TAIL):
+        if jump2 > JUMP_CHI2 * _level(self._jump, TAIL_CHI2_6DOF, TAIL):
             signs.append(FailureReason.MOTION_JUMP)
         dof = max(2 * track.n_inliers - 6, 1)
-        if track.chi2 > _level(self._chi2, 1.0) * (1 + config.sign_sigmas * math.sqrt(2 / dof)):
+        if track.chi2 > _level(self._chi2, 1.0) * (1 + SIGN_SIGMAS * math.sqrt(2 / dof)):
             signs.append(FailureReason.CHI_SQUARE)
         return tuple(signs)
 

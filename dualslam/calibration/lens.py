@@ -20,6 +20,13 @@ from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Keyframe, View
 from dualslam.map.submap import Submap
 
+GROWTH = 1.5
+"""Each next time comes when it has so many times the keyframes."""
+UPDATE_SIGMA_RATIO = 0.7
+"""A camera that was changed on an answer that was not even sure by `max_sigma_ratio` is changed again, however little,
+where the new sigma of the focal length is below this share of that answer's: twice the information. One that was
+sure stays, until another is significantly different."""
+
 log = logging.getLogger(__name__)
 
 RETRY_KEYFRAMES, RETRY_SHARE = 10, 0.25
@@ -156,7 +163,7 @@ class Calibration:
         self._camera, self._refined_in, self._covariance = answer.camera, answer.submap.id, answer.covariance
 
     def _asked(self, submap_id: int, n: int) -> None:
-        self._due_at[submap_id] = int(np.ceil(self._config.growth * n))
+        self._due_at[submap_id] = int(np.ceil(GROWTH * n))
 
     def _said_nothing(self, submap_id: int, n: int) -> None:
         self._due_at[submap_id] = n + max(RETRY_KEYFRAMES, int(RETRY_SHARE * n))
@@ -217,7 +224,7 @@ class Calibration:
             return False
         config, present, found = self._config, *(float(np.sqrt(C[0, 0])) for C in (self._covariance, covariance))
         hardly_sure = present > config.max_sigma_ratio * config.log_focal_sigma
-        return hardly_sure and found < config.update_sigma_ratio * present
+        return hardly_sure and found < UPDATE_SIGMA_RATIO * present
 
     def rectified(self, view: View) -> View:
         """Return a view with the pixels of the present camera; features without a place there keep their old one."""

@@ -14,8 +14,6 @@ class CalibrationConfig(StrictModel):
     """Whether to do it at all."""
     first_keyframes: int = Field(30, ge=10)
     """Keyframes at which a submap is asked for the first time."""
-    growth: float = Field(1.5, gt=1)
-    """Each next time comes when it has so many times the keyframes."""
     min_rotation_deg: float = Field(15.0, ge=0)
     """Turning, summed over the window, below which nothing is tried: the focal length could not be known."""
     max_keyframes: int = Field(60, ge=10)
@@ -26,13 +24,6 @@ class CalibrationConfig(StrictModel):
     """Prior of the log of both focal lengths. A chequerboard gives 0.003, a data sheet 0.05, the depth camera's focal
     length taken for the colour camera's 0.1. It need not be tight: where the motion does not fix the focal length,
     nothing is changed at all."""
-    principal_point_sigma: float = Field(0.015, gt=0)
-    """Prior of the principal point, relative to the image's width: what lenses are off the middle."""
-    k1_sigma: float = Field(0.03, gt=0)
-    """Prior of the radial distortion that is left in the rectified image: the displacement at 45 degrees from the axis
-    (or at the image's corner, if that is farther out), relative to the radius."""
-    k2_sigma: float = Field(0.03, gt=0)
-    """The same for the term with the fourth power of the radius."""
     inflation: float = Field(4.0, ge=1)
     """How much larger than the residuals say the errors of the pixels are taken to be, because neighbouring ones err
     alike. With the exact camera (rendered images) corrections came out up to 3.8 times as far from zero as the
@@ -41,16 +32,3 @@ class CalibrationConfig(StrictModel):
     """The focal length counts as observed where its sigma is below this share of its prior's; else nothing changes. In
     a right-angled bend 1 % of focal length costs 10 % of scale and more: half as sure an answer does more harm than
     good (a car driving backwards round a bend: 6 % off, with a sigma of 1.3 %)."""
-    far_sigma_ratio: float = Field(0.4, gt=0, le=1)
-    """The same bound where the given focal length is far off, by more than `far_sigmas`: there an answer of 2 % is
-    better than none."""
-    far_sigmas: float = Field(6.0, gt=0)
-    """Standard deviations that count as far. The worst answer seen was off by five of its own: they are too small along
-    the valley in which focal length and k1 make up for each other."""
-    update_sigma_ratio: float = Field(0.7, gt=0, le=1)
-    """A camera that was changed on an answer that was not even sure by `max_sigma_ratio` is changed again, however
-    little, where the new sigma of the focal length is below this share of that answer's: twice the information. One
-    that was sure stays, until another is significantly different."""
-    min_distance2: float = Field(20.5, gt=0)
-    """Squared Mahalanobis distance from the present calibration above which the new one is taken: chi-square, 5 degrees
-    of freedom, 99.9 %."""

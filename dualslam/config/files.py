@@ -14,19 +14,11 @@ from typing import Any, TypeVar, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from dualslam.config import strict_yaml
+from dualslam.config.former import RENAMED, what_became_of
 from dualslam.config.settings import Config
 from dualslam.core.errors import ConfigError
 
 Model = TypeVar("Model", bound=BaseModel)
-
-_RENAMED = {
-    "max_leap_frames": "max_gap_frames",
-    "max_leap_scale_sigma": "max_gap_scale_sigma",
-    "resume_after": "relocalise_after",
-    "seam_keyframes": "overlap_keyframes",
-    "walk": "tracking",
-}
-"""Fields of configurations that older versions wrote, and what they are called now."""
 
 _PLAIN_WORDS = {
     "must be an object": "must be a mapping of fields",
@@ -180,8 +172,11 @@ def _unknown(path: tuple[str | int, ...], root: type[BaseModel]) -> str:
     *sections, field = map(str, path)
     model = _model_at(root, path[:-1])
     known = list(model.model_fields) if model else []
-    if _RENAMED.get(field) in known:
-        return f"{'.'.join(map(str, path))} is now called {'.'.join([*sections, _RENAMED[field]])}"
+    if RENAMED.get(field) in known:
+        return f"{'.'.join(map(str, path))} is now called {'.'.join([*sections, RENAMED[field]])}"
+    former = what_became_of(".".join(map(str, path)))
+    if former:
+        return former
     section = ".".join(sections)
     near = difflib.get_close_matches(field, known, n=1)
     if near:

@@ -33,9 +33,6 @@ class CameraConfig(StrictModel):
     """Time between reading the first and the last row of an image: 0 for a global shutter, about 0.03 for webcams and
     the first Kinect. None: the frames in which there is no map are asked for it, and where one that
     rolls is likely, no map starts from a fast turn until it is known."""
-    readout_evidence: float = Field(144.0, gt=0)
-    """Chi-square by which a rolling shutter must explain frames better than a global one, or a global one better than
-    0.02 s, to be known: three sigmas, with errors four times what they seem, as neighbouring pixels err alike."""
 
 
 class InitialiserConfig(StrictModel):
@@ -44,8 +41,6 @@ class InitialiserConfig(StrictModel):
     matching: Literal["ratio", "gms"] = "ratio"
     """How the two views are matched: by the front end's own wide matching, or by grid-based motion statistics, which
     any front end with binary descriptors supports (`orb` with `gms` is the paper's Dual-SLAM+)."""
-    min_matches: int = Field(60, ge=20)
-    """Matches between the two views below which no model is tried."""
     min_points: int = Field(50, ge=15)
     """Triangulated points that must survive the first bundle adjustment."""
     min_parallax_deg: float = Field(1.0, gt=0)
@@ -53,14 +48,11 @@ class InitialiserConfig(StrictModel):
     However many more are far away: on a road most are, and the near ones fix the motion."""
     max_direction_sigma_deg: float = Field(1.5, gt=0)
     """Largest standard deviation (from the bundle adjustment's Hessian) of the direction of translation."""
-    max_chi2: float = Field(2.5, gt=0)
-    """Mean squared whitened residual per degree of freedom after the bundle adjustment (1 is expected)."""
-    min_support: float = Field(0.6, gt=0, le=1)
-    """Share of the points that the frames between the two views must confirm by their own pixels."""
-    homography_ratio: float = Field(0.45, gt=0, lt=1)
-    """Share of the homography's score in both models' above which the scene is planar, or the motion as a turn."""
-    max_views: int = Field(120, ge=5)
-    """How many recent frames are kept as possible first views."""
+
+    @property
+    def min_matches(self) -> int:
+        """Matches between the two views below which no model is tried: a sixth of them may be wrong."""
+        return round(1.2 * self.min_points)
 
 
 class TrackingConfig(StrictModel):
@@ -68,18 +60,12 @@ class TrackingConfig(StrictModel):
 
     search_radius_px: float = Field(15.0, gt=0)
     """Search radius about a landmark's predicted pixel, at the finest octave, when the motion model is trusted."""
-    local_radius_px: float = Field(4.0, gt=0)
-    """The same for the landmarks of the local map, after a first pose is found."""
     min_inliers: int = Field(20, ge=6)
     """Landmarks that must agree with a pose for it to be taken at all."""
     local_keyframes: int = Field(20, ge=2)
     """Covisible keyframes whose landmarks make the local map."""
     wide_keyframes: int = Field(3, ge=1)
     """Recent keyframes that are tried by wide matching and PnP when guided matching fails."""
-    max_gap_scale_sigma: float = Field(0.025, gt=0)
-    """Largest standard deviation (relative) of the scale beyond a gap over which wide matching has skipped, unless the
-    step is small against the depth of the scene: all that is mapped beyond inherits the error, and 5 %, two of these,
-    is a wrong link. Where it is larger the frame counts as lost."""
     max_lost_frames: int = Field(8, ge=0)
     """Frames in a row that wide matching may fail on before the submap is given up."""
 
@@ -89,8 +75,6 @@ class KeyframeConfig(StrictModel):
 
     max_tracked_ratio: float = Field(0.6, gt=0, le=1)
     """A keyframe is due when fewer than this share of the last keyframe's landmarks is still tracked."""
-    min_parallax_deg: float = Field(0.5, ge=0)
-    """...and the camera has moved enough to see the scene's median depth under this angle (or tracking is weak)."""
     max_parallax_deg: float = Field(4.0, gt=0)
     """Parallax at which a keyframe is due whatever is tracked."""
     max_frames: int = Field(30, ge=1)
@@ -102,18 +86,10 @@ class KeyframeConfig(StrictModel):
 class MappingConfig(StrictModel):
     """New landmarks at a keyframe, and what is culled."""
 
-    triangulate_against: int = Field(6, ge=1)
-    """Older keyframes that a new keyframe is paired with."""
     min_parallax_deg: float = Field(1.0, gt=0)
     """Smallest angle between the two rays of a new landmark."""
-    reprojection_chi2: float = Field(5.991, gt=0)
-    """Gate of a new landmark's squared whitened residual in each view: chi-square, 2 degrees of freedom, 95 %."""
     max_observations: int = Field(250, ge=50)
     """Known landmarks that a keyframe holds on to, spread over its image: more make the solver slower, not better."""
-    min_found_ratio: float = Field(0.25, ge=0, le=1)
-    """A young landmark that tracking finds in fewer of the frames that should see it is culled."""
-    min_observations: int = Field(3, ge=2)
-    """Keyframes that must see a landmark by the time that two more keyframes have come."""
     redundant_ratio: float = Field(0.9, gt=0, le=1)
     """A keyframe of whose landmarks this share is seen by three others at the same or a finer scale is culled."""
 
@@ -127,26 +103,9 @@ class HealthConfig(StrictModel):
     """Share of the matched landmarks that must agree."""
     max_chi2: float = Field(2.5, gt=0)
     """Mean squared whitened residual per degree of freedom of the agreeing landmarks (1 is expected)."""
-    majority: float = Field(0.5, ge=0, le=1)
-    """Early sign: share of the matches below which those that disagree could hold another pose."""
-    jump_chi2: float = Field(27.856, gt=0)
-    """Early sign: squared Mahalanobis distance of a pose from the motion model's, under the pose's covariance and the
-    motion model's own error as the last frames show it, above its level there: chi-square, 6 degrees of freedom,
-    99.99 % (what drivers and hands do has heavier tails than a Gaussian)."""
-    sign_sigmas: float = Field(3.09, gt=0)
-    """Early sign: standard deviations of a chi-square over its degrees of freedom, above its level as a rule
-    (one-sided 99.9 %)."""
-    max_keyframe_chi2: float = Field(2.0, gt=0)
-    """Early sign: chi-square of the graph's newest factors over its degrees of freedom, relative to that level. They
-    hold outliers that no one has sorted out yet, and no quantile is known for them."""
     max_refused: float = Field(0.5, ge=0, le=1)
     """Share of a new keyframe's matches that its graph may refuse: where the map contradicts the majority, the pose
     is wrong, and the keyframe is taken out again before the map grows about it. 1 lets every pose in."""
-    level_frames: int = Field(60, ge=10)
-    """Healthy frames on which the level of the chi-square and the error of the motion model are measured."""
-    sign_weight: int = Field(4, ge=1)
-    """Healthy frames that outweigh one with a sign: the stretch in which the signs outweigh, up to the loss, is
-    suspected to be corrupted. Signs on up to one healthy frame in five then add up to nothing."""
 
 
 class AttemptConfig(StrictModel):
@@ -205,10 +164,6 @@ class RecoveryConfig(StrictModel):
     )
     """In this order, each from the same snapshot of the new map, until one leads to a link. A list of words will do,
     such as `[live, gap, sift]`; an attempt with settings is written `{frontend: sift, n_features: 3000}`."""
-    max_gap_scale_sigma: float = Field(0.05, gt=0)
-    """Largest standard deviation (relative) of the scale beyond a gap, by the Hessian of its wide matches. Twice what
-    a link may have (`linking.max_live_scale_sigma`, by which the walk is judged in the end): the landmarks that are
-    found again beyond the gap halve it, if the gap relocalisation is right."""
     relocalise_after: int | None = Field(15, ge=0)
     """Frames that show something without a start, after which a lost map is looked for, and gone on with where it is
     seen again; null: never. A map that starts sooner is better linked, by all that a walk back finds: most start within
@@ -223,11 +178,6 @@ class RecoveryConfig(StrictModel):
     """Keyframes that a walk which only poses frames, or a search for a lost map, matches widely at most, beyond those
     nearest in time (`tracking.wide_keyframes`): the ones that together show the most of the map, since in a gap the
     camera may have looked anywhere. Each costs about 2 ms of CPU for a frame that is not found."""
-    min_shared_keyframes: int = Field(4, ge=2)
-    """Keyframes that both maps must hold before a link is tried."""
-    max_shared_keyframes: int = Field(40, ge=4)
-    """Healthy keyframes of a lost map that a walk holds when its last try to link them is made: ten times what a link
-    must stand on. A walk that fits none of so many is bent, and going on bends it further."""
     workers: int = Field(0, ge=0, le=16)
     """Processes for long work beside the tracking, which never waits for it (`--workers`): walks back and
     self-calibration. With any there is one more, which solves the live map's graph. 0: inline, in the tracking process,
@@ -256,32 +206,11 @@ class GraphConfig(StrictModel):
     robust_k: float = Field(0.8, gt=0)
     """Huber threshold in sigmas: 1.345 keeps 95 % efficiency under Gaussian noise, 0.8 does where residuals are at
     `least_noise` of their sigmas, and 88 % where the sigmas are right."""
-    outlier_chi2: float = Field(9.210, gt=0)
-    """Squared residual, in the residuals' own variance, above which an observation is an outlier: chi-square, 2 degrees
-    of freedom, 99 %, since what is dropped here is dropped for good."""
-    least_noise: float = Field(0.6, gt=0, le=1)
-    """Standard deviation, in the pixels' sigmas, that gates take residuals to have at least. Landmarks of four views
-    and more have 0.25 to 0.5 (the error of a lens model is much the same in neighbouring views), those of fewer, seen
-    from further apart, some more. 1: gates are never tighter than the pixels' sigmas."""
     max_keyframes: int = Field(150, ge=20, le=1000)
     """Keyframes at which a submap rolls over into the next: an update's cost grows with the map (on a road 65 ms on
     average with this cap, 140 ms without), and the solver's Cholesky rejects chains of more than about 1,000."""
     rollover_keyframes: int = Field(12, ge=3, le=19)
     """Keyframes that a submap shares with the one that it rolls over into."""
-    max_depth_sigma: float = Field(0.25, gt=0)
-    """A landmark enters the graph once its views fix its distance to this relative standard deviation (0.25 is about
-    half a degree of parallax at 1 px and a focal length of 700 px); it leaves at twice that."""
-    min_views: int = Field(3, ge=2)
-    """Keyframes that must see a landmark before it enters the graph: two views fit almost any pair of poses."""
-    young_keyframes: int = Field(5, ge=2)
-    """Up to so many keyframes two views are enough, or there would be no graph to start with."""
-    enter_sigmas: float = Field(6.0, gt=0)
-    """Observations of a landmark that is new to the graph must fit within so many sigmas: two views of which one is
-    wrong throw their point behind a camera, and the solver fails."""
-    insert_sigmas: float = Field(25.0, gt=0)
-    """Observations of a landmark that is in the graph are refused only beyond this; the robust kernel has the rest."""
-    min_ties: int = Field(6, ge=3)
-    """Keyframes tied to the graph by fewer landmarks are held at their pose by a loose prior, until they have more."""
     factors_per_keyframe: int = Field(60, ge=20)
     """Observations of a keyframe that become factors of the graph, about, chosen from those that it could bear: spread
     over the image, long tracks first. Points of the others follow the poses. An update's cost grows with it; where few
@@ -291,88 +220,67 @@ class GraphConfig(StrictModel):
     update_every: int = Field(1, ge=1, le=10)
     """Keyframes at which the graph is solved, once a map is past its first: a window of neighbours poses those between,
     and these, too, before anything is mapped from them."""
-    read_window: int = Field(20, ge=0)
-    """Keyframes (the last inserted ones, and their landmarks) whose estimate is read after each update; 0 reads all."""
-    read_all_every: int = Field(10, ge=1)
-    """Each so-many-th update reads the whole estimate."""
-    extra_iterations: int = Field(0, ge=0, le=10)
-    """Further Gauss-Newton steps of the incremental solver at each update, of which a keyframe has two: one poses it by
-    its matches, one takes in what was then mapped from there."""
-    rebuild_inlier_ratio: float = Field(0.65, ge=0, le=1)
-    """Share of a keyframe's matches that must agree with its pose, or the graph is made anew in batch: the incremental
-    estimate has then fallen behind its optimum, and good observations would be dropped as outliers."""
-    rebuild_spacing: int = Field(8, ge=1)
-    """Keyframes at least between two such batches."""
-    rebuild_iterations: int = Field(8, ge=1)
-    """Batch iterations at most when a graph is made anew."""
-    merge_iterations: int = Field(2, ge=1)
-    """The same when the parts of a submap are solved already, and tracking waits: merging what a walk back found (39
-    keyframes of KITTI 03) two reach the cost of eight to 0.4 %, in half the time."""
 
 
 class LinkingConfig(StrictModel):
     """When two submaps that saw the same frames are linked by a similarity.
 
-    A wrong link is one that is off by more than 5 % in scale, 3 degrees or 5 % in position: the bounds on sigmas below
-    are a third of that.
+    A wrong link is off by more than one of the first three limits. All bounds on sigmas follow from them: a third, so
+    that three sigmas are the limit; half of it, two sigmas, for what is judged again later.
     """
+
+    wrong_scale: float = Field(0.05, gt=0)
+    """Relative error of the scale at which a link is wrong."""
+    wrong_rotation_deg: float = Field(3.0, gt=0)
+    """Error of the rotation at which it is."""
+    wrong_position: float = Field(0.05, gt=0)
+    """Error of the matched landmarks' centre, relative to their median depth, at which it is."""
 
     deformation_sigma: float = Field(0.01, gt=0, le=0.1)
     """Relative deformation (standard deviation: drift in scale, bending in radians) that two healthy maps may have
     against each other over the length of their overlap, beyond their pixels' noise. It is the noise model of all gates
     that compare parts of the maps with each other."""
-    gate_sigmas: float = Field(3.0, gt=0)
-    """Standard deviations at which such a comparison fails."""
-    pair_chi2: float = Field(11.345, gt=0)
-    """Gate of a matched pair's squared Mahalanobis distance: chi-square, 3 degrees of freedom, 99 %."""
-    pixel_chi2: float = Field(9.210, gt=0)
-    """Gate of a squared whitened reprojection residual: chi-square, 2 degrees of freedom, 99 %."""
-    strain_chi2: float = Field(20.515, gt=0)
-    """Gate of the stretching and shearing between the maps: chi-square, 5 degrees of freedom, 99.9 %."""
-    min_majority: float = Field(0.5, gt=0, lt=1)
-    """Share of the matched landmarks (over all, in a keyframe, in a map's own pixels) that must agree. Below a half
-    the pairs that disagree could hold a second similarity with more support."""
     min_inliers: int = Field(20, ge=6)
     """Matched landmarks that must agree."""
     min_keyframes: int = Field(4, ge=2)
     """Shared keyframes older than the suspected onset of corruption that must agree one by one. A rigid corrupted tail
     passes every other gate: two keyframes fix it, so evidence starts with the third."""
-    min_pairs_per_keyframe: int = Field(8, ge=4)
-    """Matched landmarks that a keyframe must hold to have a say (four fix a similarity with one to spare)."""
-    max_misfits: int = Field(1, ge=0)
-    """Keyframes in a row that may disagree before this counts as a change point: one can be wrong by itself."""
-    descriptor_radius_px: float = Field(3.0, gt=0)
-    """Distance in the same image within which two keypoints can be the same point: the detector's own scatter."""
-    min_ties: int = Field(10, ge=3)
-    """Landmarks that keyframes on both sides of a place in the old map must see in agreement with their pixels; with
-    fewer the old map is broken there, and what is newer counts as suspected."""
-    tie_window: int = Field(5, ge=1)
-    """Keyframes on either side that are searched for ties."""
-    look_back: int = Field(10, ge=0)
-    """Keyframes of the old map, older than the oldest shared one, among which a break is still looked for."""
-    min_image_spread: float = Field(0.25, ge=0, le=1)
-    """Share of the image, along either axis, that the agreeing landmarks must cover (5 % to 95 % of them, against the
-    keypoints of the same keyframes)."""
-    min_depth_spread: float = Field(0.05, ge=0)
-    """Relative difference between near (10 %) and far (90 %) agreeing landmarks' depths in the shared keyframes: less
-    than triangulation itself scatters is a single depth, which cannot tell scale from motion along the axis."""
-    max_scale: float = Field(50.0, gt=1)
-    """Largest scale, and inverse of the smallest: submaps start with a median depth of 1, so that the scale is the
-    ratio of the depths at their starts."""
-    max_scale_sigma: float = Field(0.0167, gt=0)
-    """Largest standard deviation of the scale (relative)."""
-    max_live_scale_sigma: float = Field(0.025, gt=0)
-    """The same at the new map's live end, with what the walk back has lost of the scale on the way from there to the
-    overlap: as for a gap relocalisation (`recovery.max_gap_scale_sigma`), 5 %, two of these, is a wrong link."""
-    max_live_rotation_deg: float = Field(1.5, gt=0)
-    """Rotation by which the new map would bend, on the way from the overlap to its live end, under the camera that its
-    pixels ask for. Twice that, 3 degrees, is a wrong link."""
-    max_rotation_sigma_deg: float = Field(1.0, gt=0)
-    """Largest standard deviation of the rotation about any axis."""
-    max_position_sigma: float = Field(0.0167, gt=0)
-    """Largest standard deviation of the position of the matched landmarks' centre, relative to their median depth."""
-    max_hypotheses: int = Field(512, ge=16)
-    """Triplets that RANSAC draws at most."""
+
+    @property
+    def max_scale_sigma(self) -> float:
+        """Largest standard deviation of the scale (relative)."""
+        return self.wrong_scale / 3
+
+    @property
+    def max_rotation_sigma_deg(self) -> float:
+        """Largest standard deviation of the rotation about any axis."""
+        return self.wrong_rotation_deg / 3
+
+    @property
+    def max_position_sigma(self) -> float:
+        """Largest standard deviation of the position of the matched landmarks' centre, relative to their depth."""
+        return self.wrong_position / 3
+
+    @property
+    def max_live_scale_sigma(self) -> float:
+        """Largest standard deviation of the scale at the new map's live end, with what the walk back has lost of it on
+        the way from there to the overlap; and beyond a gap over which wide matching has skipped while tracking.
+        """
+        return self.wrong_scale / 2
+
+    @property
+    def max_live_rotation_deg(self) -> float:
+        """Rotation by which the new map may bend, from the overlap to its live end, under the camera that its pixels
+        ask for.
+        """
+        return self.wrong_rotation_deg / 2
+
+    @property
+    def max_gap_scale_sigma(self) -> float:
+        """Largest standard deviation of the scale beyond a gap of a walk back, by the Hessian of its wide matches: the
+        landmarks that are found again beyond the gap halve it, if the gap relocalisation is right.
+        """
+        return self.wrong_scale
 
 
 class FusionConfig(StrictModel):
@@ -382,9 +290,6 @@ class FusionConfig(StrictModel):
     """Keyframes of the old map's healthy end that the new map takes in as observations, beside those that it holds:
     half of what a frame's local map joins, so that the two overlap by as much as neighbouring frames do. 0 leaves the
     overlap as the link found it."""
-    max_shift_chi2: float = Field(24.322, gt=0)
-    """Squared Mahalanobis distance of the link estimated again on the refined overlap from the first one, above which
-    neither is believed: chi-square, 7 degrees of freedom, 99.9 %."""
 
 
 class AtlasConfig(StrictModel):

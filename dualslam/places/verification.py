@@ -24,6 +24,14 @@ from dualslam.core.types import Failure, FailureReason, Features, FloatArray, In
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 from dualslam.places.second_pose import SecondPose, alike, find_second_pose
+from dualslam.recovery.linking.gates import (
+    MAX_HYPOTHESES,
+    MAX_SCALE,
+    MIN_IMAGE_SPREAD,
+    MIN_MAJORITY,
+    MIN_PAIRS_PER_KEYFRAME,
+    PAIR_CHI2,
+)
 
 GROUP = 5
 """Keyframes on a side: the one that is asked about and the four that see most of the same landmarks."""
@@ -230,9 +238,9 @@ class PlaceVerifier:
             pairs.cov_place,
             rng,
             min_inliers=config.min_inliers,
-            max_hypotheses=config.max_hypotheses,
-            chi2_gate=config.pair_chi2,
-            scale_bounds=(1.0 / config.max_scale, config.max_scale),
+            max_hypotheses=MAX_HYPOTHESES,
+            chi2_gate=PAIR_CHI2,
+            scale_bounds=(1.0 / MAX_SCALE, MAX_SCALE),
         )
 
     def _search(self, place: _Side, query: _Side, S_place_query: FloatArray) -> _Looks:
@@ -262,8 +270,8 @@ class PlaceVerifier:
         n = int(inliers.sum())
         found, own = looks.found, looks.own_found
         sigmas = _sigmas(pairs.xyz_query[inliers], S, estimate.covariance, place)
-        keyframes_place = _seeing(place, pairs.place[inliers], config.min_pairs_per_keyframe)
-        keyframes_query = _seeing(query, pairs.query[inliers], config.min_pairs_per_keyframe)
+        keyframes_place = _seeing(place, pairs.place[inliers], MIN_PAIRS_PER_KEYFRAME)
+        keyframes_query = _seeing(query, pairs.query[inliers], MIN_PAIRS_PER_KEYFRAME)
         spread = min(
             _spread(place.submap, keyframes_place, pairs.place[inliers]),
             _spread(query.submap, keyframes_query, pairs.query[inliers]),
@@ -280,7 +288,7 @@ class PlaceVerifier:
             "scale": float(sim3.scale(S)),
             **sigmas,
         }
-        if n <= config.min_majority * len(inliers):
+        if n <= MIN_MAJORITY * len(inliers):
             return Failure(FailureReason.LOW_INLIER_RATIO, f"{n} of {len(inliers)} pairs agree", numbers)
         if min(len(keyframes_place), len(keyframes_query)) < MIN_KEYFRAMES:
             detail = f"{len(keyframes_place)} and {len(keyframes_query)} keyframes agree, {MIN_KEYFRAMES} needed"
@@ -288,7 +296,7 @@ class PlaceVerifier:
         if found < MIN_FOUND * own:
             detail = f"{found:.0%} of what the place should show is there, {own:.0%} in its own keyframes"
             return Failure(FailureReason.REPROJECTION, detail, numbers)
-        if spread < config.min_image_spread:
+        if spread < MIN_IMAGE_SPREAD:
             return Failure(FailureReason.SPREAD, f"{spread:.0%} of the image is covered", numbers)
         if sigmas["sigma_scale"] > config.max_scale_sigma:
             return Failure(FailureReason.SCALE, f"scale known to {sigmas['sigma_scale']:.1%}", numbers)
@@ -346,11 +354,11 @@ class PlaceVerifier:
             all_pairs.cov_place,
             i,
             S,
-            all_pairs.mahalanobis2(S) < NEAR_FIRST * self._config.pair_chi2,
+            all_pairs.mahalanobis2(S) < NEAR_FIRST * PAIR_CHI2,
             rng,
             min_support=self._config.min_inliers,
-            chi2_gate=self._config.pair_chi2,
-            max_hypotheses=self._config.max_hypotheses,
+            chi2_gate=PAIR_CHI2,
+            max_hypotheses=MAX_HYPOTHESES,
         )
 
 

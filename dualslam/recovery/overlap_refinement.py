@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.config.settings import FusionConfig
+from dualslam.core.chi_square import CHI2_999
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph
@@ -21,6 +22,10 @@ from dualslam.core.types import BoolArray, Failure, FailureReason, IntArray
 from dualslam.map.solving import solve
 from dualslam.map.submap import NO_LANDMARK, Submap
 from dualslam.recovery.linking import LinkEstimate
+
+MAX_SHIFT_CHI2 = CHI2_999[7]
+"""Squared Mahalanobis distance of the link estimated again on the refined overlap from the first one, above which
+neither is believed: chi-square, 7 degrees of freedom, 99.9 %."""
 
 Relink = Callable[[Submap, Submap, int | None], LinkEstimate | Failure]
 
@@ -122,7 +127,7 @@ def refine_overlap(
     if isinstance(again, Failure):
         return again
     chi2 = link_distance2(link, again)
-    if chi2 > config.max_shift_chi2:
+    if chi2 > MAX_SHIFT_CHI2:
         numbers = {
             "shift_chi2": chi2,
             "scale_first": float(sim3.scale(link.S_old_new)),

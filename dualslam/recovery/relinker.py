@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from dualslam.config.settings import RecoveryConfig
 from dualslam.core.types import Failure
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking import LinkEstimate
+
+MIN_SHARED_KEYFRAMES = 4
+"""Keyframes that both maps must hold before a link is tried."""
+MAX_SHARED_KEYFRAMES = 40
+"""Healthy keyframes of a lost map that a walk holds when its last try to link them is made: ten times what a link must
+stand on. A walk that fits none of so many is bent, and going on bends it further."""
 
 Linker = Callable[[Submap, Submap, int | None], LinkEstimate | Failure]
 
@@ -38,7 +43,7 @@ class Relinker:
     onsets : dict of int to int
         For each lost submap the frame from which on it is suspected to be corrupted.
     linker : callable
-    config : RecoveryConfig
+    max_shared : int
 
     Attributes
     ----------
@@ -52,11 +57,11 @@ class Relinker:
         lost: dict[int, Submap],
         onsets: dict[int, int],
         linker: Linker,
-        config: RecoveryConfig,
+        max_shared: int = MAX_SHARED_KEYFRAMES,
     ) -> None:
         self._submap = submap
         self._linker = linker
-        self._config = config
+        self._max_shared = max_shared
         self._onsets = onsets
         self._old = [lost[m] for m in sorted(lost)]
         self._tried_with: dict[int, int] = {}  # by old map: how many keyframes were shared at the last try
@@ -74,11 +79,11 @@ class Relinker:
             if keyframe_id not in shared or not self._is_due(old.id, len(shared)):
                 continue
             n_healthy = sum(k < self._onsets[old.id] for k in shared)
-            self.has_seen_enough |= n_healthy >= self._config.max_shared_keyframes
+            self.has_seen_enough |= n_healthy >= self._max_shared
             yield LinkTry(old.id, len(shared), self._linker(old, self._submap, self._onsets[old.id]))
 
     def _is_due(self, old_id: int, n_shared: int) -> bool:
-        if n_shared < self._config.min_shared_keyframes:
+        if n_shared < MIN_SHARED_KEYFRAMES:
             return False
         if n_shared == self._tried_with.get(old_id):  # over keyframes that an earlier walk has left
             return False

@@ -225,7 +225,7 @@ def _make_attempt(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, unti
     submap.apply_estimate(*estimate.values)
     reverse_tracker = attempt.new_odometry(job, submap, graph)
     reverse_tracker.start_at(job.newest_id)
-    relinker = Relinker(submap, job.lost, job.onsets, parts.link, parts.config)
+    relinker = Relinker(submap, job.lost, job.onsets, parts.link)
     reverse_tracker.keep(relinker.keyframe_ids)  # redundant or not: linking stands on keyframes that both maps hold
     progress = _Progress(submap)
     # Frames before a start are worth a look each, however many show nothing; no map waits for the end of that walk.

@@ -377,7 +377,7 @@ class PnpOdometry:
 
     def _judge(self, wide: GapPose | Failure) -> GapPose | Failure:
         """Hold a gap relocalisation to what health asks of a track, and to the scale that it must not lose."""
-        limit = self._config.recovery.max_gap_scale_sigma
+        limit = self._config.linking.max_gap_scale_sigma
         if isinstance(wide, Failure):
             return wide
         lack = find_lack_of_support(int(wide.inliers.sum()), len(wide.inliers), wide.chi2, self._config.health)

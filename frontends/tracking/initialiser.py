@@ -34,6 +34,15 @@ from dualslam.frontends.gates import CHI2_2DOF_95
 from dualslam.frontends.tracking.resection import resect
 from dualslam.frontends.tracking.two_view_hypotheses import propose_relative_poses
 
+MAX_CHI2 = 2.5
+"""Mean squared whitened residual per degree of freedom after the bundle adjustment (1 is expected)."""
+MIN_SUPPORT = 0.6
+"""Share of the points that the frames between the two views must confirm by their own pixels."""
+HOMOGRAPHY_RATIO = 0.45
+"""Share of the homography's score in both models' above which the scene is planar, or the motion as a turn."""
+MAX_VIEWS = 120
+"""How many recent frames are kept as possible first views."""
+
 LAGS = (2, 4, 8, 16, 32, 64)  # frames back that are tried as the first view
 N_WITNESSES = 3  # frames between the two views that must agree
 NEAR = 0.5  # share of the points that a start needs at least which must be near: on a road these fix the motion
@@ -91,7 +100,7 @@ class Initialiser:
 
     def collect(self, view: View) -> None:
         """Keep a view as a possible first view, without trying to start from it."""
-        self._views = [*self._views[-self._config.max_views :], view]
+        self._views = [*self._views[-MAX_VIEWS:], view]
 
     def add(self, view: View, briefly: bool = False) -> Start | Failure:
         """Take a view in and try to start from it and an earlier one, the nearest first.
@@ -141,9 +150,7 @@ class Initialiser:
         fa, fb = matches.index[:, 0], matches.index[:, 1]
         uv_a, uv_b = a.features.uv_rect_px[fa], b.features.uv_rect_px[fb]
         sigma = np.maximum(a.features.sigma_px[fa], b.features.sigma_px[fb])
-        hypotheses = propose_relative_poses(
-            uv_a, uv_b, sigma, self._K, self._size_px, self._config.homography_ratio, self._seed
-        )
+        hypotheses = propose_relative_poses(uv_a, uv_b, sigma, self._K, self._size_px, HOMOGRAPHY_RATIO, self._seed)
         pairs = [self._evaluate(a, b, matches, T_b_a) for T_b_a in hypotheses.T_b_a]
         contenders = _contenders(pairs, len(matches))
         best = max(contenders, key=lambda p: int(p.good.sum()))
@@ -191,7 +198,6 @@ class Initialiser:
         return [self._views[p] for p in positions if len(self._views[p].features) >= self._config.min_points]
 
     def _verify(self, pair: _Pair, views: list[View]) -> Start | Failure:
-        config = self._config
         good = np.flatnonzero(pair.good)
         xyz = pair.xyz[good]
         feature = np.full((len(views), len(good)), -1, np.int64)
@@ -212,7 +218,7 @@ class Initialiser:
             "parallax_deg": pair.parallax_deg,
             "support": float(min(support)) if support else 0.0,
         }
-        if not support or min(support) < config.min_support:
+        if not support or min(support) < MIN_SUPPORT:
             detail = f"the frames between confirm {numbers['support']:.0%} of the points"
             return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers)
         views = [views[v] for v in np.flatnonzero(keep_views)]
@@ -257,11 +263,11 @@ class Initialiser:
         in_front = np.all(se3.act(se3.inverse(result.T_submap_kf), result.xyz_mu)[..., 2] > 0, axis=0)
         keep = ends_ok & (n_bad <= 1) & in_front & result.adjusted
         numbers["n_points"] = float(keep.sum())
-        if keep.sum() < self._config.min_points or keep.mean() < self._config.min_support:
+        if keep.sum() < self._config.min_points or keep.mean() < MIN_SUPPORT:
             return Failure(
                 FailureReason.DOUBTFUL_INITIALISATION, f"{keep.sum()} of {len(xyz)} points survive adjustment", numbers
             )
-        if not numbers["chi2"] < self._config.max_chi2:
+        if not numbers["chi2"] < MAX_CHI2:
             return Failure(FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {numbers['chi2']:.1f}", numbers)
         if not direction < self._config.max_direction_sigma_deg:
             return Failure(

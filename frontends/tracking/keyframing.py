@@ -9,6 +9,9 @@ from dualslam.core.geometry import se3
 from dualslam.core.types import Track
 from dualslam.map.submap import Submap
 
+MIN_PARALLAX_DEG = 0.5
+"""...and the camera has moved enough to see the scene's median depth under this angle (or tracking is weak)."""
+
 ESTABLISHED = 3  # views of a landmark from which on its loss says that the scene has changed
 
 
@@ -31,7 +34,7 @@ def keyframe_due(track: Track, submap: Submap, reference_id: int, config: Keyfra
     parallax = parallax_deg(track, submap, reference_id)
     if parallax > config.max_parallax_deg:
         return True
-    if parallax < config.min_parallax_deg:
+    if parallax < MIN_PARALLAX_DEG:
         # A turn in place reveals nothing that could be triangulated, until half of what was known is out of view.
         return tracked_ratio < 0.5 * config.max_tracked_ratio
     return tracked_ratio < config.max_tracked_ratio or abs(track.view.index - reference_id) >= config.max_frames

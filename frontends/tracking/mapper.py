@@ -7,6 +7,7 @@ from collections.abc import Set
 import numpy as np
 
 from dualslam.config.settings import MappingConfig
+from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose
@@ -16,6 +17,13 @@ from dualslam.frontends.features.groups import rank_in_runs
 from dualslam.frontends.features.matching import FeatureGrid, match_epipolar, match_projected
 from dualslam.frontends.tracking.local_map import LocalMap
 from dualslam.map.submap import NO_LANDMARK, Submap
+
+MIN_FOUND_RATIO = 0.25
+"""A young landmark that tracking finds in fewer of the frames that should see it is culled."""
+MIN_OBSERVATIONS = 3
+"""Keyframes that must see a landmark by the time that two more keyframes have come."""
+TRIANGULATE_AGAINST = 6
+"""Older keyframes that a new keyframe is paired with."""
 
 FUSE_RADIUS_PX = 3.0  # about 3 sigma of a well-posed landmark's pixel at the finest octave
 CELLS_ACROSS = 16  # cells of the image's width by which observations are spread
@@ -62,7 +70,7 @@ class Mapper:
         self._young: list[tuple[int, IntArray]] = []  # keyframe count at birth, landmark ids
         self._n_inserted = 0
         self._grids: dict[int, tuple[Features, FeatureGrid]] = {}  # of the keyframes searched last
-        self._gate_chi2 = config.reprojection_chi2  # as it is for the keyframe that grows
+        self._gate_chi2 = CHI2_95[2]  # as it is for the keyframe that grows
 
     def observe(self, track: Track) -> None:
         """Make a tracked frame a keyframe that sees the landmarks by which it was tracked, and nothing new."""
@@ -84,7 +92,7 @@ class Mapper:
         these is let in neither as a new landmark nor as another view of one; noisier pixels open no gate to landmarks.
         """
         view = track.view
-        self._gate_chi2 = self._config.reprojection_chi2 * min(noise2, 1.0)
+        self._gate_chi2 = CHI2_95[2] * min(noise2, 1.0)
         self._n_inserted += 1
         n_culled = self._cull_young()
         neighbours = self._neighbours(view.index)
@@ -105,31 +113,31 @@ class Mapper:
         ids = submap.landmark_of[keyframe_id]
         found, counts = submap.covisible(ids[ids >= 0])
         keep = (found != keyframe_id) & (counts >= 15)
-        covisible = [int(k) for k in found[keep][: self._config.triangulate_against]]
+        covisible = [int(k) for k in found[keep][:TRIANGULATE_AGAINST]]
         if covisible:
             return covisible
         # Beyond a gap relocalisation hardly a landmark may be known: what the frames on the other side see is found by
         # its features.
-        return [k for k in submap.keyframes_near(keyframe_id) if k != keyframe_id][: self._config.triangulate_against]
+        return [k for k in submap.keyframes_near(keyframe_id) if k != keyframe_id][:TRIANGULATE_AGAINST]
 
     def _on_this_side(self, keyframe_id: int, neighbours: list[int], apart: Set[int]) -> list[int]:
         """Return the neighbours that no gap parts from a keyframe; those nearest in time where there is a gap."""
         if not any(k in apart for k in neighbours):
             return neighbours
         near = [k for k in self._submap.keyframes_near(keyframe_id) if k not in apart and k != keyframe_id]
-        return near[: self._config.triangulate_against]
+        return near[:TRIANGULATE_AGAINST]
 
     def _cull_young(self) -> int:
         """Cull landmarks on probation that tracking does not find, or that too few keyframes came to see."""
-        submap, config, kept, n_culled = self._submap, self._config, [], 0
+        submap, kept, n_culled = self._submap, [], 0
         for born, ids in self._young:
             ids = ids[submap.landmarks["alive"][ids]]
             age = self._n_inserted - born
             lm = submap.landmarks
             ratio = lm["n_found"][ids] / np.maximum(lm["n_visible"][ids], 1)
-            bad = ratio < config.min_found_ratio
+            bad = ratio < MIN_FOUND_RATIO
             if age >= 2:
-                bad |= submap.n_observations(ids) < config.min_observations
+                bad |= submap.n_observations(ids) < MIN_OBSERVATIONS
             submap.remove_landmarks(ids[bad])
             n_culled += int(bad.sum())
             if age < YOUNG_KEYFRAMES:

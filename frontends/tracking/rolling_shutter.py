@@ -21,6 +21,10 @@ from dualslam.frontends.gates import CHI2_1DOF_95
 from dualslam.frontends.tracking.resection import poselib_camera
 from dualslam.frontends.tracking.turning import turn_between
 
+READOUT_EVIDENCE = 144.0
+"""Chi-square by which a rolling shutter must explain frames better than a global one, or a global one better than 0.02
+s, to be known: three sigmas, with errors four times what they seem, as neighbouring pixels err alike."""
+
 STEP_S = 0.005
 READOUTS_S = STEP_S * np.arange(8)
 """Readout times that are tried: up to all of the time between frames at 30 Hz."""
@@ -105,7 +109,7 @@ class ReadoutEstimator:
     ----------
     seed : int
     min_evidence : float
-        See `CameraConfig.readout_evidence`.
+        See `READOUT_EVIDENCE`.
 
     Attributes
     ----------
@@ -205,7 +209,7 @@ class RollingShutter:
         self._frontend = frontend
         self.readout_s = config.readout_s or 0.0
         asks = config.readout_s is None
-        self._estimator = ReadoutEstimator(frontend, seed, config.readout_evidence) if asks else None
+        self._estimator = ReadoutEstimator(frontend, seed, READOUT_EVIDENCE) if asks else None
         self._meter = TurnMeter(frontend)
 
     def shutter_corrected(self, view: View, camera: Camera) -> View:

@@ -21,6 +21,9 @@ from dualslam.frontends.tracking.local_map import LocalMap, Prediction, covering
 from dualslam.frontends.tracking.resection import resect
 from dualslam.map.submap import NO_LANDMARK, Submap
 
+LOCAL_RADIUS_PX = 4.0
+"""The same for the landmarks of the local map, after a first pose is found."""
+
 WIDER = 2.5  # second guided search: this many times the first radius
 MAX_EXTRAPOLATION = 3.0  # intervals for which the motion between the last two frames says something
 GIVEN_POSE_CHI2 = 4 * CHI2_2DOF_99  # 99 % with 2 degrees of freedom, and the pose off by as much as a pixel
@@ -53,6 +56,8 @@ class Tracker:
     """Tracks frames against one submap, one after the other, in whatever direction of time they come.
 
     `n_covering`: beyond the keyframes nearest in time, wide matching tries so many that show the most of the map.
+    `max_gap_scale_sigma`: largest standard deviation (relative) of the scale beyond frames that wide matching has
+    skipped, unless the step is small against the depth of the scene; where it is larger the frame counts as lost.
     """
 
     def __init__(
@@ -63,8 +68,10 @@ class Tracker:
         size_px: tuple[int, int],
         seed: int,
         n_covering: int = 0,
+        max_gap_scale_sigma: float = 0.025,
     ) -> None:
         self._frontend = frontend
+        self._max_gap_scale_sigma = max_gap_scale_sigma
         self._config = config
         self._submap = submap
         self._size_px = size_px
@@ -288,7 +295,7 @@ class Tracker:
             return track
         known = pose_uncertainty(self._submap, track.T_cam_submap, ids, track.view.features.sigma_px[row])
         scale_sigma = np.inf if known is None else known[1]
-        if scale_sigma <= self._config.max_gap_scale_sigma:
+        if scale_sigma <= self._max_gap_scale_sigma:
             return track
         detail = f"the scale beyond the gap is known to {scale_sigma:.1%}"
         return Failure(FailureReason.SCALE, detail, {"gap_scale_sigma": scale_sigma})
@@ -365,7 +372,7 @@ class Tracker:
             grid,
             features,
             prediction.uv_px[new],
-            self._config.local_radius_px * self._frontend.scale_factor ** prediction.octave[new],
+            LOCAL_RADIUS_PX * self._frontend.scale_factor ** prediction.octave[new],
             local.descriptors[prediction.rows[new]],
             octave=prediction.octave[new],
             taken=landmark_ids >= 0,

@@ -21,6 +21,12 @@ from dualslam.frontends.tracking.tracker import GivenPose, Tracker
 from dualslam.map.submap import RelativePose, Submap
 from dualslam.map.submap_change import change_of_frame
 
+REBUILD_INLIER_RATIO = 0.65
+"""Share of a keyframe's matches that must agree with its pose, or the graph is made anew in batch: the incremental
+estimate has then fallen behind its optimum, and good observations would be dropped as outliers."""
+REBUILD_SPACING = 8
+"""Keyframes at least between two such batches."""
+
 CULL_BEHIND = 2  # the newest keyframes are not judged redundant: the next ones may need them
 N_CULL_CANDIDATES = 10  # of the covisible keyframes, the nearest in what they see
 N_FREE = 3  # newest keyframes that the window moves
@@ -49,7 +55,15 @@ class VisualFrontEnd:
         self.submap = submap
         self.graph = graph
         self._config = config
-        self._tracker = Tracker(frontend, config.tracking, submap, size_px, config.seed, n_covering)
+        self._tracker = Tracker(
+            frontend,
+            config.tracking,
+            submap,
+            size_px,
+            config.seed,
+            n_covering,
+            config.linking.max_live_scale_sigma,  # all that is mapped beyond inherits it
+        )
         self._mapper = Mapper(frontend, config.mapping, submap, size_px)
         self._refinder = refinder
         self._window = window
@@ -253,8 +267,8 @@ class VisualFrontEnd:
     def _rebuild_due(self, track: Track) -> bool:
         """Whether the frame contradicts the map so much that the incremental estimate is to be made anew in batch."""
         self._since_rebuild += 1
-        doubtful = track.n_inliers < self._config.graph.rebuild_inlier_ratio * track.n_matches
-        if not doubtful or self._since_rebuild < self._config.graph.rebuild_spacing:
+        doubtful = track.n_inliers < REBUILD_INLIER_RATIO * track.n_matches
+        if not doubtful or self._since_rebuild < REBUILD_SPACING:
             return False
         self._since_rebuild = 0
         return True

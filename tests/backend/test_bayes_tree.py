@@ -40,7 +40,7 @@ def test_the_tree_holds_every_variable_once_and_separators_stand_above(n) -> Non
             above |= set(tree.keyframes[parent])
             parent = int(tree.parent[parent])
         assert set(separator) <= above
-    assert len(graph.statistics) == 1 + GraphConfig().extra_iterations
+    assert len(graph.statistics) == 1
     assert 0 < graph.statistics[0].reeliminated <= len(frontal) + len(variables)
     assert np.all(tree.parent < np.arange(len(tree)))
 

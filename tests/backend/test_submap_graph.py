@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dualslam.backend import submap_graph
 from dualslam.backend.local_ba import bundle_adjust
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.backend.window import WindowSolver
@@ -41,9 +42,8 @@ def start(n=30, per_view=120, noise_px=1.0, seed=0, config=None, order=None, fir
 
 def pose(submap, k):
     """Pose a new keyframe by its neighbours, as a front end does before the graph looks at it."""
-    config = GraphConfig()
     newest = list(submap.keyframes)[-3:][::-1]
-    posed = WindowSolver(config.robust_k, config.outlier_chi2, config.least_noise)(submap, newest)
+    posed = WindowSolver(GraphConfig().robust_k)(submap, newest)
     if posed:
         apply(submap, posed)
 
@@ -79,7 +79,7 @@ def test_estimate_is_near_the_batch_optimum_and_the_newest_fit():
     e = graph.full_estimate(feeder.submap)
     apply(feeder.submap, e)
     batch = bundle_adjust(feeder.submap, e.keyframe_ids[2:], e.keyframe_ids[:2], max_iterations=30)
-    oracle = ISam2SubmapGraph(GraphConfig(rebuild_iterations=50, **EVERY_FACTOR)).rebuild(feeder.submap)
+    oracle = ISam2SubmapGraph(GraphConfig(**EVERY_FACTOR), rebuild_iterations=50).rebuild(feeder.submap)
     np.testing.assert_array_equal(oracle.keyframe_ids, e.keyframe_ids)
     t, r = pose_errors(e.T_submap_kf, oracle.T_submap_kf)
     assert t.max() < OPTIMUM_MU
@@ -93,8 +93,10 @@ def test_estimate_is_near_the_batch_optimum_and_the_newest_fit():
     assert t.max() < 2 * OPTIMUM_MU
 
 
-def test_window_is_read_each_time_and_all_each_nth_time():
-    feeder, graph, rest = start(config=GraphConfig(read_window=6, read_all_every=5, **EVERY_FACTOR))
+def test_window_is_read_each_time_and_all_each_nth_time(monkeypatch):
+    monkeypatch.setattr(submap_graph, "READ_WINDOW", 6)
+    monkeypatch.setattr(submap_graph, "READ_ALL_EVERY", 5)
+    feeder, graph, rest = start()
     sizes = [len(e.keyframe_ids) for e in grow(feeder, graph, rest)]
     assert max(sizes[:4] + sizes[5:9]) < 12 < len(rest)
     assert sizes[9] == 4 + 10
@@ -267,7 +269,7 @@ def test_covariances_against_monte_carlo():
         for i in range(10):
             feeder.add(i, exact=True)
         feeder.submap.gauge = (0, 3)
-        graph = ISam2SubmapGraph(GraphConfig(robust_k=100.0, rebuild_iterations=20, **EVERY_FACTOR))
+        graph = ISam2SubmapGraph(GraphConfig(robust_k=100.0, **EVERY_FACTOR), rebuild_iterations=20)
         e = graph.update(feeder.submap)
         off = np.linalg.inv(scene.T_true[k]) @ e.T_submap_kf[k]
         runs.append(off[:3, 3])
@@ -295,7 +297,7 @@ def relative_to(ref, T_submap_ref, T_submap_kf, covariance):
 
 def test_a_relative_pose_counts_by_its_covariance():
     """Two Gaussians of the same pose: informations add, and the estimate moves by their ratio."""
-    gaussian = GraphConfig(robust_k=100.0, rebuild_iterations=30, **EVERY_FACTOR)
+    gaussian = GraphConfig(robust_k=100.0, **EVERY_FACTOR)
     feeder, graph, rest = start(n=8, config=gaussian)
     grow(feeder, graph, rest)
     submap, k = feeder.submap, rest[-1]

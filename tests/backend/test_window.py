@@ -14,8 +14,7 @@ from tests.backend.test_submap_graph import grow, start
 
 
 def solver() -> WindowSolver:
-    config = GraphConfig()
-    return WindowSolver(config.robust_k, config.outlier_chi2, config.least_noise)
+    return WindowSolver(GraphConfig().robust_k)
 
 
 def newest(submap, n=3):

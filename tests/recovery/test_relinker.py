@@ -5,7 +5,6 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any, cast
 
-from dualslam.config.settings import RecoveryConfig
 from dualslam.core.types import Failure, FailureReason
 from dualslam.map.submap import Submap
 from dualslam.recovery.relinker import Relinker
@@ -26,7 +25,7 @@ def tries_of_a_walk(n: int, **settings: Any) -> tuple[list[int], int | None]:
         asked.append(len(new.keyframes) - 10)
         return Failure(FailureReason.AGREEMENT, "no")
 
-    relinker = Relinker(new, {0: old}, {0: ONSET}, refuse, RecoveryConfig.model_validate(settings))
+    relinker = Relinker(new, {0: old}, {0: ONSET}, refuse, **settings)
     for shared in range(1, n + 1):
         k = 200 - shared
         new.keyframes[k] = None  # type: ignore[assignment]
@@ -42,14 +41,14 @@ def test_it_tries_at_each_of_the_first_shared_keyframes() -> None:
 
 
 def test_later_on_it_tries_at_each_tenth_part_more() -> None:
-    asked, _ = tries_of_a_walk(100, max_shared_keyframes=200)
+    asked, _ = tries_of_a_walk(100, max_shared=200)
     late = [n for n in asked if n > 12]
     assert all(b >= 1.1 * a for a, b in zip([12, *late], late, strict=False))
     assert all(b <= 1.1 * a + 1 for a, b in zip([12, *late], late, strict=False))
 
 
 def test_it_has_seen_enough_once_it_has_tried_with_so_many_healthy_keyframes() -> None:
-    asked, ended = tries_of_a_walk(150, max_shared_keyframes=30)
+    asked, ended = tries_of_a_walk(150, max_shared=30)
     suspected = 200 - ONSET
     assert ended is not None
     assert ended == asked[-1]
@@ -62,7 +61,7 @@ def test_a_keyframe_that_the_lost_map_does_not_hold_is_no_reason_to_try() -> Non
     def never(old: Submap, new: Submap, onset: int | None) -> Failure:
         raise AssertionError
 
-    assert not list(Relinker(new, {0: old}, {0: ONSET}, never, RecoveryConfig()).attempts(11))
+    assert not list(Relinker(new, {0: old}, {0: ONSET}, never).attempts(11))
 
 
 def test_over_keyframes_that_an_earlier_walk_has_left_it_tries_once() -> None:
@@ -73,7 +72,7 @@ def test_over_keyframes_that_an_earlier_walk_has_left_it_tries_once() -> None:
         asked.append(len(old.keyframes.keys() & new.keyframes.keys()))
         return Failure(FailureReason.AGREEMENT, "no")
 
-    relinker = Relinker(new, {0: old}, {0: ONSET}, refuse, RecoveryConfig())
+    relinker = Relinker(new, {0: old}, {0: ONSET}, refuse)
     for k in range(99, 84, -1):
         new.keyframes[k] = None  # type: ignore[assignment]
         list(relinker.attempts(k))

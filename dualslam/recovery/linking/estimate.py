@@ -29,6 +29,15 @@ from dualslam.recovery.linking.correspondences import (
     match_landmarks,
     place_pairs,
 )
+from dualslam.recovery.linking.gates import (
+    LOOK_BACK,
+    MAX_HYPOTHESES,
+    MAX_MISFITS,
+    MAX_SCALE,
+    MIN_MAJORITY,
+    MIN_PAIRS_PER_KEYFRAME,
+    PAIR_CHI2,
+)
 from dualslam.recovery.linking.pairs import PairModel
 from dualslam.recovery.linking.shape import Shape, deformation_covariance, measure_shape
 from dualslam.recovery.linking.timeline import KeyframeVotes, ask_keyframes, find_discontinuities, leading_run
@@ -113,7 +122,7 @@ def estimate_link(
     )
     discontinuities_new = find_discontinuities(new, int(pairs.keyframes[0]), int(pairs.keyframes[-1]), config)
     onset = min([*discontinuities_old.tolist(), *([] if suspected_onset is None else [suspected_onset])], default=None)
-    trusted = pairs.count_by_keyframe(np.ones(len(pairs.view_pair), bool)) >= config.min_pairs_per_keyframe
+    trusted = pairs.count_by_keyframe(np.ones(len(pairs.view_pair), bool)) >= MIN_PAIRS_PER_KEYFRAME
     if onset is not None:
         trusted &= pairs.keyframes < onset
     if len(discontinuities_new):
@@ -184,7 +193,7 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
     while True:
         pairs = overlap.pairs_before(limit)
         model = PairModel(pairs, old, new, config.deformation_sigma)
-        can_vote = pairs.count_by_keyframe(np.ones(len(pairs.view_pair), bool)) >= config.min_pairs_per_keyframe
+        can_vote = pairs.count_by_keyframe(np.ones(len(pairs.view_pair), bool)) >= MIN_PAIRS_PER_KEYFRAME
         consensus = _oldest_consensus(model, can_vote & np.isin(pairs.keyframes, before), config, rng, limit)
         if isinstance(consensus, Failure):
             return consensus
@@ -192,7 +201,7 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
             break
         limit, before = consensus.change, before[before < consensus.change]
     contradicted = ~consensus.votes.agrees[can_vote & (pairs.keyframes < oldest)]
-    if np.count_nonzero(contradicted) > config.max_misfits:
+    if np.count_nonzero(contradicted) > MAX_MISFITS:
         return Failure(FailureReason.AGREEMENT, f"{np.count_nonzero(contradicted)} older keyframes disagree")
     # Newer keyframes that nothing speaks against, and that part with it all the same: enough of them for another link.
     whole = PairModel(all_pairs, old, new, config.deformation_sigma)
@@ -238,9 +247,9 @@ class _Consensus:
 
 
 def _look_back(old: Submap, keyframe_id: int, config: LinkingConfig) -> int:
-    """Return the id of the keyframe that stands `config.look_back` before one of the old map's."""
+    """Return the id of the keyframe that stands `LOOK_BACK` before one of the old map's."""
     ids = sorted(old.keyframes)
-    return ids[max(ids.index(keyframe_id) - config.look_back, 0)]
+    return ids[max(ids.index(keyframe_id) - LOOK_BACK, 0)]
 
 
 def _needs_older(n: int, config: LinkingConfig, onset: int | None, change: int | None = None) -> Failure:
@@ -277,7 +286,7 @@ def _oldest_consensus(
             continue
         votes = ask_keyframes(model, estimate.S_dst_src, config)
         agrees = votes.agrees[rows]
-        n_run = leading_run(agrees, config.max_misfits)
+        n_run = leading_run(agrees, MAX_MISFITS)
         if n_run == len(rows):
             return _Consensus(estimate, votes, chosen & votes.agrees, seen, estimate.inliers, change)
         if n_run > 0:  # it holds for the oldest: keep those
@@ -303,9 +312,9 @@ def _fit(model: PairModel, used: BoolArray, config: LinkingConfig, rng: Generato
         model.covariance_old[rows],
         rng,
         min_inliers=config.min_inliers,
-        max_hypotheses=config.max_hypotheses,
-        chi2_gate=config.pair_chi2,
-        scale_bounds=(1.0 / config.max_scale, config.max_scale),
+        max_hypotheses=MAX_HYPOTHESES,
+        chi2_gate=PAIR_CHI2,
+        scale_bounds=(1.0 / MAX_SCALE, MAX_SCALE),
     )
     if isinstance(estimate, Failure):
         return estimate
@@ -320,7 +329,7 @@ def _verify(
     """Pass a consensus through the gates."""
     S, keyframes, inliers = consensus.estimate.S_dst_src, consensus.keyframes, consensus.inliers
     ratio, n_agreeing = consensus.inlier_ratio, int(keyframes.sum())
-    if ratio <= config.min_majority:
+    if ratio <= MIN_MAJORITY:
         detail = f"{ratio:.0%} of {int(consensus.seen.sum())} pairs agree"
         return Failure(FailureReason.LOW_INLIER_RATIO, detail, {"inlier_ratio": ratio})
     if n_agreeing < config.min_keyframes:
@@ -358,7 +367,7 @@ def _link(
         change_point = limit if change_point is None else min(limit, change_point)
     holds = np.isin(every.keyframes, c.keyframes[consensus.keyframes])
     holds |= later.agrees & (every.keyframes < (np.inf if change_point is None else change_point))
-    same = (whole.mahalanobis2(S) < config.pair_chi2) & every.pairs_seen_in(holds)
+    same = (whole.mahalanobis2(S) < PAIR_CHI2) & every.pairs_seen_in(holds)
     on = consensus.keyframes
     numbers = {
         "scale": float(sim3.scale(S)),

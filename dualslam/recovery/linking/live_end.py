@@ -13,6 +13,7 @@ from dualslam.core.types import Failure, FailureReason
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking.camera_bend import NO_BEND, Bend
 from dualslam.recovery.linking.estimate import LinkEstimate
+from dualslam.recovery.linking.gates import PIXEL_CHI2
 from dualslam.recovery.linking.scale_observability import scale_sigma_between
 
 HOPELESS = 3.0
@@ -48,7 +49,7 @@ def propagate_to_live_end(
         the camera's, `sigma_scale_camera`, where there is one.
     """
     live = np.array([k for k in new.keyframes if k >= live_since], np.int64)
-    walk = scale_sigma_between(new, link.agreeing_keyframes, live, config.pixel_chi2)
+    walk = scale_sigma_between(new, link.agreeing_keyframes, live, PIXEL_CHI2)
     sigma = math.hypot(link.numbers["sigma_scale"], walk, bend.log_scale)
     numbers = {"sigma_scale": sigma, "sigma_scale_reverse": walk}
     if bend.log_scale:

@@ -10,6 +10,7 @@ import numpy as np
 from dualslam.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
+from dualslam.recovery.linking.gates import GATE_SIGMAS
 from dualslam.recovery.linking.pairs import PairModel
 
 UNTESTABLE = 3.0
@@ -42,7 +43,7 @@ class Deviation:
 def _beyond(value: float, sigma: float, config: LinkingConfig) -> bool:
     """Whether a deviation is significant under its noise and the allowed deformation."""
     allowed = config.deformation_sigma
-    return sigma < UNTESTABLE * allowed and abs(value) > config.gate_sigmas * math.hypot(sigma, allowed)
+    return sigma < UNTESTABLE * allowed and abs(value) > GATE_SIGMAS * math.hypot(sigma, allowed)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,6 +14,15 @@ from dualslam.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.submap import Submap
+from dualslam.recovery.linking.gates import (
+    GATE_SIGMAS,
+    MIN_MAJORITY,
+    MIN_PAIRS_PER_KEYFRAME,
+    MIN_TIES,
+    PAIR_CHI2,
+    PIXEL_CHI2,
+    TIE_WINDOW,
+)
 from dualslam.recovery.linking.pairs import PairModel, pixel_chi2
 
 
@@ -52,10 +61,10 @@ def ask_keyframes(model: PairModel, S_old_new: FloatArray, config: LinkingConfig
     every = np.ones(len(c.view_pair), bool)
     n = c.count_by_keyframe(every)
     per = np.maximum(n, 1)
-    near = model.mahalanobis2(S_old_new) < config.pair_chi2
+    near = model.mahalanobis2(S_old_new) < PAIR_CHI2
     share = c.count_by_keyframe(near[c.view_pair]) / per
     residuals = (*model.reprojection2(S_old_new), *model.own_reprojection2())
-    share_pixels = np.min([c.count_by_keyframe(chi2 < config.pixel_chi2) for chi2 in residuals], axis=0) / per
+    share_pixels = np.min([c.count_by_keyframe(chi2 < PIXEL_CHI2) for chi2 in residuals], axis=0) / per
     T_moved = sim3.act_on_pose(S_old_new, model.T_new_kf)
     turn = so3.log(T_moved[:, :3, :3].swapaxes(1, 2) @ model.T_old_kf[:, :3, :3])
     rotation = np.sqrt((turn**2).sum(1))
@@ -64,10 +73,10 @@ def ask_keyframes(model: PairModel, S_old_new: FloatArray, config: LinkingConfig
     distance = np.linalg.norm(c.xyz_old[c.view_pair] - centres[c.view_keyframe], axis=1)
     depth = np.array([np.median(distance[c.view_keyframe == k]) for k in range(len(c.keyframes))])
     reach = np.maximum(depth, np.linalg.norm(centres - model.centre_old, axis=1))
-    bound = config.gate_sigmas * config.deformation_sigma
-    agrees = (share > config.min_majority) & (share_pixels > config.min_majority)
+    bound = GATE_SIGMAS * config.deformation_sigma
+    agrees = (share > MIN_MAJORITY) & (share_pixels > MIN_MAJORITY)
     agrees &= (rotation < bound) & (apart < bound * reach)
-    return KeyframeVotes(n, share, share_pixels, rotation, apart / reach, agrees, n >= config.min_pairs_per_keyframe)
+    return KeyframeVotes(n, share, share_pixels, rotation, apart / reach, agrees, n >= MIN_PAIRS_PER_KEYFRAME)
 
 
 def leading_run(agrees: BoolArray, max_misfits: int) -> int:
@@ -102,22 +111,22 @@ def find_discontinuities(submap: Submap, oldest: int, newest: int, config: Linki
         Keyframe ids; the places after `oldest` up to before `newest` are searched.
     config : LinkingConfig
     """
-    w = config.tie_window
+    w = TIE_WINDOW
     ids = np.array(sorted(submap.keyframes))
     first, last = int(np.searchsorted(ids, oldest, "right")), int(np.searchsorted(ids, newest, "right"))
     start = max(first - w, 0)
     ids = ids[start : last + w]
-    seen, good = _own_agreement(submap, ids, config.pixel_chi2)
+    seen, good = _own_agreement(submap, ids, PIXEL_CHI2)
     places = range(max(first - start, 1), last - start)
     torn, contrast = np.zeros((2, len(ids)), bool), np.zeros(len(ids))
     for i in places:
         before, after = slice(max(i - w, 0), i), slice(i, i + w)
         ties = good[:, before].any(1) & good[:, after].any(1)
-        torn[0, i] = np.count_nonzero(ties) < config.min_ties
+        torn[0, i] = np.count_nonzero(ties) < MIN_TIES
         followed = (seen[:, before].sum(1) >= 2) & (seen[:, after].sum(1) >= 2)
-        if np.count_nonzero(followed) >= config.min_ties:
+        if np.count_nonzero(followed) >= MIN_TIES:
             share = [good[followed, side].sum() / seen[followed, side].sum() for side in (before, after)]
-            torn[1, i] = min(share) <= config.min_majority
+            torn[1, i] = min(share) <= MIN_MAJORITY
             contrast[i] = abs(share[0] - share[1])
     # Windows that reach over a discontinuity disagree already beside it: of such neighbours the clearest is the place.
     for run in np.split(np.arange(len(ids)), np.flatnonzero(np.diff(torn[1].astype(int))) + 1):

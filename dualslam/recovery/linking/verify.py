@@ -10,6 +10,14 @@ from dualslam.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
+from dualslam.recovery.linking.gates import (
+    GATE_SIGMAS,
+    MIN_DEPTH_SPREAD,
+    MIN_IMAGE_SPREAD,
+    MIN_MAJORITY,
+    PIXEL_CHI2,
+    STRAIN_CHI2,
+)
 from dualslam.recovery.linking.pairs import PairModel
 from dualslam.recovery.linking.scale_observability import scale_sigma_between
 from dualslam.recovery.linking.shape import Shape
@@ -19,8 +27,8 @@ def check_own_pixels(model: PairModel, views: BoolArray, config: LinkingConfig) 
     """Refuse where either map's points do not lie on that map's own pixels: mirrored or bent copies give way here."""
     in_old, in_new = model.own_reprojection2()
     for name, chi2 in (("old", in_old), ("new", in_new)):
-        share = float((chi2[views] < config.pixel_chi2).mean())
-        if share <= config.min_majority:
+        share = float((chi2[views] < PIXEL_CHI2).mean())
+        if share <= MIN_MAJORITY:
             detail = f"{share:.0%} of the {name} map's matched points lie on their own pixels"
             return Failure(FailureReason.REPROJECTION, detail, {f"own_share_{name}": share})
     return None
@@ -32,8 +40,8 @@ def check_reprojection(
     """Refuse where the points of one map do not fall on the pixels of the other, in either direction."""
     in_old, in_new = model.reprojection2(S_old_new)
     for name, chi2 in (("old", in_old), ("new", in_new)):
-        share = float((chi2[views] < config.pixel_chi2).mean())
-        if share <= config.min_majority:
+        share = float((chi2[views] < PIXEL_CHI2).mean())
+        if share <= MIN_MAJORITY:
             detail = f"{share:.0%} of the points of the other map fall on the {name} map's pixels"
             return Failure(FailureReason.REPROJECTION, detail, {f"share_in_{name}": share})
     return None
@@ -50,7 +58,7 @@ def check_spread(
     covered = np.ptp(np.percentile(c.uv_old[views], [5, 95], axis=0), axis=0)
     share = covered / np.maximum(np.ptp(np.percentile(features, [5, 95], axis=0), axis=0), 1e-9)
     numbers = {"spread_u": float(share[0]), "spread_v": float(share[1])}
-    if share.min() < config.min_image_spread:
+    if share.min() < MIN_IMAGE_SPREAD:
         return Failure(FailureReason.SPREAD, f"{share.min():.0%} of the image is covered", numbers)
     depth = model.depths_old()
     ranges = []
@@ -58,7 +66,7 @@ def check_spread(
         near, middle, far = np.percentile(depth[views & (c.view_keyframe == k)], [10, 50, 90])
         ranges.append((far - near) / middle)
     numbers["spread_depth"] = float(np.median(ranges))
-    if np.median(ranges) < config.min_depth_spread:
+    if np.median(ranges) < MIN_DEPTH_SPREAD:
         return Failure(FailureReason.SPREAD, f"depths differ by {np.median(ranges):.1%}", numbers)
     return None
 
@@ -81,14 +89,14 @@ def check_parting(
     nothing of it (HoloLens, a gap relocalisation of 24 frames: 47 % off, where the old map left 3 % open and the new
     one 0.7 %).
     """
-    sigma_old, sigma_new = (scale_sigma_between(m, agreeing, parted, config.pixel_chi2) for m in (old, new))
+    sigma_old, sigma_new = (scale_sigma_between(m, agreeing, parted, PIXEL_CHI2) for m in (old, new))
     apart = _log_scale_at(model, parted) - math.log(sim3.scale(S_old_new))
     numbers = {"parted": float(len(parted)), "change_point": float(parted[0])}
     numbers |= {"held_old": sigma_old, "held_new": sigma_new, "log_scale": apart}
-    if abs(apart) > config.gate_sigmas * math.hypot(sigma_old, sigma_new):
+    if abs(apart) > GATE_SIGMAS * math.hypot(sigma_old, sigma_new):
         detail = f"the maps part by {apart:+.0%} in scale at {len(parted)} newer keyframes, and neither is torn"
         return Failure(FailureReason.AGREEMENT, detail, numbers)
-    if math.isfinite(sigma_new) and sigma_old > config.gate_sigmas * sigma_new:
+    if math.isfinite(sigma_new) and sigma_old > GATE_SIGMAS * sigma_new:
         return None
     detail = f"the maps part at {len(parted)} newer keyframes, and either may be the bent one"
     return Failure(FailureReason.AGREEMENT, detail, numbers)
@@ -131,7 +139,7 @@ def sigma_numbers(model: PairModel, S_old_new: FloatArray, covariance: FloatArra
 def check_shape(shape: Shape, config: LinkingConfig) -> Failure | None:
     """Refuse maps of different shape: stretched or sheared as a whole, or parts that want another scale or rotation."""
     chi2 = shape.strain_chi2(config)
-    if chi2 > config.strain_chi2:
+    if chi2 > STRAIN_CHI2:
         strain = float(np.linalg.norm(shape.strain))
         numbers = {"strain": strain, "strain_chi2": chi2}
         return Failure(FailureReason.DEFORMED, f"stretched by {strain:.1%}", numbers)

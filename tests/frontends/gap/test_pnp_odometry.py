@@ -261,7 +261,7 @@ class TestGapRelocalisation:
     def test_a_small_step_is_decided_by_landmarks_that_are_still_seen(self) -> None:
         """The auxiliary front end's own points keep no scale here, and one frame is missing: the live landmarks do."""
         live, auxiliary = worlds(range(38, 40))
-        config = Config.model_validate({"recovery": {"max_gap_scale_sigma": 1e-4}})
+        config = Config.model_validate({"linking": {"wrong_scale": 1e-4}})
         reverse_tracker = odometry(live, auxiliary, config)
         steps = walk(reverse_tracker, live, range(39, 29, -1))
         assert all(steps[i] for i in range(37, 29, -1))
@@ -272,7 +272,7 @@ class TestGapRelocalisation:
 
     def test_a_scale_that_is_not_known_is_refused(self) -> None:
         live, auxiliary = worlds(self.covered)
-        config = Config.model_validate({"recovery": {"max_gap_scale_sigma": 1e-4}})
+        config = Config.model_validate({"linking": {"wrong_scale": 1e-4}})
         reverse_tracker = odometry(live, auxiliary, config)
         steps = walk(reverse_tracker, live, range(39, 14, -1))
         assert not any(steps.values())

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.config.settings import Config, KeyframeConfig, MappingConfig
+from dualslam.config.settings import Config, KeyframeConfig
+from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.interfaces import KeyframeReport
 from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe, Track, View
@@ -241,7 +242,7 @@ class TestMapping:
                 error = (CAMERA.project(se3.act(T_cam_submap, xyz_mu[None]))[0] - uv_px[i]) / sigma_px[i]
                 chi2.append(error @ error)
             worst[noise2] = max(chi2)
-        gate = MappingConfig().reprojection_chi2
+        gate = CHI2_95[2]
         assert worst[0.25] < 0.25 * gate < worst[1.0] < gate
         assert 0 < n_new[0.25] < n_new[1.0] == n_new[4.0]
 

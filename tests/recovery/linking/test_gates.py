@@ -8,6 +8,7 @@ from dualslam.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure, FailureReason
 from dualslam.recovery.linking import propose_correspondences, shape, verify
+from dualslam.recovery.linking.gates import PAIR_CHI2, PIXEL_CHI2, STRAIN_CHI2
 from dualslam.recovery.linking.pairs import STRAINS, PairModel
 from dualslam.recovery.linking.timeline import ask_keyframes, find_discontinuities, leading_run
 from dualslam.testing.adversaries import ONSET_ID, corrupted_tail
@@ -23,7 +24,7 @@ def model_of(case: Case, deformation_sigma: float = CONFIG.deformation_sigma) ->
 
 def everything(model: PairModel, S) -> tuple[np.ndarray, np.ndarray]:
     """Inliers and keyframes, all that agree."""
-    return model.mahalanobis2(S) < CONFIG.pair_chi2, np.ones(len(model.pairs.keyframes), bool)
+    return model.mahalanobis2(S) < PAIR_CHI2, np.ones(len(model.pairs.keyframes), bool)
 
 
 def judge_shape(model: PairModel, S, inliers, keyframes) -> Failure | None:
@@ -32,9 +33,9 @@ def judge_shape(model: PairModel, S, inliers, keyframes) -> Failure | None:
 
 
 def test_gates_are_the_quantiles_that_they_say():
-    assert CONFIG.pair_chi2 == pytest.approx(stats.chi2.ppf(0.99, 3), abs=1e-3)
-    assert CONFIG.pixel_chi2 == pytest.approx(stats.chi2.ppf(0.99, 2), abs=1e-3)
-    assert CONFIG.strain_chi2 == pytest.approx(stats.chi2.ppf(0.999, 5), abs=1e-3)
+    assert pytest.approx(stats.chi2.ppf(0.99, 3), abs=1e-3) == PAIR_CHI2
+    assert pytest.approx(stats.chi2.ppf(0.99, 2), abs=1e-3) == PIXEL_CHI2
+    assert pytest.approx(stats.chi2.ppf(0.999, 5), abs=1e-3) == STRAIN_CHI2
 
 
 @pytest.mark.parametrize(
@@ -67,7 +68,7 @@ def test_a_wrong_pose_tears_a_map_where_it_stands(layout, seed, ties):
 def test_normal_equations_are_the_derivatives():
     case = make_case("room", 0)
     model = model_of(case)
-    used = model.mahalanobis2(case.S_old_new) < CONFIG.pair_chi2
+    used = model.mahalanobis2(case.S_old_new) < PAIR_CHI2
     H, g = model.normal_equations(case.S_old_new, used)
     A = case.S_old_new[:3, :3]
     W = np.linalg.inv(model.covariance_old + A @ model.covariance_new @ A.T)[used]
@@ -90,7 +91,7 @@ def test_reprojection_both_ways_is_whitened():
     case = make_case("street", 1, drift=0.0, outliers=0.0)
     model = model_of(case)
     for chi2 in model.reprojection2(case.S_old_new):
-        assert (chi2 < CONFIG.pixel_chi2).mean() > 0.98
+        assert (chi2 < PIXEL_CHI2).mean() > 0.98
 
 
 def test_every_keyframe_of_a_true_link_agrees_and_none_of_a_wrong_one():

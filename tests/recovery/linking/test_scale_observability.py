@@ -15,6 +15,7 @@ from dualslam.map.solving import solve
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking import DescriptorMatcher, LinkEstimate, estimate, estimate_link, propagate_to_live_end
 from dualslam.recovery.linking.correspondences import propose_correspondences
+from dualslam.recovery.linking.gates import GATE_SIGMAS, MIN_TIES, PIXEL_CHI2
 from dualslam.recovery.linking.pairs import PairModel
 from dualslam.recovery.linking.scale_observability import scale_sigma_between
 from dualslam.recovery.linking.verify import check_parting
@@ -63,7 +64,7 @@ def test_the_sigma_is_that_of_the_error(layout: str) -> None:
     whitened = []
     for seed in range(8):
         world, submap = solved(layout, seed)
-        sigma = scale_sigma_between(submap, HERE, THERE, CONFIG.pixel_chi2)
+        sigma = scale_sigma_between(submap, HERE, THERE, PIXEL_CHI2)
         whitened.append((log_scale(world, submap, THERE) - log_scale(world, submap, HERE)) / sigma)
     assert 0.2 < np.sqrt(np.mean(np.square(whitened))) < 2.0, whitened
 
@@ -82,20 +83,19 @@ def thinned(submap: Submap, place: int, n_ties: int) -> Submap:
 def test_fewer_ties_hold_less_and_none_hold_nothing() -> None:
     _, submap = solved("street", 0)
     sigmas = [
-        scale_sigma_between(thinned(submap, 12 * FRAME_STEP, n), HERE, THERE, CONFIG.pixel_chi2)
-        for n in (1000, 30, 12, 0)
+        scale_sigma_between(thinned(submap, 12 * FRAME_STEP, n), HERE, THERE, PIXEL_CHI2) for n in (1000, 30, 12, 0)
     ]
     assert (np.diff(sigmas) > 0).all()
     assert sigmas[2] > 2 * sigmas[0]
     assert sigmas[3] == np.inf
-    assert scale_sigma_between(submap, HERE, np.array([10_000]), CONFIG.pixel_chi2) == np.inf
+    assert scale_sigma_between(submap, HERE, np.array([10_000]), PIXEL_CHI2) == np.inf
 
 
 def test_the_unit_does_not_matter() -> None:
     _, submap = solved("room", 1)
-    before = scale_sigma_between(submap, HERE, THERE, CONFIG.pixel_chi2)
+    before = scale_sigma_between(submap, HERE, THERE, PIXEL_CHI2)
     submap.transform(7.0, se3.exp(np.array([0.3, -0.2, 0.5, 3.0, 1.0, -2.0])))
-    assert scale_sigma_between(submap, HERE, THERE, CONFIG.pixel_chi2) == pytest.approx(before, rel=1e-3)
+    assert scale_sigma_between(submap, HERE, THERE, PIXEL_CHI2) == pytest.approx(before, rel=1e-3)
 
 
 # --- the live end
@@ -121,7 +121,7 @@ def test_a_link_is_carried_to_the_live_end_with_what_the_walk_loses() -> None:
 def test_a_walk_that_hangs_by_few_landmarks_carries_no_link() -> None:
     """There are ties enough that nothing counts as torn."""
     case, link = linked()
-    for n_ties in (CONFIG.min_ties + 2, 0):
+    for n_ties in (MIN_TIES + 2, 0):
         refused = propagate_to_live_end(link, thinned(case.new, 18 * FRAME_STEP, n_ties), int(THERE[0]), CONFIG)
         assert isinstance(refused, Failure)
         assert refused.reason in (FailureReason.SCALE, FailureReason.SCALE_LOST)
@@ -132,8 +132,8 @@ def test_what_more_keyframes_cannot_cure_is_said_to_be_lost() -> None:
     case, link = linked()
     live_since = int(THERE[0])
     live = np.array([k for k in case.new.keyframes if k >= live_since])
-    walk = scale_sigma_between(case.new, link.agreeing_keyframes, live, CONFIG.pixel_chi2)
-    strict = CONFIG.model_copy(update={"max_live_scale_sigma": walk / 1.5})
+    walk = scale_sigma_between(case.new, link.agreeing_keyframes, live, PIXEL_CHI2)
+    strict = CONFIG.model_copy(update={"wrong_scale": 2 * walk / 1.5})
     assert len(link.agreeing_keyframes) >= 4
     reasons = []
     for n in (4, 16):
@@ -206,8 +206,8 @@ def test_it_is_not_where_the_maps_part_by_more_than_it_leaves_open(rate: float, 
     """Two landmarks hold the old map to 7 %: that explains a few per cent, and not a quarter."""
     case, _ = bent_walk(0, rate)
     loose = thinned(case.old, 10 * FRAME_STEP, 2)
-    sigmas = [scale_sigma_between(m, AGREEING, PARTED, CONFIG.pixel_chi2) for m in (loose, case.new)]
-    assert CONFIG.gate_sigmas * sigmas[1] < sigmas[0] < 0.1
+    sigmas = [scale_sigma_between(m, AGREEING, PARTED, PIXEL_CHI2) for m in (loose, case.new)]
+    assert GATE_SIGMAS * sigmas[1] < sigmas[0] < 0.1
     refused = blame(case, loose, case.new)
     assert (refused is None) is is_possible
     if refused is not None:
