@@ -24,10 +24,10 @@ import cv2
 import numpy as np
 
 from dualslam.backend.local_ba import bundle_adjust_arrays
-from dualslam.build import view_of
 from dualslam.config.files import load_config
 from dualslam.config.settings import Config
 from dualslam.core.types import FloatArray, Start, View
+from dualslam.frontends.frame_reader import view_of
 from dualslam.frontends.registry import create_frontend
 from dualslam.frontends.tracking.initialiser import Initialiser
 from dualslam.lab.audits.link_audit import truth_by_frame

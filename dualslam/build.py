@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -19,15 +20,13 @@ from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.camera.corrected import CorrectedCamera
 from dualslam.core.camera.models import Camera
-from dualslam.core.camera.rectification import rectify
 from dualslam.core.errors import ConfigError
-from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend, PreferredCamera, SelfCalibrator, SubmapGraph, WindowSolver
 from dualslam.core.threads import spare_cores
-from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, IntArray, View
+from dualslam.core.types import Failure, FloatArray, IntArray
 from dualslam.frontends.features.image_features import ImageFeatures
-from dualslam.frontends.features.images import to_grey
 from dualslam.frontends.features.motion_statistics import nearest_search
+from dualslam.frontends.frame_reader import FrameReader
 from dualslam.frontends.gap.auxiliary_features import AuxiliaryFeatures, BufferedFeatures, OwnFeatures
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry, Route
 from dualslam.frontends.gap.refinding import Refinder
@@ -127,19 +126,8 @@ def build_system(
     faults = FaultScript(config.corruptions)
     shutter = RollingShutter(frontend, config.camera, config.seed)
 
-    sigma_px = config.camera.model_sigma_px
-
-    def calibrated() -> Camera:
-        return calibration.camera
-
-    def corrected_view_of(frame: Frame) -> View | Failure:
-        camera = calibration.camera
-        view = view_of(frame, frontend, camera, config.camera.model_sigma_px)
-        return view if isinstance(view, Failure) else shutter.shutter_corrected(view, camera)
-
-    def odometry(submap: Submap, graph: SubmapGraph, n_covering: int = 0) -> VisualFrontEnd:
-        refinder = Refinder(submap, frontend, calibrated, sigma_px)
-        return VisualFrontEnd(frontend, config, submap, graph, size_px, refinder, n_covering, window_solver(config))
+    live = LiveParts(config, frontend, calibration, size_px)
+    reader = FrameReader(frontend, live.camera, config.camera.model_sigma_px, shutter)
 
     workers = config.recovery.workers
     if recovery is None:
@@ -152,13 +140,11 @@ def build_system(
 
     return System(
         Components(
-            view_of=faults.around_views(corrected_view_of),
-            new_starter=lambda: Initialiser(
-                frontend, _adjuster(config), config.initialiser, calibration.camera.K, size_px, config.seed
-            ),
-            new_graph=graphs.new_graph if graphs is not None else lambda: ISam2SubmapGraph(config.graph),
-            new_odometry=faults.around_odometry(odometry),
-            new_relocaliser=faults.around_odometry(partial(odometry, n_covering=config.recovery.covering_keyframes)),
+            view_of=faults.around_views(reader),
+            new_starter=live.new_starter,
+            new_graph=graphs.new_graph if graphs is not None else live.new_graph,
+            new_odometry=faults.around_odometry(live.new_odometry),
+            new_relocaliser=faults.around_odometry(live.new_relocaliser),
             calibration=calibration,
             shutter=shutter,
             recovery=recovery,
@@ -172,6 +158,49 @@ def build_system(
         saved,
         localise,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class LiveParts:
+    """What the system makes anew with each start and each submap: the stations of a frame's walk after its features.
+
+    `FrameReader` finds a frame's features; `Initialiser` starts a map from them; `VisualFrontEnd` poses the frames that
+    follow, and extends the map by keyframes; `ISam2SubmapGraph` solves it.
+    """
+
+    config: Config
+    frontend: Frontend
+    calibration: Calibration
+    size_px: tuple[int, int]
+
+    def camera(self) -> Camera:
+        """Return the camera as it is known now."""
+        return self.calibration.camera
+
+    def new_starter(self) -> Initialiser:
+        """Make what collects views until two of them start a map."""
+        config = self.config
+        return Initialiser(
+            self.frontend, _adjuster(config), config.initialiser, self.camera().K, self.size_px, config.seed
+        )
+
+    def new_graph(self) -> ISam2SubmapGraph:
+        """Make the factor graph of a submap, solved in this process."""
+        return ISam2SubmapGraph(self.config.graph)
+
+    def new_odometry(self, submap: Submap, graph: SubmapGraph) -> VisualFrontEnd:
+        """Make the front end that tracks frames against a submap and extends it."""
+        return self._front_end(submap, graph, 0)
+
+    def new_relocaliser(self, submap: Submap, graph: SubmapGraph) -> VisualFrontEnd:
+        """Make one that looks in the whole submap, and not only at what is near in time."""
+        return self._front_end(submap, graph, self.config.recovery.covering_keyframes)
+
+    def _front_end(self, submap: Submap, graph: SubmapGraph, n_covering: int) -> VisualFrontEnd:
+        config, frontend = self.config, self.frontend
+        refinder = Refinder(submap, frontend, self.camera, config.camera.model_sigma_px)
+        window = window_solver(config)
+        return VisualFrontEnd(frontend, config, submap, graph, self.size_px, refinder, n_covering, window)
 
 
 def place_parts(config: Config, frontend: Frontend, size_px: tuple[int, int]) -> PlaceParts:
@@ -370,20 +399,6 @@ def _naming_attempt(number: int) -> Iterator[None]:
         yield
     except ConfigError as error:
         raise ConfigError(f"recovery.attempts[{number}]: {error}") from error
-
-
-def view_of(frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: float) -> View | Failure:
-    """Find a frame's features and take the lens distortion out of them."""
-    if frame.image is None:
-        return Failure(FailureReason.UNREADABLE, frame.error)
-    height, width = frame.image.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        return Failure(
-            FailureReason.UNREADABLE,
-            f"frame {frame.index} is {width}x{height}, the calibration is for {camera.width}x{camera.height}",
-        )
-    features = rectify(frontend.extract(frame.image), camera, model_sigma_px)
-    return View(frame.index, frame.timestamp_s, features, GreyImage.of(to_grey(frame.image)))
 
 
 def _adjuster(config: Config) -> BundleAdjuster:

@@ -344,7 +344,7 @@ class System:
         n = int((submap.landmark_of[view.index] >= 0).sum())
         T_cam_submap = se3.inverse(submap.T_submap_kf[view.index])
         ids = submap.landmark_of[view.index]
-        return Track(view, T_cam_submap, T_cam_submap, ids, n, n, n, 1.0, False, np.zeros((6, 6)))
+        return Track(view, T_cam_submap, T_cam_submap, ids, np.zeros(0, np.int64), n, n, 1.0, False, np.zeros((6, 6)))
 
     # --- tracking
 
@@ -395,6 +395,8 @@ class System:
         self._posed_at = time.perf_counter()
         if self.on_pose is not None:
             self.on_pose(track)
+        if not self._localises:
+            odometry.submap.count_sightings(track)
         if track.wide:
             self._record.event(EventKind.GAP_RELOCALISED, view, odometry.submap.id, n_inliers=track.n_inliers)
         if self._localises:

@@ -28,7 +28,7 @@ def track(i: int, innovation: np.ndarray, **changes: Any) -> Track:
         se3.exp(innovation) @ T_predicted,
         T_predicted,
         np.zeros(0, np.int64),
-        n_visible=300,
+        visible_ids=np.zeros(0, np.int64),
         covariance=1e-8 * np.eye(6),
         **numbers,
     )

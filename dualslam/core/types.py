@@ -191,8 +191,10 @@ class Track:
         What the motion model said.
     landmark_ids : (N,) int64
         For each feature of the view the landmark it agrees with, or `NO_LANDMARK`.
-    n_visible, n_matches, n_inliers : int
-        Landmarks that should be seen, were matched, and agree with the pose.
+    visible_ids : (V,) int64
+        Landmarks that the search expected to see; none where the pose came from elsewhere.
+    n_matches, n_inliers : int
+        Landmarks that were matched, and that agree with the pose.
     chi2 : float
         Mean squared whitened residual per degree of freedom of the inliers.
     wide : bool
@@ -205,7 +207,7 @@ class Track:
     T_cam_submap: FloatArray
     T_predicted: FloatArray
     landmark_ids: IntArray
-    n_visible: int
+    visible_ids: IntArray
     n_matches: int
     n_inliers: int
     chi2: float

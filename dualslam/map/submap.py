@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe, Start
+from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe, Start, Track
 from dualslam.map.tables import Table
 
 NO_LANDMARK = -1
@@ -229,6 +229,12 @@ class Submap:
             return
         self.landmarks["alive"][landmark_ids] = False
         self.remove_observations(self.rows_of_landmarks(landmark_ids))
+
+    def count_sightings(self, track: Track) -> None:
+        """Take in which landmarks a frame should have shown, and which it did: the rarely found are culled."""
+        if len(track.visible_ids):
+            self.landmarks["n_visible"][track.visible_ids] += 1
+            self.landmarks["n_found"][track.landmark_ids[track.landmark_ids >= 0]] += 1
 
     def merge_landmarks(self, keep: IntArray, drop: IntArray) -> None:
         """Make each ``drop[i]`` one with ``keep[i]``: its observations move over, save where both are in a keyframe."""

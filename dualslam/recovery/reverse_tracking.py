@@ -380,6 +380,7 @@ def _track_one(reverse_tracker: VisualOdometry, view: View, track: Track | Failu
     """Make a frame that was posed a keyframe where it is wanted or due."""
     if isinstance(track, Failure):
         return ReverseStep(view, track, None)
+    reverse_tracker.submap.count_sightings(track)
     is_new = view.index not in reverse_tracker.submap.keyframes
     if not ((is_wanted and is_new) or reverse_tracker.keyframe_due(track)):
         return ReverseStep(view, track, None)

@@ -75,8 +75,9 @@ class _Beyond(BeyondGap):
         """Return the frame with a pose that it was given in the end, and no landmarks."""
         wide, ids = self.pose, np.full(len(self.view.features), NO_LANDMARK, np.int64)
         n, n_inliers = len(wide.inliers), int(wide.inliers.sum())
-        numbers = (n, n, n_inliers, wide.chi2)
-        return Track(self.view, T_cam_submap, T_cam_submap, ids, *numbers, wide=True, covariance=wide.covariance)
+        numbers = (n, n_inliers, wide.chi2)
+        none = np.zeros(0, np.int64)
+        return Track(self.view, T_cam_submap, T_cam_submap, ids, none, *numbers, wide=True, covariance=wide.covariance)
 
 
 class PnpOdometry:

@@ -154,7 +154,7 @@ class Tracker:
         self._local = LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(keyframe_ids))
         landmark_ids = np.full(len(view.features), NO_LANDMARK, np.int64)
         grid = FeatureGrid.build(view.features.uv_rect_px)
-        landmark_ids, visible = self._search_local_map(view, grid, pose.T_cam_submap, landmark_ids)
+        landmark_ids, _ = self._search_local_map(view, grid, pose.T_cam_submap, landmark_ids)
         feature = np.flatnonzero(landmark_ids >= 0)
         uv, _ = project_points(
             self._submap.K, pose.T_cam_submap, self._submap.landmarks["xyz_mu"][landmark_ids[feature]]
@@ -168,7 +168,7 @@ class Tracker:
             T,
             T,
             landmark_ids,
-            len(visible),
+            np.zeros(0, np.int64),
             pose.n_matches,
             pose.n_inliers,
             pose.chi2,
@@ -344,14 +344,12 @@ class Tracker:
         if estimate.n_inliers < self._config.min_inliers:
             return Failure(FailureReason.TOO_FEW_INLIERS, f"{estimate.n_inliers} inliers of {len(ids)} matches")
         landmark_ids[feature[~estimate.inliers]] = NO_LANDMARK
-        submap.landmarks["n_visible"][visible] += 1
-        submap.landmarks["n_found"][ids[estimate.inliers]] += 1
         return Track(
             view,
             estimate.T_cam_w,
             T_predicted,
             landmark_ids,
-            n_visible=len(visible),
+            visible_ids=visible,
             n_matches=len(ids),
             n_inliers=estimate.n_inliers,
             chi2=float(estimate.chi2[estimate.inliers].mean() / 2),

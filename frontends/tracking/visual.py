@@ -88,7 +88,9 @@ class VisualFrontEnd:
         T_cam_submap = se3.inverse(self.submap.T_submap_kf[keyframe_id])
         landmark_ids = self.submap.landmark_of[keyframe_id].copy()
         n = int((landmark_ids >= 0).sum())
-        track = Track(view, T_cam_submap, T_cam_submap, landmark_ids, n, n, n, 1.0, False, np.zeros((6, 6)))
+        track = Track(
+            view, T_cam_submap, T_cam_submap, landmark_ids, np.zeros(0, np.int64), n, n, 1.0, False, np.zeros((6, 6))
+        )
         self._tracker.start(track)
         self._reference_id = keyframe_id
         self._path = [keyframe_id]

@@ -106,7 +106,9 @@ class TestComposition:
 
 
 def track(n_matches: int = 100, n_inliers: int = 90, chi2: float = 1.0) -> Track:
-    return Track(view(0), np.eye(4), np.eye(4), np.zeros(0, int), 200, n_matches, n_inliers, chi2, False, np.eye(6))
+    return Track(
+        view(0), np.eye(4), np.eye(4), np.zeros(0, int), np.zeros(0, int), n_matches, n_inliers, chi2, False, np.eye(6)
+    )
 
 
 class TestHealth:

@@ -71,7 +71,7 @@ def track_of(view: View, T_cam_submap: FloatArray, ahead_m: float = POSE_OFF_M /
     """Pose a frame without any landmark, known so well that `nearly` is two standard deviations off."""
     ids = np.full(len(view.features), NO_LANDMARK, np.int64)
     covariance = np.diag([(POSE_OFF_RAD / 2) ** 2] * 3 + [0.1**2, 0.1**2, ahead_m**2])
-    return Track(view, T_cam_submap, T_cam_submap, ids, 0, 0, 0, 1.0, True, covariance)
+    return Track(view, T_cam_submap, T_cam_submap, ids, np.zeros(0, np.int64), 0, 0, 1.0, True, covariance)
 
 
 def depths_of_found(submap: Submap, track: Track) -> FloatArray:

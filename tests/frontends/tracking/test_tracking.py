@@ -68,6 +68,18 @@ def front_end(world: PointWorld, keyframes: list[int], start_at: int, every: int
     return live
 
 
+def test_tracking_leaves_the_map_alone_and_says_what_it_saw(world: PointWorld) -> None:
+    live = front_end(world, [0, 4, 8], start_at=8)
+    before = {name: column.copy() for name, column in live.submap.landmarks.columns().items()}
+    track = tracked(live, world.view(9))
+    assert all(np.array_equal(column, before[name]) for name, column in live.submap.landmarks.columns().items())
+    live.submap.count_sightings(track)
+    found = track.landmark_ids[track.landmark_ids >= 0]
+    after = live.submap.landmarks
+    assert (after["n_visible"] - before["n_visible"]).sum() == len(track.visible_ids)
+    assert (after["n_found"] - before["n_found"]).nonzero()[0].tolist() == sorted(found.tolist())
+
+
 @pytest.fixture
 def world() -> PointWorld:
     return PointWorld(cloud(), hand_held(80))

@@ -1,0 +1,54 @@
+"""From a frame to its view: the first steps of a frame's walk, in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from dualslam.core.camera.models import Camera
+from dualslam.core.camera.rectification import rectify
+from dualslam.core.grey_image import GreyImage
+from dualslam.core.interfaces import Frontend, Shutter
+from dualslam.core.types import Failure, FailureReason, Frame, View
+from dualslam.frontends.features.images import to_grey
+
+
+class FrameReader:
+    """Finds the features of live frames, as an ideal camera would have seen them.
+
+    Parameters
+    ----------
+    frontend : Frontend
+    camera : callable
+        Returns the camera as it is known now: self-calibration may change it between two frames.
+    model_sigma_px : float
+        Error of the camera model itself, see `CameraConfig.model_sigma_px`.
+    shutter : Shutter
+    """
+
+    def __init__(
+        self, frontend: Frontend, camera: Callable[[], Camera], model_sigma_px: float, shutter: Shutter
+    ) -> None:
+        self._frontend, self._camera, self._shutter = frontend, camera, shutter
+        self._model_sigma_px = model_sigma_px
+
+    def __call__(self, frame: Frame) -> View | Failure:
+        """Return the frame's view; a failure where there is no image, or one of another size."""
+        camera = self._camera()
+        # 1. Features of the image, and 2. the lens taken out of their pixels.
+        view = view_of(frame, self._frontend, camera, self._model_sigma_px)
+        # 3. The rows' times taken out, where the shutter is known to roll.
+        return view if isinstance(view, Failure) else self._shutter.shutter_corrected(view, camera)
+
+
+def view_of(frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: float) -> View | Failure:
+    """Find a frame's features and take the lens distortion out of them."""
+    if frame.image is None:
+        return Failure(FailureReason.UNREADABLE, frame.error)
+    height, width = frame.image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        return Failure(
+            FailureReason.UNREADABLE,
+            f"frame {frame.index} is {width}x{height}, the calibration is for {camera.width}x{camera.height}",
+        )
+    features = rectify(frontend.extract(frame.image), camera, model_sigma_px)
+    return View(frame.index, frame.timestamp_s, features, GreyImage.of(to_grey(frame.image)))
