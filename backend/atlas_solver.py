@@ -19,6 +19,7 @@ from dualslam.backend.edge_covariance import edge_covariances
 from dualslam.backend.refit import refit_points
 from dualslam.backend.sim3_graph import Sim3Edge, Sim3Prior, Sim3Solution, optimise_sim3
 from dualslam.core.atlas_problem import AtlasProblem, AtlasSolution
+from dualslam.core.chi_square import CHI2_99, MEDIAN_CHI2
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import sim3
 from dualslam.core.types import BoolArray, FloatArray, IntArray
@@ -34,10 +35,8 @@ MAX_PASSES = 4
 MAX_ITERATIONS = 100
 ODOMETRY = ("within", "rollover")
 """Kinds of edges that say how a camera went, and not where it has been before."""
-MEDIAN_CHI2 = 6.35
-"""With 7 degrees of freedom."""
-OUTLIER_CHI2 = 18.48
-"""The 0.99 quantile of chi-square with 7 degrees of freedom: the price of a rejection."""
+REJECTION_CHI2 = CHI2_99[7]
+"""The price of a rejection: an edge has 7 degrees of freedom."""
 LEAST_REDUNDANCY = 1e-6
 """Share of an edge's variance below which the rest of the graph has no say in it."""
 
@@ -163,7 +162,7 @@ class _Graph:
             return 1.0
         C, r = self._innovations(self.optimise(believed), believed, tested)
         chi2 = np.sort(np.einsum("ei,ei->e", r, np.linalg.solve(C, r[..., None])[..., 0]))
-        ratio2 = max(1.0, float(chi2[(len(chi2) - 1) // 2]) / MEDIAN_CHI2)
+        ratio2 = max(1.0, float(chi2[(len(chi2) - 1) // 2]) / MEDIAN_CHI2[7])
         for i in np.flatnonzero(odometry).tolist():
             self.edges[i] = replace(self.edges[i], covariance=ratio2 * self.edges[i].covariance)
         return float(np.sqrt(ratio2))
@@ -179,7 +178,7 @@ class _Graph:
             without = found.believed.copy()
             without[accused] = False
             other = self._settle(self._connected(without, doubtful, last=accused), doubtful)
-            if other.objective < found.objective - 0.5 * OUTLIER_CHI2:
+            if other.objective < found.objective - 0.5 * REJECTION_CHI2:
                 found = other
         return found.believed, found.chi2
 
@@ -197,7 +196,7 @@ class _Graph:
                 break
             believed = after
         cost = self.optimise(believed).cost_after
-        return _Choice(believed, chi2, cost + 0.5 * OUTLIER_CHI2 * np.count_nonzero(~believed))
+        return _Choice(believed, chi2, cost + 0.5 * REJECTION_CHI2 * np.count_nonzero(~believed))
 
     def _accused(self, believed: BoolArray, doubtful: BoolArray) -> list[int]:
         """Return the believed edges that two rejected ones or more would do without: one of them may be the wrong one.

@@ -11,10 +11,11 @@ import numpy as np
 from dualslam.backend import convert
 from dualslam.backend.factors import baseline_factor, pose_prior
 from dualslam.backend.gtsam_output import without_gtsam_output
-from dualslam.backend.noise import MEDIAN_CHI2_2DOF, PixelNoise
+from dualslam.backend.noise import PixelNoise
 from dualslam.backend.observability import MIN_DEPTH_MU
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.camera.corrected import LensCorrection
+from dualslam.core.chi_square import MEDIAN_CHI2
 from dualslam.core.types import FloatArray, IntArray
 
 ASPECT_SIGMA, SKEW_SIGMA, TANGENTIAL_SIGMA = 1e-4, 1e-7, 1e-7
@@ -152,7 +153,7 @@ def _noise_ratio(problem: BundleProblem, T: FloatArray, xyz: FloatArray, correct
     p_cam = np.einsum("rji,rj->ri", T[p.kf, :3, :3], xyz[p.point] - T[p.kf, :3, 3])
     uv = LensCorrection.of_vector(correction).distort_px(p.K, p_cam[:, :2] / p_cam[:, 2:])
     chi2 = ((uv - p.uv_px) ** 2).sum(1) / p.sigma_px**2
-    return max(MIN_NOISE_RATIO, math.sqrt(float(np.median(chi2)) / MEDIAN_CHI2_2DOF))
+    return max(MIN_NOISE_RATIO, math.sqrt(float(np.median(chi2)) / MEDIAN_CHI2[2]))
 
 
 def _to_cal3_ds2(K: FloatArray, correction: FloatArray) -> gtsam.Cal3DS2:

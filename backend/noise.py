@@ -5,7 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from dualslam.core.chi_square import CHI2_99
+from dualslam.core.chi_square import CHI2_99, MEDIAN_CHI2
 from dualslam.core.types import FloatArray, IntArray
 
 OUTLIER_CHI2 = CHI2_99[2]
@@ -20,7 +20,6 @@ GAUGE_SIGMA = 1e-5
 """Sigma of the priors that fix a gauge (rad, and submap units): tight, yet far from the limits of a double."""
 GAUGE_RANGE_RATIO = 1e-4
 """Sigma of the first baseline, relative to its length."""
-MEDIAN_CHI2_2DOF = 1.386
 MIN_VIEWS, MIN_OBSERVATIONS = 4, 400
 """What the residuals' variance is read from: landmarks of so many views, and so many of their observations, which put
 the median's own sigma at 7 %."""
@@ -51,7 +50,7 @@ def residual_variance(chi2: FloatArray, n_views: IntArray, least: float) -> floa
     if np.count_nonzero(tells) < MIN_OBSERVATIONS:
         return 1.0
     per_number = chi2[tells] / (1 - 1.5 / n_views[tells])
-    return max(least, float(np.median(per_number)) / MEDIAN_CHI2_2DOF)
+    return max(least, float(np.median(per_number)) / MEDIAN_CHI2[2])
 
 
 class PixelNoise:

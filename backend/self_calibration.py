@@ -31,6 +31,7 @@ from dualslam.config.calibration_config import CalibrationConfig
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.camera.corrected import LensCorrection, correction_of, given_camera
 from dualslam.core.camera.models import Camera
+from dualslam.core.chi_square import CHI2_999
 from dualslam.core.geometry import so3
 from dualslam.core.interfaces import CalibrationEstimate, PreferredCamera
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
@@ -49,7 +50,7 @@ than none."""
 FAR_SIGMAS = 6.0
 """Standard deviations that count as far. The worst answer seen was off by five of its own: they are too small along
 the valley in which focal length and k1 make up for each other."""
-MIN_DISTANCE2 = 20.5
+MIN_DISTANCE2 = CHI2_999[5]
 """Squared Mahalanobis distance from the present calibration above which the new one is taken: chi-square, 5 degrees of
 freedom, 99.9 %."""
 

@@ -117,10 +117,6 @@ class IncrementalSolver:
         )
         return np.asarray(indices, np.int64)
 
-    def iterate(self, newest: list[int]) -> None:
-        """Take one more Gauss-Newton step where variables have moved beyond their thresholds."""
-        self.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [], newest, relinearise=True)
-
     def pose(self, keyframe_id: int) -> FloatArray:
         """Return the (4, 4) estimate of one pose."""
         try:

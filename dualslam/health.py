@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.config.settings import HealthConfig
-from dualslam.core.chi_square import CHI2_9999
+from dualslam.core.chi_square import CHI2_90, CHI2_9999
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import KeyframeReport
 from dualslam.core.support import find_lack_of_support
@@ -40,8 +40,8 @@ to be corrupted. Signs on up to one healthy frame in five then add up to nothing
 
 MEMORY_FRAMES = 300
 """Verdicts that are kept: no suspected stretch reaches back farther than the frame buffer."""
-TAIL, TAIL_SIGMAS, TAIL_CHI2_6DOF = 0.9, 1.645, 10.645
-"""A quantile; where it lies for the size of a Gaussian (in sigmas) and for a chi-square with 6 degrees of freedom."""
+TAIL, TAIL_SIGMAS = 0.9, 1.645
+"""A quantile, and where it lies for the size of a Gaussian (in sigmas)."""
 MIN_INNOVATIONS = 8
 """Frames before which the motion model's error is not known."""
 
@@ -169,7 +169,7 @@ class HealthMonitor:
             signs.append(FailureReason.TOO_FEW_INLIERS)
         if track.n_inliers < MAJORITY * track.n_matches:
             signs.append(FailureReason.LOW_INLIER_RATIO)
-        if jump2 > JUMP_CHI2 * _level(self._jump, TAIL_CHI2_6DOF, TAIL):
+        if jump2 > JUMP_CHI2 * _level(self._jump, CHI2_90[6], TAIL):
             signs.append(FailureReason.MOTION_JUMP)
         dof = max(2 * track.n_inliers - 6, 1)
         if track.chi2 > _level(self._chi2, 1.0) * (1 + SIGN_SIGMAS * math.sqrt(2 / dof)):

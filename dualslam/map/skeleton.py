@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.core.atlas_problem import AtlasEdge, AtlasProblem
+from dualslam.core.chi_square import CHI2_999
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.types import FloatArray
 from dualslam.map.atlas import Atlas, Link, joined
@@ -33,8 +34,6 @@ radians, way in depths of the scene). Chosen on `tum_fr1_rpy`, `hololens_000` an
 keyframes: RMS errors over what the factors say are 0.8 to 2.2 where the camera is exact, 2.4 to 18 on the sequences.
 With these numbers they are 0.03 to 0.3, and 0.7 to 2.5 (a submap with a broken stretch: to 5)."""
 
-TORN_CHI2 = 24.3
-"""The 0.999 quantile of chi-square with 7 degrees of freedom."""
 SAME_TURN_RAD, SAME_WAY, SAME_SEEN = 0.02, 0.05, 0.2
 """Changes of an edge, and of how much its keyframes see, up to which its covariance is that of before."""
 
@@ -251,7 +250,7 @@ def _is_torn(own: FloatArray, now: FloatArray, covariance: FloatArray) -> bool:
     that had the bend taken out of it would deny it.
     """
     off = sim3.log(sim3.inverse(own) @ now)
-    return bool(off @ np.linalg.solve(covariance, off) > TORN_CHI2)
+    return bool(off @ np.linalg.solve(covariance, off) > CHI2_999[7])
 
 
 def _inflated(submap: Submap, pairs: list[tuple[int, int]], covariances: FloatArray) -> FloatArray:

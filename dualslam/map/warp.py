@@ -47,8 +47,3 @@ class Warp:
         """Return this bending of what `earlier` has bent already, with the knots of both."""
         index = np.union1d(self.index, earlier.index)
         return Warp(index, self.at(index) @ earlier.at(index))
-
-    @property
-    def is_identity(self) -> bool:
-        """Whether it leaves everything where it is, but for rounding."""
-        return bool(np.abs(self.S - np.eye(4)).max() < 1e-12)

@@ -12,7 +12,6 @@ from dualslam.core.geometry.umeyama import umeyama
 from dualslam.core.types import Failure, FloatArray, IntArray
 from dualslam.report.run_data import PosedRows, RunData
 
-MIN_ALIGNED = 3
 MIN_UPRIGHT = 0.3
 """Length of the mean of all cameras' downward axes, under which the camera was held at all angles."""
 

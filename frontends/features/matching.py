@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.chi_square import CHI2_95
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Matches
 from dualslam.frontends.features.groups import NO_MATCHES, best_pairs, best_per_group, consistent_rotation
-from dualslam.frontends.gates import CHI2_1DOF_95
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,7 +173,6 @@ def match_epipolar(
     rows_b: IntArray,
     F_b_a: FloatArray,
     *,
-    segments: FloatArray | None = None,
     pose_sigma_px: float = 0.0,
     epipole_px: float = 10.0,
     octave_tolerance: int = 1,
@@ -194,9 +193,6 @@ def match_epipolar(
         Features that take part, usually those without a landmark.
     F_b_a : (3, 3) float64
         Fundamental matrix on rectified pixels: the line in b of x_a is ``F_b_a @ x_a``, its sign and scale are free.
-    segments : (A, 2, 2) float64, optional
-        From `ray_segments`: pixels in b of the nearest and the farthest point that each ray of `rows_a` may hold;
-        candidates must lie between them. A row with a non-finite number is not limited.
     pose_sigma_px : float
         Standard deviation of the line's place caused by the relative pose's own error.
     epipole_px : float
@@ -218,9 +214,6 @@ def match_epipolar(
     first, second = _near_lines(uv_a, uv_b, a.sigma_px[rows_a], b.sigma_px[rows_b], F_b_a, pose_sigma_px)
     usable = np.abs(a.octave[rows_a][first] - b.octave[rows_b][second]) <= octave_tolerance
     usable &= _off_epipole(uv_a, F_b_a, epipole_px)[first] & _off_epipole(uv_b, F_b_a.T, epipole_px)[second]
-    if segments is not None:
-        slack_px = 2.0 * b.sigma_px[rows_b][second] + pose_sigma_px
-        usable &= _within_segments(uv_b[second], segments[first], slack_px)
     first, second = first[usable], second[usable]
     if len(first) == 0:
         return NO_MATCHES
@@ -236,38 +229,6 @@ def match_epipolar(
     if check_rotation:
         kept = consistent_rotation(b.angle_rad[index[:, 1]] - a.angle_rad[index[:, 0]])
     return Matches(index[kept], distance[chosen][kept])
-
-
-def ray_segments(
-    uv_a: FloatArray, K: FloatArray, T_b_a: FloatArray, inverse_depth: tuple[FloatArray | float, FloatArray | float]
-) -> FloatArray:
-    """Where in b the rays of a begin and end, for `match_epipolar`.
-
-    Parameters
-    ----------
-    uv_a : (A, 2) float64
-        Rectified pixels in a.
-    K : (3, 3) float64
-        Pinhole matrix of both rectified images.
-    T_b_a : (4, 4) float64
-        Takes coordinates in camera a to camera b.
-    inverse_depth : (nearest, farthest)
-        Greatest and least inverse depth along a's optical axis, scalars or (A,), in the inverse unit of `T_b_a`;
-        0 is infinity.
-
-    Returns
-    -------
-    (A, 2, 2) float64
-        Pixels in b of the nearest and the farthest point; NaN for a point behind b.
-    """
-    homogeneous = np.concatenate([uv_a, np.ones((len(uv_a), 1))], axis=1)
-    # K (R z K^-1 x + t) with z = 1 / rho is, up to scale, K R K^-1 x + rho K t: finite at infinity too.
-    at_infinity = homogeneous @ (K @ T_b_a[:3, :3] @ np.linalg.inv(K)).T
-    shift = K @ T_b_a[:3, 3]
-    points = np.stack([at_infinity + np.reshape(rho, (-1, 1)) * shift for rho in inverse_depth], axis=1)
-    depth = points[:, :, 2:]
-    in_front = depth > 1e-6
-    return np.where(in_front, points[:, :, :2] / np.where(in_front, depth, 1.0), np.nan)
 
 
 def _cells(uv_px: FloatArray, origin_px: FloatArray, cell_px: float, shape: tuple[int, int]) -> IntArray:
@@ -296,8 +257,8 @@ def _near_lines(
     off_line = lines.astype(np.float32) @ points.T
     np.square(off_line, out=off_line)
     # The noise of a's pixel moves the line by about as much as it moves the pixel.
-    gate_a = (CHI2_1DOF_95 * (sigma_a**2 + extra_px**2)).astype(np.float32)
-    gate_b = (CHI2_1DOF_95 * sigma_b**2).astype(np.float32)
+    gate_a = (CHI2_95[1] * (sigma_a**2 + extra_px**2)).astype(np.float32)
+    gate_b = (CHI2_95[1] * sigma_b**2).astype(np.float32)
     off_line -= gate_b
     flat = np.flatnonzero(off_line <= gate_a[:, None])
     first, second = np.divmod(flat, max(len(uv_b), 1))
@@ -311,15 +272,3 @@ def _off_epipole(uv_px: FloatArray, F_other: FloatArray, radius_px: float) -> Bo
         return np.ones(len(uv_px), np.bool_)
     off: BoolArray = np.hypot(*(uv_px - epipole[:2] / epipole[2]).T) > radius_px
     return off
-
-
-def _within_segments(uv_px: FloatArray, segments: FloatArray, slack_px: FloatArray) -> BoolArray:
-    """Whether each point (P, 2) lies between the ends of its segment (P, 2, 2), measured along the segment."""
-    along = segments[:, 1] - segments[:, 0]
-    length = np.hypot(along[:, 0], along[:, 1])
-    step = uv_px - segments[:, 0]
-    place = (step * along).sum(axis=1) / np.where(length > 0, length, 1.0)
-    # A segment shorter than the slack has no usable direction: the distance to its near end decides.
-    short = length <= 1e-6
-    place = np.where(short, np.hypot(step[:, 0], step[:, 1]), place)
-    return ~np.isfinite(length) | ((place >= -slack_px) & (place <= length + slack_px))

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import in_front, triangulate_n_view
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Matches
-from dualslam.frontends.gates import CHI2_2DOF_95
 from dualslam.map.submap import Submap
 
 NO_TRACK = -1
@@ -150,7 +150,7 @@ def triangulate(views: TrackViews, K: FloatArray) -> tuple[FloatArray, BoolArray
     points = triangulate_n_view(views.uv_px[seen], K, views.T_cam_submap, visible)
     xyz[seen] = points.xyz
     sigma = views.sigma_px[seen]
-    fits = ((points.error2 < CHI2_2DOF_95 * sigma**2) | ~visible).all(axis=1)
+    fits = ((points.error2 < CHI2_95[2] * sigma**2) | ~visible).all(axis=1)
     # Depth is off by about its pixel's noise over the parallax.
     parallax_rad = np.arccos(np.clip(points.min_cos_parallax, -1.0, 1.0))
     certain = parallax_rad * K[0, 0] * MAX_DEPTH_SIGMA > np.where(visible, sigma, 0.0).max(axis=1)

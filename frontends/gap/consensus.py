@@ -12,13 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.core.chi_square import CHI2_95, CHI2_99
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, projection_jacobians
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_distance
 from dualslam.core.types import Features, FloatArray, IntArray
 from dualslam.frontends.gap.relocalisation import GapPose
-from dualslam.frontends.gates import CHI2_1DOF_95, CHI2_2DOF_99, CHI2_6DOF_99, MIN_CONSENSUS
+from dualslam.frontends.gates import MIN_CONSENSUS
 
 CONFIRMING_SHARE = 0.85
 """Of what two frames beyond a gap both see must agree with their poses. Of two right ones on rendered streets 95 to
@@ -66,7 +67,7 @@ def confirmed_share(first: BeyondGap, second: BeyondGap, matches: IntArray, K: F
     """
     T_b_a = second.pose.T_cam_submap @ se3.inverse(first.pose.T_cam_submap)
     Ad = se3.adjoint(T_b_a)
-    within = CHI2_6DOF_99 * (second.pose.covariance + Ad @ first.pose.covariance @ Ad.T)
+    within = CHI2_99[6] * (second.pose.covariance + Ad @ first.pose.covariance @ Ad.T)
     point_of = np.full(len(first.features), -1)
     point_of[first.rows] = np.arange(len(first.rows))
     rows_a, rows_b = matches.T
@@ -88,7 +89,7 @@ def _share_in_place(
     """Share of points that are seen where they should be, by a camera that is off by an error `within` (6, 6)."""
     uv, _ = project_points(K, T_cam, xyz)
     J_pose, _ = projection_jacobians(K, T_cam, xyz)
-    bound = CHI2_2DOF_99 * variance[:, None, None] * np.eye(2) + J_pose @ within @ J_pose.swapaxes(1, 2)
+    bound = CHI2_99[2] * variance[:, None, None] * np.eye(2) + J_pose @ within @ J_pose.swapaxes(1, 2)
     error = uv - uv_px
     return float((np.einsum("ni,nij,nj->n", error, np.linalg.inv(bound), error) < 1.0).mean())
 
@@ -103,9 +104,9 @@ def _static_share(
 
     J = np.column_stack([(distance(xi) - distance(-xi)) / (2 * STEP) for xi in STEP * np.eye(6)])
     of_pose = np.einsum("ni,ij,nj->n", J, within, J)
-    agrees = distance(np.zeros(6)) ** 2 < CHI2_1DOF_95 * variance + of_pose
+    agrees = distance(np.zeros(6)) ** 2 < CHI2_95[1] * variance + of_pose
     points = triangulate_two_view(uv_a, uv_b, K, np.eye(4), se3.inverse(T_b_a))
     # So far away that an error decides on which side of infinity a point comes to lie, neither side says anything.
-    angle2 = CHI2_1DOF_95 * variance / K[0, 0] ** 2 + np.linalg.eigvalsh(within[:3, :3])[-1]
+    angle2 = CHI2_95[1] * variance / K[0, 0] ** 2 + np.linalg.eigvalsh(within[:3, :3])[-1]
     far = points.cos_parallax > np.cos(np.minimum(np.sqrt(angle2), np.pi))
     return float((agrees & (far | ((points.depth_a > 0) & (points.depth_b > 0)))).mean())

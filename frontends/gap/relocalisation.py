@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.core.bundle import BundleAdjuster, BundleProblem
+from dualslam.core.chi_square import CHI2_99
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians
@@ -27,7 +28,7 @@ from dualslam.core.geometry.triangulation import triangulate_n_view, triangulate
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 from dualslam.frontends.gap.auxiliary_map import TrackViews, triangulate
 from dualslam.frontends.gap.uncertainty import gap_uncertainty
-from dualslam.frontends.gates import CHI2_2DOF_99, MIN_CONSENSUS
+from dualslam.frontends.gates import MIN_CONSENSUS
 from dualslam.frontends.tracking.resection import resect
 from dualslam.frontends.tracking.two_view_hypotheses import propose_relative_poses
 
@@ -184,7 +185,7 @@ def _adjust(
     inliers &= ((points.depth > 0) | ~visible).all(axis=1) & np.isfinite(points.xyz).all(axis=1)
     xyz, chi2 = points.xyz, np.where(visible, points.error2 / sigma**2, 0.0)
     for _ in range(2):
-        used = _heard(inliers & (chi2 < 16 * CHI2_2DOF_99).all(axis=1), known.visible)
+        used = _heard(inliers & (chi2 < 16 * CHI2_99[2]).all(axis=1), known.visible)
         if used.sum() < MIN_CONSENSUS:
             return None
         row, view = np.nonzero(visible & used[:, None])
@@ -200,7 +201,7 @@ def _adjust(
         xyz[used] = np.where(result.adjusted[:, None], result.xyz_mu, xyz[used])
         chi2 = np.where(visible, points.error2 / sigma**2, 0.0)
         in_front = ((points.depth > 0) | ~visible).all(axis=1) & np.isfinite(xyz).all(axis=1)
-        inliers = in_front & (np.nan_to_num(chi2, nan=np.inf) < CHI2_2DOF_99).all(axis=1)
+        inliers = in_front & (np.nan_to_num(chi2, nan=np.inf) < CHI2_99[2]).all(axis=1)
     if inliers.sum() < MIN_CONSENSUS:
         return None
     mean = float(chi2[inliers].sum() / (2 * visible[inliers].sum() - 3 * inliers.sum()).clip(1))

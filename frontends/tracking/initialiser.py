@@ -13,6 +13,7 @@ import numpy as np
 
 from dualslam.config.settings import InitialiserConfig
 from dualslam.core.bundle import BundleAdjuster, BundleProblem
+from dualslam.core.chi_square import CHI2_95
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians, refine_pose
@@ -30,7 +31,6 @@ from dualslam.core.types import (
     View,
 )
 from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
-from dualslam.frontends.gates import CHI2_2DOF_95
 from dualslam.frontends.tracking.resection import resect
 from dualslam.frontends.tracking.two_view_hypotheses import propose_relative_poses
 
@@ -176,8 +176,8 @@ class Initialiser:
             a.features.uv_rect_px[fa], b.features.uv_rect_px[fb], self._K, np.eye(4), se3.inverse(T_b_a)
         )
         uv_a, uv_b, sigma_b = a.features.uv_rect_px[fa], b.features.uv_rect_px[fb], b.features.sigma_px[fb]
-        fits = (points.error2_a < CHI2_2DOF_95 * a.features.sigma_px[fa] ** 2) & (
-            points.error2_b < CHI2_2DOF_95 * sigma_b**2
+        fits = (points.error2_a < CHI2_95[2] * a.features.sigma_px[fa] ** 2) & (
+            points.error2_b < CHI2_95[2] * sigma_b**2
         )
         good = fits & (points.depth_a > 0) & (points.depth_b > 0)
         moved_px = np.linalg.norm(_turned(uv_a, self._K, T_b_a) - uv_b, axis=1)
@@ -253,7 +253,7 @@ class Initialiser:
             result = self._adjuster(problem)
         except SolverError as error:
             return Failure(FailureReason.SOLVER, str(error), numbers)
-        inlier = result.chi2 < CHI2_2DOF_95
+        inlier = result.chi2 < CHI2_95[2]
         n_bad = np.bincount(point_of[~inlier], minlength=len(xyz))
         direction = direction_sigma_deg(problem, result.T_submap_kf, result.xyz_mu, inlier)
         numbers = {**numbers, "chi2": float(np.median(result.chi2) / 1.386), "direction_sigma_deg": direction}

@@ -13,11 +13,11 @@ import poselib
 
 from dualslam.config.settings import CameraConfig
 from dualslam.core.camera.models import Camera
+from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import so3
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Features, FloatArray, View
-from dualslam.frontends.gates import CHI2_1DOF_95
 from dualslam.frontends.tracking.resection import poselib_camera
 from dualslam.frontends.tracking.turning import turn_between
 
@@ -161,7 +161,7 @@ class ReadoutEstimator:
         """
         sigma_px = np.sqrt(0.5 * (a.sigma_px**2 + b.sigma_px**2))
         lens = poselib_camera(camera.K, (camera.width, camera.height))
-        gate_px = CHI2_1DOF_95**0.5 * float(np.median(sigma_px))
+        gate_px = CHI2_95[1] ** 0.5 * float(np.median(sigma_px))
         straight = [
             tuple(correct_shutter(x, camera, s * rate).uv_rect_px for x, rate in ((a, rate_a), (b, rate_b)))
             for s in READOUTS_S
@@ -177,7 +177,7 @@ class ReadoutEstimator:
                 T_b_a = np.eye(4)
                 T_b_a[:3] = pose.Rt
                 error2 = sampson_error(fundamental_from_pose(camera.K, T_b_a), uv_a, uv_b) / sigma_px**2
-                of_pose.append(float((CHI2_1DOF_95 * np.log1p(error2 / CHI2_1DOF_95)).sum()))
+                of_pose.append(float((CHI2_95[1] * np.log1p(error2 / CHI2_95[1])).sum()))
             misfits.append(min(of_pose))
         return np.array(misfits)
 

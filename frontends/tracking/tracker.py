@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.config.settings import TrackingConfig
+from dualslam.core.chi_square import CHI2_99
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from dualslam.frontends.features.matching import FeatureGrid, match_projected
 from dualslam.frontends.gap.uncertainty import SMALL_STEP, pose_uncertainty
-from dualslam.frontends.gates import CHI2_2DOF_99, MIN_CONSENSUS
+from dualslam.frontends.gates import MIN_CONSENSUS
 from dualslam.frontends.tracking.local_map import LocalMap, Prediction, covering_keyframes
 from dualslam.frontends.tracking.resection import resect
 from dualslam.map.submap import NO_LANDMARK, Submap
@@ -26,7 +27,7 @@ LOCAL_RADIUS_PX = 4.0
 
 WIDER = 2.5  # second guided search: this many times the first radius
 MAX_EXTRAPOLATION = 3.0  # intervals for which the motion between the last two frames says something
-GIVEN_POSE_CHI2 = 4 * CHI2_2DOF_99  # 99 % with 2 degrees of freedom, and the pose off by as much as a pixel
+GIVEN_POSE_CHI2 = 4 * CHI2_99[2]  # 99 % with 2 degrees of freedom, and the pose off by as much as a pixel
 
 
 @dataclass(frozen=True, slots=True, eq=False)

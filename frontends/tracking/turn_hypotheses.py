@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import so3
 from dualslam.core.types import BoolArray, FloatArray, IntArray
-from dualslam.frontends.gates import CHI2_1DOF_95, CHI2_2DOF_95
 
 N_SAMPLES = 200
 """Pairs of matches that a turn, and then a translation, is tried from: of a layer of a sixth, one at 99.6 %."""
@@ -93,7 +93,7 @@ class _Views:
         z = np.where(z > 1e-9, z, np.inf)
         u, v = self._uv_b[rows].T
         # Both pixels have noise.
-        return np.asarray((x / z - u) ** 2 + (y / z - v) ** 2 < 2.0 * CHI2_2DOF_95 * self._variance[rows])
+        return np.asarray((x / z - u) ** 2 + (y / z - v) ** 2 < 2.0 * CHI2_95[2] * self._variance[rows])
 
     def direction_with(self, R: FloatArray, near: IntArray, rng: np.random.Generator) -> FloatArray | None:
         """Return the direction of translation that most matches allow with a rotation; None where none has parallax."""
@@ -106,7 +106,7 @@ class _Views:
         if len(directions) == 0:
             return None
         scored = rng.permutation(len(self._a))[:N_SCORED]
-        fits = self._sampson2(R, directions, scored) < CHI2_1DOF_95 * self._variance[scored]
+        fits = self._sampson2(R, directions, scored) < CHI2_95[1] * self._variance[scored]
         t = directions[int(np.argmax(np.count_nonzero(fits, axis=1)))]
         # Of its two signs the one with more points in front: the parallax turns a ray towards the translation.
         ahead = np.einsum("ni,ni->n", normals, np.cross(turned, t[None]))

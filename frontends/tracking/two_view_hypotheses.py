@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import poselib
 
+from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry.two_view import (
     decompose_homography,
     fundamental_from_pose,
@@ -18,7 +19,6 @@ from dualslam.core.geometry.two_view import (
     sampson_error,
 )
 from dualslam.core.types import FloatArray
-from dualslam.frontends.gates import CHI2_1DOF_95, CHI2_2DOF_95
 from dualslam.frontends.tracking.resection import poselib_camera
 from dualslam.frontends.tracking.turn_hypotheses import poses_by_turn
 
@@ -62,8 +62,8 @@ def propose_relative_poses(
     options = {"max_reproj_error": 3.0 * sigma, "max_iterations": 1000, "min_iterations": 100, "seed": seed}
     H_b_a, _ = poselib.estimate_homography(uv_a_px, uv_b_px, options, {})
     variance = sigma_px**2
-    score_e = _score(sampson_error(fundamental_from_pose(K, T_b_a), uv_a_px, uv_b_px) / variance, CHI2_1DOF_95)
-    score_h = _score(homography_transfer_error(H_b_a, uv_a_px, uv_b_px).mean(axis=1) / variance, CHI2_2DOF_95)
+    score_e = _score(sampson_error(fundamental_from_pose(K, T_b_a), uv_a_px, uv_b_px) / variance, CHI2_95[1])
+    score_h = _score(homography_transfer_error(H_b_a, uv_a_px, uv_b_px).mean(axis=1) / variance, CHI2_95[2])
     share = score_h / max(score_e + score_h, 1e-12)
     candidates = [_unit_baseline(T_b_a)]
     # Refined, what is of one basin with another comes to the same, and no longer looks like a second answer.
@@ -87,4 +87,4 @@ def _unit_baseline(T_b_a: FloatArray) -> FloatArray:
 
 
 def _score(squared: FloatArray, gate: float) -> float:
-    return float(np.sum(np.where(squared < gate, CHI2_2DOF_95 - squared, 0.0)))
+    return float(np.sum(np.where(squared < gate, CHI2_95[2] - squared, 0.0)))

@@ -12,16 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 
+from dualslam.core.chi_square import CHI2_95, CHI2_99
 from dualslam.core.geometry import sim3, so3, symmetric3
 from dualslam.core.geometry.umeyama import Alignment, umeyama, umeyama_batch
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 
 __all__ = ["Alignment", "Sim3Estimate", "estimate_sim3_robust", "umeyama", "umeyama_batch"]
 
-CHI2_99_3DOF = 11.345
-"""99 % quantile of chi-square with three degrees of freedom: gate of a squared Mahalanobis distance of points."""
-CHI2_95_3DOF = 7.815
-"""95 % quantile: the square of the Huber threshold."""
 COVARIANCE_INFLATION = 1.5
 """The Hessian's covariance is a little optimistic (measured): it takes the gated points for the true inliers."""
 MAX_ROTATION_SIGMA_RAD = 0.2
@@ -116,7 +113,7 @@ def estimate_sim3_robust(
     min_inliers: int = 10,
     max_hypotheses: int = 512,
     confidence: float = 0.999,
-    chi2_gate: float = CHI2_99_3DOF,
+    chi2_gate: float = CHI2_99[3],
     scale_bounds: tuple[float, float] = (1e-3, 1e3),
 ) -> Sim3Estimate | Failure:
     """Estimate the similarity between two maps from matched points, some of them wrong.
@@ -236,7 +233,7 @@ def _refine(problem: _Sim3Problem, S: FloatArray, gate: float, n_rounds: int = 4
     inliers = d2 < gate
     for _ in range(n_rounds):
         for _ in range(n_iterations):
-            weight = inliers * np.sqrt(CHI2_95_3DOF / np.maximum(d2, CHI2_95_3DOF))
+            weight = inliers * np.sqrt(CHI2_95[3] / np.maximum(d2, CHI2_95[3]))
             H, g = problem.normal_equations(S, weight)
             try:
                 step = np.linalg.solve(H, g)

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import se3
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 
-CHI2_95_2DOF = 5.991
-"""95 % quantile of chi-square with two degrees of freedom: gate of a squared whitened pixel residual."""
 MIN_DEPTH = 1e-6
 """Points nearer to the image plane (or behind it) do not project."""
 
@@ -197,7 +196,7 @@ def refine_pose(
     min_inliers: int = 6,
     n_rounds: int = 4,
     n_iterations: int = 5,
-    chi2_gate: float = CHI2_95_2DOF,
+    chi2_gate: float = CHI2_95[2],
     tolerance: float = 1e-6,
 ) -> PoseEstimate | Failure:
     """Refine a camera pose against known points, with outliers.

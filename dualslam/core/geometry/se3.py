@@ -130,13 +130,8 @@ def left_jacobian_inverse(xi: ArrayLike) -> FloatArray:
     return J
 
 
-def right_jacobian(xi: ArrayLike) -> FloatArray:
-    """Return J with ``exp(xi + d) ~= exp(xi) exp(J d)``, (..., 6) -> (..., 6, 6)."""
-    return left_jacobian(-np.asarray(xi, np.float64))
-
-
 def right_jacobian_inverse(xi: ArrayLike) -> FloatArray:
-    """Return the inverse of `right_jacobian`."""
+    """Return the inverse of the right Jacobian, ``J_l(-xi)``."""
     return left_jacobian_inverse(-np.asarray(xi, np.float64))
 
 

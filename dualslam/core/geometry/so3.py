@@ -137,13 +137,8 @@ def left_jacobian_inverse(omega: ArrayLike) -> FloatArray:
     return np.eye(3) - 0.5 * W + d[..., None, None] * (W @ W)
 
 
-def right_jacobian(omega: ArrayLike) -> FloatArray:
-    """Return J with ``exp(w + d) ~= exp(w) exp(J d)``, (..., 3) -> (..., 3, 3)."""
-    return left_jacobian(-np.asarray(omega, np.float64))
-
-
 def right_jacobian_inverse(omega: ArrayLike) -> FloatArray:
-    """Return the inverse of `right_jacobian`."""
+    """Return the inverse of the right Jacobian, ``J_l(-xi)``."""
     return left_jacobian_inverse(-np.asarray(omega, np.float64))
 
 

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from dualslam.core.types import FloatArray
 from dualslam.lab.synthetic.road import Road
-
-YawOffset = Callable[[float], float]
 
 
 class Sway:

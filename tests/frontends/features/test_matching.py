@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dualslam.core.chi_square import CHI2_95
 from dualslam.core.types import Features, FloatArray, Matches
-from dualslam.frontends.features.matching import FeatureGrid, match_epipolar, match_projected, ray_segments
+from dualslam.frontends.features.matching import FeatureGrid, match_epipolar, match_projected
 from dualslam.frontends.features.orb import OrbFrontend
-from dualslam.frontends.gates import CHI2_1DOF_95
 from tests.frontends.conftest import made_up_features
 
 FRONTEND = OrbFrontend()
@@ -195,7 +195,7 @@ def test_epipolar_matches_agree_with_a_loop(sign: float) -> None:
         for j in range(150):
             off = line @ (*b.uv_px[j], 1.0) / np.hypot(line[0], line[1])
             variance = a.sigma_px[i] ** 2 + b.sigma_px[j] ** 2 + 0.3**2
-            if off**2 <= CHI2_1DOF_95 * variance and abs(a.octave[i] - b.octave[j]) <= 1:
+            if off**2 <= CHI2_95[1] * variance and abs(a.octave[i] - b.octave[j]) <= 1:
                 cost[i, j] = FRONTEND.distance(a.descriptors[i : i + 1], b.descriptors[j : j + 1])[0]
     expected = {
         (i, int(cost[i].argmin()))
@@ -203,28 +203,6 @@ def test_epipolar_matches_agree_with_a_loop(sign: float) -> None:
         if cost[i].min() <= FRONTEND.max_distance and cost[:, cost[i].argmin()].argmin() == i
     }
     assert {tuple(row) for row in matches.index.tolist()} == expected
-
-
-def test_epipolar_segments_hold_the_true_points_and_exclude_others() -> None:
-    a, b, F_b_a, T_b_a, rho = two_views(300, seed=7)
-    rows = np.arange(300)
-    ends = ray_segments(a.uv_rect_px, K, T_b_a, (rho * 1.2, rho * 0.8))
-    free = match_epipolar(FRONTEND, a, b, rows, rows, F_b_a)
-    limited = match_epipolar(FRONTEND, a, b, rows, rows, F_b_a, segments=ends)
-    right = limited.index[:, 0] == limited.index[:, 1]
-    assert right.sum() >= 0.97 * (free.index[:, 0] == free.index[:, 1]).sum()
-    elsewhere = ray_segments(a.uv_rect_px, K, T_b_a, (rho * 5, rho * 4))
-    assert len(match_epipolar(FRONTEND, a, b, rows, rows, F_b_a, segments=elsewhere)) == 0
-    unlimited = match_epipolar(FRONTEND, a, b, rows, rows, F_b_a, segments=np.full((300, 2, 2), np.nan))
-    np.testing.assert_array_equal(unlimited.index, free.index)
-
-
-def test_ray_segments_at_infinity_and_behind() -> None:
-    T_b_a = np.eye(4)
-    T_b_a[2, 3] = -1.0  # b stands one unit ahead of a
-    ends = ray_segments(np.array([[320.0, 240.0], [420.0, 240.0]]), K, T_b_a, (2.0, 0.0))
-    assert np.isnan(ends[:, 0]).all()  # half a unit ahead of a is behind b
-    np.testing.assert_allclose(ends[:, 1], [[320, 240], [420, 240]])
 
 
 def test_features_beside_the_epipole_are_passed_over() -> None:
