@@ -10,11 +10,11 @@ from typing import NoReturn
 
 from dualslam import __version__
 
-WORLDS = ("street", "room", "circuit", "eight", "terrace")
+WORLDS = ("street", "room", "circuit", "eight", "terrace", "board", "parked", "takeoff", "standstill", "hover")
 SOURCE_HELP = (
     "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours), a folder of images or a video file with --camera or "
-    "--fov, a webcam's number, or an embedded world: synthetic:street, room, circuit, eight, terrace, with options as "
-    "in synthetic:street,frames=300,seed=1,events=FILE"
+    "--fov, a webcam's number, or an embedded world: synthetic:street, room, circuit, eight, terrace, "
+    "board, parked, takeoff, standstill, hover, with options as in synthetic:street,frames=300,seed=1,events=FILE"
 )
 
 

@@ -18,13 +18,15 @@ from dualslam.lab.synthetic.render import Renderer
 from dualslam.lab.synthetic.room import HALF_SIZE_M, make_room
 from dualslam.lab.synthetic.sensor import Sensor
 from dualslam.lab.synthetic.street import make_street
+from dualslam.lab.synthetic.traps import TRAPS
 
 if TYPE_CHECKING:
     from dualslam.core.camera.models import PinholeCamera
 
 # A smear of motion blur is the average of images about three pixels apart, within these bounds on their number.
 _N_SUBFRAMES = (9, 33)
-SCENES = ("street", "room", "circuit", "eight", "terrace")
+SCENES = ("street", "room", "circuit", "eight", "terrace", *TRAPS)
+ON_WHEELS = ("street", "circuit", "eight", "terrace", "standstill")
 
 
 class CameraPath(Protocol):
@@ -159,9 +161,10 @@ def make_sequence(
 
     Parameters
     ----------
-    scene : {"street", "room", "circuit", "eight", "terrace"}
+    scene : {"street", "room", "circuit", "eight", "terrace", "board", "parked", "takeoff", "standstill", "hover"}
         A drive of about 9 m/s between houses, or a hand-held camera in a furnished room; a block of houses driven round
-        and round, a figure of eight, and a straight street of houses that are all the same.
+        and round, a figure of eight, and a straight street of houses that are all the same; the others are told in
+        `dualslam/lab/synthetic/traps.py`.
     n_frames : int
     seed : int
         Of the world, the path and the noise: the same seed gives the same images, bit for bit.
@@ -170,7 +173,7 @@ def make_sequence(
     events : iterable of ScriptedEvent or mapping
         Disturbances of some of the frames.
     rate_hz : float, optional
-        Frames a second: 10 on the street, 30 in the room.
+        Frames a second: 10 on the street, 30 in the room and in the hand.
     supersampling : float
         Silhouettes are smoother and rendering slower with more.
 
@@ -181,7 +184,7 @@ def make_sequence(
     """
     if scene not in SCENES:
         raise ConfigError(f"synthetic scene {scene!r} is unknown; use one of {', '.join(SCENES)}")
-    rate_hz = float(rate_hz) if rate_hz is not None else (30.0 if scene == "room" else 10.0)
+    rate_hz = float(rate_hz) if rate_hz is not None else (10.0 if scene in ON_WHEELS else 30.0)
     limits = {"n_frames": (1, 100_000), "seed": (0, 2**63), "width": (32, 4096), "height": (32, 4096)}
     for name, (low, high) in limits.items():
         value = locals()[name]
@@ -195,7 +198,11 @@ def make_sequence(
     duration_s = n_frames / rate_hz
     rng = np.random.default_rng([seed, 0xCA4])
     path: CameraPath
-    if scene != "room":
+    in_hand = scene == "room"
+    if scene in TRAPS:
+        trap = TRAPS[scene](seed, duration_s)
+        world, path, in_hand = trap.scene, trap.path, trap.in_hand
+    elif not in_hand:
         length_m = 10.0 * duration_s + 30
         if scene == "circuit":
             world, road = make_circuit(seed)
@@ -205,11 +212,13 @@ def make_sequence(
             world, road = make_terrace(seed, length_m)
         else:
             world, road = make_street(seed, length_m)
-        path, focal = Drive(road, rng, duration_s, speed_m_s=10.0), 0.72
-        sensor = Sensor(seed, width, height, blur_px=0.45)
+        path = Drive(road, rng, duration_s, speed_m_s=10.0)
     else:
         world = make_room(seed)
-        path, focal = Walk(rng, duration_s, (HALF_SIZE_M[0] - 1.3, HALF_SIZE_M[1] - 1.3)), 0.82
+        path = Walk(rng, duration_s, (HALF_SIZE_M[0] - 1.3, HALF_SIZE_M[1] - 1.3))
+    focal, sensor = 0.72, Sensor(seed, width, height, blur_px=0.45)
+    if in_hand:
+        focal = 0.82
         # A cheap camera in the hand: softer than the one on the car.
         sensor = Sensor(seed, width, height, blur_px=0.9, noise=1.2, stops=0.4)
     camera = _pinhole(focal * width, width, height)
