@@ -11,6 +11,7 @@ from typing import NoReturn
 from dualslam import __version__
 
 WORLDS = ("street", "room", "circuit", "eight", "terrace", "board", "parked", "takeoff", "standstill", "hover")
+EXPORTS = ("bal", "colmap", "g2o", "kitti", "nerfstudio", "ply", "tum")
 SOURCE_HELP = (
     "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours), a folder of images or a video file with --camera or "
     "--fov, a webcam's number, or an embedded world: synthetic:street, room, circuit, eight, terrace, "
@@ -44,6 +45,7 @@ def _build_parser() -> _Parser:
     _add_eval(commands)
     _add_compare(commands)
     _add_view(commands)
+    _add_export(commands)
     _add_render(commands)
     _add_config(commands)
     _add_demo(commands)
@@ -130,6 +132,40 @@ def _add_view(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument("run", metavar="RUN", type=Path, help="a run folder")
     parser.add_argument("--save", metavar="FILE", type=Path, help="write the recording (.rrd) instead of opening it")
     parser.add_argument("--overwrite", action="store_true", help="replace the recording that is there")
+
+
+def _add_export(commands: argparse._SubParsersAction[_Parser]) -> None:
+    parser, _ = _command(commands, "export", "Write the map of a run in the format of another program.")
+    parser.add_argument("run", metavar="RUN", type=Path, help="a run folder")
+    parser.add_argument(
+        "--to", choices=EXPORTS, required=True, help="colmap and nerfstudio are folders, the others a file"
+    )
+    parser.add_argument("--out", metavar="PATH", type=Path, required=True, help="folder or file to write")
+    parser.add_argument("--overwrite", action="store_true", help="replace what is there")
+    parser.add_argument(
+        "--distance",
+        metavar=("FRAME", "FRAME", "METRES"),
+        nargs=3,
+        action=_Distance,
+        help="true distance between two keyframes: the export is in metres",
+    )
+    images = parser.add_argument_group("images")
+    images.add_argument(
+        "--images", metavar="SOURCE", help="what the run was made of: colours, and images without the lens (a folder)"
+    )
+    camera = images.add_mutually_exclusive_group()
+    camera.add_argument("--camera", metavar="FILE", type=Path, help="calibration, as it was given to the run")
+    camera.add_argument("--fov", metavar="DEGREES", type=_angle, help="horizontal field of view, as it was given")
+
+
+class _Distance(argparse.Action):
+    """Two frames and a length."""
+
+    def __call__(self, parser, namespace, values, option_string=None) -> None:  # type: ignore[no-untyped-def]
+        try:
+            setattr(namespace, self.dest, (int(values[0]), int(values[1]), float(values[2])))
+        except ValueError:
+            parser.error(f"argument {option_string}: give two frames and a distance in metres, as 10 250 3.2")
 
 
 def _add_render(commands: argparse._SubParsersAction[_Parser]) -> None:

@@ -249,6 +249,26 @@ def read_frames(path: str | Path) -> list[FrameRow]:
     return rows
 
 
+def read_summary(run: Path) -> dict[str, Any]:
+    """Read ``summary.json`` of a run folder.
+
+    Raises
+    ------
+    InputError
+        If the folder is none of a run, or the file is damaged.
+    """
+    path = run / SUMMARY
+    if not path.is_file():
+        raise InputError(f"{run} is no run folder: there is no {SUMMARY}.")
+    try:
+        summary = json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path} is no valid JSON: {error}.") from None
+    if not isinstance(summary, dict):
+        raise InputError(f"{path} is no summary of a run.")
+    return summary
+
+
 def read_events(path: str | Path) -> list[dict[str, Any]]:
     """Read an ``events.jsonl``; a last line that a crash cut off is left out."""
     lines = [line for line in read_text(path).splitlines() if line.strip()]

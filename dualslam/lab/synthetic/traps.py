@@ -47,7 +47,7 @@ class Trap:
 
 @dataclass(frozen=True, slots=True)
 class _FromRest:
-    """A path that is at rest at first: its own time begins slowly, over `rest_s`. `tremor`: what moves all the while."""
+    """A path that is at rest at first: its own time begins slowly, over `rest_s`. `tremor`: what moves all along."""
 
     path: _Path
     rest_s: float

@@ -1,0 +1,104 @@
+"""`dualslam export`: the map of a run for other programs."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from dualslam.cli.outputs import check_free
+from dualslam.core.errors import InputError, OutputError
+from dualslam.export.exported_map import ExportedMap, flatten, read_stored
+from dualslam.export.formats import FORMATS
+from dualslam.export.images import with_images
+from dualslam.io.atomic import write_text
+from dualslam.io.map_store import StoredMap
+from dualslam.io.run_folder import TRAJECTORY, TRAJECTORY_KITTI, read_summary
+from dualslam.map.frame_numbers import FrameNumbers
+from dualslam.run.sources import open_source
+
+TRAJECTORIES = {"tum": TRAJECTORY, "kitti": TRAJECTORY_KITTI}
+"""Formats of which a run folder has the file already."""
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Write the map of a run in another format."""
+    _check_out(args)
+    if args.to in TRAJECTORIES:
+        return _copy_trajectory(args)
+    stored = read_stored(args.run)
+    numbers = _numbers(args.run)
+    exported = flatten(stored)
+    if args.distance is not None:
+        exported = exported.scaled(_metres_per_unit(exported, numbers, *args.distance))
+    chosen = FORMATS[args.to]
+    if args.images is not None:
+        exported = _with_images(args, stored, exported, numbers)
+    chosen.write(exported, args.out)
+    if not args.quiet:
+        errors = exported.reprojection_errors_px()
+        print(
+            f"{len(exported.frame)} views, {len(exported.xyz)} points, {len(exported.view)} observations, "
+            f"mean reprojection error {np.nanmean(errors):.3f} px; {args.to} in {args.out}",
+            flush=True,
+        )
+    return 0
+
+
+def _check_out(args: argparse.Namespace) -> None:
+    is_folder = args.to in FORMATS and FORMATS[args.to].is_folder
+    if is_folder and args.out.exists():
+        if not args.out.is_dir():
+            raise OutputError(f"{args.out} is a file, and {args.to} needs a folder; name another with --out.")
+        if any(args.out.iterdir()) and not args.overwrite:
+            raise OutputError(f"{args.out} is there already; name another with --out, or give --overwrite.")
+    if not is_folder:
+        if args.out.is_dir():
+            raise OutputError(f"{args.out} is a folder, and {args.to} is one file; name another with --out.")
+        check_free(args.out, args.overwrite, "another with --out")
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+
+
+def _copy_trajectory(args: argparse.Namespace) -> int:
+    if args.images is not None or args.distance is not None:
+        raise InputError(f"--images and --distance do not go with --to {args.to}, which copies the run's trajectory.")
+    source = args.run / TRAJECTORIES[args.to]
+    if not source.is_file():
+        raise InputError(f"{args.run} has no {source.name}; give a run folder.")
+    write_text(args.out, source.read_text())
+    if not args.quiet:
+        print(f"trajectory in {args.out}", flush=True)
+    return 0
+
+
+def _numbers(run: Path) -> FrameNumbers:
+    summary = read_summary(run)
+    return FrameNumbers(summary.get("first_id", 0), summary.get("first_index"))
+
+
+def _metres_per_unit(exported: ExportedMap, numbers: FrameNumbers, a: int, b: int, metres: float) -> float:
+    row_of = {k: v for v, k in enumerate(exported.frame.tolist())}
+    nearest = [min(row_of, key=lambda k: abs(k - numbers.number_of(i))) for i in (a, b)]
+    for index, k in zip((a, b), nearest, strict=True):
+        if k != numbers.number_of(index):
+            raise InputError(
+                f"--distance: frame {index} is no keyframe of the map; the nearest is {numbers.index_of(k)}."
+            )
+    p, q = (exported.T_world_cam[row_of[k], :3, 3] for k in nearest)
+    length = float(np.linalg.norm(p - q))
+    if not length > 0 or not metres > 0:
+        raise InputError("--distance: give two frames that lie apart, and a distance above 0.")
+    return metres / length
+
+
+def _with_images(
+    args: argparse.Namespace, stored: StoredMap, exported: ExportedMap, numbers: FrameNumbers
+) -> ExportedMap:
+    assert stored.camera is not None
+    camera = stored.camera
+    source = open_source(args.images, camera_file=args.camera, fov_degrees=args.fov)
+    if (source.camera.width, source.camera.height) != exported.size_px:
+        raise InputError(f"{args.images} has images of another size than the run's.")
+    has_images = FORMATS[args.to].has_images
+    return with_images(exported, camera, source, numbers, args.out if has_images else None)

@@ -1,0 +1,85 @@
+"""The keyframes' images with the lens taken out, and the colours of the points from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.camera.models import Camera
+from dualslam.core.types import FloatArray, Frame
+from dualslam.export.colmap import image_name
+from dualslam.export.exported_map import ExportedMap
+from dualslam.io.atomic import atomic_file
+from dualslam.map.frame_numbers import FrameNumbers
+
+FOLDER = "images"
+
+
+def with_images(
+    exported: ExportedMap, camera: Camera, frames: Iterable[Frame], numbers: FrameNumbers, out: Path | None
+) -> ExportedMap:
+    """Return the map with its points' colours, the median of their views, and write the images if a folder is given.
+
+    Parameters
+    ----------
+    exported : ExportedMap
+    camera : Camera
+        As in the saved map: it knows the lens.
+    frames : iterable of Frame
+        Of the source that the run was made of; those that are no keyframes are passed over.
+    numbers : FrameNumbers
+        The run's.
+    out : Path, optional
+        Images go into ``out/images``.
+    """
+    row_of = {k: v for v, k in enumerate(exported.frame.tolist())}
+    maps: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
+    seen = np.zeros((len(exported.view), 3))
+    known = np.zeros(len(exported.view), bool)
+    for frame in frames:
+        v = row_of.get(numbers.number_of(frame.index))
+        if v is None or frame.image is None:
+            continue
+        c = int(exported.camera[v])
+        if c not in maps:
+            maps[c] = _undistortion(camera, exported.K[c], exported.size_px)
+        image = cv2.remap(frame.image, *maps[c], cv2.INTER_LINEAR)
+        image = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+        if out is not None:
+            _write(out / FOLDER / image_name(int(exported.frame[v])), image)
+        rows = np.flatnonzero(exported.view == v)
+        at = np.rint(exported.uv_px[rows]).astype(int)
+        inside = ((at >= 0) & (at < np.array(exported.size_px))).all(axis=1)
+        seen[rows[inside]] = image[at[inside, 1], at[inside, 0], ::-1]
+        known[rows[inside]] = True
+    return replace(exported, colour=_medians(exported, seen, known))
+
+
+def _undistortion(
+    camera: Camera, K: FloatArray, size_px: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    u, v = np.meshgrid(np.arange(size_px[0], dtype=float), np.arange(size_px[1], dtype=float))
+    rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], 1) @ np.linalg.inv(K).T
+    raw = np.nan_to_num(camera.project(rays), nan=-1e4).astype(np.float32).reshape(*u.shape, 2)
+    return np.ascontiguousarray(raw[..., 0]), np.ascontiguousarray(raw[..., 1])
+
+
+def _write(path: Path, image: NDArray[np.uint8]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path) as file:
+        file.write(cv2.imencode(".png", image)[1].tobytes())
+
+
+def _medians(exported: ExportedMap, seen: FloatArray, known: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    colour = exported.colour.copy()
+    rows = np.flatnonzero(known)
+    point = exported.point[rows]
+    first = np.searchsorted(point, np.arange(len(colour) + 1))
+    for p in np.unique(point).tolist():
+        colour[p] = np.rint(np.median(seen[rows[first[p] : first[p + 1]]], axis=0)).astype(np.uint8)
+    return colour

@@ -1,0 +1,190 @@
+"""Maps in the formats of other programs, read back by those programs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from dualslam.cli import main
+from dualslam.core.geometry import se3
+from dualslam.export.bal import write_bal
+from dualslam.export.colmap import write_colmap
+from dualslam.export.exported_map import ExportedMap, flatten
+from dualslam.export.g2o import write_g2o
+from dualslam.export.nerfstudio import write_nerfstudio
+from dualslam.export.ply import write_ply
+from dualslam.io.map_store import StoredMap
+from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, system_in
+
+
+@pytest.fixture(scope="module")
+def stored() -> StoredMap:
+    """Two submaps: a full one and the one that it has rolled over into, with keyframes that both have."""
+    world = PointWorld(cloud(), hand_held(60))
+    system = system_in(
+        world,
+        graph={"max_keyframes": 20, "rollover_keyframes": 6},
+        keyframes={"max_parallax_deg": 1.0},
+        mapping={"redundant_ratio": 1.0},
+    )
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    assert len(system.atlas.submaps) > 1
+    return StoredMap(system.atlas, system.poses, CAMERA)
+
+
+@pytest.fixture(scope="module")
+def exported(stored: StoredMap) -> ExportedMap:
+    found = flatten(stored)
+    rng = np.random.default_rng(0)
+    return replace(found, colour=rng.integers(0, 256, (len(found.xyz), 3), np.uint8))
+
+
+def test_each_keyframe_is_there_once_and_what_it_sees_fits(stored: StoredMap, exported: ExportedMap) -> None:
+    keyframes = {k for m in stored.atlas.submaps.values() for k in m.keyframes}
+    assert exported.frame.tolist() == sorted(keyframes)
+    assert np.median(exported.reprojection_errors_px()) < 1.0
+    assert np.bincount(exported.point).min() >= 2
+    assert len(np.unique(np.column_stack([exported.view, exported.point]), axis=0)) == len(exported.view)
+
+
+def test_the_world_is_the_truth_up_to_a_similarity(exported: ExportedMap) -> None:
+    from dualslam.lab.metrics.alignment import align_points
+
+    truth = hand_held(60)[exported.frame]
+    p, q = exported.T_world_cam[:, :3, 3], truth[:, :3, 3]
+    s, R, t = align_points(p, q)
+    error = np.linalg.norm(q - (s * p @ R.T + t), axis=1)
+    assert error.max() < 0.03 * np.linalg.norm(np.diff(q, axis=0), axis=1).sum()
+
+
+def test_what_is_condemned_is_left_out(stored: StoredMap) -> None:
+    submap = stored.atlas.submaps[0].copy()
+    doomed = list(submap.keyframes)[:3]
+    submap.condemn(doomed)
+    atlas = type(stored.atlas)()
+    atlas.add(submap)
+    found = flatten(StoredMap(atlas, {k: p for k, p in stored.poses.items() if p.submap_id == 0}, CAMERA))
+    assert not set(doomed) & set(found.frame.tolist())
+    healthy = submap.landmarks["alive"] & ~submap.landmarks["condemned"]
+    assert len(found.xyz) <= healthy.sum()
+
+
+def test_colmap_reads_the_same_reprojection_errors(exported: ExportedMap, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+    write_colmap(exported, tmp_path)
+    read = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    assert (read.num_images(), read.num_points3D()) == (len(exported.frame), len(exported.xyz))
+    errors = exported.reprojection_errors_px()
+    n_seen = 0
+    for p, point in read.points3D.items():
+        rows = np.flatnonzero(exported.point == p - 1)
+        np.testing.assert_array_equal(point.color, exported.colour[p - 1])
+        of_view = dict(zip(exported.view[rows].tolist(), errors[rows], strict=True))
+        for element in point.track.elements:
+            image = read.images[element.image_id]
+            uv = image.points2D[element.point2D_idx].xy
+            projected = image.project_point(point.xyz)
+            assert np.linalg.norm(uv - projected) == pytest.approx(of_view[element.image_id - 1], abs=0.01)
+            n_seen += 1
+    assert n_seen == len(exported.view)
+
+
+def test_ply_has_points_and_colours(exported: ExportedMap, tmp_path: Path) -> None:
+    plyfile = pytest.importorskip("plyfile", reason="plyfile is not installed")
+    write_ply(exported, tmp_path / "map.ply")
+    vertex = plyfile.PlyData.read(str(tmp_path / "map.ply"))["vertex"]
+    np.testing.assert_allclose(np.column_stack([vertex[a] for a in "xyz"]), exported.xyz, rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(np.column_stack([vertex[c] for c in ("red", "green", "blue")]), exported.colour)
+
+
+def test_gtsam_finds_the_map_again_from_its_pose_graph(exported: ExportedMap, tmp_path: Path) -> None:
+    write_g2o(exported, tmp_path / "map.g2o")
+    graph, values = gtsam.readG2o(str(tmp_path / "map.g2o"), True)
+    assert sorted(values.keys()) == exported.frame.tolist()
+    graph.add(
+        gtsam.PriorFactorPose3(
+            int(exported.frame[0]), values.atPose3(int(exported.frame[0])), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+        )
+    )
+    rng = np.random.default_rng(1)
+    start = gtsam.Values()
+    for k in exported.frame.tolist():
+        start.insert(k, values.atPose3(k).retract(0.02 * rng.normal(size=6)))
+    solved = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
+    for k, T in zip(exported.frame.tolist(), exported.T_world_cam, strict=True):
+        np.testing.assert_allclose(solved.atPose3(k).matrix(), T, atol=1e-4)
+
+
+def test_gtsam_reads_the_bundle_with_the_same_errors(exported: ExportedMap, tmp_path: Path) -> None:
+    write_bal(exported, tmp_path / "map.bal")
+    data = gtsam.SfmData.FromBalFile(str(tmp_path / "map.bal"))
+    assert (data.numberCameras(), data.numberTracks()) == (len(exported.frame), len(exported.xyz))
+    errors = exported.reprojection_errors_px()
+    first = np.searchsorted(exported.point, np.arange(len(exported.xyz) + 1))
+    for p in range(0, len(exported.xyz), 7):
+        track = data.track(p)
+        for j in range(track.numberMeasurements()):
+            v, uv = track.measurement(j)
+            row = first[p] + j
+            assert v == exported.view[row]
+            error = np.linalg.norm(data.camera(v).project(track.point3()) - uv)
+            assert error == pytest.approx(errors[row], abs=0.01)
+
+
+def test_nerfstudio_cameras_look_along_minus_z(exported: ExportedMap, tmp_path: Path) -> None:
+    write_nerfstudio(exported, tmp_path)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    assert (tmp_path / content["ply_file_path"]).is_file()
+    rows = np.flatnonzero(exported.view == 3)
+    frame = content["frames"][3]
+    T_world_gl = np.array(frame["transform_matrix"])
+    in_gl = se3.act(se3.inverse(T_world_gl), exported.xyz[exported.point[rows]])
+    assert (in_gl[:, 2] < 0).all()
+    u = frame["fl_x"] * in_gl[:, 0] / -in_gl[:, 2] + frame["cx"] - 0.5
+    v = frame["fl_y"] * in_gl[:, 1] / in_gl[:, 2] + frame["cy"] - 0.5
+    assert np.median(np.linalg.norm(np.column_stack([u, v]) - exported.uv_px[rows], axis=1)) < 1.0
+
+
+def test_scaled_keeps_what_is_seen(exported: ExportedMap) -> None:
+    metric = exported.scaled(2.5)
+    np.testing.assert_allclose(metric.reprojection_errors_px(), exported.reprojection_errors_px(), atol=1e-9)
+    np.testing.assert_allclose(metric.T_world_cam[:, :3, 3], 2.5 * exported.T_world_cam[:, :3, 3])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["nowhere", "--to", "ply", "--out", "map.ply"], "nowhere"),
+        (["run", "--to", "colmap", "--out", "taken"], "taken is there already"),
+        (["run", "--to", "ply", "--out", "taken"], "is a folder"),
+        (["run", "--to", "tum", "--out", "a.txt", "--distance", "0", "1", "2"], "--distance"),
+        (["run", "--to", "ply", "--out", "a.ply", "--distance", "0", "x", "2"], "--distance"),
+    ],
+)
+def test_bad_input_is_one_sentence(
+    arguments: list[str],
+    sentence: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "mine").write_text("keep")
+    try:
+        status = main(["export", *arguments])
+    except SystemExit as stop:
+        status = stop.code  # type: ignore[assignment]
+    assert status == 2
+    error = capsys.readouterr().err.strip()
+    assert sentence in error
+    assert len(error.splitlines()) == 1
+    assert (tmp_path / "taken" / "mine").read_text() == "keep"
