@@ -27,6 +27,8 @@ class CorruptionKind(StrEnum):
     WRONG_POSE = "wrong_pose"  # a wrong pose goes into the map as a keyframe (degrees; moved by as much of the depth)
     KILL_WORKER = "kill_worker"  # the first recovery that starts in the frames loses its process (without meaning)
     SOLVER_ERROR = "solver_error"  # the live graph fails once, at the first keyframe of the frames (without meaning)
+    SHUTTER = "shutter"  # rendered worlds: the shutter stays open (fraction of the time between frames)
+    ROTATION = "rotation"  # rendered worlds: the camera is swung aside and back (degrees, positive to the right)
 
 
 class Cause(StrEnum):
@@ -39,6 +41,8 @@ class Cause(StrEnum):
 
 
 INTERNAL_KINDS = frozenset({CorruptionKind.WRONG_POSE, CorruptionKind.SOLVER_ERROR, CorruptionKind.KILL_WORKER})
+
+RENDERED_KINDS = frozenset({CorruptionKind.SHUTTER, CorruptionKind.ROTATION})
 
 # kind: (default, lowest, highest strength)
 STRENGTHS: dict[CorruptionKind, tuple[float, float, float]] = {
@@ -56,6 +60,8 @@ STRENGTHS: dict[CorruptionKind, tuple[float, float, float]] = {
     CorruptionKind.WRONG_POSE: (15.0, 0.0, 180.0),
     CorruptionKind.SOLVER_ERROR: (1.0, 0.0, 1.0),
     CorruptionKind.KILL_WORKER: (1.0, 0.0, 1.0),
+    CorruptionKind.SHUTTER: (1.0, 0.0, 4.0),
+    CorruptionKind.ROTATION: (60.0, -180.0, 180.0),
 }
 
 
@@ -64,7 +70,7 @@ class Corruption(StrictModel):
 
     kind: CorruptionKind
     """wipe, occlusion, blur, motion_blur, blackout, exposure, noise, freeze, drop, stride, few_features, wrong_pose,
-    solver_error or kill_worker."""
+    solver_error or kill_worker; in the script of a rendered world also shutter and rotation."""
     start: int = Field(0, ge=0)
     """First frame, counted in the source whatever the stride."""
     length: int | None = Field(None, ge=1)
@@ -79,6 +85,8 @@ class Corruption(StrictModel):
         _, low, high = STRENGTHS[self.kind]
         if not low <= self.level <= high:
             raise ValueError(f"strength of {self.kind} is {self.level:g}; it must lie between {low:g} and {high:g}")
+        if self.kind is CorruptionKind.ROTATION and self.length is None:
+            raise ValueError("rotation needs a length: the camera is swung aside and back in it")
         return self
 
     @property

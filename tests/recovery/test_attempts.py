@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from dualslam.build import build_system, recovery_parts
+from dualslam.config.corruption import Corruption
+from dualslam.config.corruption import CorruptionKind as SpoilKind
 from dualslam.config.settings import AttemptConfig, Config, RecoveryConfig
 from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.errors import ConfigError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import se3, sim3
 from dualslam.lab.audits.link_audit import LinkAudit, audit_links
-from dualslam.lab.synthetic import ScriptedEvent as Spoil
 from dualslam.lab.synthetic import make_sequence
-from dualslam.lab.synthetic.events import ScriptedEventKind as SpoilKind
 from dualslam.recovery.executor import InlineExecutor, Outcome
 from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryResult, run_recovery
 from dualslam.run.results import trajectories_of
@@ -174,7 +174,7 @@ class TestRetry:
 
 def drive(attempts: list[str]) -> tuple[System, np.ndarray]:
     """A street with a black-out of a second, at ten frames a second and half a metre a frame."""
-    sequence = make_sequence("street", 52, seed=2, events=[Spoil(SpoilKind.BLACKOUT, 26, 10)])
+    sequence = make_sequence("street", 52, seed=2, events=[Corruption(kind=SpoilKind.BLACKOUT, start=26, length=10)])
     settings = {"recovery": {"attempts": attempts}, "calibration": {"refine": False}, "buffer": {"duration_s": 5.0}}
     system = build_system(Config.model_validate(settings), sequence.camera)
     for i in range(6, 52):
@@ -215,7 +215,7 @@ def test_a_black_out_on_the_road_is_leapt(attempt: str) -> None:
 
 @pytest.mark.slow
 def test_the_result_is_the_same_whatever_the_threads() -> None:
-    world = make_sequence("street", 52, seed=2, events=[Spoil(SpoilKind.BLACKOUT, 26, 10)])
+    world = make_sequence("street", 52, seed=2, events=[Corruption(kind=SpoilKind.BLACKOUT, start=26, length=10)])
     config = Config.model_validate({"recovery": {"attempts": ["gap"]}, "calibration": {"refine": False}})
     system = build_system(config, world.camera)
     jobs: list[RecoveryJob] = []
@@ -233,7 +233,7 @@ def test_the_result_is_the_same_whatever_the_threads() -> None:
 @pytest.mark.slow
 def test_missing_frames_lead_to_no_wrong_link() -> None:
     """Ten metres of road without a frame: guided matching goes over them to a place 5.6 m off, and does not notice."""
-    world = make_sequence("street", 90, 8, 320, 240, events=[Spoil(SpoilKind.DROP, 53, 10)])
+    world = make_sequence("street", 90, 8, 320, 240, events=[Corruption(kind=SpoilKind.DROP, start=53, length=10)])
     config = Config.model_validate({"seed": 8, "frontend": {"n_features": 600}})
     system = build_system(config, world.camera)
     for frame in world:

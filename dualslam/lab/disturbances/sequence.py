@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from dualslam.config.corruption import Corruption, CorruptionKind
+from dualslam.config.corruption import RENDERED_KINDS, Corruption, CorruptionKind
+from dualslam.core.errors import ConfigError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame, IntArray
 from dualslam.lab.disturbances.images import U8Image, corrupt_image
@@ -26,8 +27,17 @@ _ON_IMAGES = (
 _ON_STREAM = (CorruptionKind.FREEZE, CorruptionKind.DROP, CorruptionKind.STRIDE)
 
 
-def corrupted(sequence: Sequence, corruptions: Iterable[Corruption]) -> Sequence:
-    """Return the sequence with corruptions put on it: itself, where none of them is for its frames."""
+def corrupted(sequence: Sequence, corruptions: Collection[Corruption]) -> Sequence:
+    """Return the sequence with corruptions put on it: itself, where none of them is for its frames.
+
+    Raises
+    ------
+    ConfigError
+        Where one of them is for rendered worlds.
+    """
+    for corruption in corruptions:
+        if corruption.kind in RENDERED_KINDS:
+            raise ConfigError(f"{corruption.kind} is for rendered worlds: write it into their script (events=FILE)")
     chosen = [c for c in corruptions if c.kind in _ON_IMAGES + _ON_STREAM]
     return CorruptedSequence(sequence, chosen) if chosen else sequence
 

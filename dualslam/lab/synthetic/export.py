@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import cv2
@@ -70,7 +69,7 @@ def _write_texts(sequence: SyntheticSequence, out: Path) -> None:
     rows = np.column_stack([times_s, T_world_cam[:, :3, 3], quat_xyzw])
     lines = [f"{row[0]:.6f} " + " ".join(f"{value:.9f}" for value in row[1:]) + "\n" for row in rows]
     (out / "groundtruth_tum.txt").write_text("# t tx ty tz qx qy qz qw (camera to world, metres)\n" + "".join(lines))
-    events = [dataclasses.asdict(event) | {"kind": str(event.kind)} for event in sequence.events]
+    events = [event.model_dump(mode="json", exclude_defaults=True) for event in sequence.events]
     (out / "SOURCE.md").write_text(
         f"# {sequence.name}\n\n"
         "Rendered by `dualslam.lab.synthetic`: no photograph, no recording, no licence of others.\n\n"

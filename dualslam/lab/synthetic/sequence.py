@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.config.corruption import Corruption
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.types import FloatArray, Frame, IntArray
 from dualslam.lab.synthetic.circuit import make_circuit, make_eight, make_terrace
-from dualslam.lab.synthetic.events import ScriptedEvent, disturbance, parse_events, yaw_offset_rad
+from dualslam.lab.synthetic.events import disturbance, parse_events, yaw_offset_rad
 from dualslam.lab.synthetic.path import Drive, Walk, pose
 from dualslam.lab.synthetic.render import Renderer
 from dualslam.lab.synthetic.room import HALF_SIZE_M, make_room
@@ -55,7 +56,7 @@ class SyntheticSequence:
     timestamps_s : (n_frames,) float64
     ground_truth_T_world_cam : (n_frames, 4, 4) float64
         Camera to world, metres, in the middle of the exposure; row i belongs to the frame with index i.
-    events : tuple of ScriptedEvent
+    events : tuple of Corruption
     parameters : dict
         What `make_sequence` was called with, for the record.
     """
@@ -67,7 +68,7 @@ class SyntheticSequence:
         path: CameraPath,
         renderer: Renderer,
         sensor: Sensor,
-        events: tuple[ScriptedEvent, ...],
+        events: tuple[Corruption, ...],
     ) -> None:
         self.parameters = dict(parameters)
         self.name = f"synthetic_{parameters['scene']}_{parameters['seed']}"
@@ -153,7 +154,7 @@ def make_sequence(
     seed: int = 0,
     width: int = 640,
     height: int = 480,
-    events: Iterable[ScriptedEvent | Mapping[str, Any]] = (),
+    events: Iterable[Corruption | Mapping[str, Any]] = (),
     rate_hz: float | None = None,
     supersampling: float = 1.5,
 ) -> SyntheticSequence:
@@ -170,7 +171,7 @@ def make_sequence(
         Of the world, the path and the noise: the same seed gives the same images, bit for bit.
     width, height : int
         Image size, pixels. The horizontal field of view does not depend on it.
-    events : iterable of ScriptedEvent or mapping
+    events : iterable of Corruption or mapping
         Disturbances of some of the frames.
     rate_hz : float, optional
         Frames a second: 10 on the street, 30 in the room and in the hand.

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from dualslam.build import build_system
+from dualslam.config.corruption import Corruption
+from dualslam.config.corruption import CorruptionKind as Spoil
 from dualslam.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.types import FrameStatus
-from dualslam.lab.synthetic import ScriptedEvent, SyntheticSequence, make_sequence
-from dualslam.lab.synthetic.events import ScriptedEventKind as Spoil
+from dualslam.lab.synthetic import SyntheticSequence, make_sequence
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
 from dualslam.testing.point_world import pose_errors
@@ -53,7 +54,8 @@ def test_trajectory_is_right(scene: str, n_frames: int, size: dict[str, int], sh
 @pytest.mark.parametrize("kind", [Spoil.BLACKOUT, pytest.param(Spoil.WIPE, marks=pytest.mark.slow)])
 def test_no_map_starts_while_nothing_is_seen(kind: Spoil) -> None:
     hidden = range(20, 45)
-    sequence = make_sequence("street", 60, seed=1, events=[ScriptedEvent(kind, hidden.start, len(hidden))], **SIZE)
+    dark = Corruption(kind=kind, start=hidden.start, length=len(hidden))
+    sequence = make_sequence("street", 60, seed=1, events=[dark], **SIZE)
     system = run(sequence)
     assert len(system.atlas.submaps) == 2
     (again,) = system.events.of_kind(EventKind.REINITIALISED)

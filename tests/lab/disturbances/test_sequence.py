@@ -185,4 +185,4 @@ def test_a_wrong_corruption_is_named(text: str, said: str) -> None:
 
 def test_all_kinds_have_a_default() -> None:
     for kind in CorruptionKind:
-        assert isinstance(Corruption(kind=kind).level, float)
+        assert isinstance(Corruption(kind=kind, length=3).level, float)

@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dualslam.config.corruption import Corruption, CorruptionKind
 from dualslam.core.errors import ConfigError, OutputError
-from dualslam.lab.synthetic import ScriptedEvent, make_sequence, render_to_folder
+from dualslam.lab.synthetic import make_sequence, render_to_folder
 
 
 def test_folder_round_trips(tmp_path: Path) -> None:
-    events = (ScriptedEvent("drop", 3, 2), ScriptedEvent("blackout", 6, 1))
+    events = (
+        Corruption(kind=CorruptionKind.DROP, start=3, length=2),
+        Corruption(kind=CorruptionKind.BLACKOUT, start=6, length=1),
+    )
     sequence = make_sequence("room", n_frames=8, seed=1, width=96, height=72, events=events)
     out = render_to_folder(sequence, tmp_path / "run")
     names = sorted(p.name for p in (out / "images").iterdir())

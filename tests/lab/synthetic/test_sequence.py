@@ -6,19 +6,20 @@ import cv2
 import numpy as np
 import pytest
 
+from dualslam.config.corruption import Corruption, CorruptionKind
 from dualslam.core.errors import ConfigError, InputError
-from dualslam.lab.synthetic import ScriptedEvent, ScriptedEventKind, SyntheticSequence, make_sequence, parse_events
+from dualslam.lab.synthetic import SyntheticSequence, make_sequence, parse_events
 
 SMALL = {"width": 160, "height": 120, "n_frames": 40}
 SPOILT = (
-    ScriptedEvent(ScriptedEventKind.BLUR, 2, 2, 6.0),
-    ScriptedEvent(ScriptedEventKind.BLACKOUT, 5, 2),
-    ScriptedEvent(ScriptedEventKind.DROP, 9, 3),
-    ScriptedEvent(ScriptedEventKind.EXPOSURE, 14, 1, 2.0),
-    ScriptedEvent(ScriptedEventKind.WIPE, 16, 1),
-    ScriptedEvent(ScriptedEventKind.NOISE, 18, 1, 30.0),
-    ScriptedEvent(ScriptedEventKind.ROTATION, 20, 10, 50.0),
-    ScriptedEvent(ScriptedEventKind.MOTION_BLUR, 24, 2, 1.0),
+    Corruption(kind=CorruptionKind.BLUR, start=2, length=2, strength=6.0),
+    Corruption(kind=CorruptionKind.BLACKOUT, start=5, length=2),
+    Corruption(kind=CorruptionKind.DROP, start=9, length=3),
+    Corruption(kind=CorruptionKind.EXPOSURE, start=14, length=1, strength=2.0),
+    Corruption(kind=CorruptionKind.WIPE, start=16, length=1),
+    Corruption(kind=CorruptionKind.NOISE, start=18, length=1, strength=30.0),
+    Corruption(kind=CorruptionKind.ROTATION, start=20, length=10, strength=50.0),
+    Corruption(kind=CorruptionKind.SHUTTER, start=24, length=2, strength=1.0),
 )
 
 
@@ -184,16 +185,19 @@ def test_rotation_events_turn_the_camera_on_the_spot_and_back(
 
 
 def test_scripts_are_read_from_plain_mappings() -> None:
-    script = parse_events([{"kind": "blackout", "start": 3, "length": 2}, ScriptedEvent("blur", 0, 1)])
-    assert script[0] == ScriptedEvent(ScriptedEventKind.BLACKOUT, 3, 2, 1.0)
+    script = parse_events(
+        [{"kind": "blackout", "start": 3, "length": 2}, Corruption(kind=CorruptionKind.BLUR, start=0, length=1)]
+    )
+    assert script[0] == Corruption(kind=CorruptionKind.BLACKOUT, start=3, length=2)
     for wrong, message in (
-        ({"kind": "fog", "start": 0, "length": 1}, "kind 'fog' is unknown"),
-        ({"kind": "blur", "start": -1, "length": 1}, "start is -1"),
-        ({"kind": "blur", "start": 0, "length": 0}, "length is 0"),
-        ({"kind": "blur", "start": 0, "length": 1, "strength": -2}, "strength is -2"),
-        ({"kind": "blur", "start": 0, "length": 1, "strength": "much"}, "strength is 'much'"),
-        ({"kind": "blur", "start": 0}, "no length"),
-        ({"kind": "blur", "start": 0, "length": 1, "size": 3}, "unknown fields"),
+        ({"kind": "fog", "start": 0, "length": 1}, "kind must be 'wipe'"),
+        ({"kind": "blur", "start": -1, "length": 1}, "start must be greater"),
+        ({"kind": "blur", "start": 0, "length": 0}, "length must be greater"),
+        ({"kind": "blur", "start": 0, "length": 1, "strength": -2}, "strength of blur is -2"),
+        ({"kind": "blur", "start": 0, "length": 1, "strength": "much"}, "strength must be a number"),
+        ({"kind": "rotation", "start": 0}, "needs a length"),
+        ({"kind": "freeze", "start": 0}, "freeze needs images that are there"),
+        ({"kind": "blur", "start": 0, "length": 1, "size": 3}, "unknown field size"),
         ("blur", "must be a mapping"),
     ):
         with pytest.raises(ConfigError, match=message):
@@ -218,7 +222,9 @@ def test_wrong_parameters_are_refused(wrong: dict[str, object], message: str) ->
 
 def test_noise_is_new_in_each_frame() -> None:
     """Else a covered lens shows a world of its own: a plane of noise, which features match and a map is made of."""
-    sequence = make_sequence("street", seed=3, events=[ScriptedEvent(ScriptedEventKind.BLACKOUT, 0, 3)], **SMALL)
+    sequence = make_sequence(
+        "street", seed=3, events=[Corruption(kind=CorruptionKind.BLACKOUT, start=0, length=3)], **SMALL
+    )
     spectra = []
     for index in range(3):
         noise = sequence.frame(index).image.astype(np.float64)
