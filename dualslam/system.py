@@ -26,7 +26,7 @@ from dualslam.io.map_store import StoredMap
 from dualslam.map.atlas import Link
 from dualslam.map.connections import Connections
 from dualslam.map.frame_numbers import FrameNumbers
-from dualslam.map.frame_records import FrameRecord, FrameResult
+from dualslam.map.frame_records import FrameResult, FrameRow
 from dualslam.map.graph_beside import N_FREE, N_FREE_BEHIND, BesideGraphs, Moved
 from dualslam.map.propagation import propagate_links
 from dualslam.map.record import FrameStamp, Record
@@ -82,7 +82,7 @@ class System:
     Attributes
     ----------
     atlas : Atlas
-    rows : dict of int to FrameRecord
+    rows : dict of int to FrameRow
         Every frame that was given to `step`, by its index.
     poses : dict of int to FramePose
     events : EventLog
@@ -187,7 +187,7 @@ class System:
         """
         started, self._posed_at = time.perf_counter(), None
         source, frame = frame, replace(frame, index=self.numbers.number(frame.index))
-        self.rows[frame.index] = FrameRecord(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
+        self.rows[frame.index] = FrameRow(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
         # 1. What was found beside the tracking meanwhile comes into the map between two frames.
         self._collect_graphs(frame)
         self._calibrations.collect(self._live, frame, self._recoveries.waiting)
@@ -311,7 +311,7 @@ class System:
         self.buffer.map(lambda buffered: shutter.shutter_corrected(buffered, camera))
         self._starter = self._parts.new_starter()
         self._relocaliser.end()  # it is of the pixels of before
-        *waiting, newest = (v for v in self.buffer if self.rows[v.index].submap_id is None)
+        *waiting, newest = (v for v in self.buffer if self.rows[v.index].submap is None)
         for earlier in waiting:
             self._starter.collect(earlier)
         return newest
@@ -528,7 +528,7 @@ class System:
         return FrameResult(
             self.numbers.index_of(frame.index),
             row.status,
-            row.submap_id,
+            row.submap,
             T_submap_cam,
             row.n_matches,
             row.n_inliers,

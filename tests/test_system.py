@@ -146,7 +146,7 @@ def test_frames_since_a_loss_wait_for_the_next_map_however_short_the_buffer() ->
     both_sides = np.concatenate([cloud(), cloud(seed=1) * (1, 1, -1)])
     system = run(PointWorld(both_sides, T), buffer={"duration_s": 0.3})
     assert len(system.atlas.submaps) == 2
-    assert {i: row.submap_id for i, row in system.rows.items()} == {i: int(i >= 20) for i in range(60)}
+    assert {i: row.submap for i, row in system.rows.items()} == {i: int(i >= 20) for i in range(60)}
 
 
 def turning_back(n_away: int) -> PointWorld:

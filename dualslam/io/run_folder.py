@@ -17,10 +17,11 @@ import yaml
 
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.events import Event
-from dualslam.core.types import FloatArray, FrameStatus, IntArray
+from dualslam.core.types import FrameStatus
 from dualslam.io.atomic import atomic_file, write_text
 from dualslam.io.map_files import to_plain
 from dualslam.io.trajectory_files import Trajectory, read_text, write_kitti, write_tum
+from dualslam.map.frame_records import FrameRow as FrameRow  # a row of frames.csv
 
 log = logging.getLogger(__name__)
 
@@ -44,46 +45,6 @@ _SAMPLE_NAME = re.compile(r"\d+\.jpg")
 _MAP_NAME = re.compile(r"[\w.-]+\.(npz|json)")
 
 
-@dataclass(frozen=True, slots=True)
-class FrameRow:
-    """One input frame: a row of ``frames.csv``. `submap` is None for a frame that is in none."""
-
-    index: int
-    timestamp_s: float
-    status: FrameStatus
-    submap: int | None
-    in_main_map: bool
-    n_matches: int
-    n_inliers: int
-    latency_ms: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PosedFrames:
-    """Frames with their poses, N of them.
-
-    Attributes
-    ----------
-    index : (N,) int64
-        Frame index in the source.
-    timestamps_s : (N,) float64
-    T_world_cam : (N, 4, 4) float64
-        Camera to the frame of the map that they are in.
-    """
-
-    index: IntArray
-    timestamps_s: FloatArray
-    T_world_cam: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.index)
-
-    def in_time_order(self) -> PosedFrames:
-        """Return the same frames, ascending in time (a run may have read them backwards)."""
-        order = self.timestamps_s.argsort(kind="stable")
-        return PosedFrames(self.index[order], self.timestamps_s[order], self.T_world_cam[order])
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class RunRecord:
     """The result of a run as it goes to the disk.
@@ -92,17 +53,17 @@ class RunRecord:
     ----------
     frames : sequence of FrameRow
         One for every input frame.
-    main : PosedFrames
+    main : Trajectory
         All frames posed in the main map.
-    unlinked : mapping of int to PosedFrames
+    unlinked : mapping of int to Trajectory
         Submaps that are not linked to the main map, each in its own unit.
     summary : mapping
         Plain numbers, strings and lists.
     """
 
     frames: Sequence[FrameRow]
-    main: PosedFrames
-    unlinked: Mapping[int, PosedFrames] = field(default_factory=dict)
+    main: Trajectory
+    unlinked: Mapping[int, Trajectory] = field(default_factory=dict)
     summary: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -176,7 +137,7 @@ class RunFolder:
         """Write frames, trajectories and the summary. May be called again as the run goes on: the last word holds."""
         self.write_frames(record.frames)
         main = record.main.in_time_order()
-        write_tum(self.path / TRAJECTORY, Trajectory(main.timestamps_s, main.T_world_cam))
+        write_tum(self.path / TRAJECTORY, main)
         write_kitti(self.path / TRAJECTORY_KITTI, main.T_world_cam, main.index, self.path / TRAJECTORY_KITTI_FRAMES)
         self._write_unlinked(record.unlinked)
         self.write_summary(record.summary)
@@ -197,11 +158,11 @@ class RunFolder:
         """Write ``summary.json``; NaN becomes null, as JSON has none."""
         write_text(self.path / SUMMARY, json.dumps(to_plain(summary), indent=2, allow_nan=False) + "\n")
 
-    def _write_unlinked(self, unlinked: Mapping[int, PosedFrames]) -> None:
+    def _write_unlinked(self, unlinked: Mapping[int, Trajectory]) -> None:
         folder = self.path / SUBMAPS
         for submap_id, frames in unlinked.items():
             ordered = frames.in_time_order()
-            write_tum(folder / f"{submap_id:02d}.txt", Trajectory(ordered.timestamps_s, ordered.T_world_cam))
+            write_tum(folder / f"{submap_id:02d}.txt", ordered)
         # A submap that was written earlier in the run may be linked by now.
         kept = {f"{submap_id:02d}.txt" for submap_id in unlinked}
         for file in _named(folder, _SUBMAP_NAME):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,29 +9,12 @@ from numpy.typing import ArrayLike
 
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.geometry.so3 import matrix_from_quat_xyzw, quat_xyzw_from_matrix
+from dualslam.core.trajectory import Trajectory as Trajectory  # read and written here
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.io.atomic import write_text
 
 MAX_DT_S = 0.02
 """Largest gap in time between a frame and its true pose."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
-    """Poses in time, ascending.
-
-    Attributes
-    ----------
-    timestamps_s : (N,) float64
-    T_world_cam : (N, 4, 4) float64
-        Camera to world.
-    """
-
-    timestamps_s: FloatArray
-    T_world_cam: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.timestamps_s)
 
 
 # --- TUM

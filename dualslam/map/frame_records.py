@@ -8,13 +8,24 @@ from dualslam.core.types import Failure, FloatArray, FrameStatus
 
 
 @dataclass(slots=True)
-class FrameRecord:
-    """What became of one frame so far; a later walk back in time may still pose it."""
+class FrameRow:
+    """What became of one frame so far: a row of ``frames.csv``. A later walk back in time may still pose it.
+
+    Attributes
+    ----------
+    index : int
+        The frame's number inside the system; its index in the source in what a run leaves behind.
+    submap : int or None
+        The one that it is in.
+    in_main_map : bool
+        Known at the end of the run.
+    """
 
     index: int
     timestamp_s: float
     status: FrameStatus
-    submap_id: int | None = None
+    submap: int | None = None
+    in_main_map: bool = False
     n_matches: int = 0
     n_inliers: int = 0
     latency_ms: float = 0.0

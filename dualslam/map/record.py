@@ -9,7 +9,7 @@ from dualslam.core.events import EventKind, EventLog
 from dualslam.core.stage_timer import StageTimer
 from dualslam.core.types import FrameStatus
 from dualslam.map.atlas import Atlas
-from dualslam.map.frame_records import FrameRecord
+from dualslam.map.frame_records import FrameRow
 from dualslam.map.trajectory import FramePose
 
 
@@ -34,7 +34,7 @@ class Record:
     Attributes
     ----------
     atlas : Atlas
-    rows : dict of int to FrameRecord
+    rows : dict of int to FrameRow
         Every frame that was given to the system, by its index.
     poses : dict of int to FramePose
     events : EventLog
@@ -42,7 +42,7 @@ class Record:
     """
 
     atlas: Atlas = field(default_factory=Atlas)
-    rows: dict[int, FrameRecord] = field(default_factory=dict)
+    rows: dict[int, FrameRow] = field(default_factory=dict)
     poses: dict[int, FramePose] = field(default_factory=dict)
     events: EventLog = field(default_factory=EventLog)
     timer: StageTimer = field(default_factory=StageTimer)
@@ -51,7 +51,7 @@ class Record:
         """Enter where a frame is; without numbers, its row keeps those that it has."""
         self.poses[pose.index] = pose
         row = self.rows[pose.index]
-        row.status, row.submap_id = FrameStatus.TRACKED, pose.submap_id
+        row.status, row.submap = FrameStatus.TRACKED, pose.submap_id
         if n_matches is not None:
             row.n_matches, row.n_inliers = n_matches, n_inliers
 

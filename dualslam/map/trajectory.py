@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.core.geometry import sim3
-from dualslam.core.types import FloatArray, IntArray
+from dualslam.core.trajectory import Trajectory
+from dualslam.core.types import FloatArray
 from dualslam.map.atlas import Atlas
 
 
@@ -23,26 +24,7 @@ class FramePose:
     T_kf_cam: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ComposedTrajectory:
-    """Composed poses, in order of frame index.
-
-    Attributes
-    ----------
-    index : (N,) int64
-    timestamp_s : (N,) float64
-    T_world_cam : (N, 4, 4) float64
-    """
-
-    index: IntArray
-    timestamp_s: FloatArray
-    T_world_cam: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.index)
-
-
-def compose(poses: Iterable[FramePose], atlas: Atlas, S_world_submap: dict[int, FloatArray]) -> ComposedTrajectory:
+def compose(poses: Iterable[FramePose], atlas: Atlas, S_world_submap: dict[int, FloatArray]) -> Trajectory:
     """Compose the poses of the frames that stand in the given submaps, in their common frame.
 
     Parameters
@@ -57,6 +39,5 @@ def compose(poses: Iterable[FramePose], atlas: Atlas, S_world_submap: dict[int, 
     for i, pose in enumerate(kept):
         T_submap_cam = atlas.submaps[pose.submap_id].resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
         T_world_cam[i] = sim3.act_on_pose(S_world_submap[pose.submap_id], T_submap_cam)
-    return ComposedTrajectory(
-        np.array([p.index for p in kept], np.int64), np.array([p.timestamp_s for p in kept], float), T_world_cam
-    )
+    timestamps_s = np.array([p.timestamp_s for p in kept], float)
+    return Trajectory(timestamps_s, T_world_cam, np.array([p.index for p in kept], np.int64))

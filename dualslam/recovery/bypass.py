@@ -42,7 +42,7 @@ def drop_corrupted(record: Record, old_id: int, since: int) -> int:
     corrupted = [i for i, pose in poses.items() if pose.submap_id == old_id and i >= since]
     for i in corrupted:
         del poses[i]
-        record.rows[i].status, record.rows[i].submap_id = FrameStatus.BYPASSED, None
+        record.rows[i].status, record.rows[i].submap = FrameStatus.BYPASSED, None
     return len(corrupted)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from platform import python_version
 from typing import Any
@@ -16,7 +16,7 @@ from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.memory import peak_rss_mb
 from dualslam.core.types import FrameStatus
-from dualslam.io.run_folder import FrameRow, PosedFrames
+from dualslam.io.run_folder import FrameRow
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
 from dualslam.lab.metrics.trajectory_metrics import score_trajectory
 from dualslam.map.atlas import LinkKind
@@ -39,15 +39,15 @@ class Trajectories:
     ----------
     main_submaps : list of int
         The largest linked set of submaps, by the number of posed frames: the main map.
-    main : PosedFrames
+    main : Trajectory
         Frames posed in it.
-    unlinked : dict of int to PosedFrames
+    unlinked : dict of int to Trajectory
         Each other submap, in its own unit.
     """
 
     main_submaps: list[int]
-    main: PosedFrames
-    unlinked: dict[int, PosedFrames]
+    main: Trajectory
+    unlinked: dict[int, Trajectory]
 
 
 def trajectories_of(system: System) -> Trajectories:
@@ -65,7 +65,7 @@ def trajectories_of(system: System) -> Trajectories:
 
 def frame_rows(
     system: System,
-    main: PosedFrames,
+    main: Trajectory,
     dropped: Iterable[tuple[int, float]] = (),
     latencies_ms: Sequence[float] | None = None,
 ) -> list[FrameRow]:
@@ -75,19 +75,15 @@ def frame_rows(
     """
     in_main = set(main.index.tolist())
     rows = [
-        FrameRow(
-            system.numbers.index_of(row.index),
-            row.timestamp_s,
-            row.status,
-            row.submap_id,
-            system.numbers.index_of(row.index) in in_main,
-            row.n_matches,
-            row.n_inliers,
-            row.latency_ms if latencies_ms is None else latencies_ms[n],
+        replace(
+            row,
+            index=system.numbers.index_of(row.index),
+            in_main_map=system.numbers.index_of(row.index) in in_main,
+            latency_ms=row.latency_ms if latencies_ms is None else latencies_ms[n],
         )
         for n, row in enumerate(system.rows.values())
     ]
-    late = [FrameRow(i, t, FrameStatus.DROPPED, None, False, 0, 0, 0.0) for i, t in dropped]
+    late = [FrameRow(i, t, FrameStatus.DROPPED) for i, t in dropped]
     if not late:
         return rows
     return sorted(rows + late, key=lambda row: system.numbers.number_of(row.index))
@@ -176,7 +172,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def _posed(system: System, submap_ids: list[int]) -> PosedFrames:
+def _posed(system: System, submap_ids: list[int]) -> Trajectory:
     S_world_submap = system.atlas.S_world_submap(submap_ids) if submap_ids else {}
     if system.world in S_world_submap:
         S_world_first = sim3.inverse(S_world_submap[system.world])
@@ -185,7 +181,7 @@ def _posed(system: System, submap_ids: list[int]) -> PosedFrames:
     composed = compose(own, system.atlas, S_world_submap)
     index = np.array([system.numbers.index_of(i) for i in composed.index.tolist()], np.int64)
     order = np.argsort(index, kind="stable")  # a source that was read from its end: files ascend all the same
-    return PosedFrames(index[order], composed.timestamp_s[order], composed.T_world_cam[order])
+    return Trajectory(composed.timestamps_s[order], composed.T_world_cam[order], index[order])
 
 
 def _beside(system: System) -> dict[str, Any]:
@@ -201,12 +197,12 @@ def _latency(latencies_ms: tuple[float, ...]) -> dict[str, float]:
     return {"median": median, "p95": p95, "p99": p99, "max": max(latencies_ms)}
 
 
-def _errors(system: System, main: PosedFrames, truth: Trajectory, report: RunReport) -> dict[str, Any]:
+def _errors(system: System, main: Trajectory, truth: Trajectory, report: RunReport) -> dict[str, Any]:
     times = [row.timestamp_s for row in system.rows.values()] + [t for _, t in report.dropped]
     if len(times) < 2 or not len(main):
         return {}
     ordered = main.in_time_order()
-    estimate = Trajectory(ordered.timestamps_s, ordered.T_world_cam)
+    estimate = ordered
     score = asdict(score_trajectory(estimate, truth, np.array(times)))
     return {
         "ate_rmse_m": score["ate_rmse_m"],

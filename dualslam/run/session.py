@@ -116,7 +116,7 @@ def run_to_folder(
         report = run_sequence(watched, sequence, realtime=realtime, pace=system.pace, on_frame=after_frame)
         if report.interrupted and system.rows:
             last = next(reversed(system.rows.values()))
-            system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap_id)
+            system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap)
         _write_new_events(system, folder, n_events)
         try:
             summary = _write_results(system, report, config, sequence, folder, given)

@@ -16,7 +16,7 @@ from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import BoolArray, FloatArray, FrameStatus, Keyframe
 from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.connections import Connections
-from dualslam.map.frame_records import FrameRecord
+from dualslam.map.frame_records import FrameRow
 from dualslam.map.record import Record
 from dualslam.map.split import next_submap
 from dualslam.map.submap import Submap
@@ -74,7 +74,7 @@ class DriftingMap:
             lambda: self.front_ends,
         )
         self.front_ends: list[Any] = []
-        self.now = FrameRecord(0, 0.0, FrameStatus.TRACKED)
+        self.now = FrameRow(0, 0.0, FrameStatus.TRACKED)
         self.submap = self._new_submap(0)
         self.place_of: dict[int, int] = {}  # landmark of the submap by point
         self.last_seen: dict[int, int] = {}
@@ -118,7 +118,7 @@ class DriftingMap:
         ids = self.submap.add_landmarks(xyz, np.zeros((int(new.sum()), 1), np.uint8), np.ones(int(new.sum())), k)
         self.place_of.update(zip(points[new].tolist(), ids.tolist(), strict=True))
         self.submap.add_observations(k, np.arange(len(points)), np.array([self.place_of[p] for p in points.tolist()]))
-        self.now = FrameRecord(k, 0.1 * k, FrameStatus.TRACKED)
+        self.now = FrameRow(k, 0.1 * k, FrameStatus.TRACKED)
         self.record.rows[k] = self.now
         self.record.pose(FramePose(k, 0.1 * k, self.submap.id, k, np.eye(4)))
         if self.submap.gauge[0] < 0 and len(self.submap.keyframes) == 4:

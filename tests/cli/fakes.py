@@ -13,7 +13,7 @@ from dualslam.core.stage_timer import StageTimer
 from dualslam.core.types import Features, FloatArray, Frame, FrameStatus, Keyframe
 from dualslam.map.atlas import Atlas
 from dualslam.map.frame_numbers import FrameNumbers
-from dualslam.map.frame_records import FrameRecord, FrameResult
+from dualslam.map.frame_records import FrameResult, FrameRow
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
 from dualslam.pace import Pace
@@ -41,7 +41,7 @@ class FakeSystem:
         before_step: Callable[[Frame], None] = lambda frame: None,
     ) -> None:
         self.atlas = Atlas()
-        self.rows: dict[int, FrameRecord] = {}
+        self.rows: dict[int, FrameRow] = {}
         self.poses: dict[int, FramePose] = {}
         self.events = EventLog()
         self.timer = StageTimer()
@@ -81,7 +81,7 @@ class FakeSystem:
     def _result(self, frame: Frame, status: FrameStatus) -> FrameResult:
         submap_id = None if self._submap is None else self._submap.id
         number = self.numbers.number(frame.index)
-        self.rows[number] = FrameRecord(number, frame.timestamp_s, status, submap_id, 100, 90, 5.0)
+        self.rows[number] = FrameRow(number, frame.timestamp_s, status, submap_id, False, 100, 90, 5.0)
         return FrameResult(frame.index, status, submap_id, None, 100, 90, 5.0, None)
 
 

@@ -11,7 +11,7 @@ import pytest
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.types import FrameStatus
-from dualslam.io import FrameRow, PosedFrames, RunFolder, RunRecord, read_kitti, read_tum
+from dualslam.io import FrameRow, RunFolder, RunRecord, Trajectory, read_kitti, read_tum
 from dualslam.io.run_folder import read_events, read_frames, unlinked_submaps
 
 ROWS = [
@@ -21,10 +21,10 @@ ROWS = [
 ]
 
 
-def posed(index: list[int]) -> PosedFrames:
+def posed(index: list[int]) -> Trajectory:
     T = np.tile(np.eye(4), (len(index), 1, 1))
     T[:, 0, 3] = index
-    return PosedFrames(np.array(index, np.int64), np.array(index) * 0.1, T)
+    return Trajectory(np.array(index) * 0.1, T, np.array(index, np.int64))
 
 
 def record(**changes: object) -> RunRecord:

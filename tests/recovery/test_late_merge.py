@@ -113,7 +113,7 @@ def test_the_live_map_has_rolled_over_meanwhile() -> None:
     }
     system = run(world, 50, **settings)
     (ended,) = system.events.of_kind(EventKind.RECOVERY_ENDED)
-    assert system.rows[ended.frame].submap_id != ended.submap
+    assert system.rows[ended.frame].submap != ended.submap
     assert_one_right_map(system, world, COVERED)
 
 
@@ -325,7 +325,7 @@ def test_any_schedule_leaves_a_consistent_atlas(seed: int) -> None:
         assert_consistent(submap)
         assert submap.keyframes.keys() == submap.T_submap_kf.keys() == submap.landmark_of.keys()
         assert np.isfinite([submap.resolve_anchor(k, np.eye(4)) for k in submap.anchors]).all()
-    assert all(system.rows[i].submap_id == pose.submap_id for i, pose in system.poses.items())
+    assert all(system.rows[i].submap == pose.submap_id for i, pose in system.poses.items())
     for component in system.atlas.components():  # what is linked is one map
         found = compose(system.poses.values(), system.atlas, system.atlas.S_world_submap(component))
         translation, rotation = pose_errors(found.T_world_cam, world.T_world_cam[found.index])

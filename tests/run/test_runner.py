@@ -69,9 +69,9 @@ def in_real_time(indices: list[int], work_s: dict[int, float]) -> tuple[list[int
 
 
 def _no_poses() -> object:
-    from dualslam.io.run_folder import PosedFrames
+    from dualslam.core.trajectory import Trajectory
 
-    return PosedFrames(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 4, 4)))
+    return Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
 
 
 def test_in_real_time_a_quick_system_waits_for_its_frames() -> None:

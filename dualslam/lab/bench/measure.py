@@ -10,7 +10,7 @@ import numpy as np
 
 from dualslam.core.events import Event, EventKind
 from dualslam.core.types import FloatArray, FrameStatus
-from dualslam.io.run_folder import FrameRow, PosedFrames
+from dualslam.io.run_folder import FrameRow
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
 from dualslam.lab.bench.record import STATUS_LETTERS, Breakage
 from dualslam.lab.metrics.alignment import align_points
@@ -81,21 +81,21 @@ def _count(losses: Iterable[dict[str, Any]], attempt: int) -> None:
         lost["attempts"] = max(lost.get("attempts", 0), attempt)
 
 
-def trajectory_error(main: PosedFrames, truth: Trajectory, times_s: FloatArray) -> tuple[float | None, float | None]:
+def trajectory_error(main: Trajectory, truth: Trajectory, times_s: FloatArray) -> tuple[float | None, float | None]:
     """Return ATE and the length of the path, metres; None where too few frames have ground truth.
 
     Where ground truth is there in parts alone (TUM-Mono: start and end), the path is the estimate's own, in the unit
     that the alignment found.
     """
     ordered = main.in_time_order()
-    score = score_trajectory(Trajectory(ordered.timestamps_s, ordered.T_world_cam), truth, times_s)
+    score = score_trajectory(ordered, truth, times_s)
     path_m = score.path_m
     if score.scale is not None and score.compared < _WHOLE_TRUTH * score.posed:
         path_m = score.scale * _length(ordered.T_world_cam[:, :3, 3])
     return score.ate_rmse_m, path_m
 
 
-def end_point_error(main: PosedFrames, truth: Trajectory | None) -> float | None:
+def end_point_error(main: Trajectory, truth: Trajectory | None) -> float | None:
     """Return how far the end of the estimate is off where its start is right, for a camera that comes back.
 
     It is the alignment error of Engel et al. (2016), "A photometrically calibrated benchmark for monocular visual

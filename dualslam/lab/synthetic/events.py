@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+
 import numpy as np
 
 from dualslam.config.corruption import Corruption, CorruptionKind

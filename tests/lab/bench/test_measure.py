@@ -10,7 +10,7 @@ import pytest
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import so3
 from dualslam.core.types import FrameStatus
-from dualslam.io.run_folder import FrameRow, PosedFrames
+from dualslam.io.run_folder import FrameRow
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.lab.bench.measure import (
     breakages,
@@ -145,10 +145,10 @@ def loop(n: int = 200, rate_hz: float = 10.0) -> Trajectory:
     return Trajectory(np.arange(n) / rate_hz, T)
 
 
-def estimate_of(truth: Trajectory, S: np.ndarray, drift: np.ndarray) -> PosedFrames:
+def estimate_of(truth: Trajectory, S: np.ndarray, drift: np.ndarray) -> Trajectory:
     T = truth.T_world_cam.copy()
     T[:, :3, 3] = (T[:, :3, 3] + drift) @ S[:3, :3].T + S[:3, 3]
-    return PosedFrames(np.arange(len(T)), truth.timestamps_s, T)
+    return Trajectory(truth.timestamps_s, T)
 
 
 def similarity() -> np.ndarray:
