@@ -18,6 +18,7 @@ of a ``calib.txt`` and the ``camera.txt`` of TUM-Mono.
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,8 @@ from dualslam.core.camera.models import (
 )
 from dualslam.core.errors import InputError
 from dualslam.io.trajectory_files import read_text
+
+log = logging.getLogger(__name__)
 
 CALIB_LINE = "fx fy cx cy [k1 k2 p1 p2 [k3]] width height"
 _MATRIX_KEYS = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "M1")
@@ -61,7 +64,14 @@ def read_camera_file(path: str | Path) -> Camera:
         return _from_orb_slam(content, str(path))
     if any(key in content for key in _MATRIX_KEYS):
         return _from_matrix(content, str(path))
+    if content.get("model") in (PinholeCamera.model, RadTanCamera.model) and _is_negative(content.get("fy")):
+        log.info("%s: fy is negative, so its y-axis points up; here it points down", path)
+        content = {**content, "fy": -content["fy"]} | ({"p1": -content["p1"]} if content.get("p1") else {})
     return make_camera(str(path), lambda: camera_from_dict(content))
+
+
+def _is_negative(value: object) -> bool:
+    return isinstance(value, int | float) and value < 0
 
 
 def make_camera(where: str, build: Callable[[], Camera]) -> Camera:
@@ -72,9 +82,21 @@ def make_camera(where: str, build: Callable[[], Camera]) -> Camera:
         raise InputError(f"{where}: {str(e).removeprefix('camera: ').rstrip('.')}; correct the calibration.") from e
 
 
+P1 = 2
+"""Its place among the coefficients k1 k2 p1 p2 k3: it is odd in y."""
+
+
 def radtan_camera(fxycxy: list[float], distortion: list[float], size: tuple[float, float], where: str) -> Camera:
-    """Make a pinhole camera, or a radial-tangential one where any of k1 k2 p1 p2 [k3] is not zero."""
+    """Make a pinhole camera, or a radial-tangential one where any of k1 k2 p1 p2 [k3] is not zero.
+
+    A negative fy (ICL-NUIM's is -480) says that y points up in the calibration's camera frame. The image is the same;
+    here y points down.
+    """
     pixels = whole_size(size, where)
+    if fxycxy[1] < 0:
+        log.info("%s: fy is negative, so its y-axis points up; here it points down", where)
+        fxycxy = [fxycxy[0], -fxycxy[1], *fxycxy[2:]]
+        distortion = [-d if i == P1 else d for i, d in enumerate(distortion)]
     if any(d != 0 for d in distortion):
         return make_camera(where, lambda: RadTanCamera(*pixels, *fxycxy, *distortion))
     return make_camera(where, lambda: PinholeCamera(*pixels, *fxycxy))

@@ -150,3 +150,28 @@ def test_more_distortion_than_we_know(tmp_path: Path) -> None:
         read_camera_file(path)
     path.write_text(head + "distortion_coefficients: [-0.1, 0.02, 0.001, -0.002, 0.003, 0, 0, 0]\n")
     assert read_camera_file(path) == RADTAN
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("calib.txt", "481.2 -480 319.5 239.5 -0.2 0.05 0.001 0.002 640 480\n"),
+        (
+            "c.yaml",
+            "model: radtan\nfx: 481.2\nfy: -480\ncx: 319.5\ncy: 239.5\nk1: -0.2\nk2: 0.05\np1: 0.001\np2: 0.002\n"
+            "width: 640\nheight: 480\n",
+        ),
+    ],
+)
+def test_a_y_axis_that_points_up_is_turned_down(tmp_path: Path, name: str, text: str) -> None:
+    """What the calibration's own camera frame, y up, projects to a pixel, ours projects there with y down."""
+    (tmp_path / name).write_text(text)
+    camera = read_camera_file(tmp_path / name)
+    k1, k2, p1, p2 = -0.2, 0.05, 0.001, 0.002
+    x, y = np.random.default_rng(0).uniform(-0.4, 0.4, (2, 20))
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2 * r2
+    u = 481.2 * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + 319.5
+    v = -480 * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + 239.5
+    ours = camera.project(np.column_stack([x, -y, np.ones(20)]))
+    np.testing.assert_allclose(ours, np.column_stack([u, v]), atol=1e-9)
