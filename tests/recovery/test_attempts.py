@@ -215,7 +215,7 @@ def test_a_black_out_on_the_road_is_leapt(attempt: str) -> None:
 
 @pytest.mark.slow
 def test_the_result_is_the_same_whatever_the_threads() -> None:
-    world = make_sequence("street", 52, seed=2, events=[Corruption(kind=SpoilKind.BLACKOUT, start=26, length=10)])
+    world = make_sequence("street", 52, seed=3, events=[Corruption(kind=SpoilKind.BLACKOUT, start=26, length=10)])
     config = Config.model_validate({"recovery": {"attempts": ["gap"]}, "calibration": {"refine": False}})
     system = build_system(config, world.camera)
     jobs: list[RecoveryJob] = []
