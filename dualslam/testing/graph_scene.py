@@ -142,6 +142,30 @@ class Feeder:
         submap.add_observations(k, np.array(new_feature), ids)
 
 
+def guessed_submap(scene: GraphScene, pose_noise: float = 0.01, point_noise: float = 0.02, seed: int = 1) -> Submap:
+    """Return a submap of all the scene's keyframes and points, off their true places.
+
+    The first and the last keyframe are its gauge, and true: what a graph makes of it is in the truth's frame and unit.
+
+    Parameters
+    ----------
+    scene : GraphScene
+    pose_noise : float
+        Standard deviation of each coordinate of the camera's centre.
+    point_noise : float
+        Of a point's distance, relative to it.
+    seed : int
+    """
+    feeder, rng = Feeder(scene, seed, point_noise=point_noise), np.random.default_rng(seed)
+    n = len(scene.features)
+    for k in range(n):
+        feeder.add(k, exact=True)
+    for k in range(1, n - 1):
+        feeder.submap.T_submap_kf[k][:3, 3] += pose_noise * rng.normal(size=3)
+    feeder.submap.gauge = (0, n - 1)
+    return feeder.submap
+
+
 def pose_errors(T_est: FloatArray, T_true: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return translation norms and angles (rad) of ``inv(T_est) @ T_true``."""
     off = np.linalg.inv(T_est) @ T_true
