@@ -1,4 +1,4 @@
-# make setup | demo | test | test-all | check | docs | bench | accuracy | lock | clean
+# make setup | demo | test | test-all | check | docs | package | bench | accuracy | lock | clean
 # A fresh clone needs python3 (3.11 to 3.13, choose with PYTHON=python3.12), its venv and pip modules, and make.
 
 PYTHON ?= python3
@@ -14,7 +14,7 @@ export OPENBLAS_NUM_THREADS = 1
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 unexport PYTHONPATH
 
-.PHONY: setup demo test test-all check docs format bench accuracy lock clean
+.PHONY: setup demo test test-all check docs package format bench accuracy lock clean
 .DEFAULT_GOAL := setup
 
 setup: $(STAMP)
@@ -50,6 +50,10 @@ check: setup
 
 docs: setup
 	$(BIN)/mkdocs build --quiet --strict
+
+# A wheel and an sdist, each installed into an empty environment and run from elsewhere.
+package: setup
+	tools/try_package.sh $(BIN)/python dist
 
 format: setup
 	$(BIN)/ruff check --fix .
