@@ -264,6 +264,7 @@ class FailureReason(StrEnum):
     DEFORMED = "deformed"
     NEEDS_OLDER_KEYFRAMES = "needs_older_keyframes"
     UNCONFIRMED = "unconfirmed"
+    LOOK_ALIKE = "look_alike"
     TIMEOUT = "timeout"
     WORKER = "worker"
     BUSY = "busy"

@@ -205,6 +205,8 @@ class Recoveries:
                 with self._record.timer.measure("merging"):
                     self._take_in(job, result, live, now, walk.began_s)
             unlinked = bool(job.onsets) and (isinstance(result, Failure) or result.link is None)
+            if not isinstance(result, Failure) and result.looks_alike:
+                continue
             if unlinked or self._way_to_gaps(self._record.atlas.submaps[job.submap.id]):
                 self._retries.leave_open(job.submap.id, walk.n_live, job.camera)
 

@@ -105,6 +105,8 @@ class RecoveryResult:
         Of all attempts, in order.
     seconds, cpu_s : float
         Wall time of all attempts, and CPU time of the process, whose threads find features beside the walk.
+    looks_alike : bool
+        Whether beyond a gap two poses explained as much: no later walk over it would tell them apart.
     """
 
     submap: Submap
@@ -113,6 +115,7 @@ class RecoveryResult:
     events: tuple[Event, ...]
     seconds: float
     cpu_s: float
+    looks_alike: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,6 +155,7 @@ def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Fai
     best: _Progress | None = None
     problem = Failure(FailureReason.SOLVER)
     events: list[Event] = []
+    looks_alike = False
     until = np.inf if parts.budget_s is None else started + parts.budget_s
     for attempt in parts.attempts if job.lost else (parts.posing,):
         if best is not None and time.perf_counter() > until:
@@ -161,14 +165,16 @@ def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Fai
             problem = progress
             continue
         events += progress.events
+        looks_alike |= progress.looks_alike
         if best is None or progress.link is not None:
             best = progress
-        if progress.link is not None or progress.needs_camera or progress.needs_live_end:
+        if progress.link is not None or progress.needs_camera or progress.needs_live_end or progress.looks_alike:
             break
     if best is None:
         return problem
     seconds, cpu_s = time.perf_counter() - started, time.process_time() - cpu_started
-    return RecoveryResult(best.submap, tuple(best.frames.values()), best.link, tuple(events), seconds, cpu_s)
+    frames = tuple(best.frames.values())
+    return RecoveryResult(best.submap, frames, best.link, tuple(events), seconds, cpu_s, looks_alike)
 
 
 @dataclass(slots=True, eq=False)
@@ -187,6 +193,7 @@ class _Progress:
     given_up: bool = False
     needs_camera: bool = False  # no other walk would do better, before the camera is calibrated
     needs_live_end: bool = False  # nor before the live end has grown, from which all of them set out
+    looks_alike: bool = False  # beyond a gap: what one front end cannot tell apart another may not even notice
     why_unusable: str = ""
     why_not_linked: str = ""
 
@@ -200,6 +207,7 @@ class _Progress:
 
     def note_unusable(self, failure: Failure) -> None:
         self.n_unusable += 1
+        self.looks_alike |= failure.reason is FailureReason.LOOK_ALIKE
         self.why_unusable = failure.detail or str(failure.reason)
 
     def note_posed(self, frame: RecoveredFrame, new_keyframe: bool) -> None:

@@ -32,6 +32,7 @@ from dualslam.frontends.gap.auxiliary_features import AuxiliaryFeatures
 from dualslam.frontends.gap.auxiliary_map import AuxiliaryMap, triangulate
 from dualslam.frontends.gap.consensus import CONFIRMING_SHARE, BeyondGap, confirmed_share
 from dualslam.frontends.gap.relocalisation import GapPose, relocalise_across_gap
+from dualslam.frontends.gap.second_pose import refuse_look_alike
 from dualslam.frontends.gap.uncertainty import SMALL_STEP
 from dualslam.frontends.tracking.resection import resect
 from dualslam.frontends.tracking.tracker import GivenPose
@@ -124,6 +125,7 @@ class PnpOdometry:
         self._confirmed: tuple[_Beyond, FloatArray] | None = (
             None  # with its pose from the last gap relocalisation's frame
         )
+        self._doubt: Failure | None = None  # what was found to look alike beyond the gap at hand
         self._beyond: _Beyond | None = None  # the last frame beyond a gap, until another confirms it
 
     # --- the VisualOdometry protocol, as far as the live front end does it
@@ -212,7 +214,7 @@ class PnpOdometry:
         if isinstance(pose, Failure):
             return pose
         track = pose if isinstance(pose, Track) else self._live.track_at(view, pose)
-        self._following, self._beyond = True, None
+        self._following, self._beyond, self._doubt = True, None, None
         self._map.put(view.index, self.reference_id, track.T_cam_submap)
         self._forget()
         return track
@@ -334,6 +336,12 @@ class PnpOdometry:
             self._config.seed,
         )
         wide = self._judge(found)
+        if not isinstance(wide, Failure):
+            refused = self._refuse_look_alike(wide, features, frames)
+            wide = wide if refused is None else refused
+        if isinstance(wide, Failure) and wide.reason is FailureReason.LOOK_ALIKE:
+            self._map.drop(index)
+            return wide
         if isinstance(wide, Failure):
             step = self._small_step(view, found) if isinstance(found, GapPose) else None
             if step is None:
@@ -375,6 +383,25 @@ class PnpOdometry:
             return None
         self._live.take(track)
         return track
+
+    def _refuse_look_alike(self, wide: GapPose, features: Features, frames: list[int]) -> Failure | None:
+        """Return why a gap relocalisation is not believed, if another pose explains nearly as much."""
+        if self._doubt is not None:
+            return self._doubt
+        last = frames[-1]
+        rows = self._map.rows_with_track(last)
+        xyz, good = triangulate(self._map.views(last, rows, frames), self.submap.K)
+        self._doubt = refuse_look_alike(
+            self._auxiliary,
+            self._map.features(last).descriptors[rows[good]],
+            xyz[good],
+            features,
+            wide.T_cam_submap,
+            self.submap.K,
+            self._size_px,
+            self._config.seed,
+        )
+        return self._doubt
 
     def _judge(self, wide: GapPose | Failure) -> GapPose | Failure:
         """Hold a gap relocalisation to what health asks of a track, and to the scale that it must not lose."""

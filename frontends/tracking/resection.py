@@ -17,7 +17,13 @@ def poselib_camera(K: FloatArray, size_px: tuple[int, int]) -> dict[str, Any]:
 
 
 def resect(
-    K: FloatArray, size_px: tuple[int, int], uv_px: FloatArray, xyz: FloatArray, sigma_px: float, seed: int
+    K: FloatArray,
+    size_px: tuple[int, int],
+    uv_px: FloatArray,
+    xyz: FloatArray,
+    sigma_px: float,
+    seed: int,
+    max_iterations: int = 1000,
 ) -> FloatArray:
     """RANSAC over the 3-point problem (PoseLib), a starting point for `refine_pose`.
 
@@ -30,6 +36,8 @@ def resect(
     sigma_px : float
         Typical noise of the pixels; the inlier threshold is three times that.
     seed : int
+    max_iterations : int
+        Hypotheses at most; a thousand find one where a sixth of the matches are right.
 
     Returns
     -------
@@ -37,7 +45,12 @@ def resect(
         ``T_cam_w``.
     """
     camera = poselib_camera(K, size_px)
-    options = {"max_reproj_error": 3.0 * sigma_px, "max_iterations": 1000, "min_iterations": 50, "seed": seed}
+    options: dict[str, Any] = {
+        "max_reproj_error": 3.0 * sigma_px,
+        "max_iterations": max_iterations,
+        "min_iterations": 50,
+        "seed": seed,
+    }
     pose, _ = poselib.estimate_absolute_pose(uv_px, xyz, camera, options, {})
     T_cam_w = np.eye(4)
     T_cam_w[:3] = pose.Rt

@@ -16,6 +16,7 @@ from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from dualslam.frontends.features.matching import FeatureGrid, match_projected
+from dualslam.frontends.gap.second_pose import refuse_look_alike
 from dualslam.frontends.gap.uncertainty import SMALL_STEP, pose_uncertainty
 from dualslam.frontends.gates import MIN_CONSENSUS
 from dualslam.frontends.tracking.local_map import LocalMap, Prediction, covering_keyframes
@@ -27,6 +28,7 @@ LOCAL_RADIUS_PX = 4.0
 
 WIDER = 2.5  # second guided search: this many times the first radius
 MAX_EXTRAPOLATION = 3.0  # intervals for which the motion between the last two frames says something
+BEFORE_GAP = 3  # keyframes whose landmarks are asked for a second pose beyond a gap
 GIVEN_POSE_CHI2 = 4 * CHI2_99[2]  # 99 % with 2 degrees of freedom, and the pose off by as much as a pixel
 
 
@@ -81,6 +83,7 @@ class Tracker:
         self._last: Track | None = None
         self._velocity: tuple[FloatArray, float] | None = None
         self._local: LocalMap | None = None
+        self._doubt: Failure | None = None  # what was found to look alike beyond the gap at hand
 
     @property
     def last(self) -> Track | None:
@@ -89,7 +92,7 @@ class Tracker:
 
     def start(self, track: Track) -> None:
         """Begin at a frame whose pose is known, at rest."""
-        self._last, self._velocity = track, None
+        self._last, self._velocity, self._doubt = track, None, None
         self.refresh()
 
     def refresh(self) -> None:
@@ -141,6 +144,9 @@ class Tracker:
         if isinstance(track, Failure):
             return track
         verdict = self._judge_relocalised(track) if wide else track
+        if not isinstance(verdict, Failure) and wide:
+            refused = self._refuse_look_alike(track)
+            verdict = track if refused is None else refused
         if not isinstance(verdict, Failure):
             self._accept(track)
         return verdict
@@ -301,6 +307,34 @@ class Tracker:
         detail = f"the scale beyond the gap is known to {scale_sigma:.1%}"
         return Failure(FailureReason.SCALE, detail, {"gap_scale_sigma": scale_sigma})
 
+    def _refuse_look_alike(self, track: Track) -> Failure | None:
+        """Return why a pose across a gap is not believed, if another explains nearly as much of what was seen before.
+
+        That is asked of the last keyframes, in the descriptors that they saw. A gap beyond which two poses stood once
+        is not crossed any more: frames further on show ever less of what was seen, and one would pass by chance.
+        """
+        if self._doubt is not None:
+            return self._doubt
+        submap = self._submap
+        features, ids, known = [], [], np.zeros(len(submap.landmarks), bool)
+        for k in submap.keyframes_near(track.view.index)[:BEFORE_GAP]:
+            row = np.flatnonzero(submap.landmark_of[k] >= 0)
+            row = row[~known[submap.landmark_of[k][row]]]
+            ids.append(submap.landmark_of[k][row])
+            features.append(submap.keyframes[k].features.descriptors[row])
+            known[ids[-1]] = True
+        self._doubt = refuse_look_alike(
+            self._frontend,
+            np.concatenate(features),
+            submap.landmarks["xyz_mu"][np.concatenate(ids)],
+            track.view.features,
+            track.T_cam_submap,
+            submap.K,
+            self._size_px,
+            self._seed,
+        )
+        return self._doubt
+
     def _refine(
         self, view: View, T_start: FloatArray, ids: IntArray, xyz_mu: FloatArray, feature: IntArray
     ) -> tuple[FloatArray, IntArray] | Failure:
@@ -385,7 +419,7 @@ class Tracker:
         last = self._last
         dt = track.view.timestamp_s - last.view.timestamp_s
         self._velocity = (se3.log(track.T_cam_submap @ se3.inverse(last.T_cam_submap)), dt)
-        self._last = track
+        self._last, self._doubt = track, None
 
     # --- the local map
 

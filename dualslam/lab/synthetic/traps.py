@@ -47,7 +47,7 @@ class Trap:
 
 @dataclass(frozen=True, slots=True)
 class _FromRest:
-    """A path that is at rest at first: its own time begins slowly, over `rest_s`. `tremor`: what moves all along."""
+    """A path that is at rest for `rest_s`, and whose time then begins slowly. `tremor`: what moves all the while."""
 
     path: _Path
     rest_s: float
@@ -94,7 +94,10 @@ class _TakeOff:
 
 
 def make_board(seed: int, n_s: float) -> Trap:
-    """Build a board of prints that are all the same, `BOARD_PERIOD_M` apart, and slide along it for `n_s` seconds."""
+    """Build a board of prints that are all the same, `BOARD_PERIOD_M` apart, and slide along it for `n_s` seconds.
+
+    On every second one stands a carton; so it is two periods after which all is as it was.
+    """
     rng = np.random.default_rng([seed, 0xB0A])
     surfaces = []
     for column in range(int((BOARD_SPEED_M_S * n_s + 5.0) / BOARD_PERIOD_M)):
@@ -109,6 +112,10 @@ def make_board(seed: int, n_s: float) -> Trap:
                 400.0,
             )
             surfaces.append(replace(print_, texture=TEXTURES_FROM))
+            if (row + column) % 2:  # something to see depth by
+                size, cartons = (0.13, 0.12, 0.13), [room_materials.carton] * 6
+                carton = box((left + 0.12, 1.2), 0.0, size, 0.46 + row * BOARD_PERIOD_M, cartons, 400.0)
+                surfaces += [replace(face, texture=TEXTURES_FROM + 1 + i) for i, face in enumerate(carton)]
     path = _Slide(BOARD_SPEED_M_S, 1.5, Sway(rng, [0.01, 0.01, 0.03, 0.01, 0.01, 0.01], (0.15, 0.6)))
     return Trap(Scene(tuple(surfaces), 150, seed), path, in_hand=True)
 

@@ -1,0 +1,190 @@
+"""Does a second pose beyond a gap explain nearly as much as the first? Then the scene repeats itself: none is known.
+
+A match is made where the best candidate is clearly better than the second, which throws out just those that would show
+a repetition; among the few that are left a wrong pose, one period off, may have all. So every point is paired with all
+features that look like it; what the first pose explains is taken out, and the rest is asked for another pose. (The
+same test for two maps: `dualslam/places/second_pose.py`.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from dualslam.core.chi_square import CHI2_99
+from dualslam.core.geometry.projection import project_points, refine_pose
+from dualslam.core.interfaces import Frontend
+from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray
+from dualslam.frontends.gates import MIN_CONSENSUS
+from dualslam.frontends.tracking.resection import resect
+
+NEARLY_AS_MUCH = 0.5
+"""Share of the first pose's support at which a second makes it doubtful, as for two maps: at a half, the better
+explanation no longer stands out."""
+N_ALIKE = 4
+"""Features that one point is paired with: copies of a thing that are told apart."""
+N_POINTS, N_FEATURES = 300, 1500
+"""Of a kind that are compared, all with all, at most (spread over them): half a million pairs are 50 ms."""
+N_MODES = 4
+"""Shifted poses that are tried."""
+HYPOTHESES = 5000
+"""Of three points: of four candidates for each point one is right at best, and of many points none."""
+SAME_PX = 12.0
+"""Median distance in the image, in sigmas of the pixels, up to which two poses show the points at one place: four times
+what the gate of a match lets through. Texture alone makes nearer neighbours alike."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SecondPose:
+    """Another pose, and how many points it and the first one explain.
+
+    Attributes
+    ----------
+    T_cam_w : (4, 4)
+    support, first_support : int
+    """
+
+    T_cam_w: FloatArray
+    support: int
+    first_support: int
+
+    @property
+    def makes_doubtful(self) -> bool:
+        """Whether it explains nearly as much as the first."""
+        return self.support >= NEARLY_AS_MUCH * self.first_support
+
+
+def refuse_look_alike(
+    frontend: Frontend,
+    descriptors: NDArray[np.generic],
+    xyz: FloatArray,
+    features: Features,
+    T_cam_w: FloatArray,
+    K: FloatArray,
+    size_px: tuple[int, int],
+    seed: int,
+) -> Failure | None:
+    """Return why a pose beyond a gap is not to be believed, if another one explains nearly as much.
+
+    Parameters
+    ----------
+    frontend : Frontend
+        Whose descriptors these are.
+    descriptors : (N, D), xyz : (N, 3)
+        What is known of before the gap, whether or not it was matched.
+    features : Features
+        Of the frame beyond the gap.
+    T_cam_w : (4, 4)
+        The first pose.
+    K : (3, 3)
+    size_px : (width, height)
+    seed : int
+    """
+    second = find_second_pose(frontend, descriptors, xyz, features, T_cam_w, K, size_px, seed)
+    if second is None or not second.makes_doubtful:
+        return None
+    numbers = {"second_pose": float(second.support), "first_pose": float(second.first_support)}
+    detail = f"another pose explains {second.support} points, this one {second.first_support}"
+    return Failure(FailureReason.LOOK_ALIKE, detail, numbers)
+
+
+def find_second_pose(
+    frontend: Frontend,
+    descriptors: NDArray[np.generic],
+    xyz: FloatArray,
+    features: Features,
+    T_cam_w: FloatArray,
+    K: FloatArray,
+    size_px: tuple[int, int],
+    seed: int,
+) -> SecondPose | None:
+    """Look for another pose among the pairs that the first one leaves over; parameters as `refuse_look_alike`."""
+    chosen, seen = _spread(len(xyz), N_POINTS), _spread(len(features), N_FEATURES)
+    xyz, features = xyz[chosen], features.take(seen)
+    point, feature = _alike(frontend, descriptors[chosen], features.descriptors)
+    explained = _explained(T_cam_w, xyz[point], features, feature, K)
+    first_support = len(np.unique(point[explained]))
+    rest = np.flatnonzero(~explained)
+    if len(rest) < MIN_CONSENSUS:
+        return None
+    uv, sigma = features.uv_rect_px[feature[rest]], features.sigma_px[feature[rest]]
+    sigma_px = float(np.median(sigma))
+    starts = [*_shifted(T_cam_w, xyz[point[rest]], uv, K, sigma_px)]
+    starts.append(resect(K, size_px, uv, xyz[point[rest]], sigma_px, seed, max_iterations=HYPOTHESES))
+    best: SecondPose | None = None
+    for T_start in starts:
+        near = _within(T_start, xyz[point[rest]], uv, K, SAME_PX * sigma)
+        if np.count_nonzero(near) < MIN_CONSENSUS:
+            continue
+        refined = refine_pose(K, T_start, xyz[point[rest[near]]], uv[near], sigma[near])
+        if isinstance(refined, Failure):
+            continue
+        T = refined.T_cam_w
+        held = np.unique(point[_explained(T, xyz[point], features, feature, K)])
+        if len(held) < MIN_CONSENSUS or _are_one(T_cam_w, T, xyz[held], K, sigma_px):
+            continue
+        if best is None or len(held) > best.support:
+            best = SecondPose(T, len(held), first_support)
+    return best
+
+
+def _shifted(
+    T_cam_w: FloatArray, xyz: FloatArray, uv_px: FloatArray, K: FloatArray, sigma_px: float
+) -> Iterator[FloatArray]:
+    """Yield poses beside the first one that many pairs ask for: what is moved by a period seldom turns as well.
+
+    A camera that has moved sideways by d sees a point at depth z moved by ``- f d / z``: each pair votes for one d, and
+    where the votes are densest there is a pose to be tried.
+    """
+    uv, depth = project_points(K, T_cam_w, xyz)
+    seen = depth > 0
+    if not seen.any():
+        return
+    votes = (uv_px[seen] - uv[seen]) * depth[seen, None] / K[0, 0]
+    radius = SAME_PX * sigma_px * float(np.median(depth[seen])) / K[0, 0]
+    left = np.linalg.norm(votes, axis=1) > radius
+    tree = cKDTree(votes)
+    density = np.asarray(tree.query_ball_point(votes, radius / 2.0, return_length=True))
+    for _ in range(N_MODES):
+        if not left.any():
+            return
+        top = int(np.argmax(np.where(left, density, -1)))
+        T_shifted = T_cam_w.copy()
+        T_shifted[:2, 3] += votes[top]
+        yield T_shifted
+        left &= np.linalg.norm(votes - votes[top], axis=1) > radius
+
+
+def _spread(n: int, at_most: int) -> IntArray:
+    return np.linspace(0, n - 1, min(n, at_most)).round().astype(np.int64)
+
+
+def _alike(frontend: Frontend, a: NDArray[np.generic], b: NDArray[np.generic]) -> tuple[IntArray, IntArray]:
+    """Return all pairs of rows that look alike: for each of a the `N_ALIKE` nearest of b that are near enough."""
+    if not len(a) or not len(b):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    distance = np.stack([frontend.distance(np.broadcast_to(row, b.shape), b) for row in a])
+    nearest = np.argsort(distance, axis=1, kind="stable")[:, :N_ALIKE]
+    i, column = np.nonzero(np.take_along_axis(distance, nearest, axis=1) <= frontend.max_distance_strict)
+    return i, nearest[i, column]
+
+
+def _explained(T_cam_w: FloatArray, xyz: FloatArray, features: Features, feature: IntArray, K: FloatArray) -> BoolArray:
+    reach = np.sqrt(CHI2_99[2]) * features.sigma_px[feature]
+    return _within(T_cam_w, xyz, features.uv_rect_px[feature], K, reach)
+
+
+def _within(T_cam_w: FloatArray, xyz: FloatArray, uv_px: FloatArray, K: FloatArray, reach_px: FloatArray) -> BoolArray:
+    uv, depth = project_points(K, T_cam_w, xyz)
+    return np.asarray((depth > 0) & (np.linalg.norm(uv - uv_px, axis=1) < reach_px))
+
+
+def _are_one(T_a: FloatArray, T_b: FloatArray, xyz: FloatArray, K: FloatArray, sigma_px: float) -> bool:
+    """Whether two poses show the points at one place."""
+    (uv_a, depth_a), (uv_b, _) = project_points(K, T_a, xyz), project_points(K, T_b, xyz)
+    apart = np.where(depth_a > 0, np.linalg.norm(uv_a - uv_b, axis=1), np.inf)
+    return bool(np.median(apart) < SAME_PX * sigma_px)
