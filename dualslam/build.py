@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -19,11 +19,12 @@ from dualslam.calibration.lens import Calibration, CalibrationAnswer, Calibratio
 from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.camera.corrected import CorrectedCamera
+from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.camera.models import Camera
 from dualslam.core.errors import ConfigError
 from dualslam.core.interfaces import Frontend, PreferredCamera, SelfCalibrator, SubmapGraph, WindowSolver
 from dualslam.core.threads import spare_cores
-from dualslam.core.types import Failure, FloatArray, IntArray
+from dualslam.core.types import Failure, FloatArray, Frame, IntArray
 from dualslam.frontends.features.image_features import ImageFeatures
 from dualslam.frontends.features.motion_statistics import nearest_search
 from dualslam.frontends.frame_reader import FrameReader
@@ -33,6 +34,7 @@ from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.place_matcher import FrontendPlaceMatcher
 from dualslam.frontends.registry import check_frontend
 from dualslam.frontends.registry import create_frontend as create_frontend  # part of the Python interface
+from dualslam.frontends.tracking.focal_search import search_focal
 from dualslam.frontends.tracking.initialiser import Initialiser
 from dualslam.frontends.tracking.rolling_shutter import RollingShutter
 from dualslam.frontends.tracking.visual import VisualFrontEnd
@@ -297,6 +299,19 @@ def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript) -
     )
     graphs = Lane("map", (JobKind.GRAPH,), partial(graph_handlers, config), 1, GRAPH_LIMIT_S)
     return WorkerDesk([graphs, walks], recovery.finish_wait_s, faults.kill_worker)
+
+
+def find_focal(config: Config, frames: Iterable[Frame], size_px: tuple[int, int]) -> FocalSearch | Failure:
+    """Search for the focal length of a camera of which nothing is known, by frames from its beginning.
+
+    Raises
+    ------
+    ConfigError
+        If the front end is not known, or its options are wrong.
+    """
+    frontend = create_frontend(config.frontend)
+    features = [frontend.extract(frame.image) for frame in frames if frame.image is not None]
+    return search_focal(frontend, features, size_px, config.seed)
 
 
 def recovery_parts(

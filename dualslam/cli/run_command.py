@@ -7,7 +7,9 @@ import argparse
 from dualslam.cli import logs
 from dualslam.cli.configuration import config_of
 from dualslam.cli.console import final_line, progress, stage_table
-from dualslam.core.errors import InputError
+from dualslam.core.camera.focal import FocalSearch
+from dualslam.core.errors import InputError, NoCalibrationError
+from dualslam.run.focal import open_without_calibration
 from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import open_source
 
@@ -19,15 +21,18 @@ def execute(args: argparse.Namespace) -> int:
     if args.localise and args.map is None:
         raise InputError("--localise finds poses in a saved map: name its run folder with --map.")
     config = config_of(args)
-    sequence = open_source(
-        args.source,
-        camera_file=args.camera,
-        fov_degrees=args.fov,
-        start=args.start,
-        stride=args.stride,
-        max_frames=args.max_frames,
-        reverse=args.reverse,
-    )
+    selection = {
+        "start": args.start,
+        "stride": args.stride,
+        "max_frames": args.max_frames,
+        "reverse": args.reverse,
+    }
+    focal: FocalSearch | None = None
+    try:
+        sequence = open_source(args.source, camera_file=args.camera, fov_degrees=args.fov, **selection)
+    except NoCalibrationError:
+        sequence, focal = open_without_calibration(config, args.source, **selection)
+        _tell(focal, args.quiet)
     logs.release()
     with progress(sequence, args.quiet) as on_frame:
         outcome = run_to_folder(
@@ -39,8 +44,19 @@ def execute(args: argparse.Namespace) -> int:
             on_frame=on_frame,
             saved_map=args.map,
             localise=args.localise,
+            focal=focal,
         )
     return conclude(outcome, args)
+
+
+def _tell(focal: FocalSearch, quiet: bool) -> None:
+    if not quiet:
+        low, high = focal.fov_range_deg
+        print(
+            f"no calibration: the frames show a field of view of {focal.fov_deg:.0f} degrees (likely {low:.0f} to "
+            f"{high:.0f}); self-calibration goes on from there, --fov or --camera know better",
+            flush=True,
+        )
 
 
 def conclude(outcome: Outcome, args: argparse.Namespace) -> int:

@@ -15,6 +15,10 @@ class InputError(DualSlamError):
     """A sequence, image, calibration or trajectory cannot be read or makes no sense. Names the file."""
 
 
+class NoCalibrationError(InputError):
+    """Images that can be read, of a camera of which nothing is known."""
+
+
 class OutputError(DualSlamError):
     """A result cannot be written where it was asked for. Names the path."""
 

@@ -9,7 +9,7 @@ from typing import Protocol
 from numpy.typing import ArrayLike
 
 from dualslam.core.camera.models import Camera, camera_from_fov
-from dualslam.core.errors import InputError
+from dualslam.core.errors import InputError, NoCalibrationError
 from dualslam.io import dataset_folder, euroc, folder, kitti, tum_mono, tum_rgbd, video
 from dualslam.io.camera_files import make_camera, read_camera_file
 from dualslam.io.sequence import Given, RecordedSequence, Recording, Selection, check_image_size, image_size
@@ -111,6 +111,8 @@ def _open_recording(source: Path, given: Given) -> Recording:
 
 def _camera_from_fov(recording: Recording, fov_degrees: float | None) -> Camera:
     if fov_degrees is None:
-        raise InputError(f"{recording.name} has no calibration; give a camera file, or a field of view in degrees.")
+        raise NoCalibrationError(
+            f"{recording.name} has no calibration; give a camera file, or a field of view in degrees."
+        )
     width, height = image_size(recording.images, recording.name)
     return make_camera("the field of view", lambda: camera_from_fov(width, height, fov_degrees))

@@ -11,6 +11,7 @@ from typing import Any
 from dualslam.build import build_system
 from dualslam.config.files import dump_config
 from dualslam.config.settings import Config
+from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.camera.models import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
@@ -65,6 +66,7 @@ def run_to_folder(
     build: Callable[[Config, Camera], System] | None = None,
     saved_map: str | Path | None = None,
     localise: bool = False,
+    focal: FocalSearch | None = None,
 ) -> Outcome:
     """Run on a sequence and write a run folder. What an interrupted run, or one that crashed, has found is kept.
 
@@ -84,6 +86,8 @@ def run_to_folder(
         Run folder whose map this run finds its frames in, and extends. It is read and never written.
     localise : bool
         Find poses in it, and add nothing.
+    focal : FocalSearch, optional
+        How the camera was found, where nothing was known of it; for the summary.
 
     Raises
     ------
@@ -92,6 +96,8 @@ def run_to_folder(
         Whatever the system raised, once what it had found until then is written; a note on it says where.
     """
     given = _given(sequence, realtime)
+    if focal is not None:
+        given["focal_search"] = focal.as_dict()
     sequence = corrupted(sequence, config.corruptions)
     if saved_map is not None and Path(out).resolve() == Path(saved_map).resolve():
         raise InputError(f"{out} holds the map that is to be gone on with; give another folder to write to.")

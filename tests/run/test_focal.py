@@ -1,0 +1,39 @@
+"""A folder of images and nothing else: the focal length is searched for, or the person is asked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dualslam.config.settings import Config
+from dualslam.core.errors import InputError
+from dualslam.lab.synthetic import make_sequence
+from dualslam.run.focal import open_without_calibration
+
+
+def write(folder: Path, images: list[np.ndarray]) -> Path:
+    folder.mkdir()
+    for i, image in enumerate(images):
+        cv2.imwrite(str(folder / f"{i:04d}.png"), image)
+    return folder
+
+
+def test_the_beginning_tells_the_field_of_view(tmp_path: Path) -> None:
+    world = make_sequence("room", 70, 3, 320, 240)
+    folder = write(tmp_path / "images", [world.frame(i).image for i in range(70)])
+    config = Config.model_validate({"frontend": {"n_features": 800}})
+    sequence, found = open_without_calibration(config, str(folder), start=0, stride=1, max_frames=None)
+    assert sequence.camera.K[0, 0] == pytest.approx(found.focal_px)
+    assert found.low_px <= world.camera.K[0, 0] <= found.high_px
+    assert found.focal_px == pytest.approx(world.camera.K[0, 0], rel=0.2)
+    assert len(sequence) == 70
+
+
+def test_where_nothing_moves_the_person_is_asked(tmp_path: Path) -> None:
+    image = make_sequence("room", 2, 3, 320, 240).frame(0).image
+    folder = write(tmp_path / "images", [image] * 12)
+    with pytest.raises(InputError, match="give a camera file, or a field of view"):
+        open_without_calibration(Config(), str(folder), start=0, stride=1, max_frames=None)
