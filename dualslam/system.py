@@ -144,6 +144,7 @@ class System:
             components.calibration,
             self._connections,
             config.recovery,
+            config.audit.enabled,
         )
         self._calibrations = Calibrations(
             record, self.buffer, components.calibration, components.desk, components.new_graph, self._connections
@@ -362,6 +363,7 @@ class System:
                 self._roll_over(live, view)
             else:
                 self._recoveries.retry(live.submap, view)
+                self._recoveries.audit_if_due(live.submap, view)
                 self._revisit(live, view)
             return track
         assert isinstance(track, Failure)

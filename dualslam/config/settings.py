@@ -292,6 +292,14 @@ class FusionConfig(StrictModel):
     overlap as the link found it."""
 
 
+class AuditConfig(StrictModel):
+    """The start of each map, asked again once the map has matured."""
+
+    enabled: bool = True
+    """Whether the younger part of a map walks back over its start, confirms it or cuts it off. Costs a walk over some
+    ten keyframes a map; off as well where recovery is (`recovery.enabled`)."""
+
+
 class AtlasConfig(StrictModel):
     """The graph over all submaps."""
 
@@ -331,6 +339,7 @@ class Config(StrictModel):
     graph: GraphConfig = GraphConfig()
     linking: LinkingConfig = LinkingConfig()
     fusion: FusionConfig = FusionConfig()
+    audit: AuditConfig = AuditConfig()
     atlas: AtlasConfig = AtlasConfig()
     places: PlacesConfig = PlacesConfig()
     loops: LoopsConfig = LoopsConfig()

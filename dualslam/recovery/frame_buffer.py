@@ -61,6 +61,11 @@ class FrameBuffer:
         return iter(self._views)
 
     @property
+    def duration_s(self) -> float:
+        """Seconds of video that are kept while all is well."""
+        return self._duration_s
+
+    @property
     def numbers(self) -> dict[str, float]:
         """What it holds, for the event log."""
         images = sum(view.image is not None for view in self._views)

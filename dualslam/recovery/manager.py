@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import takewhile
 from typing import Any
 
@@ -23,6 +24,7 @@ from dualslam.map.record import FrameStamp, Record
 from dualslam.map.solving import solve
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
+from dualslam.recovery.audits import Audits
 from dualslam.recovery.bypass import absorb, bypass, condemn_tail, drop_corrupted
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
@@ -62,6 +64,8 @@ class Recoveries:
     calibration : Calibration
     connections : Connections
     config : RecoveryConfig
+    audits : bool
+        Whether maps are asked about their start (`recovery/audit.py`).
     """
 
     def __init__(
@@ -73,6 +77,7 @@ class Recoveries:
         calibration: Calibration,
         connections: Connections,
         config: RecoveryConfig,
+        audits: bool = False,
     ) -> None:
         self._record = record
         self._buffer = buffer
@@ -85,6 +90,7 @@ class Recoveries:
         self._under_way: dict[int, _UnderWay] = {}  # by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
         self._retries = RetrySchedule(config.retry_keyframes)
+        self._audits = Audits(record, buffer, calibration, audits and config.enabled)
 
     @property
     def waiting(self) -> list[int]:
@@ -147,6 +153,13 @@ class Recoveries:
         elif way := self._way_to_gaps(submap):
             self._submit(submap, way[0], way[1:], {}, now)
 
+    def audit_if_due(self, submap: Submap, now: FrameStamp) -> None:
+        """Walk back over the start of a map that has matured, as long as the buffer holds it: once a map."""
+        if submap.id in self._under_way or (job := self._audits.due(submap, now)) is None:
+            return
+        self._under_way[submap.id] = _UnderWay(time.perf_counter(), len(submap.keyframes), again=False)
+        self._executor.submit(job)
+
     def _submit(
         self, submap: Submap, newest: View, views: Iterable[View], onsets: dict[int, int], now: FrameStamp | None
     ) -> None:
@@ -195,6 +208,9 @@ class Recoveries:
     def _take(self, outcomes: list[Outcome], live: VisualOdometry | None, now: FrameStamp) -> None:
         for job, result in outcomes:
             walk = self._under_way.pop(job.submap.id)
+            if job.is_audit:
+                self._audits.take(job, result, now, partial(self._take_in, live=live, now=now, started_s=walk.began_s))
+                continue
             if isinstance(result, Failure):
                 self._failed(job, now, result, time.perf_counter() - walk.began_s)
             else:
@@ -251,8 +267,11 @@ class Recoveries:
 
     def _take_in(
         self, job: RecoveryJob, result: RecoveryResult, live: VisualOdometry | None, now: FrameStamp, started_s: float
-    ) -> None:
-        """Merge a result into its submap, live or archived by now; solve it; pose and link by what came of it."""
+    ) -> bool:
+        """Merge a result into its submap, live or archived by now; solve it; pose and link by what came of it.
+
+        Returns whether it could be solved.
+        """
         submap = self._record.atlas.submaps[job.submap.id]
         merged = merge_recovery(submap, job.submap, result.submap, self._rectifier(job, submap))
         if result.link is not None:
@@ -263,7 +282,7 @@ class Recoveries:
         except SolverError as error:
             failure = Failure(FailureReason.SOLVER, str(error))
             self._failed(job, now, failure, time.perf_counter() - started_s)
-            return
+            return False
         before = submap.copy()
         submap.take_over(merged.submap)
         if live is not None and live.submap is submap:
@@ -293,6 +312,7 @@ class Recoveries:
             self._settle(result.link.old_id, live)
         for gone in absorb(self._record, recovered_frames, submap.id, self._lost.keys(), now):
             self._lost.pop(gone, None)
+        return True
 
     def _rectifier(self, job: RecoveryJob, submap: Submap) -> Callable[[Keyframe], Keyframe]:
         """Return what gives the walk's keyframes the pixels of the camera that the submap has now."""

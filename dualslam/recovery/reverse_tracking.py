@@ -59,6 +59,8 @@ class RecoveryJob:
         The one that rectified them.
     camera_covariance : (5, 5) or None
         Of the correction that it has, if it was estimated.
+    is_audit : bool
+        Whether the submap is one without its start, which the walk is to be compared with (`recovery/audit.py`).
     """
 
     submap: Submap
@@ -69,6 +71,7 @@ class RecoveryJob:
     own: tuple[View, ...]
     camera: Camera
     camera_covariance: FloatArray | None
+    is_audit: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
