@@ -1,4 +1,4 @@
-# make setup | demo | test | test-all | check | docs | package | bench | accuracy | lock | clean
+# make setup | demo | test | test-all | check | docs | package | bench | accuracy | results | lock | clean
 # A fresh clone needs python3 (3.11 to 3.13, choose with PYTHON=python3.12), its venv and pip modules, and make.
 
 PYTHON ?= python3
@@ -14,7 +14,7 @@ export OPENBLAS_NUM_THREADS = 1
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 unexport PYTHONPATH
 
-.PHONY: setup demo test test-all check docs package format bench accuracy lock clean
+.PHONY: setup demo test test-all check docs package format bench accuracy results lock clean
 .DEFAULT_GOAL := setup
 
 setup: $(STAMP)
@@ -64,6 +64,10 @@ bench: setup
 
 accuracy: setup
 	$(BIN)/python benchmarks/sequences.py $(ARGS)
+
+# Everything that README and docs/results.md claim: make results DATA=/folder/of/sequences ARGS="--part sequences"
+results: setup
+	$(BIN)/python benchmarks/results.py $(if $(DATA),--data $(DATA)) $(ARGS)
 
 lock: setup
 	$(BIN)/python tools/lock.py

@@ -43,20 +43,22 @@ def breakages(events: Sequence[Event]) -> tuple[Breakage, ...]:
 
     A recovery starts from a new submap and looks for the maps that are lost by then (``recovery_started``). Each
     ``recovery_attempt`` of that submap is its next attempt; a map that several recoveries looked for counts the most
-    attempts that one of them made. A map that was seen again before another had started (``resumed``) may be lost once
-    more.
+    attempts that one of them made. A walk that is made again (``again``) is a retry: what it tries is no attempt of its
+    own, since it is made where all attempts have failed, of a map that has grown. A map that was seen again before
+    another had started (``relocalised``) may be lost once more.
     """
     found: list[dict[str, Any]] = []
     last: dict[int, dict[str, Any]] = {}  # the last loss of each submap
     looked_for: dict[int, list[dict[str, Any]]] = {}  # by the recovery's submap
     made: Counter[int] = Counter()
+    again: set[int] = set()  # submaps whose walk back is a retry
     for event in events:
         submap = -1 if event.submap is None else event.submap
         if event.event is EventKind.FAILED:
             reason = str(event.data.get("reason", ""))
             last[submap] = {"submap": submap, "frame": event.frame, "reason": reason, "at_s": event.timestamp_s}
             found.append(last[submap])
-        elif event.event is EventKind.RELOCALISED:
+        elif event.event is EventKind.RELOCALISED and submap in last:
             last[submap]["relocalised"] = True
         elif event.event is EventKind.REINITIALISED:
             for lost in found:
@@ -65,14 +67,25 @@ def breakages(events: Sequence[Event]) -> tuple[Breakage, ...]:
                     lost["restart_s"] = abs(event.timestamp_s - lost["at_s"])
         elif event.event is EventKind.RECOVERY_STARTED:
             looked_for[submap] = [last[m] for m in event.data.get("lost", ()) if m in last]
-            _count(looked_for[submap], 1)
-        elif event.event is EventKind.RECOVERY_ATTEMPT:
+            if event.data.get("again"):
+                again.add(submap)
+                for lost in looked_for[submap]:
+                    lost["retries"] = lost.get("retries", 0) + 1
+            else:
+                _count(looked_for[submap], 1)
+        elif event.event is EventKind.RECOVERY_ATTEMPT and submap not in again:
             made[submap] += 1
             _count(looked_for.get(submap, []), made[submap])
         elif event.event is EventKind.LINKED and event.data.get("old_submap") in last:
-            attempt = max(made[submap], 1)
             lost = last[event.data["old_submap"]]
-            lost |= {"attempts": attempt, "succeeded_at": attempt, "recovery_s": event.data.get("seconds")}
+            lost["recovery_s"] = event.data.get("seconds")
+            if submap in again:
+                lost["linked_by_retry"] = True
+            else:
+                attempt = max(made[submap], 1)
+                lost |= {"attempts": attempt, "succeeded_at": attempt}
+        elif event.event is EventKind.MERGED and event.data.get("other_submap") in last:
+            last[event.data["other_submap"]]["merged"] = True
     return tuple(Breakage(**{name: value for name, value in lost.items() if name != "at_s"}) for lost in found)
 
 

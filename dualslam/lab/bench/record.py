@@ -55,13 +55,18 @@ class Breakage:
     restart_s : float or None
         The same in seconds of the source.
     attempts : int
-        Attempts at recovery that were made.
+        Attempts that the first walk back of a recovery made.
     succeeded_at : int or None
-        The attempt that linked the map, from 1.
+        The one of these that linked the map, from 1.
     recovery_s : float or None
         Seconds that the recovery took.
     relocalised : bool
         Whether the map was seen again before another had started, and gone on with.
+    retries : int
+        Walks back that were made again later, once the new map had grown; their attempts are not counted above.
+    linked_by_retry : bool
+    merged : bool
+        Whether it was joined by a place that a later map saw again.
     """
 
     frame: int
@@ -73,11 +78,14 @@ class Breakage:
     succeeded_at: int | None = None
     recovery_s: float | None = None
     relocalised: bool = False
+    retries: int = 0
+    linked_by_retry: bool = False
+    merged: bool = False
 
     @property
     def recovered(self) -> bool:
         """Whether it is part of what was mapped after it."""
-        return self.relocalised or self.succeeded_at is not None
+        return self.relocalised or self.succeeded_at is not None or self.linked_by_retry or self.merged
 
 
 @dataclass(frozen=True, slots=True)

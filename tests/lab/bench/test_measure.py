@@ -90,6 +90,29 @@ def test_a_later_recovery_may_link_what_the_first_could_not() -> None:
     assert (second.attempts, second.succeeded_at, second.restart_frames) == (1, 1, 10)
 
 
+def test_retries_are_no_attempts() -> None:
+    events = [
+        event(EventKind.FAILED, 40, 0, reason="x"),
+        event(EventKind.REINITIALISED, 50, 1),
+        event(EventKind.RECOVERY_STARTED, 50, 1, lost=[0], again=False),
+        event(EventKind.RECOVERY_ATTEMPT, 36, 1, attempt="gap (sift)"),
+        event(EventKind.RECOVERY_ATTEMPT, 36, 1, attempt="live"),
+        event(EventKind.RECOVERY_STARTED, 70, 1, lost=[0], again=True),
+        event(EventKind.RECOVERY_ATTEMPT, 36, 1, attempt="gap (sift)"),
+        event(EventKind.LINKED, 70, 1, old_submap=0, attempt="gap (sift)", seconds=1.0),
+    ]
+    (lost,) = breakages(events)
+    assert (lost.attempts, lost.succeeded_at, lost.retries, lost.linked_by_retry) == (2, None, 1, True)
+    assert lost.recovered
+
+
+def test_a_map_that_a_revisit_joins_is_recovered() -> None:
+    events = [event(EventKind.FAILED, 40, 0, reason="x"), event(EventKind.MERGED, 90, 1, other_submap=0)]
+    (lost,) = breakages(events)
+    assert lost.merged
+    assert lost.recovered
+
+
 def test_a_loss_that_is_never_linked() -> None:
     events = [
         event(EventKind.FAILED, 40, 0, reason="x"),

@@ -1,0 +1,190 @@
+"""Measure what the README and docs/results.md claim, at one commit, and write the tables there.
+
+    python benchmarks/results.py --data DIR [--part sequences] [--part failures] [--part links]
+                                 [--seeds 5] [--trials 4] [--worlds 8] [--jobs 2] [--out runs/results] [--write-only]
+
+`make results DATA=DIR` is the same. DIR holds `kitti_03`, `7scenes_1000`, `tum_fr1_rpy` and `hololens_000`, each with
+an `images` folder, as `dualslam run` reads them. A measurement that was stopped goes on where it was; one that was
+begun at another commit is refused: a table has one commit. All seeds are of the reporting half. Parts that were not
+measured keep their place in the page, and it says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+PARTS = ("sequences", "failures", "links")
+FIRST_SEED = 100
+CONDITIONS: dict[str, list[str]] = {"": [], "recovery off": ["--no-recovery"]}
+BLACK = ("kitti_03", "7scenes_1000")
+BLACK_FRAMES = 10
+NOT_MEASURED = "Not measured at this commit."
+
+
+def main() -> None:
+    """Measure what is missing, then write the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--part", action="append", choices=PARTS)
+    parser.add_argument("--seeds", type=int, default=5, help="of each whole sequence")
+    parser.add_argument("--trials", type=int, default=4, help="of each sequence and condition of the failure bench")
+    parser.add_argument("--worlds", type=int, default=8, help="of each kind of failure in rendered worlds")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=ROOT / "runs" / "results")
+    parser.add_argument("--write-only", action="store_true", help="from what was measured so far")
+    args = parser.parse_args()
+    commit = _git("describe", "--always", "--dirty")
+    if not args.write_only:
+        _begin(args.out, commit)
+        for part in args.part or PARTS:
+            if part != "links" and args.data is None:
+                parser.error(f"{part} needs --data")
+            {"sequences": measure_sequences, "failures": measure_failures, "links": measure_links}[part](args)
+    known = args.out / "commit.txt"
+    at = f"Commit `{known.read_text().strip()}`" if known.exists() else NOT_MEASURED
+    write(args.out, at)
+
+
+def _begin(out: Path, commit: str) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    marker = out / "commit.txt"
+    if marker.exists() and marker.read_text().strip() != commit:
+        sys.exit(f"{out} was measured at {marker.read_text().strip()}, this is {commit}: move it away, or --write-only")
+    marker.write_text(commit + "\n")
+
+
+# --- measuring
+
+
+def measure_sequences(args: argparse.Namespace) -> None:
+    """Run each whole sequence with each seed, with recovery and without; two of them with black frames half-way."""
+    for folder in sorted(path for path in args.data.iterdir() if (path / "images").is_dir()):
+        for condition, options in [*CONDITIONS.items(), *_black(folder, args.out)]:
+            for seed in range(FIRST_SEED, FIRST_SEED + args.seeds):
+                out = args.out / "sequences" / folder.name / (condition or "as it is") / str(seed)
+                if not (out / "summary.json").exists():
+                    _run("run", str(folder), "--out", out, "--overwrite", "--quiet", "--seed", seed, *options)
+
+
+def _black(folder: Path, out: Path) -> list[tuple[str, list[str]]]:
+    """Return the conditions with the lens covered half-way."""
+    if folder.name not in BLACK:
+        return []
+    start = len(list((folder / "images").iterdir())) // 2
+    script = out / f"{folder.name}_black.yaml"
+    script.write_text(yaml.safe_dump([{"kind": "blackout", "start": start, "length": BLACK_FRAMES}]))
+    corrupt = ["--corrupt", str(script)]
+    name = f"{BLACK_FRAMES} black frames"
+    return [(name, corrupt), (f"{name}, recovery off", [*corrupt, "--no-recovery"])]
+
+
+def measure_failures(args: argparse.Namespace) -> None:
+    """Run the bench of causes that lose a map."""
+    spec, out = ROOT / "benchmarks" / "failures.yaml", args.out / "failures"
+    _run("bench", spec, "--data", args.data, "--out", out, "--trials", args.trials, "--jobs", args.jobs, "--quiet")
+
+
+def measure_links(args: argparse.Namespace) -> None:
+    """Run rendered worlds in which exact truth says how true each link is."""
+    command = [sys.executable, ROOT / "benchmarks" / "synthetic_recovery.py", "--out", args.out / "links.jsonl"]
+    subprocess.run([*map(str, command), "--runs", str(args.worlds), "--jobs", str(args.jobs)], check=True, cwd=ROOT)
+
+
+def _run(*arguments: object) -> None:
+    done = subprocess.run([sys.executable, "-m", "dualslam.cli", *map(str, arguments)], check=False, cwd=ROOT)
+    if done.returncode not in (0, 1):  # 1: no map, which is a result
+        sys.exit(done.returncode)
+
+
+def _git(*arguments: str) -> str:
+    return subprocess.run(["git", *arguments], check=True, capture_output=True, text=True, cwd=ROOT).stdout.strip()
+
+
+# --- writing
+
+
+def write(out: Path, at: str) -> None:
+    """Put the tables into README.md and docs/results.md, between their marks."""
+    sequences, failures, links = sequences_table(out), failures_tables(out), links_table(out)
+    _fill(ROOT / "README.md", {"sequences": sequences}, at)
+    _fill(ROOT / "docs" / "results.md", {"sequences": sequences, "failures": failures, "links": links}, at)
+
+
+def _fill(page: Path, tables: dict[str, str | None], at: str) -> None:
+    text = page.read_text()
+    for name, table in tables.items():
+        pattern = rf"(<!-- results: {name} -->\n).*?(<!-- end -->)"
+        assert re.search(pattern, text, re.DOTALL), f"{page} has no place for {name}"
+        filled = f"{at}, `make results`.\n\n{table}\n" if table else f"{NOT_MEASURED}\n"
+        text = re.sub(pattern, lambda m, filled=filled: m[1] + filled + m[2], text, flags=re.DOTALL)
+    page.write_text(text)
+
+
+def sequences_table(out: Path) -> str | None:
+    """Return a row for each sequence and condition: medians over the seeds, the worst in brackets."""
+    rows = []
+    for condition in sorted((out / "sequences").glob("*/*"), key=lambda path: (path.parent.name, path.name)):
+        runs = [json.loads(path.read_text()) for path in sorted(condition.glob("*/summary.json"))]
+        if runs:
+            rows.append(_sequence_row(condition.parent.name, condition.name, runs))
+    if not rows:
+        return None
+    names = ("sequence", "condition", "seeds", "coverage %", "ATE m", "maps lost", "joined again", "CPU ms a frame")
+    return "\n".join([_line(names), "|" + "---|" * len(names), *rows])
+
+
+def _sequence_row(sequence: str, condition: str, runs: list[dict[str, Any]]) -> str:
+    cells = [
+        sequence,
+        condition,
+        str(len(runs)),
+        _median([100 * run["coverage"] for run in runs], min, 1),
+        _median([run["ate_rmse_m"] for run in runs if run.get("ate_rmse_m") is not None], max, 3),
+        str(sum(run["failures"] for run in runs)),
+        str(sum(run["recoveries"] + run["relocalised"] for run in runs)),
+        _median([run["cpu_ms_per_frame"] for run in runs], max, 0),
+    ]
+    return _line(cells)
+
+
+def failures_tables(out: Path) -> str | None:
+    """Return what the bench wrote: failures by cause, recoveries by attempt, independence of attempts."""
+    page = out / "failures" / "tables.md"
+    if not page.exists():
+        return None
+    sections = re.split(r"(?m)^(?=### )", page.read_text())
+    wanted = [s.strip() for s in sections if s.startswith(("### Table II", "### Table III", "### Eq. (1)"))]
+    return "\n\n".join(wanted)
+
+
+def links_table(out: Path) -> str | None:
+    """Return the table of links against exact truth."""
+    records = out / "links.jsonl"
+    if not records.exists():
+        return None
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    from synthetic_recovery import table
+
+    return str(table([json.loads(line) for line in records.read_text().splitlines()]))
+
+
+def _median(values: list[float], worst: Any, digits: int) -> str:
+    return f"{statistics.median(values):.{digits}f} ({worst(values):.{digits}f})" if values else "-"
+
+
+def _line(cells: Any) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+if __name__ == "__main__":
+    main()
