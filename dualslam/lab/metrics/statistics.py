@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import norm
+from scipy.stats import binomtest
 
 LEVEL = 0.95
 RESAMPLES = 10_000
@@ -41,11 +40,8 @@ def wilson_interval(k: int, n: int, level: float = LEVEL) -> Interval:
         raise ValueError(f"{k} of {n} is no rate")
     if n == 0:
         return Interval(0.0, 1.0)
-    z2 = float(norm.ppf(0.5 + level / 2)) ** 2
-    centre = (k + z2 / 2) / (n + z2)
-    half = math.sqrt(z2 * k * (n - k) / n + z2 * z2 / 4) / (n + z2)
-    # At the ends the limits are exact; rounding must not push them out.
-    return Interval(0.0 if k == 0 else centre - half, 1.0 if k == n else centre + half)
+    found = binomtest(k, n).proportion_ci(level, method="wilson")
+    return Interval(float(found.low), float(found.high))
 
 
 @dataclass(frozen=True, slots=True)
