@@ -54,8 +54,8 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class StartTrial:
-    """What came of one start frame: frames until a map started, its error, the truth's own, and what the start says of
-    its error; all None where none did.
+    """The outcome of one start frame: frames until a map started, its error, the truth's own, and what the
+    start says of its error; all None where none did.
     """
 
     delay: int | None

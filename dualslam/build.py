@@ -101,7 +101,7 @@ def build_system(
     camera : Camera
         Lens model and size of the images that `System.step` will be given.
     recovery : RecoveryExecutor, optional
-        What takes on the walks back in time, in the place of what the config says: to look at them one by one.
+        Takes the recovery jobs instead of what the config says: to look at them one by one.
     saved : StoredMap, optional
         A map to find frames in and to extend (`load_atlas`); it becomes the system's own. Its camera, as it was found
         out, is taken as known.

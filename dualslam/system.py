@@ -96,7 +96,7 @@ class System:
     numbers : FrameNumbers
         The frames' own count, by which all here goes but the frames that `step` is given and its results.
     saved : StoredMap or None
-        The map that was gone on with.
+        The map that this run continues.
     """
 
     def __init__(

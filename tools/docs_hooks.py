@@ -23,7 +23,7 @@ _TOKEN = "equation{}of{}"
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Put the configuration in, and tokens in the place of equations, which Markdown must not touch."""
+    """Put the configuration in, and tokens instead of equations, which Markdown must not touch."""
     page.meta["equations"] = equations = []
 
     def replace(found: re.Match[str]) -> str:

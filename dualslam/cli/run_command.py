@@ -17,7 +17,7 @@ EXIT_DONE, EXIT_NO_MAP, EXIT_INTERRUPTED = 0, 1, 130
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run, and say in one line what came of it."""
+    """Run, and tell the outcome in one line."""
     if args.localise and args.map is None:
         raise InputError("--localise finds poses in a saved map: name its run folder with --map.")
     config = config_of(args)

@@ -165,7 +165,7 @@ class RecoveryConfig(StrictModel):
     """In this order, each from the same snapshot of the new map, until one leads to a link. A list of words will do,
     such as `[live, gap, sift]`; an attempt with settings is written `{frontend: sift, n_features: 3000}`."""
     relocalise_after: int | None = Field(15, ge=0)
-    """Frames that show something without a start, after which a lost map is looked for, and gone on with where it is
+    """Frames that show something without a start, after which a lost map is looked for, and continued where it is
     seen again; null: never. A map that starts sooner is better linked, by all that a walk back finds: most start within
     2 to 5 frames, unless the camera turns in place, and then it may come back to what the lost map shows before any
     can start."""

@@ -1,4 +1,4 @@
-"""Bundle adjustment between front ends and back end: what is to be solved, what came of it, who solves it."""
+"""Bundle adjustment between front ends and back end: the problem, its solution, who solves it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class BundleProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleResult:
-    """What came of a `BundleProblem`.
+    """The solution of a `BundleProblem`.
 
     Attributes
     ----------

@@ -26,7 +26,7 @@ class Anchor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativePose:
-    """Where a keyframe stands by what is no observation of the submap's landmarks: another front end's leap.
+    """Where a keyframe stands by what is no observation of the submap's landmarks: a gap relocalisation.
 
     Attributes
     ----------

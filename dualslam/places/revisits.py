@@ -231,7 +231,7 @@ class Revisits:
         return self._link(match, waiting.seconds, live, view)
 
     def _link(self, match: PlaceMatch, seconds: int, live: VisualOdometry, view: View) -> AtlasReport | None:
-        """Hand a link to the atlas; say what came of it."""
+        """Hand a link to the atlas, and record whether it was taken."""
         atlas = self._record.atlas
         (a, keyframe_a), (b, keyframe_b) = match.place, match.query
         together = any(a in component and b in component for component in atlas.components())

@@ -23,7 +23,7 @@ class RecoveryExecutor(Protocol):
         ...
 
     def finish(self) -> list[Outcome]:
-        """Take no more jobs, and return what came of all that are left."""
+        """Take no more jobs, and return the outcomes of all that are left."""
         ...
 
 

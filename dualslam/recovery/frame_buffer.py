@@ -3,7 +3,7 @@
 K = k + k_r frames: the last k while all is well, and all that came since while the live submap is lost. Memory has a
 hard bound, which k frames and a short loss stay far below. A long loss (a lens that stays covered) reaches it, and then
 the frames of the loss give way, not those before it: a recovery needs the k frames before the loss, which the old map
-saw, and the newest, with which the new map starts; what it cannot use of the stretch between, it leaps. In order:
+saw, and the newest, with which the new map starts; what it cannot use of the stretch between, it skips. In order:
 
 1. images are packed (`GreyImage.pack`), the oldest first: nothing is lost but time;
 2. images of the stretch are dropped, each time the one whose neighbours stay closest together, so that what is left

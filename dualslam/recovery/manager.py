@@ -268,7 +268,7 @@ class Recoveries:
     def _take_in(
         self, job: RecoveryJob, result: RecoveryResult, live: VisualOdometry | None, now: FrameStamp, started_s: float
     ) -> bool:
-        """Merge a result into its submap, live or archived by now; solve it; pose and link by what came of it.
+        """Merge a result into its submap, live or archived by now; solve it; pose frames and link maps by it.
 
         Returns whether it could be solved.
         """

@@ -1,4 +1,4 @@
-"""Looking for the map that was lost last, until another has started: seen twice in a row, it is gone on with."""
+"""Looking for the map that was lost last, until another has started: seen twice in a row, it is continued."""
 
 from __future__ import annotations
 

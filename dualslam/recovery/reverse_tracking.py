@@ -261,7 +261,7 @@ def _make_attempt(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, unti
                 break
             progress.why_not_linked = found.detail
             progress.needs_camera |= found.reason is FailureReason.CAMERA
-            # What was lost in a gap relocalisation the others lose as well: they leap by the same matches, or by fewer.
+            # What was lost across a gap the others lose as well: they cross it by the same matches, or by fewer.
             progress.needs_live_end |= found.reason is FailureReason.SCALE_LOST and progress.n_gaps > 0
             progress.given_up |= progress.needs_camera or found.reason is FailureReason.SCALE_LOST
             progress.events.append(_refusal(tried, found, attempt.name, step.view, submap.id))

@@ -152,7 +152,7 @@ def _told(run: RunData, story: FailureStory) -> str:
     if story.relocalised is not None:
         gap = abs(run.row_of.get(story.relocalised["frame"], 0) - run.row_of.get(story.lost_since, 0))
         again = f"It was seen again at frame {story.relocalised['frame']}, {count(gap, 'frame')} after the loss, before"
-        return " ".join([*told, again, "another map had started, and gone on with."])
+        return " ".join([*told, again, "another map had started, and continued."])
     if story.restart is None:
         return " ".join([*told, "No map was started after it, until the run ended."])
     first_view = story.restart.get("first_view")

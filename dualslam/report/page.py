@@ -45,7 +45,7 @@ def _atlas(run: RunData) -> Markup | None:
 
 
 def headline(run: RunData) -> str:
-    """Say in one sentence what came of the run."""
+    """Tell the outcome of the run in one sentence."""
     n = len(run.rows)
     if not len(run.main):
         return f"No map: none of {count(n, 'frame')} has a pose."

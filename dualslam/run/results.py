@@ -185,7 +185,7 @@ def _posed(system: System, submap_ids: list[int]) -> Trajectory:
 
 
 def _beside(system: System) -> dict[str, Any]:
-    """What came of the jobs in processes of their own, by kind: counts, the longest queue and wait, CPU time."""
+    """Statistics of the jobs in processes of their own, by kind: counts, the longest queue and wait, CPU time."""
     desk = system.desk
     return {str(kind): asdict(each) for kind, each in desk.statistics.items()} if isinstance(desk, WorkerDesk) else {}
 

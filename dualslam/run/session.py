@@ -100,7 +100,7 @@ def run_to_folder(
         given["focal_search"] = focal.as_dict()
     sequence = corrupted(sequence, config.corruptions)
     if saved_map is not None and Path(out).resolve() == Path(saved_map).resolve():
-        raise InputError(f"{out} holds the map that is to be gone on with; give another folder to write to.")
+        raise InputError(f"{out} holds the map that this run is to continue; give another folder to write to.")
     if saved_map is not None:
         saved = load_atlas(saved_map)
         system = build_system(config, sequence.camera, saved=saved, localise=localise)

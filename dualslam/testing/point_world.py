@@ -110,7 +110,7 @@ def hand_held(n: int) -> FloatArray:
 
 
 def system_in(world: PointWorld, **settings: object) -> System:
-    """Build the real system, with the world's features in the place of those of an image."""
+    """Build the real system, with the world's features instead of those of an image."""
     config = Config.model_validate(
         {"camera": {"model_sigma_px": 0.0}, "calibration": {"refine": False}, "recovery": {"enabled": False}} | settings
     )

@@ -91,7 +91,7 @@ class Worker:
         self._jobs.put((kind, work))
 
     def result(self) -> _Answer | None:
-        """Return what came of the job, or None while it runs. A worker that has died says so by a `Failure`."""
+        """Return the outcome of the job, or None while it runs. A worker that has died says so by a `Failure`."""
         try:
             return self._results.get_nowait()
         except Empty:
@@ -215,7 +215,7 @@ class _Queue:
 
 @dataclass(slots=True)
 class QueueStatistics:
-    """What came of the jobs of a kind.
+    """Statistics of the jobs of a kind.
 
     Attributes
     ----------

@@ -8,9 +8,9 @@ features, and the factor graph solves for the pose anew. What other attempts too
 Or the live front end walks by itself as far as it can (`tracks_live`), which is ten times as fast, and the other one
 poses only the frames where it fails.
 
-Where the next frame cannot be posed so (blur, black-out, frames that are missing) the odometry leaps: it matches each
-further frame with several frames before the gap, and believes a pose only once a second frame beyond the gap, posed by
-itself, sees the same points where they should be.
+Where the next frame cannot be posed so (blur, black-out, frames that are missing) the odometry crosses the gap: it
+matches each further frame with several frames before the gap, and believes a pose only once a second frame beyond the
+gap, posed by itself, sees the same points where they should be.
 """
 
 from __future__ import annotations

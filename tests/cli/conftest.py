@@ -38,7 +38,7 @@ def folder(world: SyntheticSequence, tmp_path_factory: pytest.TempPathFactory) -
 
 @pytest.fixture
 def fake(world: SyntheticSequence, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Put a fake system in the place of the real one, with the options of `FakeSystem`."""
+    """Put a fake system instead of the real one, with the options of `FakeSystem`."""
 
     def install(**options: object) -> None:
         truth = dict(enumerate(world.ground_truth_T_world_cam))

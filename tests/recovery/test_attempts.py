@@ -38,8 +38,8 @@ class TestConfig:
         assert [attempt.frontend for attempt in attempts] == ["live", "sift", "orb"]
         assert attempts[0].is_live
         assert attempts[2] == AttemptConfig(frontend="orb", n_features=4000)
-        (leap,) = config(attempts=["gap"]).attempts
-        assert (leap.frontend, leap.tracking, leap.name) == ("sift", "live", "gap (sift)")
+        (gap,) = config(attempts=["gap"]).attempts
+        assert (gap.frontend, gap.tracking, gap.name) == ("sift", "live", "gap (sift)")
 
     @pytest.mark.parametrize(
         ("attempts", "told"),
@@ -243,6 +243,6 @@ def test_missing_frames_lead_to_no_wrong_link() -> None:
     truth = dict(enumerate(world.ground_truth_T_world_cam))
     links = audit_links(system.atlas, system.poses.values(), truth)
     assert all(isinstance(link, LinkAudit) and not link.wrong for link in links)
-    leapt = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)[-1]
-    assert (leapt.data["verdict"] == "linked") == bool(links)
-    assert leapt.data["gaps"] == bool(links)  # over the gap no walk goes but by a gap relocalisation
+    crossed = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)[-1]
+    assert (crossed.data["verdict"] == "linked") == bool(links)
+    assert crossed.data["gaps"] == bool(links)  # over the gap no walk goes but by a gap relocalisation

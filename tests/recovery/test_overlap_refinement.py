@@ -152,7 +152,7 @@ def test_without_keyframes_to_take_in_the_seam_stays_as_it_is(room: tuple[Case, 
     assert refinement.reason is FailureReason.DISABLED
 
 
-def test_the_gauge_goes_to_the_widest_baseline_of_the_seam() -> None:
+def test_the_gauge_goes_to_the_widest_baseline_of_the_overlap() -> None:
     """Else the scale of the overlap drifts away under the link while the map is still solved at its other end."""
     case, link = linked("street", 0)
     assert case.new.gauge not in {(39, 30), (30, 39)}

@@ -42,7 +42,7 @@ class FailureKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Breakage:
-    """A map that was lost, and what came of it.
+    """A map that was lost, and how it was recovered, if it was.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Breakage:
     recovery_s : float or None
         Seconds that the recovery took.
     relocalised : bool
-        Whether the map was seen again before another had started, and gone on with.
+        Whether the map was seen again, and continued, before another had started.
     retries : int
         Walks back that were made again later, once the new map had grown; their attempts are not counted above.
     linked_by_retry : bool

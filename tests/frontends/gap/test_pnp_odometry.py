@@ -1,4 +1,4 @@
-"""Poses from another front end, leaps over a gap: on scenes of points where both front ends see what truth says."""
+"""Poses from another front end, gaps crossed: on scenes of points where both front ends see what truth says."""
 
 from __future__ import annotations
 

@@ -140,7 +140,7 @@ class TestTracker:
 
     @pytest.mark.parametrize(("keyframes", "holds"), [([0, 1], False), ([0, 4, 8, 12], True)])
     def test_a_leap_that_loses_the_scale_is_refused(self, keyframes: list[int], holds: bool) -> None:
-        """Two keyframes side by side hardly know depths; the same leap from a wide map holds the scale."""
+        """Two keyframes side by side hardly know depths; the same gap crossed from a wide map holds the scale."""
         drive = PointWorld(cloud(1200, seed=1) * (1.5, 1.0, 2.5), path(60, np.array([0.05, 0, 0.2]), np.zeros(3)))
         live = front_end(drive, keyframes, start_at=keyframes[-1], every=8)
         last = keyframes[-1] + 1
@@ -264,10 +264,10 @@ class TestMapping:
         live = front_end(world, before, start_at=9, every=12)
         tracked(live, world.view(9))
         n_before = len(live.submap.landmarks)
-        leapt = tracked(live, world.view(24))
-        assert leapt.wide
-        assert np.count_nonzero(leapt.landmark_ids >= 0) < Config().keyframes.weak_landmarks
-        live.insert_keyframe(leapt)
+        crossed = tracked(live, world.view(24))
+        assert crossed.wide
+        assert np.count_nonzero(crossed.landmark_ids >= 0) < Config().keyframes.weak_landmarks
+        live.insert_keyframe(crossed)
         assert len(live.submap.landmarks) == n_before  # it stands alone on its side
         for i in (27, 30, 33):
             live.insert_keyframe(tracked(live, world.view(i)))

@@ -15,7 +15,7 @@ from dualslam.map.trajectory import FramePose
 from dualslam.testing.point_world import path, random_features
 
 N = 60
-SEAM = (26, 28, 30)
+OVERLAP = (26, 28, 30)
 # From the world to each map.
 S_OLD_WORLD = sim3.from_parts(0.4, so3.exp(np.array([0.3, -0.2, 0.5])), np.array([1.0, 2.0, -1.0]))
 S_NEW_WORLD = sim3.from_parts(2.0, so3.exp(np.array([-0.1, 0.9, 0.0])), np.array([-3.0, 0.0, 1.0]))
@@ -49,8 +49,8 @@ def audit(
     """
     atlas = Atlas()
     old, new = submap(0, S_OLD_WORLD, range(36), T_world_cam), submap(1, S_NEW_WORLD, range(25, N), T_world_cam)
-    pivot = old.T_submap_kf[SEAM[-1]][:3, 3].copy()
-    for k in range(SEAM[-1] + 1, 36):
+    pivot = old.T_submap_kf[OVERLAP[-1]][:3, 3].copy()
+    for k in range(OVERLAP[-1] + 1, 36):
         old.T_submap_kf[k][:3, 3] = pivot + tail * (old.T_submap_kf[k][:3, 3] - pivot)
     rng = np.random.default_rng(0)
     since, scale = drift
@@ -59,7 +59,7 @@ def audit(
         T[:3, 3] = pivot + (scale if k > since else 1.0) * (T[:3, 3] - pivot) + noise * rng.normal(size=3)
     atlas.add(old)
     atlas.add(new)
-    atlas.link(Link(0, 1, S_link, np.eye(7), LinkKind.RECOVERY, SEAM))
+    atlas.link(Link(0, 1, S_link, np.eye(7), LinkKind.RECOVERY, OVERLAP))
     poses = [FramePose(i, 0.1 * i, int(i >= 30), i, np.eye(4)) for i in range(N)]
     (found,) = audit_links(atlas, poses, dict(enumerate(T_world_cam)), reach=4)
     assert isinstance(found, LinkAudit)
@@ -152,7 +152,7 @@ def test_the_truth_of_a_noisy_map_has_its_sigma() -> None:
     atlas = Atlas()
     atlas.add(submap(0, S_OLD_WORLD, range(36), noisy))
     atlas.add(submap(1, S_NEW_WORLD, range(25, N), noisy))
-    atlas.link(Link(0, 1, S_OLD_NEW, np.eye(7), LinkKind.RECOVERY, SEAM))
+    atlas.link(Link(0, 1, S_OLD_NEW, np.eye(7), LinkKind.RECOVERY, OVERLAP))
     (found,) = audit_links(atlas, [], dict(enumerate(T)))
     assert isinstance(found, LinkAudit)
     assert 0.002 < found.scale_sigma < 0.04
@@ -166,7 +166,7 @@ def test_frames_without_truth_are_left_out_and_too_few_are_said_so() -> None:
     atlas = Atlas()
     atlas.add(submap(0, S_OLD_WORLD, range(36), T))
     atlas.add(submap(1, S_NEW_WORLD, range(25, N), T))
-    atlas.link(Link(0, 1, S_OLD_NEW, np.eye(7), LinkKind.RECOVERY, SEAM))
+    atlas.link(Link(0, 1, S_OLD_NEW, np.eye(7), LinkKind.RECOVERY, OVERLAP))
     (found,) = audit_links(atlas, [], truth)
     assert not isinstance(found, LinkAudit)
     assert "submap 0" in found.detail

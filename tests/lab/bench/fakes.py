@@ -1,4 +1,4 @@
-"""Trials that take no time: what came of one depends on its numbers alone."""
+"""Trials that take no time: the outcome of one depends on its numbers alone."""
 
 from __future__ import annotations
 
