@@ -38,7 +38,7 @@ class FaultScript:
 
     def __init__(self, corruptions: Iterable[Corruption]) -> None:
         self._faults = tuple(c for c in corruptions if c.kind in _KINDS)
-        self._frame = -1
+        self._frame, self._time_s = -1, float("nan")
         self._fired: list[Corruption] = []
 
     def around_views(self, view_of: Callable[[Frame], View | Failure]) -> Callable[[Frame], View | Failure]:
@@ -47,7 +47,7 @@ class FaultScript:
             return view_of
 
         def disturbed(frame: Frame) -> View | Failure:
-            self._frame = frame.index
+            self._frame, self._time_s = frame.index, frame.timestamp_s
             view = view_of(frame)
             return view if isinstance(view, Failure) else self._lose_features(view)
 
@@ -70,30 +70,33 @@ class FaultScript:
         if kind is JobKind.WALK and pid is not None and self.worker_dies(job):
             os.kill(pid, signal.SIGKILL)
 
-    def active(self, kind: CorruptionKind, index: int) -> Corruption | None:
-        """Return the fault of a kind at frame `index`, if that is the live frame."""
-        if index != self._frame:
-            return None
-        return next((f for f in self._faults if f.kind is kind and f.covers(index)), None)
+    def active(self, kind: CorruptionKind, timestamp_s: float) -> Corruption | None:
+        """Return the fault of a kind at the frame of this time, if that is the live frame.
 
-    def solver_fails(self, index: int) -> bool:
+        Frames are told by their time: inside the system they have another number than in the source.
+        """
+        if timestamp_s != self._time_s:
+            return None
+        return next((f for f in self._faults if f.kind is kind and f.covers(self._frame)), None)
+
+    def solver_fails(self, timestamp_s: float) -> bool:
         """Return whether the solver fails at this keyframe: once for each fault, at its first live keyframe."""
-        return self._fires_once(CorruptionKind.SOLVER_ERROR, index)
+        return self._fires_once(CorruptionKind.SOLVER_ERROR, timestamp_s)
 
     def worker_dies(self, job: RecoveryJob) -> bool:
         """Return whether the recovery that starts now loses its process: once for each fault."""
         # A walk that only poses the frames before a start recovers nothing.
-        return bool(job.lost) and self._fires_once(CorruptionKind.KILL_WORKER, self._frame)
+        return bool(job.lost) and self._fires_once(CorruptionKind.KILL_WORKER, self._time_s)
 
-    def _fires_once(self, kind: CorruptionKind, index: int) -> bool:
-        fault = self.active(kind, index)
+    def _fires_once(self, kind: CorruptionKind, timestamp_s: float) -> bool:
+        fault = self.active(kind, timestamp_s)
         if fault is None or fault in self._fired:
             return False
         self._fired.append(fault)
         return True
 
     def _lose_features(self, view: View) -> View:
-        fault = self.active(CorruptionKind.FEW_FEATURES, view.index)
+        fault = self.active(CorruptionKind.FEW_FEATURES, view.timestamp_s)
         if fault is None:
             return view
         n = len(view.features)
@@ -113,19 +116,19 @@ class _FaultyOdometry:
 
     def track(self, view: View) -> Track | Failure:
         track = self._inner.track(view)
-        fault = self._script.active(CorruptionKind.WRONG_POSE, view.index)
+        fault = self._script.active(CorruptionKind.WRONG_POSE, view.timestamp_s)
         if fault is None or isinstance(track, Failure):
             return track
         return replace(track, T_cam_submap=wrong_pose(track, self._inner.submap, fault))
 
     def keyframe_due(self, track: Track) -> bool:
         # A wrong pose that is no keyframe would not reach the map.
-        forced = self._script.active(CorruptionKind.WRONG_POSE, track.view.index) is not None
+        forced = self._script.active(CorruptionKind.WRONG_POSE, track.view.timestamp_s) is not None
         known = track.view.index in self._inner.submap.keyframes
         return (forced and not known) or self._inner.keyframe_due(track)
 
     def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
-        if self._script.solver_fails(track.view.index):
+        if self._script.solver_fails(track.view.timestamp_s):
             raise SolverError(f"frame {track.view.index}: the failure lab lets the solver fail here")
         return self._inner.insert_keyframe(track)
 

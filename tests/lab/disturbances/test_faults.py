@@ -23,7 +23,7 @@ from tests.cli.conftest import _own_environment  # noqa: F401 (used by every tes
 N = 45
 
 
-def run(*corruptions: dict[str, object], **settings: object) -> System:
+def run(*corruptions: dict[str, object], backwards: bool = False, **settings: object) -> System:
     world = PointWorld(cloud(), hand_held(N))
     system = system_in(world, **settings)
     script = FaultScript([Corruption.model_validate(c) for c in corruptions])
@@ -32,7 +32,7 @@ def run(*corruptions: dict[str, object], **settings: object) -> System:
         view_of=script.around_views(system._parts.view_of),
         new_odometry=script.around_odometry(system._parts.new_odometry),
     )
-    for frame in world.frames():
+    for frame in world.frames()[:: -1 if backwards else 1]:
         system.step(frame)
     system.finish()
     return system
@@ -78,6 +78,13 @@ def test_too_few_features_lose_the_track() -> None:
     system = run({"kind": "few_features", "start": 20, "length": 5, "strength": 0.98})
     assert [system.rows[i].status for i in range(20, 25)] == [FrameStatus.LOST] * 5
     assert system.rows[26].status is FrameStatus.TRACKED
+
+
+def test_faults_count_in_the_source_whichever_way_it_is_read() -> None:
+    fault = {"kind": "wrong_pose", "start": 25, "length": 1, "strength": 15}
+    system = run(fault, backwards=True)
+    lost = [row.index for row in system.rows.values() if row.status is FrameStatus.LOST]
+    assert [system.numbers.index_of(number) for number in lost] == [25]
 
 
 def test_a_wrong_pose_that_the_map_contradicts_is_taken_out_again() -> None:
