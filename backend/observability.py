@@ -48,16 +48,33 @@ def compute_residuals(
     xyz_mu : (R, 3)
     uv_px : (R, 2), sigma_px : (R,)
     """
-    R, t = T_submap_kf[pose, :3, :3], T_submap_kf[pose, :3, 3]
-    xyz_cam = np.einsum("rji,rj->ri", R, xyz_mu - t)
-    depth = xyz_cam[:, 2]
-    front = depth > MIN_DEPTH_MU
-    x = xyz_cam[:, :2] / np.where(front, depth, 1.0)[:, None]
-    u = K[0, 0] * x[:, 0] + K[0, 1] * x[:, 1] + K[0, 2] - uv_px[:, 0]
-    v = K[1, 1] * x[:, 1] + K[1, 2] - uv_px[:, 1]
+    xyz_cam, front, uv = reproject(K, T_submap_kf, pose, xyz_mu)
+    u, v = (uv - uv_px).T
     chi2 = np.where(front, (u * u + v * v) / (sigma_px * sigma_px), np.inf)
     chi2[~np.isfinite(chi2)] = np.inf
-    return Residuals(chi2, depth, xyz_cam)
+    return Residuals(chi2, xyz_cam[:, 2], xyz_cam)
+
+
+def reproject(
+    K: FloatArray, T_submap_kf: FloatArray, pose: IntArray, xyz_mu: FloatArray
+) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """Project R points, each by a pose of its own; arguments as in `compute_residuals`.
+
+    Returns
+    -------
+    xyz_cam : (R, 3) float64
+    front : (R,) bool
+        Whether the point is in front of the camera.
+    uv_px : (R, 2) float64
+        The pixel; that of the optical axis where it is not.
+    """
+    R, t = T_submap_kf[pose, :3, :3], T_submap_kf[pose, :3, 3]
+    xyz_cam = np.einsum("rji,rj->ri", R, xyz_mu - t)
+    front = xyz_cam[:, 2] > MIN_DEPTH_MU
+    safe = np.where(front[:, None], xyz_cam, [0.0, 0.0, 1.0])
+    x, y = (safe[:, :2] / safe[:, 2:]).T
+    uv_px = np.column_stack((K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]))
+    return xyz_cam, front, uv_px
 
 
 def compute_depth_sigmas(

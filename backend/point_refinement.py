@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dualslam.backend.observability import MIN_DEPTH_MU
+from dualslam.backend.observability import MIN_DEPTH_MU, reproject
 from dualslam.core.types import FloatArray, IntArray
 
 STEPS = 2
@@ -78,16 +78,14 @@ def refine_points(
     n = len(xyz_mu)
     if n == 0 or len(pose) == 0:
         return xyz_mu
-    R, t = T_submap_kf[pose, :3, :3], T_submap_kf[pose, :3, 3]
+    R = T_submap_kf[pose, :3, :3]
     best = xyz_mu.copy()
     xyz = best
     cost = np.full(n, np.inf)
     for step in range(STEPS + 1):
-        xyz_cam = np.einsum("rji,rj->ri", R, xyz[point] - t)
-        front = xyz_cam[:, 2] > MIN_DEPTH_MU
+        xyz_cam, front, uv = reproject(K, T_submap_kf, pose, xyz[point])
         safe = np.where(front[:, None], xyz_cam, [0.0, 0.0, 1.0])
-        uv = safe[:, :2] / safe[:, 2:]
-        r = np.column_stack((K[0, 0] * uv[:, 0] + K[0, 1] * uv[:, 1] + K[0, 2], K[1, 1] * uv[:, 1] + K[1, 2])) - uv_px
+        r = uv - uv_px
         r /= sigma_px[:, None]
         weight, loss = huber(np.einsum("ri,ri->r", r, r), robust_k)
         loss[~front] = 1e12

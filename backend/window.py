@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.backend.noise import LEAST_NOISE, OUTLIER_CHI2, residual_variance
-from dualslam.backend.observability import MIN_DEPTH_MU
+from dualslam.backend.observability import reproject
 from dualslam.backend.point_refinement import huber, projection_jacobian, sum_by
 from dualslam.backend.selection import rank_in_runs, spread_evenly
 from dualslam.core.geometry import se3, so3
@@ -210,13 +210,8 @@ def _step(
 
 
 def _evaluate(window: Window, T: FloatArray, xyz: FloatArray, robust_k: float) -> _State:
-    R, t = T[window.pose, :3, :3], T[window.pose, :3, 3]
-    xyz_cam = np.einsum("rji,rj->ri", R, xyz[window.point] - t)
-    front = xyz_cam[:, 2] > MIN_DEPTH_MU
-    safe = np.where(front[:, None], xyz_cam, [0.0, 0.0, 1.0])
-    x, y = (safe[:, :2] / safe[:, 2:]).T
-    K = window.K
-    residuals = np.column_stack((K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2])) - window.uv_px
+    xyz_cam, front, uv_px = reproject(window.K, T, window.pose, xyz[window.point])
+    residuals = uv_px - window.uv_px
     residuals /= window.sigma_px[:, None]
     chi2 = np.einsum("ri,ri->r", residuals, residuals)
     weight, loss = huber(chi2, robust_k)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.geometry.projection import project_points
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 
@@ -98,14 +99,10 @@ class LocalMap:
             The front end's pyramid.
         """
         R, t = T_cam_submap[:3, :3], T_cam_submap[:3, 3]
-        p_cam = self.xyz_mu @ R.T + t
-        z = p_cam[:, 2]
-        in_front = z > 1e-6
-        uv = p_cam[:, :2] / np.where(in_front, z, 1.0)[:, None] * (K[0, 0], K[1, 1]) + (K[0, 2], K[1, 2])
+        uv, _ = project_points(K, T_cam_submap, self.xyz_mu)
         width, height = size_px
-        rows = np.flatnonzero(
-            in_front & (uv[:, 0] >= 0) & (uv[:, 1] >= 0) & (uv[:, 0] <= width - 1) & (uv[:, 1] <= height - 1)
-        )
+        # NaN, behind the camera, is in no image.
+        rows = np.flatnonzero((uv[:, 0] >= 0) & (uv[:, 1] >= 0) & (uv[:, 0] <= width - 1) & (uv[:, 1] <= height - 1))
         to_camera = -R.T @ t - self.xyz_mu[rows]
         distance = np.sqrt(np.einsum("ij,ij->i", to_camera, to_camera))
         cosine = np.einsum("ij,ij->i", to_camera, self.normal[rows]) / np.maximum(distance, 1e-12)
