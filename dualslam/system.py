@@ -35,8 +35,10 @@ from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
 from dualslam.pace import Pace
 from dualslam.places.revisits import PlaceParts, Revisits
+from dualslam.recovery.bypass import drop_corrupted
 from dualslam.recovery.executor import RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
+from dualslam.recovery.leaps import LeapWatch
 from dualslam.recovery.manager import Recoveries
 from dualslam.recovery.relocaliser import Relocaliser
 from dualslam.workers.jobs import Desk
@@ -120,6 +122,7 @@ class System:
         self._starter = components.new_starter()
         self._lost: list[View] = []
         self._health = HealthMonitor(config.health)
+        self._leaps = LeapWatch()
         self._connections = Connections(
             record, components.atlas_solver, components.new_graph, components.adjust_bundle, self._front_ends
         )
@@ -356,6 +359,12 @@ class System:
         if track:
             self._lost = []
             self.buffer.thaw()
+            first = self._leaps.first_beyond
+            wide = isinstance(track, Track) and track.wide
+            contradicted = self._leaps.judge(view, wide, self._record, live.submap)
+            if contradicted is not None and first is not None:
+                self._break_at(live, view, first.index, contradicted)
+                return contradicted
             if live.reference_id != view.index:
                 return track
             self._calibrations.ask_if_due(live, view, self._recoveries.waiting)
@@ -447,7 +456,7 @@ class System:
     def _give_up(self, live: VisualOdometry, view: View, failure: Failure) -> None:
         """Declare the track failed: archive the submap whole, and start the next from the frames since the loss."""
         suspected = self._health.suspected()
-        onset = suspected[0].index if suspected else self._lost[0].index
+        onset = min([self._lost[0].index, *(frame.index for frame in suspected)])
         self._record.event(
             EventKind.FAILED,
             view,
@@ -460,6 +469,7 @@ class System:
             **failure.numbers,
         )
         self._archive(live, "track lost")
+        self._leaps.end()
         self._recoveries.declare_lost(live.submap.id, onset, str(failure.reason), self._lost[0].index)
         self._live = None
         self._health = HealthMonitor(self._config.health)
@@ -470,6 +480,14 @@ class System:
         for lost in self._lost:
             self._starter.collect(lost)
         self._lost = []
+
+    def _break_at(self, live: VisualOdometry, view: View, first: int, failure: Failure) -> None:
+        """End a map that was found to be broken since frame `first`: what it has posed since is for a walk to pose."""
+        self._lost = [buffered for buffered in self.buffer if buffered.index >= first] or [view]
+        self.buffer.freeze()
+        drop_corrupted(self._record, live.submap.id, first)
+        live.submap.condemn({k for k in live.submap.keyframes if k >= first})
+        self._give_up(live, view, failure)
 
     def _archive(self, live: VisualOdometry, why: str) -> None:
         submap = live.submap

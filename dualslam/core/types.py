@@ -265,6 +265,7 @@ class FailureReason(StrEnum):
     NEEDS_OLDER_KEYFRAMES = "needs_older_keyframes"
     UNCONFIRMED = "unconfirmed"
     LOOK_ALIKE = "look_alike"
+    LEAP = "leap"
     TIMEOUT = "timeout"
     WORKER = "worker"
     BUSY = "busy"

@@ -9,6 +9,8 @@ from functools import partial
 from itertools import takewhile
 from typing import Any
 
+import numpy as np
+
 from dualslam.calibration.lens import Calibration
 from dualslam.config.settings import RecoveryConfig
 from dualslam.core.errors import SolverError
@@ -24,10 +26,12 @@ from dualslam.map.record import FrameStamp, Record
 from dualslam.map.solving import solve
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
+from dualslam.map.trajectory import FramePose
 from dualslam.recovery.audits import Audits
 from dualslam.recovery.bypass import absorb, bypass, condemn_tail, drop_corrupted
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
+from dualslam.recovery.leaps import refuse_leaps
 from dualslam.recovery.merge import Merged, merge_recovery
 from dualslam.recovery.overlap_refinement import gauge_at_overlap
 from dualslam.recovery.reverse_tracking import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult
@@ -217,6 +221,9 @@ class Recoveries:
                 self._record.timer.add("walk back", result.cpu_s)
             if walk.again and not job.onsets and not self._poses_any(result):
                 continue  # the last one for these frames; what it would add to the map is not worth a solution
+            if not isinstance(result, Failure) and (refused := self._refuse_leaps(result)) is not None:
+                self._failed(job, now, refused, time.perf_counter() - walk.began_s)
+                continue
             if not isinstance(result, Failure):
                 with self._record.timer.measure("merging"):
                     self._take_in(job, result, live, now, walk.began_s)
@@ -225,6 +232,19 @@ class Recoveries:
                 continue
             if unlinked or self._way_to_gaps(self._record.atlas.submaps[job.submap.id]):
                 self._retries.leave_open(job.submap.id, walk.n_live, job.camera)
+
+    def _refuse_leaps(self, result: RecoveryResult) -> Failure | None:
+        """Return why a link is not to be believed whose walk has leapt as the lost map's camera never moved."""
+        if result.link is None:
+            return None
+        old, new = self._record.atlas.submaps[result.link.old_id], result.submap
+        walked = {frame.pose.index: frame.pose for frame in result.frames}
+        ours = [p for p in self._record.poses.values() if p.submap_id == new.id and p.index not in walked]
+        ours = [p for p in ours if p.keyframe_id in new.keyframes] + list(walked.values())
+        theirs = [p for p in self._record.poses.values() if p.submap_id == old.id]
+        t_new, centres = _path_of(ours, new)
+        t_old, centres_old = _path_of(theirs, old)
+        return refuse_leaps(t_new, centres, t_old, centres_old / float(sim3.scale(result.link.estimate.S_old_new)))
 
     def _poses_any(self, result: RecoveryResult | Failure) -> bool:
         """Whether a walk has found a pose for a frame that has none."""
@@ -425,6 +445,13 @@ class Recoveries:
     def _was_lost(self, index: int, old_id: int) -> bool:
         tracked = self._record.rows[index].status is FrameStatus.TRACKED
         return tracked and self._record.poses[index].submap_id != old_id
+
+
+def _path_of(poses: list[FramePose], submap: Submap) -> tuple[FloatArray, FloatArray]:
+    """Return times (N,), ascending, and centres (N, 3) of frames posed in a map."""
+    poses = sorted(poses, key=lambda pose: pose.timestamp_s)
+    centres = [submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)[:3, 3] for pose in poses]
+    return np.array([pose.timestamp_s for pose in poses]), np.array(centres).reshape(-1, 3)
 
 
 def _same_camera(job: RecoveryJob, submap: Submap) -> bool:
