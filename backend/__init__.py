@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from dualslam.backend.self_calibration import estimate_calibration
     from dualslam.backend.sim3_graph import Sim3Edge, Sim3Prior, Sim3Solution, optimise_sim3
     from dualslam.backend.submap_graph import ISam2SubmapGraph
-    from dualslam.backend.window import WindowSolver
+    from dualslam.backend.window import NumpyWindowSolver
 
 _WHERE = {
     "GtsamAtlasSolver": "atlas_solver",
@@ -23,7 +23,7 @@ _WHERE = {
     "Sim3Prior": "sim3_graph",
     "Sim3Solution": "sim3_graph",
     "SubmapBundle": "local_ba",
-    "WindowSolver": "window",
+    "NumpyWindowSolver": "window",
     "bundle_adjust": "local_ba",
     "bundle_adjust_arrays": "local_ba",
     "estimate_calibration": "self_calibration",
@@ -33,11 +33,11 @@ _WHERE = {
 __all__ = [
     "GtsamAtlasSolver",
     "ISam2SubmapGraph",
+    "NumpyWindowSolver",
     "Sim3Edge",
     "Sim3Prior",
     "Sim3Solution",
     "SubmapBundle",
-    "WindowSolver",
     "bundle_adjust",
     "bundle_adjust_arrays",
     "estimate_calibration",

@@ -70,7 +70,7 @@ class _State:
     cost: float
 
 
-class WindowSolver:
+class NumpyWindowSolver:
     """The `dualslam.core.interfaces.WindowSolver` in numpy.
 
     Parameters

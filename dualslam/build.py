@@ -14,7 +14,7 @@ from dualslam.backend.atlas_solver import GtsamAtlasSolver
 from dualslam.backend.local_ba import bundle_adjust, bundle_adjust_arrays
 from dualslam.backend.self_calibration import estimate_calibration, find_preferred_camera
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.backend.window import WindowSolver as NumpyWindowSolver
+from dualslam.backend.window import NumpyWindowSolver
 from dualslam.calibration.lens import Calibration, CalibrationAnswer, CalibrationJob, answer
 from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.bundle import BundleAdjuster

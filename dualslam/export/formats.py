@@ -15,7 +15,7 @@ from dualslam.export.ply import write_ply
 
 
 @dataclass(frozen=True, slots=True)
-class Format:
+class ExportFormat:
     """A way to write a map.
 
     Attributes
@@ -34,9 +34,9 @@ class Format:
 
 
 FORMATS = {
-    "bal": Format(write_bal),
-    "colmap": Format(write_colmap, is_folder=True, has_images=True),
-    "g2o": Format(write_g2o),
-    "nerfstudio": Format(write_nerfstudio, is_folder=True, has_images=True),
-    "ply": Format(write_ply),
+    "bal": ExportFormat(write_bal),
+    "colmap": ExportFormat(write_colmap, is_folder=True, has_images=True),
+    "g2o": ExportFormat(write_g2o),
+    "nerfstudio": ExportFormat(write_nerfstudio, is_folder=True, has_images=True),
+    "ply": ExportFormat(write_ply),
 }

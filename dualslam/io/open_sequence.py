@@ -18,7 +18,7 @@ from dualslam.io.video import WebcamSequence
 log = logging.getLogger(__name__)
 
 
-class Format(Protocol):
+class SourceFormat(Protocol):
     """What a module of this package offers to be a folder format."""
 
     def recognises(self, folder: Path) -> bool:
@@ -31,7 +31,7 @@ class Format(Protocol):
 
 
 # The surer the sign, the earlier; the plain folder of images takes what no other does.
-FORMATS: tuple[Format, ...] = (euroc, tum_rgbd, kitti, tum_mono, dataset_folder, folder)
+FORMATS: tuple[SourceFormat, ...] = (euroc, tum_rgbd, kitti, tum_mono, dataset_folder, folder)
 
 
 def open_sequence(

@@ -7,7 +7,7 @@ linked?). faiss is imported here alone.
 
 from dualslam.places.faiss_index import FaissRecogniser
 from dualslam.places.recogniser import PlaceCandidate, PlaceRecogniser
-from dualslam.places.second_pose import SecondPose, find_second_pose
+from dualslam.places.second_pose import SecondSimilarity, find_second_pose
 from dualslam.places.verification import PlaceMatch, PlaceVerifier
 
 __all__ = [
@@ -16,6 +16,6 @@ __all__ = [
     "PlaceMatch",
     "PlaceRecogniser",
     "PlaceVerifier",
-    "SecondPose",
+    "SecondSimilarity",
     "find_second_pose",
 ]

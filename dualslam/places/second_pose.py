@@ -28,7 +28,7 @@ N_ALIKE = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SecondPose:
+class SecondSimilarity:
     """Another similarity, and how many landmarks it explains.
 
     Attributes
@@ -81,7 +81,7 @@ def find_second_pose(
     min_support: int,
     chi2_gate: float,
     max_hypotheses: int,
-) -> SecondPose | None:
+) -> SecondSimilarity | None:
     """Look for another similarity among the pairs that the first one leaves over.
 
     Parameters
@@ -102,7 +102,7 @@ def find_second_pose(
 
     Returns
     -------
-    SecondPose or None
+    SecondSimilarity or None
     """
     first_support = len(np.unique(point[explained]))
     rest = np.flatnonzero(~explained)
@@ -123,7 +123,7 @@ def find_second_pose(
     support = len(np.unique(point[rest[second.inliers]]))
     if support < min_support or _are_one(S_first, second.S_dst_src, src[rest[second.inliers]]):
         return None
-    return SecondPose(sim3.normalise(second.S_dst_src), support, first_support)
+    return SecondSimilarity(sim3.normalise(second.S_dst_src), support, first_support)
 
 
 def _are_one(S_a: FloatArray, S_b: FloatArray, src: FloatArray) -> bool:

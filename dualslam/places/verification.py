@@ -23,7 +23,7 @@ from dualslam.core.place_matcher import PlaceMatcher, Sighting
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
-from dualslam.places.second_pose import SecondPose, alike, find_second_pose
+from dualslam.places.second_pose import SecondSimilarity, alike, find_second_pose
 from dualslam.recovery.linking.gates import (
     MAX_HYPOTHESES,
     MAX_SCALE,
@@ -324,7 +324,7 @@ class PlaceVerifier:
             numbers,
         )
 
-    def _second_pose(self, place: _Side, query: _Side, S: FloatArray, rng: Generator) -> SecondPose | None:
+    def _second_pose(self, place: _Side, query: _Side, S: FloatArray, rng: Generator) -> SecondSimilarity | None:
         """Look for another similarity among all that looks alike, in the place and in the keyframe that asks."""
         ids = query.submap.landmark_of[query.keyframes[0]]
         asked = np.unique(ids[ids >= 0])

@@ -8,7 +8,7 @@ import pytest
 from dualslam.backend import submap_graph
 from dualslam.backend.local_ba import bundle_adjust
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.backend.window import WindowSolver
+from dualslam.backend.window import NumpyWindowSolver
 from dualslam.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
@@ -43,7 +43,7 @@ def start(n=30, per_view=120, noise_px=1.0, seed=0, config=None, order=None, fir
 def pose(submap, k):
     """Pose a new keyframe by its neighbours, as a front end does before the graph looks at it."""
     newest = list(submap.keyframes)[-3:][::-1]
-    posed = WindowSolver(GraphConfig().robust_k)(submap, newest)
+    posed = NumpyWindowSolver(GraphConfig().robust_k)(submap, newest)
     if posed:
         apply(submap, posed)
 

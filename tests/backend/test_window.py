@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.backend.window import Window, WindowSolver, _evaluate, _window, adjust_window
+from dualslam.backend.window import NumpyWindowSolver, Window, _evaluate, _window, adjust_window
 from dualslam.config.settings import GraphConfig
 from dualslam.core.geometry import se3
 from dualslam.core.types import Failure
@@ -13,8 +13,8 @@ from dualslam.testing.graph_scene import pose_errors
 from tests.backend.test_submap_graph import grow, start
 
 
-def solver() -> WindowSolver:
-    return WindowSolver(GraphConfig().robust_k)
+def solver() -> NumpyWindowSolver:
+    return NumpyWindowSolver(GraphConfig().robust_k)
 
 
 def newest(submap, n=3):
