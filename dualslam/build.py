@@ -348,6 +348,7 @@ def recovery_parts(
         link=lambda old, new, onset: estimate_link(
             old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
         ),
+        max_scale_sigma=config.linking.max_live_scale_sigma,
         propagate=lambda link, new, newest_id, bend: propagate_to_live_end(link, new, newest_id, config.linking, bend),
         check_camera=lambda submap, link, job: check_camera(
             submap, link, job.newest_id, partial(_preferred_camera, job, config), config.linking, config.calibration

@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
+from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.linking import NO_BEND, Bend, LinkEstimate
 from dualslam.recovery.overlap_refinement import OverlapReport, refine_overlap
 from dualslam.recovery.relinker import Linker, LinkTry, Relinker
@@ -61,6 +62,8 @@ class RecoveryJob:
         Of the correction that it has, if it was estimated.
     is_audit : bool
         Whether the submap is one without its start, which the walk is to be compared with (`recovery/audit.py`).
+    refused_for_scale : dict of int to int
+        Tries to link each lost submap that earlier walks have made in vain.
     """
 
     submap: Submap
@@ -72,6 +75,7 @@ class RecoveryJob:
     camera: Camera
     camera_covariance: FloatArray | None
     is_audit: bool = False
+    refused_for_scale: dict[int, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,6 +114,8 @@ class RecoveryResult:
         Wall time of all attempts, and CPU time of the process, whose threads find features beside the walk.
     looks_alike : bool
         Whether beyond a gap two poses explained as much: no later walk over it would tell them apart.
+    refused_for_scale : dict of int to int
+        The job's, with the tries of this walk.
     """
 
     submap: Submap
@@ -119,6 +125,7 @@ class RecoveryResult:
     seconds: float
     cpu_s: float
     looks_alike: bool = False
+    refused_for_scale: dict[int, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,6 +141,7 @@ class RecoveryParts:
     """What a recovery is made of; put together by the composition root of the process in which it runs.
 
     `posing`: the way back where there is no lost map, but frames without a pose.
+    `max_scale_sigma`: of a link, at the live end.
     `budget_s`: wall time after which it comes to an end with what it has, where it does not run inline.
     """
 
@@ -141,6 +149,7 @@ class RecoveryParts:
     posing: Attempt
     new_graph: Callable[[], SubmapGraph]
     link: Linker
+    max_scale_sigma: float
     propagate: Callable[[LinkEstimate, Submap, int, Bend], LinkEstimate | Failure]
     check_camera: Callable[[Submap, LinkEstimate, RecoveryJob], Bend | Failure]
     judge: Judge
@@ -158,12 +167,13 @@ def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Fai
     best: _Progress | None = None
     problem = Failure(FailureReason.SOLVER)
     events: list[Event] = []
-    looks_alike = False
+    looks_alike, tries = False, LinkTries(job.refused_for_scale)
     until = np.inf if parts.budget_s is None else started + parts.budget_s
     for attempt in parts.attempts if job.lost else (parts.posing,):
         if best is not None and time.perf_counter() > until:
             break
-        progress = _make_attempt(job, parts, attempt, until)
+        tries.begin_attempt()
+        progress = _make_attempt(job, parts, attempt, until, tries)
         if isinstance(progress, Failure):
             problem = progress
             continue
@@ -177,7 +187,8 @@ def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Fai
         return problem
     seconds, cpu_s = time.perf_counter() - started, time.process_time() - cpu_started
     frames = tuple(best.frames.values())
-    return RecoveryResult(best.submap, frames, best.link, tuple(events), seconds, cpu_s, looks_alike)
+    refused = dict(tries.refused)
+    return RecoveryResult(best.submap, frames, best.link, tuple(events), seconds, cpu_s, looks_alike, refused)
 
 
 @dataclass(slots=True, eq=False)
@@ -225,7 +236,9 @@ class _Progress:
         self.n_skipped -= 1
 
 
-def _make_attempt(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float) -> _Progress | Failure:
+def _make_attempt(
+    job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float, tries: LinkTries
+) -> _Progress | Failure:
     """Make one attempt, from a copy of the job's submap; it stops at the time `until`."""
     started = time.perf_counter()
     submap, graph = job.submap.copy(), parts.new_graph()
@@ -255,10 +268,11 @@ def _make_attempt(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, unti
         if step.view.index not in submap.keyframes:
             continue
         for tried in relinker.attempts(step.view.index):
-            found = _fused(tried, job, submap, attempt.name, parts)
+            found = _fused(tried, job, submap, attempt.name, parts, tries)
             if not isinstance(found, Failure):
                 progress.link = found
                 break
+            tries.note_try(tried.old_id, found.reason)
             progress.why_not_linked = found.detail
             progress.needs_camera |= found.reason is FailureReason.CAMERA
             # What was lost across a gap the others lose as well: they cross it by the same matches, or by fewer.
@@ -282,7 +296,9 @@ def _there_and_back(views: tuple[View, ...], progress: _Progress) -> Iterator[Vi
     yield from way_to_gaps(views[::-1], progress.frames, progress.submap.keyframes)
 
 
-def _fused(tried: LinkTry, job: RecoveryJob, submap: Submap, attempt: str, parts: RecoveryParts) -> FoundLink | Failure:
+def _fused(
+    tried: LinkTry, job: RecoveryJob, submap: Submap, attempt: str, parts: RecoveryParts, tries: LinkTries
+) -> FoundLink | Failure:
     """Refine the overlap and with it the link, which must hold as far as where the walk set out, and beyond."""
     found = tried.result
     if isinstance(found, Failure):
@@ -298,13 +314,21 @@ def _fused(tried: LinkTry, job: RecoveryJob, submap: Submap, attempt: str, parts
         unrefined = refinement.reason in (FailureReason.DISABLED, FailureReason.SOLVER)
         if not unrefined:
             return refinement
+        refined: Submap = submap
+        report: OverlapReport | Failure = refinement
         link = parts.propagate(found, submap, job.newest_id, bend)
-        return link if isinstance(link, Failure) else FoundLink(tried.old_id, link, refinement, attempt)
-    link = parts.propagate(refinement.link, refinement.submap, job.newest_id, bend)
+    else:
+        refined, report = refinement.submap, refinement.report
+        link = parts.propagate(refinement.link, refined, job.newest_id, bend)
     if isinstance(link, Failure):
         return link
-    submap.take_over(refinement.submap)
-    return FoundLink(tried.old_id, link, refinement.report, attempt)
+    again = tries.judge(tried.old_id, link.numbers["sigma_scale"], parts.max_scale_sigma)
+    if again is not None:
+        return again
+    if refined is not submap:
+        submap.take_over(refined)
+    link = replace(link, numbers=link.numbers | {"tries": tries.refused[tried.old_id] + 1.0})
+    return FoundLink(tried.old_id, link, report, attempt)
 
 
 def _recovered_frame(reverse_tracker: VisualOdometry, view: View, track: Track) -> RecoveredFrame:

@@ -1,0 +1,49 @@
+"""Tries at a link are counted, and the bound allows for them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dualslam.core.types import FailureReason
+from dualslam.recovery.link_tries import RISK, LinkTries, tightened
+
+MAX_SIGMA = 0.025
+
+
+def test_the_first_try_passes_by_the_bound_as_it_stands() -> None:
+    assert LinkTries({}).judge(0, 0.0249, MAX_SIGMA) is None
+    assert tightened(MAX_SIGMA, 1) == pytest.approx(MAX_SIGMA)
+
+
+@pytest.mark.parametrize("n", [2, 6, 12])
+def test_the_bound_holds_the_risk_of_one_try_over_all_of_them(n: int) -> None:
+    rng = np.random.default_rng(n)
+    sigma = tightened(MAX_SIGMA, n)
+    wrong = 1.96 * MAX_SIGMA
+    worst = np.abs(sigma * rng.standard_normal((20_000, n))).max(axis=1)
+    assert (worst > wrong).mean() < 1.1 * RISK
+
+
+def test_after_refused_tries_it_must_pass_twice_in_a_row() -> None:
+    tries = LinkTries({0: 2})
+    for _ in range(3):
+        tries.note_try(0, FailureReason.SCALE)
+    again = tries.judge(0, 0.024, MAX_SIGMA)
+    assert again is not None
+    assert again.reason is FailureReason.UNCONFIRMED
+    assert again.numbers["tries"] == 6
+    tries.note_try(0, again.reason)
+    assert tries.judge(0, 0.024, MAX_SIGMA) is None
+    assert tries.refused[0] == 5
+
+
+def test_what_fails_in_between_begins_anew_and_what_is_far_surer_passes_at_once() -> None:
+    tries = LinkTries({0: 4})
+    assert tries.judge(0, 0.024, MAX_SIGMA) is not None
+    tries.note_try(0, FailureReason.AGREEMENT)
+    assert tries.judge(0, 0.024, MAX_SIGMA) is not None
+    tries.begin_attempt()
+    assert tries.judge(0, 0.024, MAX_SIGMA) is not None
+    assert LinkTries({0: 4}).judge(0, 0.015, MAX_SIGMA) is None
+    assert LinkTries({0: 4}).judge(1, 0.024, MAX_SIGMA) is None
