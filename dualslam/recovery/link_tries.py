@@ -19,21 +19,28 @@ def tightened(max_sigma: float, n_tries: int) -> float:
 
 
 class LinkTries:
-    """Counts, for each lost map, the tries at a link that were refused for its scale, over all walks and attempts.
+    """What earlier tries at linking each lost map came to, over all walks and attempts.
 
-    Parameters
+    Attributes
     ----------
-    refused : mapping of int to int
-        By earlier walks, by the lost map.
+    refused : Counter of int
+        By lost map, the tries that were refused for the scale.
     """
 
-    def __init__(self, refused: Mapping[int, int]) -> None:
-        self.refused: Counter[int] = Counter(dict(refused))
-        self._held: set[int] = set()
+    def __init__(self, refused: Mapping[int, int] | None = None) -> None:
+        self.refused: Counter[int] = Counter(refused)
+        self._held: set[int] = set()  # lost maps whose last try passed
 
-    def begin_attempt(self) -> None:
-        """Note that what follows is another walk: nothing has held in it yet."""
-        self._held.clear()
+    def copy(self) -> LinkTries:
+        """Return tries that go on by themselves."""
+        copied = LinkTries(self.refused)
+        copied._held = set(self._held)
+        return copied
+
+    def take_over(self, old_id: int, other: LinkTries) -> None:
+        """Replace what is known of one lost map by what `other` knows."""
+        self.refused[old_id] = other.refused[old_id]
+        self._held = (self._held - {old_id}) | (other._held & {old_id})
 
     def note_try(self, old_id: int, reason: FailureReason) -> None:
         """Count a try that came to nothing."""
@@ -45,7 +52,8 @@ class LinkTries:
     def judge(self, old_id: int, sigma_scale: float, max_sigma: float) -> Failure | None:
         """Return why a link that has passed is to be tried again, if it is.
 
-        After tries that were refused it must pass twice in a row, or the bound which allows for them at once.
+        After tries that were refused it must pass twice in a row, be it in two walks, or the bound which allows for
+        them at once.
         """
         n_refused = self.refused[old_id]
         if n_refused == 0 or old_id in self._held or sigma_scale <= tightened(max_sigma, n_refused + 1):

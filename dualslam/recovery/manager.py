@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -33,6 +32,7 @@ from dualslam.recovery.bypass import absorb, bypass, condemn_tail, drop_corrupte
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.leaps import refuse_leaps
+from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.merge import Merged, merge_recovery
 from dualslam.recovery.overlap_refinement import gauge_at_overlap
 from dualslam.recovery.reverse_tracking import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult
@@ -95,7 +95,7 @@ class Recoveries:
         self._under_way: dict[int, _UnderWay] = {}  # by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
         self._retries = RetrySchedule(config.retry_keyframes)
-        self._refused_for_scale: Counter[int] = Counter()  # tries to link lost submaps
+        self._tries = LinkTries()  # at linking lost submaps
         self._audits = Audits(record, buffer, calibration, audits and config.enabled)
 
     @property
@@ -178,7 +178,7 @@ class Recoveries:
             own=tuple(view for view in self._buffer if view.index in submap.keyframes),
             camera=self._calibration.camera,
             camera_covariance=self._calibration.covariance,
-            refused_for_scale={m: self._refused_for_scale[m] for m in onsets},
+            tries=self._tries.copy(),
         )
         self._retries.start_of(submap, newest.index)
         n_live = self._retries.n_live(submap, (now or newest).index)
@@ -222,7 +222,8 @@ class Recoveries:
                 self._failed(job, now, result, time.perf_counter() - walk.began_s)
             else:
                 self._record.timer.add("walk back", result.cpu_s)
-                self._refused_for_scale.update(Counter(result.refused_for_scale) - Counter(job.refused_for_scale))
+                for lost in job.onsets:
+                    self._tries.take_over(lost, result.tries)
             if walk.again and not job.onsets and not self._poses_any(result):
                 continue  # the last one for these frames; what it would add to the map is not worth a solution
             if not isinstance(result, Failure) and (refused := self._refuse_leaps(result)) is not None:

@@ -62,8 +62,8 @@ class RecoveryJob:
         Of the correction that it has, if it was estimated.
     is_audit : bool
         Whether the submap is one without its start, which the walk is to be compared with (`recovery/audit.py`).
-    refused_for_scale : dict of int to int
-        Tries to link each lost submap that earlier walks have made in vain.
+    tries : LinkTries
+        What earlier walks have tried in vain.
     """
 
     submap: Submap
@@ -75,7 +75,7 @@ class RecoveryJob:
     camera: Camera
     camera_covariance: FloatArray | None
     is_audit: bool = False
-    refused_for_scale: dict[int, int] = field(default_factory=dict)
+    tries: LinkTries = field(default_factory=LinkTries)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +114,7 @@ class RecoveryResult:
         Wall time of all attempts, and CPU time of the process, whose threads find features beside the walk.
     looks_alike : bool
         Whether beyond a gap two poses explained as much: no later walk over it would tell them apart.
-    refused_for_scale : dict of int to int
+    tries : LinkTries
         The job's, with the tries of this walk.
     """
 
@@ -125,7 +125,7 @@ class RecoveryResult:
     seconds: float
     cpu_s: float
     looks_alike: bool = False
-    refused_for_scale: dict[int, int] = field(default_factory=dict)
+    tries: LinkTries = field(default_factory=LinkTries)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,12 +167,11 @@ def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Fai
     best: _Progress | None = None
     problem = Failure(FailureReason.SOLVER)
     events: list[Event] = []
-    looks_alike, tries = False, LinkTries(job.refused_for_scale)
+    looks_alike, tries = False, job.tries.copy()
     until = np.inf if parts.budget_s is None else started + parts.budget_s
     for attempt in parts.attempts if job.lost else (parts.posing,):
         if best is not None and time.perf_counter() > until:
             break
-        tries.begin_attempt()
         progress = _make_attempt(job, parts, attempt, until, tries)
         if isinstance(progress, Failure):
             problem = progress
@@ -187,8 +186,7 @@ def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Fai
         return problem
     seconds, cpu_s = time.perf_counter() - started, time.process_time() - cpu_started
     frames = tuple(best.frames.values())
-    refused = dict(tries.refused)
-    return RecoveryResult(best.submap, frames, best.link, tuple(events), seconds, cpu_s, looks_alike, refused)
+    return RecoveryResult(best.submap, frames, best.link, tuple(events), seconds, cpu_s, looks_alike, tries)
 
 
 @dataclass(slots=True, eq=False)

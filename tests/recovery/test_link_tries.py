@@ -43,7 +43,17 @@ def test_what_fails_in_between_begins_anew_and_what_is_far_surer_passes_at_once(
     assert tries.judge(0, 0.024, MAX_SIGMA) is not None
     tries.note_try(0, FailureReason.AGREEMENT)
     assert tries.judge(0, 0.024, MAX_SIGMA) is not None
-    tries.begin_attempt()
-    assert tries.judge(0, 0.024, MAX_SIGMA) is not None
     assert LinkTries({0: 4}).judge(0, 0.015, MAX_SIGMA) is None
     assert LinkTries({0: 4}).judge(1, 0.024, MAX_SIGMA) is None
+
+
+def test_what_held_in_one_walk_may_hold_again_in_the_next() -> None:
+    known, walk = LinkTries({0: 2, 1: 3}), LinkTries({0: 4})
+    assert walk.judge(0, 0.024, MAX_SIGMA) is not None
+    known.take_over(0, walk)
+    assert known.refused == {0: 4, 1: 3}
+    next_walk = known.copy()
+    next_walk.note_try(1, FailureReason.SCALE)
+    assert next_walk.judge(0, 0.024, MAX_SIGMA) is None
+    assert next_walk.judge(1, 0.024, MAX_SIGMA) is not None
+    assert known.refused[1] == 3
