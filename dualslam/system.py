@@ -312,7 +312,7 @@ class System:
         """Take the shutter that was found out of the frames so far; the starter begins anew. Returns the view's own."""
         shutter, camera = self._parts.shutter, self._parts.calibration.camera
         self._record.event(EventKind.SHUTTER_FOUND, view, None, readout_s=shutter.readout_s)
-        self.buffer.map(lambda buffered: shutter.shutter_corrected(buffered, camera))
+        self.buffer.change_all(lambda views: shutter.all_corrected(views, camera))
         self._starter = self._parts.new_starter()
         self._relocaliser.end()  # it is of the pixels of before
         *waiting, newest = (v for v in self.buffer if self.rows[v.index].submap is None)

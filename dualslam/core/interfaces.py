@@ -4,7 +4,7 @@ rest.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Set
+from collections.abc import Iterable, Iterator, Set
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -333,6 +333,10 @@ class Shutter(Protocol):
 
     def shutter_corrected(self, view: View, camera: Camera) -> View:
         """Return a frame's view as if all rows had been read at once. Frames come in the order of the sequence."""
+        ...
+
+    def all_corrected(self, views: Iterable[View], camera: Camera) -> list[View]:
+        """Do so for the frames that came before the readout time was known, given in their order."""
         ...
 
     def may_start(self, view: View, camera: Camera) -> bool:

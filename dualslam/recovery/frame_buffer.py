@@ -15,7 +15,7 @@ saw, and the newest, with which the new map starts; what it cannot use of the st
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -91,10 +91,10 @@ class FrameBuffer:
         """Let the buffer be a queue again."""
         self._frozen = False
 
-    def map(self, change: Callable[[View], View]) -> None:
-        """Put what `change` makes of it into the place of each view."""
+    def change_all(self, change: Callable[[Iterable[View]], Iterable[View]]) -> None:
+        """Put what `change` makes of the views, oldest first, into their places."""
         self.settle()
-        self._views = deque(change(view) for view in self._views)
+        self._views = deque(change(self._views))
         self.nbytes = sum(view.nbytes for view in self._views)
 
     def map_later(self, change: Callable[[View], View]) -> None:

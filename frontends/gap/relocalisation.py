@@ -30,7 +30,7 @@ from dualslam.frontends.gap.auxiliary_map import TrackViews, triangulate
 from dualslam.frontends.gap.uncertainty import gap_uncertainty
 from dualslam.frontends.gates import MIN_CONSENSUS
 from dualslam.frontends.tracking.resection import resect
-from dualslam.frontends.tracking.two_view_hypotheses import propose_relative_poses
+from dualslam.frontends.tracking.two_view_hypotheses import estimate_relative_pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +129,7 @@ def _from_two_views(
         return None
     uv_v = known.uv_px[shared, v]
     sigma = np.hypot(known.sigma_px[shared, v], sigma_px[shared])
-    T_new_v = propose_relative_poses(uv_v, uv_px[shared], sigma, K, size_px, 1.0, seed).T_b_a[0]
+    T_new_v = estimate_relative_pose(uv_v, uv_px[shared], sigma, K, size_px, seed)
     points = triangulate_two_view(uv_v, uv_px[shared], K, np.eye(4), se3.inverse(T_new_v))
     usable = (points.depth_a > 0) & (points.depth_b > 0) & np.isfinite(points.xyz).all(axis=1)
     T_others_v = known.T_cam_submap @ se3.inverse(known.T_cam_submap[v])

@@ -44,6 +44,7 @@ MAX_VIEWS = 120
 """How many recent frames are kept as possible first views."""
 
 LAGS = (2, 4, 8, 16, 32, 64)  # frames back that are tried as the first view
+MAX_PAIRS = 2  # tried with each view, in turn: what two views farther apart lack, the next two lack most often as well
 N_WITNESSES = 3  # frames between the two views that must agree
 NEAR = 0.5  # share of the points that a start needs at least which must be near: on a road these fix the motion
 RUNNER_UP = 0.75  # a pose that explains less than this share of what the best one does is out of the question,
@@ -96,26 +97,25 @@ class Initialiser:
         self._size_px = size_px
         self._seed = seed
         self._views: list[View] = []
-        self._turn = 0  # of `LAGS`, in a hurry
+        self._turn = 0  # of `LAGS`
 
     def collect(self, view: View) -> None:
         """Keep a view as a possible first view, without trying to start from it."""
         self._views = [*self._views[-MAX_VIEWS:], view]
 
     def add(self, view: View, briefly: bool = False) -> Start | Failure:
-        """Take a view in and try to start from it and an earlier one, the nearest first.
+        """Take a view in and try to start from it and an earlier one: with the next two in turn, `briefly` with one.
 
-        `briefly`: with one earlier view only, the next in turn with the next view.
+        The nearest come first, and again as soon as there is too little in common with one that is farther back.
         """
         self.collect(view)
         best = Failure(FailureReason.TOO_FEW_MATCHES, "one view")
         if len(view.features) < self._config.min_matches:
             return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image")
         lags = [lag for lag in LAGS if lag < len(self._views)]
-        if briefly and lags:
-            self._turn %= len(lags)
-            lags, self._turn = lags[self._turn : self._turn + 1], self._turn + 1
-        for lag in lags:
+        for _ in range(min(1 if briefly else MAX_PAIRS, len(lags))):
+            lag = lags[self._turn % len(lags)]
+            self._turn = (self._turn + 1) % len(lags)
             start = self.try_pair(len(self._views) - 1 - lag, len(self._views) - 1)
             if start:
                 return start
@@ -150,7 +150,12 @@ class Initialiser:
         fa, fb = matches.index[:, 0], matches.index[:, 1]
         uv_a, uv_b = a.features.uv_rect_px[fa], b.features.uv_rect_px[fb]
         sigma = np.maximum(a.features.sigma_px[fa], b.features.sigma_px[fb])
-        hypotheses = propose_relative_poses(uv_a, uv_b, sigma, self._K, self._size_px, HOMOGRAPHY_RATIO, self._seed)
+        n_near = int(NEAR * self._config.min_points)
+        hypotheses = propose_relative_poses(
+            uv_a, uv_b, sigma, self._K, self._size_px, HOMOGRAPHY_RATIO, self._seed, n_near
+        )
+        if isinstance(hypotheses, Failure):
+            return hypotheses
         pairs = [self._evaluate(a, b, matches, T_b_a) for T_b_a in hypotheses.T_b_a]
         contenders = _contenders(pairs, len(matches))
         best = max(contenders, key=lambda p: int(p.good.sum()))

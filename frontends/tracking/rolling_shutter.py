@@ -6,6 +6,7 @@ to the frame before tell, and from the readout time, which is the camera's own.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -211,12 +212,30 @@ class RollingShutter:
         asks = config.readout_s is None
         self._estimator = ReadoutEstimator(frontend, seed, READOUT_EVIDENCE) if asks else None
         self._meter = TurnMeter(frontend)
+        self._rates_rad_s: dict[int, FloatArray] = {}  # of the frames that were asked while the shutter was unknown
 
     def shutter_corrected(self, view: View, camera: Camera) -> View:
         """Take the frame's turn out of it. Frames come in the order of the sequence, each one once."""
         if not self.readout_s:
             return view
-        turn_rad = self.readout_s * self._meter.rate_rad_s(view, camera.K)
+        return self._corrected(view, camera, self._meter.rate_rad_s(view, camera.K))
+
+    def all_corrected(self, views: Iterable[View], camera: Camera) -> list[View]:
+        """Take the turns out of the frames that came before the shutter was found, given in their order.
+
+        The turns that `may_start` has measured serve again; only the others are measured now.
+        """
+        meter, known = TurnMeter(self._frontend), self._rates_rad_s
+        self._rates_rad_s = {}
+        return [
+            self._corrected(
+                view, camera, known[view.index] if view.index in known else meter.rate_rad_s(view, camera.K)
+            )
+            for view in views
+        ]
+
+    def _corrected(self, view: View, camera: Camera, rate_rad_s: FloatArray) -> View:
+        turn_rad = self.readout_s * rate_rad_s
         return replace(view, features=correct_shutter(view.features, camera, turn_rad), turn_rad=turn_rad)
 
     def may_start(self, view: View, camera: Camera) -> bool:
@@ -227,10 +246,10 @@ class RollingShutter:
         """
         if self._estimator is None:
             return True
-        self._meter.rate_rad_s(view, camera.K)
+        self._rates_rad_s[view.index] = self._meter.rate_rad_s(view, camera.K)
         turn = self._meter.between_rad_s
         readout_s = self._estimator.add(view, turn, camera)
         if readout_s is None:
             return not self._estimator.suspects or turn is None or not _is_fast(turn, camera)
-        self.readout_s, self._estimator, self._meter = readout_s, None, TurnMeter(self._frontend)
+        self.readout_s, self._estimator = readout_s, None
         return True

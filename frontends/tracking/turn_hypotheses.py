@@ -22,45 +22,63 @@ MIN_FAR, MIN_FAR_SHARE = 20, 0.1
 """Matches, and their share of all, that must move as one turn does to be a layer of far points and not chance."""
 
 
-def poses_by_turn(
-    uv_a_px: FloatArray, uv_b_px: FloatArray, sigma_px: FloatArray, K: FloatArray, rng: np.random.Generator
-) -> list[FloatArray]:
-    """Return poses whose rotation a layer of points shows alone, and whose translation the others fit best with it.
-
-    The first layer may be a near plane that moved like a turn: what it leaves is asked for the next.
+class TurnHypotheses:
+    """What turns and translations make of the matches of two views.
 
     Parameters
     ----------
     uv_a_px, uv_b_px : (N, 2)
-        Matched pixels of two views, undistorted.
+        Matched pixels of two views, undistorted; N > 0.
     sigma_px : (N,)
         Of a pixel's coordinate.
     K : (3, 3)
-    rng : numpy.random.Generator
+    seed : int
 
-    Returns
-    -------
-    list of (4, 4)
-        T_b_a with a baseline of 1; at most `N_LAYERS`, or none.
+    Attributes
+    ----------
+    n_moved : int
+        Matches that the turn of most does not explain: they alone tell of a translation.
     """
-    views = _Views(uv_a_px, uv_b_px, sigma_px, K)
-    enough = max(MIN_FAR, MIN_FAR_SHARE * len(uv_a_px))
-    left, poses = np.arange(len(uv_a_px)), []
-    for _ in range(N_LAYERS):
-        if len(left) < enough:
-            break
-        R = views.turn_of_most(left, rng)
-        far = views.moved_by(R)
-        left = left[~far[left]]
-        if far.sum() < enough:
-            break
-        near = np.flatnonzero(~far)
-        t = views.direction_with(R, near, rng) if len(near) >= MIN_FAR else None
-        if t is not None:
-            T_b_a = np.eye(4)
-            T_b_a[:3, :3], T_b_a[:3, 3] = R, t
-            poses.append(T_b_a)
-    return poses
+
+    def __init__(
+        self, uv_a_px: FloatArray, uv_b_px: FloatArray, sigma_px: FloatArray, K: FloatArray, seed: int
+    ) -> None:
+        self._views = _Views(uv_a_px, uv_b_px, sigma_px, K)
+        self._rng = np.random.default_rng(seed)
+        self._all = np.arange(len(uv_a_px))
+        self._turn = self._views.turn_of_most(self._all, self._rng)
+        self._far = self._views.moved_by(self._turn)
+        self.n_moved = int(np.count_nonzero(~self._far))
+
+    def poses(self) -> list[FloatArray]:
+        """Return poses whose rotation a layer of points shows alone, and whose translation the others fit best with it.
+
+        The first layer may be a near plane that moved like a turn: what it leaves is asked for the next.
+
+        Returns
+        -------
+        list of (4, 4)
+            T_b_a with a baseline of 1; at most `N_LAYERS`, or none.
+        """
+        views, rng, R, far = self._views, self._rng, self._turn, self._far
+        enough = max(MIN_FAR, MIN_FAR_SHARE * len(self._all))
+        left, poses = self._all, []
+        for layer in range(N_LAYERS):
+            if len(left) < enough:
+                break
+            if layer > 0:
+                R = views.turn_of_most(left, rng)
+                far = views.moved_by(R)
+            left = left[~far[left]]
+            if far.sum() < enough:
+                break
+            near = np.flatnonzero(~far)
+            t = views.direction_with(R, near, rng) if len(near) >= MIN_FAR else None
+            if t is not None:
+                T_b_a = np.eye(4)
+                T_b_a[:3, :3], T_b_a[:3, 3] = R, t
+                poses.append(T_b_a)
+        return poses
 
 
 class _Views:

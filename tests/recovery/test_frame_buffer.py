@@ -107,7 +107,7 @@ class TestFrameBuffer:
             buffer.append(view(i, SMOOTH if i % 2 else None))
         assert buffer.nbytes == sum(v.nbytes for v in buffer)
         assert (buffer.numbers["frames"], buffer.numbers["images"]) == (9, 5)
-        buffer.map(lambda v: replace(v, image=None))
+        buffer.change_all(lambda views: [replace(v, image=None) for v in views])
         assert buffer.nbytes == sum(v.nbytes for v in buffer)
         assert buffer.peak_bytes > buffer.nbytes
 
