@@ -45,6 +45,7 @@ from dualslam.map.graph_beside import BesideGraphs, GraphServer
 from dualslam.map.submap import Submap
 from dualslam.places import FaissRecogniser, PlaceVerifier
 from dualslam.places.revisits import PlaceParts
+from dualslam.places.search import search_places
 from dualslam.recovery.executor import DeskExecutor, InlineExecutor, RecoveryExecutor
 from dualslam.recovery.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
 from dualslam.recovery.linking.gates import DESCRIPTOR_RADIUS_PX
@@ -135,7 +136,8 @@ def build_system(
     if recovery is None:
         # Built here in any case: a mistake in the config is told at once, not by a worker.
         parts = recovery_parts(config, size_px, frontend=frontend)
-    desk = worker_desk(config, size_px, faults) if workers else InlineDesk(calibration_handlers(config))
+    places = place_parts(config, frontend, size_px)
+    desk = worker_desk(config, size_px, faults) if workers else InlineDesk(inline_handlers(config, places.verifier))
     graphs = BesideGraphs(desk, window_solver(config)) if workers else None
     if recovery is None:
         recovery = DeskExecutor(desk) if workers else faults.around_inline(InlineExecutor(parts))
@@ -154,7 +156,7 @@ def build_system(
             atlas_solver=atlas_solver(config),
             adjust_bundle=_adjuster(config),
             graphs=graphs,
-            places=place_parts(config, frontend, size_px),
+            places=places,
         ),
         config,
         saved,
@@ -272,16 +274,32 @@ def calibration_handlers(config: Config) -> Handlers:
     return {JobKind.CALIBRATION: answered}
 
 
+def place_handlers(verifier: PlaceVerifier) -> Handlers:
+    """Build what verifies places."""
+    return {JobKind.LOOP: lambda search: search_places(search, verifier)}
+
+
+def inline_handlers(config: Config, verifier: PlaceVerifier) -> Handlers:
+    """Build what is done at once where there are no workers; walks back have an executor of their own."""
+    return {**calibration_handlers(config), **place_handlers(verifier)}
+
+
 def graph_handlers(config: Config) -> Handlers:
     """Build what the worker for the live map does: it keeps and solves the graphs of submaps."""
     return {JobKind.GRAPH: GraphServer(lambda: ISam2SubmapGraph(config.graph))}
 
 
 def walk_handlers(config: Config, size_px: tuple[int, int], n_threads: int) -> Handlers:
-    """Build what a worker for long work does: walks back and calibrations."""
+    """Build what a worker for long work does: walks back, calibrations, and the search for places."""
     budget_s = WORKER_BUDGET * config.recovery.time_limit_s
-    parts = recovery_parts(config, size_px, budget_s, n_threads=n_threads)
-    return {JobKind.WALK: lambda job: run_recovery(job, parts), **calibration_handlers(config)}
+    frontend = create_frontend(config.frontend)
+    parts = recovery_parts(config, size_px, budget_s, frontend, n_threads)
+    verifier = place_parts(config, frontend, size_px).verifier
+    return {
+        JobKind.WALK: lambda job: run_recovery(job, parts),
+        **calibration_handlers(config),
+        **place_handlers(verifier),
+    }
 
 
 def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript) -> WorkerDesk:
@@ -291,7 +309,7 @@ def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript) -
     n_threads = min(FEATURE_THREADS, spare_cores(1 + recovery.workers))
     walks = Lane(
         "walks",
-        (JobKind.CALIBRATION, JobKind.WALK),
+        (JobKind.CALIBRATION, JobKind.LOOP, JobKind.WALK),
         partial(walk_handlers, config, size_px, n_threads),
         recovery.workers,
         recovery.time_limit_s,

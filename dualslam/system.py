@@ -134,6 +134,7 @@ class System:
             record,
             components.places,
             self._connections,
+            components.desk,
             components.new_graph,
             components.new_relocaliser,
             config,
@@ -194,6 +195,7 @@ class System:
         self.rows[frame.index] = FrameRow(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
         # 1. What was found beside the tracking meanwhile comes into the map between two frames.
         self._collect_graphs(frame)
+        self._collect_places(frame)
         self._calibrations.collect(self._live, frame, self._recoveries.waiting)
         self._recoveries.collect(self._live, frame)
         self.buffer.settle(SETTLED_A_FRAME)
@@ -221,6 +223,8 @@ class System:
         if self._parts.graphs is not None and last is not None:
             self._follow_graphs(self._parts.graphs.finish(self.atlas.submaps), last)
         self._recoveries.finish(self._live, last, interrupted or self._localises)
+        if last is not None and self._revisits.finish(self._live, last) is not None and self._live is not None:
+            self._recoveries.settle(self._live)
         if self._parts.graphs is not None and last is not None:
             self._follow_graphs(self._parts.graphs.finish(self.atlas.submaps), last)
         if self._live is not None and not self._localises:
@@ -393,8 +397,17 @@ class System:
         if self._recoveries.is_under_way(live.submap):
             return
         with self.timer.measure("places"):
-            report = self._revisits.note_keyframe(live, view)
-        if report is not None:
+            self._revisits.note_keyframe(live)
+        self._collect_places(view)
+
+    def _collect_places(self, now: FrameStamp) -> None:
+        """Take in the places that were found; while a walk back is under way, they wait for its end."""
+        live = self._live
+        if live is not None and self._recoveries.is_under_way(live.submap):
+            return
+        with self.timer.measure("places"):
+            report = self._revisits.collect(live, now)
+        if report is not None and live is not None:
             self._recoveries.settle(live)
 
     def _track_with(self, odometry: VisualOdometry, view: View) -> Track | Failure:

@@ -23,7 +23,9 @@ from dualslam.map.connections import Connections
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
 from dualslam.places.recogniser import PlaceRecogniser
+from dualslam.places.search import PlaceSearch, follow_maps
 from dualslam.places.verification import PlaceMatch, PlaceVerifier
+from dualslam.workers.jobs import Desk, Ended, JobKind
 
 ASK_EVERY = 2
 """Keyframes between two searches, where nothing is provisional: neighbours show the same."""
@@ -105,6 +107,8 @@ class Revisits:
     record : Record
     parts : PlaceParts
     connections : Connections
+    desk : Desk
+        Where places are verified.
     new_graph : callable
     new_relocaliser : callable
         Makes a front end of an archived submap.
@@ -118,6 +122,7 @@ class Revisits:
         record: Record,
         parts: PlaceParts,
         connections: Connections,
+        desk: Desk,
         new_graph: Callable[[], SubmapGraph],
         new_relocaliser: Callable[[Submap, SubmapGraph], Seeker],
         config: Config,
@@ -128,6 +133,7 @@ class Revisits:
         self._recogniser = parts.recogniser
         self._verifier = parts.verifier
         self._connections = connections
+        self._desk = desk
         self._new_graph = new_graph
         self._new_frontend = new_relocaliser
         self._config = config
@@ -138,51 +144,72 @@ class Revisits:
 
     # --- keyframes of the live map
 
-    def note_keyframe(self, live: VisualOdometry, view: View) -> AtlasReport | None:
-        """Look whether the live map's newest keyframe shows a place of old, and link it where that is sure.
+    def note_keyframe(self, live: VisualOdometry) -> None:
+        """Ask whether the live map's newest keyframe shows a place of old; `collect` has the answer."""
+        if not (self._config.places.enabled and self._config.loops.enabled):
+            return
+        self._frontend = None
+        self._n_asked += 1
+        if (self._provisional is None and self._n_asked % ASK_EVERY) or self._desk.n_open(JobKind.LOOP):
+            return
+        submap, keyframe_id = live.submap, live.reference_id
+        self._take_in(submap)
+        submaps = self._record.atlas.submaps
+        features = submap.keyframes[keyframe_id].features
+        candidates = tuple(self._recogniser.query(features, submaps, self._may_be(submap, keyframe_id)))
+        named = {submap.id, *(candidate.submap_id for candidate in candidates)} if candidates else set()
+        search = PlaceSearch(submap.id, keyframe_id, candidates, {m: submaps[m].copy() for m in sorted(named)})
+        self._desk.submit(JobKind.LOOP, search)
+
+    def collect(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
+        """Take in what was found meanwhile, and link it where it is sure.
 
         Returns
         -------
         AtlasReport or None
             Of the link that was made.
         """
-        if not (self._config.places.enabled and self._config.loops.enabled):
-            return None
-        self._frontend = None
-        self._n_asked += 1
-        if self._provisional is None and self._n_asked % ASK_EVERY:
-            return None
-        submap, keyframe_id = live.submap, live.reference_id
-        self._take_in(submap)
-        match = self._find(submap, keyframe_id, view)
-        return self._weigh(match, live, view)
+        return self._take_answers(self._desk.poll(JobKind.LOOP), live, now)
 
-    def _find(self, submap: Submap, keyframe_id: int, now: FrameStamp) -> PlaceMatch | None:
+    def finish(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
+        """Do the same at the end of the run, with what is under way."""
+        return self._take_answers(self._desk.drain(JobKind.LOOP), live, now)
+
+    def _take_answers(self, answers: list[Ended], live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
+        report = None
+        for ended in answers:
+            search: PlaceSearch = ended.work
+            self._record.timer.add("loop search", ended.cpu_s)
+            if isinstance(ended.result, Failure) or live is None or live.submap.id != search.submap_id:
+                continue  # it costs its search
+            report = self._weigh(self._judged(search, ended.result, now), live, now) or report
+        return report
+
+    def _judged(self, search: PlaceSearch, results: list[PlaceMatch | Failure], now: FrameStamp) -> PlaceMatch | None:
         """Return the verified place that a keyframe shows, where there is one and nothing contradicts it."""
-        submaps = self._record.atlas.submaps
-        features = submap.keyframes[keyframe_id].features
-        candidates = self._recogniser.query(features, submaps, self._may_be(submap, keyframe_id))
         found: list[PlaceMatch] = []
         refused: tuple[int, int, Failure] | None = None
-        for candidate in candidates:
-            place = submaps[candidate.submap_id], candidate.keyframe_id
-            match = self._verifier.verify((submap, keyframe_id), place)
+        for candidate, result in zip(search.candidates, results, strict=True):
+            match = result
             if not isinstance(match, Failure):
-                match = self._plausible(match)
+                followed = follow_maps(match, search, self._record.atlas.submaps)
+                if followed is None:
+                    continue
+                match = self._plausible(followed)
             if not isinstance(match, Failure):
                 found.append(match)
             elif match.reason not in _SILENT and refused is None:
                 refused = candidate.submap_id, candidate.keyframe_id, match
         if not found:
             if refused is not None:  # the best of them: one event for a keyframe
-                self._refused(now, submap.id, *refused)
+                self._refused(now, search.submap_id, *refused)
             return None
         best = max(found, key=lambda m: m.n_inliers)
         for other in found:
             if other is not best and self._contradict(best, other):
                 detail = f"keyframes {best.place[1]} and {other.place[1]} show the place as well, elsewhere"
                 why = Failure(FailureReason.AMBIGUOUS_MODEL, detail)
-                self._refused(now, submap.id, best.place[0], best.place[1], why)
+                self._refused(now, search.submap_id, best.place[0], best.place[1], why)
                 self._provisional = None
                 return None
         return best
@@ -207,7 +234,7 @@ class Revisits:
 
         return may_be
 
-    def _weigh(self, match: PlaceMatch | None, live: VisualOdometry, view: View) -> AtlasReport | None:
+    def _weigh(self, match: PlaceMatch | None, live: VisualOdometry, now: FrameStamp) -> AtlasReport | None:
         """Second what is provisional, or begin anew; link once enough keyframes say the same."""
         waiting, submap = self._provisional, live.submap
         if waiting is not None and waiting.match.query[0] != submap.id:
@@ -217,7 +244,7 @@ class Revisits:
                 waiting.misses += 1
                 if waiting.misses > MAX_MISSES:
                     why = Failure(FailureReason.UNCONFIRMED, f"seconded {waiting.seconds} times, {N_SECONDS} needed")
-                    self._refused(view, submap.id, *waiting.match.place, why)
+                    self._refused(now, submap.id, *waiting.match.place, why)
                     self._provisional = None
             return None
         if waiting is None or match.place[0] != waiting.match.place[0] or not self._agree(waiting.match, match):
@@ -228,9 +255,9 @@ class Revisits:
         if waiting.seconds < N_SECONDS:
             return None
         self._provisional = None
-        return self._link(match, waiting.seconds, live, view)
+        return self._link(match, waiting.seconds, live, now)
 
-    def _link(self, match: PlaceMatch, seconds: int, live: VisualOdometry, view: View) -> AtlasReport | None:
+    def _link(self, match: PlaceMatch, seconds: int, live: VisualOdometry, now: FrameStamp) -> AtlasReport | None:
         """Hand a link to the atlas, and record whether it was taken."""
         atlas = self._record.atlas
         (a, keyframe_a), (b, keyframe_b) = match.place, match.query
@@ -239,10 +266,10 @@ class Revisits:
         link = Link(a, b, match.S_place_query, match.covariance, kind, (), keyframe_a, keyframe_b, doubtful=False)
         verdict = self._connections.judge(link)
         self._linked_at[(b, a)] = self._n_asked
-        report = self._connections.connect([link], view)
+        report = self._connections.connect([link], now)
         if not report:
             assert report.failure is not None
-            self._refused(view, b, a, keyframe_a, report.failure)
+            self._refused(now, b, a, keyframe_a, report.failure)
             return None
         if a == b:
             self._merge_duplicates(atlas.submaps[a], match)
@@ -250,7 +277,7 @@ class Revisits:
         chi2 = None if isinstance(verdict, Failure) or not verdict.redundant else verdict.chi2
         self._record.event(
             EventKind.LOOP_CLOSED if together else EventKind.MERGED,
-            view,
+            now,
             b,
             other_submap=a,
             other_frame=keyframe_a,

@@ -1,0 +1,66 @@
+"""The search for a place of old as a job beside the tracking: a snapshot goes out, and what was verified comes back.
+
+Asking the index is cheap and stays where the map grows. Verification matches images against each other, and takes as
+long as several frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.types import Failure
+from dualslam.map.submap import Submap
+from dualslam.places.recogniser import PlaceCandidate
+from dualslam.places.verification import PlaceMatch, PlaceVerifier
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceSearch:
+    """A keyframe, and the places that it may show.
+
+    Attributes
+    ----------
+    submap_id, keyframe_id : int
+        Of the keyframe that asks.
+    candidates : tuple of PlaceCandidate
+        The most likely first.
+    submaps : mapping of int to Submap
+        Snapshots of those that are named.
+    """
+
+    submap_id: int
+    keyframe_id: int
+    candidates: tuple[PlaceCandidate, ...]
+    submaps: Mapping[int, Submap]
+
+
+def search_places(search: PlaceSearch, verifier: PlaceVerifier) -> list[PlaceMatch | Failure]:
+    """Verify the candidates of a search; the result is in their order."""
+    submaps, query = search.submaps, (search.submap_id, search.keyframe_id)
+    return [
+        verifier.verify((submaps[query[0]], query[1]), (submaps[c.submap_id], c.keyframe_id)) for c in search.candidates
+    ]
+
+
+def follow_maps(match: PlaceMatch, search: PlaceSearch, submaps: Mapping[int, Submap]) -> PlaceMatch | None:
+    """Return a match between submaps as they are now, which have been solved again since the snapshots were made.
+
+    What holds is how the two keyframes lie to each other. None where one of them is no more.
+    """
+    now, then = [], []
+    for m, k in (match.place, match.query):
+        if m not in submaps or k not in submaps[m].keyframes:
+            return None
+        now.append(submaps[m].T_submap_kf[k])
+        then.append(search.submaps[m].T_submap_kf[k])
+    if all(np.array_equal(a, b) for a, b in zip(now, then, strict=True)):
+        return match
+    (place_now, query_now), (place_then, query_then) = now, then
+    S = place_now @ se3.inverse(place_then) @ match.S_place_query @ query_then @ se3.inverse(query_now)
+    # Of the covariance, which is in the query's frame, the same motion.
+    Ad = sim3.adjoint(query_now @ se3.inverse(query_then))
+    return replace(match, S_place_query=S, covariance=Ad @ match.covariance @ Ad.T)
