@@ -122,7 +122,7 @@ class Calibrations:
         graph = self._new_graph()
         try:
             merged = merge_calibrated(live.submap, job.submap, answer)
-            merged.apply_estimate(*graph.rebuild(merged).values)
+            merged.apply_estimate(*graph.rebuild(merged, near_optimum=True).values)
         except (InputError, SolverError) as error:
             return Failure(FailureReason.SOLVER, str(error), answer.numbers)
         self._calibration.take(answer)

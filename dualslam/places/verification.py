@@ -205,6 +205,8 @@ class PlaceVerifier:
             for k in place.keyframes:
                 votes.append(self._match_keyframes(place.submap, k, query.submap, q))
                 most = max(most, len(votes[-1][0]))
+                if 2 * most < MIN_FIRST_MATCHES:
+                    break  # what the place itself hardly shares, its neighbours do not either
             if n == 0 and most < MIN_FIRST_MATCHES:
                 detail = f"{most} matches with the place, {MIN_FIRST_MATCHES} needed"
                 return Failure(FailureReason.TOO_FEW_MATCHES, detail, {"n_matches": float(most)})

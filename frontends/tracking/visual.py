@@ -250,7 +250,8 @@ class VisualFrontEnd:
 
     def _solve(self, rebuild: bool = False) -> GraphEstimate:
         """Bring the graph up to date with the submap, and the submap with its estimate."""
-        estimate = self.graph.rebuild(self.submap) if rebuild else self.graph.update(self.submap)
+        # Its parts are solved: what is doubtful is how they lie to each other, which takes a few iterations.
+        estimate = self.graph.rebuild(self.submap, near_optimum=True) if rebuild else self.graph.update(self.submap)
         self._since_graph = 0
         return self._taken(estimate)
 

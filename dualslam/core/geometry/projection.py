@@ -197,7 +197,7 @@ def refine_pose(
     n_rounds: int = 4,
     n_iterations: int = 5,
     chi2_gate: float = CHI2_95[2],
-    tolerance: float = 1e-6,
+    tolerance: float = 1e-4,
 ) -> PoseEstimate | Failure:
     """Refine a camera pose against known points, with outliers.
 
