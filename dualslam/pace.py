@@ -3,8 +3,8 @@
 Two things can be behind: the tracking, when frames are looked at after their time, and the back end, when keyframes
 wait for the graph that runs beside. In either case new keyframes are what there is to save: each costs the tracking its
 insertion and the back end its solution. A keyframe that is due but not urgent is put off until both have caught up.
-While there is no map, each try to start one takes longer than a frame: it is put off in the same way, and one pair of
-frames is tried at a time.
+While there is no map, one pair of frames is tried at a time: a start that comes late costs more than frames that are
+dropped.
 
 Only real time has a pace. Without it nothing here ever changes what a run does.
 """
@@ -18,7 +18,7 @@ BEHIND_S = 1 / 30
 MAX_LAG_KEYFRAMES = 4
 """Keyframes that the graph beside may not know yet: a job on its way, and what comes until it ends."""
 MAX_PUT_OFF = 5
-"""Frames by which a keyframe, or a start, is put off at most. At 30 Hz that is a sixth of a second: long enough to work
+"""Frames by which a keyframe is put off at most. At 30 Hz that is a sixth of a second: long enough to work
 off what a keyframe and a relinearisation hold up, too short for the view to change by more than a few degrees."""
 URGENT_TIMES = 2
 """A frame that tracks fewer than so many times the landmarks of a weak track needs new ones now, or is lost."""
@@ -31,7 +31,7 @@ class PaceStatistics:
     Attributes
     ----------
     put_off : int
-        Frames at which a keyframe, or a try to start a map, was due and did not come.
+        Frames at which a keyframe was due and did not come.
     behind : int
         Frames that were looked at while the system was behind.
     max_lag_keyframes : int
@@ -91,10 +91,6 @@ class Pace:
             So few are a weak track (`KeyframeConfig.weak_landmarks`).
         """
         return n_tracked >= URGENT_TIMES * n_weak and self._puts_off()
-
-    def puts_off_start(self) -> bool:
-        """Whether a try to start a map is put off to a later frame."""
-        return self._puts_off()
 
     def _puts_off(self) -> bool:
         if not self.behind or self._n_put_off >= MAX_PUT_OFF:

@@ -250,9 +250,6 @@ class System:
                 view = self._correct_shutter(view)
         if not may_start:
             return Failure(FailureReason.DOUBTFUL_INITIALISATION, "a fast turn before the shutter is known")
-        if self.pace.puts_off_start():
-            self._starter.collect(view)
-            return Failure(FailureReason.DOUBTFUL_INITIALISATION, "a start is put off while frames are late")
         with self.timer.measure("initialisation"):
             start = self._starter.add(view, briefly=self.pace.in_real_time)
         if isinstance(start, Failure):
