@@ -60,15 +60,3 @@ def test_a_system_that_is_behind_makes_fewer_keyframes_and_keeps_its_track() -> 
     counts = [len(system.atlas.submaps[0].keyframes) for system in systems]
     assert counts[1] < 0.5 * counts[0]
     assert all(len(system.poses) == len(systems[0].poses) for system in systems)
-
-
-def test_a_start_is_put_off_while_frames_are_late_and_what_came_meanwhile_serves_the_next_try() -> None:
-    world = PointWorld(cloud(), hand_held(30))
-    system = system_in(world)
-    system.pace.note(1.0)
-    results = [system.step(frame) for frame in world.frames()]
-    late = [result.index for result in results if result.failure is not None and "late" in result.failure.detail]
-    assert late[:MAX_PUT_OFF] == list(range(MAX_PUT_OFF))
-    (submap,) = system.atlas.submaps.values()
-    assert min(submap.keyframes) < max(late)
-    assert len(system.poses) == 30  # those before the start by a walk back
