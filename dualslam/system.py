@@ -272,6 +272,7 @@ class System:
         self._live = relocaliser
         self._relocaliser.end()
         self._record.event(EventKind.RELOCALISED, view, relocaliser.submap.id, n_inliers=track.n_inliers)
+        self._leaps.begin(view)
         self._recoveries.found_again(relocaliser.submap)
         self.buffer.thaw()
         return track
@@ -305,6 +306,7 @@ class System:
             frames=len(found.earlier) + 1,
         )
         if not self._localises:
+            self._leaps.begin(found.earlier[0][0].view)
             self._recoveries.found_again(submap)
             self.buffer.thaw()
         return found.track
@@ -483,8 +485,12 @@ class System:
         self._recoveries.declare_lost(live.submap.id, onset, str(failure.reason), self._lost[0].index)
         self._live = None
         self._health = HealthMonitor(self._config.health)
-        # Not where its graph has failed, or a walk back is about to change it.
-        if failure.reason is not FailureReason.SOLVER and not self._recoveries.is_under_way(live.submap):
+        # Not where its graph has failed, where two poses stood, or where a walk back is about to change it.
+        doubtful = failure.reason in (FailureReason.LOOK_ALIKE, FailureReason.LEAP)
+        if doubtful:
+            self._revisits.avoid(live.submap.id)
+        hopeless = doubtful or failure.reason is FailureReason.SOLVER
+        if not hopeless and not self._recoveries.is_under_way(live.submap):
             self._relocaliser.begin(live)
         self._starter = self._parts.new_starter()
         for lost in self._lost:

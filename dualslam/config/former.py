@@ -55,7 +55,7 @@ CONSTANTS = {
     "health.max_keyframe_chi2": "dualslam.health.MAX_KEYFRAME_CHI2",
     "health.sign_sigmas": "dualslam.health.SIGN_SIGMAS",
     "health.sign_weight": "dualslam.health.SIGN_WEIGHT",
-    "initialiser.homography_ratio": "dualslam.frontends.tracking.initialiser.HOMOGRAPHY_RATIO",
+    "initialiser.homography_ratio": "dualslam.frontends.tracking.two_view_hypotheses.PLANAR_SHARE",
     "initialiser.max_chi2": "dualslam.frontends.tracking.initialiser.MAX_CHI2",
     "initialiser.max_views": "dualslam.frontends.tracking.initialiser.MAX_VIEWS",
     "initialiser.min_support": "dualslam.frontends.tracking.initialiser.MIN_SUPPORT",

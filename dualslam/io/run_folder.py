@@ -38,7 +38,12 @@ SUBMAPS = "submaps"
 SAMPLES = "samples"
 MAP = "map"
 
-FRAME_COLUMNS = ("index", "timestamp_s", "status", "submap", "in_main_map", "n_matches", "n_inliers", "latency_ms")
+FRAME_COLUMNS = (
+    *("index", "timestamp_s", "status", "submap", "in_main_map", "n_matches", "n_inliers", "latency_ms"),
+    *("sigma_position_rel", "sigma_scale"),
+)
+OLD_FRAME_COLUMNS = FRAME_COLUMNS[:8]
+"""Of runs made before the map told what it claims."""
 _FILES = (TRAJECTORY, TRAJECTORY_KITTI, TRAJECTORY_KITTI_FRAMES, FRAMES, EVENTS, SUMMARY, CONFIG, REPORT, GROUND_TRUTH)
 _SUBMAP_NAME = re.compile(r"\d+\.txt")
 _SAMPLE_NAME = re.compile(r"\d+\.jpg")
@@ -151,7 +156,9 @@ class RunFolder:
             submap = "" if row.submap is None else row.submap
             counts = (int(row.in_main_map), row.n_matches, row.n_inliers)
             latency = f"{row.latency_ms:.3f}"
-            writer.writerow([row.index, repr(float(row.timestamp_s)), str(row.status), submap, *counts, latency])
+            sigmas = ["" if sigma is None else f"{sigma:.3g}" for sigma in (row.sigma_position_rel, row.sigma_scale)]
+            time_s = repr(float(row.timestamp_s))
+            writer.writerow([row.index, time_s, str(row.status), submap, *counts, latency, *sigmas])
         write_text(self.path / FRAMES, text.getvalue())
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
@@ -189,7 +196,7 @@ def read_frames(path: str | Path) -> list[FrameRow]:
     """Read a ``frames.csv``."""
     rows = []
     reader = csv.DictReader(io.StringIO(read_text(path)))
-    if tuple(reader.fieldnames or ()) != FRAME_COLUMNS:
+    if tuple(reader.fieldnames or ()) not in (FRAME_COLUMNS, OLD_FRAME_COLUMNS):
         raise InputError(f"{path} is not a frames.csv: its columns should be {','.join(FRAME_COLUMNS)}.")
     for number, row in enumerate(reader, 2):
         try:
@@ -203,11 +210,17 @@ def read_frames(path: str | Path) -> list[FrameRow]:
                     n_matches=int(row["n_matches"]),
                     n_inliers=int(row["n_inliers"]),
                     latency_ms=float(row["latency_ms"]),
+                    sigma_position_rel=_sigma(row.get("sigma_position_rel")),
+                    sigma_scale=_sigma(row.get("sigma_scale")),
                 )
             )
         except (TypeError, ValueError) as e:
             raise InputError(f"{path}, line {number}: not a row of frames.csv ({e}).") from None
     return rows
+
+
+def _sigma(cell: str | None) -> float | None:
+    return float(cell) if cell else None
 
 
 def read_summary(run: Path) -> dict[str, Any]:

@@ -19,6 +19,8 @@ class FrameRow:
         The one that it is in.
     in_main_map : bool
         Known at the end of the run.
+    sigma_position_rel, sigma_scale : float or None
+        What the map claims of it, known at the end of the run (`run/claims.py`).
     """
 
     index: int
@@ -29,6 +31,8 @@ class FrameRow:
     n_matches: int = 0
     n_inliers: int = 0
     latency_ms: float = 0.0
+    sigma_position_rel: float | None = None
+    sigma_scale: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,9 +22,11 @@ from dualslam.map.atlas_report import AtlasReport
 from dualslam.map.connections import Connections
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
+from dualslam.map.trajectory import compose
 from dualslam.places.recogniser import PlaceRecogniser
 from dualslam.places.search import PlaceSearch, follow_maps
 from dualslam.places.verification import PlaceMatch, PlaceVerifier
+from dualslam.recovery.leaps import refuse_leaps
 from dualslam.workers.jobs import Desk, Ended, JobKind
 
 ASK_EVERY = 2
@@ -141,6 +143,7 @@ class Revisits:
         self._n_asked = 0
         self._linked_at: dict[tuple[int, int], int] = {}  # counted in `_n_asked`, by pairs of submaps
         self._frontend: _Seeker | None = None
+        self._avoided: set[int] = set()
 
     # --- keyframes of the live map
 
@@ -334,7 +337,7 @@ class Revisits:
         (a, k_a), (b, k_b) = match.place, match.query
         component = self._component(b)
         if a not in component:
-            return match
+            return self._reachable(match)
         submaps, S_world = self._record.atlas.submaps, self._record.atlas.S_world_submap(component)
         S_a_b = sim3.inverse(S_world[a]) @ S_world[b]
         T_b_cam = submaps[b].T_submap_kf[k_b]
@@ -351,6 +354,17 @@ class Revisits:
             )
             return Failure(FailureReason.CONTRADICTION, detail, match.numbers)
         return match
+
+    def _reachable(self, match: PlaceMatch) -> PlaceMatch | Failure:
+        """Refuse to join two maps of this run where the camera cannot have come from the one to the other meanwhile."""
+        a, b = match.place[0], match.query[0]
+        record = self._record
+        known = compose(record.poses.values(), record.atlas, {a: np.eye(4)}).in_time_order()
+        both = compose(record.poses.values(), record.atlas, {a: np.eye(4), b: match.S_place_query}).in_time_order()
+        refused = refuse_leaps(
+            both.timestamps_s, both.T_world_cam[:, :3, 3], known.timestamps_s, known.T_world_cam[:, :3, 3]
+        )
+        return match if refused is None else refused
 
     def _component(self, submap_id: int) -> list[int]:
         return next(c for c in self._record.atlas.components() if submap_id in c)
@@ -384,6 +398,10 @@ class Revisits:
 
     # --- frames without a map
 
+    def avoid(self, submap_id: int) -> None:
+        """Find no frame in a submap any more: it was lost where two poses stood, and a third may pass by chance."""
+        self._avoided.add(submap_id)
+
     def sighted(self, view: View, K: FloatArray) -> Relocalised | None:
         """Show a frame without a map to all submaps; return where it goes on once others have said the same.
 
@@ -414,7 +432,8 @@ class Revisits:
 
     def _relocalise(self, view: View, K: FloatArray) -> _Seeker | None:
         """Pose a frame in the submap that it shows, by pixels alone."""
-        submaps = {m: submap for m, submap in self._record.atlas.submaps.items() if (submap.K == K).all()}
+        all_submaps = self._record.atlas.submaps
+        submaps = {m: s for m, s in all_submaps.items() if (s.K == K).all() and m not in self._avoided}
         found: list[tuple[_Seeker, Track]] = []
         for candidate in self._recogniser.query(view.features, submaps):
             submap = submaps[candidate.submap_id]

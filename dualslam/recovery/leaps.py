@@ -179,6 +179,10 @@ class LeapWatch:
         """The first frame beyond the gap that is looked at."""
         return self._first_beyond
 
+    def begin(self, at: FrameStamp) -> None:
+        """Look at the gap before a frame that was posed after a loss."""
+        self._first_beyond = at
+
     def end(self) -> None:
         """Forget the gap."""
         self._first_beyond = None
@@ -208,6 +212,8 @@ class LeapWatch:
         poses.sort(key=lambda pose: pose.index)
         place = next((n for n, pose in enumerate(poses) if pose.index >= first.index), len(poses))
         times = np.array([pose.timestamp_s for pose in poses])
+        if place == 0:
+            self.end()  # nothing of the moment before: too long ago, or another run's
         if place == 0 or place >= len(poses):
             return None
         usual_s = float(np.median(np.diff(times)))
@@ -215,7 +221,12 @@ class LeapWatch:
             return None
         self.end()
         centres = np.array([submap.resolve_anchor(p.keyframe_id, p.T_kf_cam)[:3, 3] for p in poses])
-        leap = measure_leap(times * np.sign(usual_s or 1.0), centres, place - 1)
+        times *= np.sign(usual_s or 1.0)
+        # A walk back may have posed frames before the first one: the leap is before these.
+        missing = np.flatnonzero(np.diff(times[: place + 1]) > MISSING * abs(usual_s))
+        if not len(missing):
+            return None
+        leap = measure_leap(times, centres, int(missing[-1]))
         if leap is None or not leap.is_refused:
             return None
         return _refusal(leap)

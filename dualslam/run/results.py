@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from platform import python_version
@@ -22,6 +22,7 @@ from dualslam.lab.metrics.trajectory_metrics import score_trajectory
 from dualslam.map.atlas import LinkKind
 from dualslam.map.trajectory import compose
 from dualslam.recovery.frame_buffer import MB
+from dualslam.run.claims import Claim, claims_of
 from dualslam.run.runner import RunReport
 from dualslam.system import System
 from dualslam.workers.desk import WorkerDesk
@@ -74,9 +75,10 @@ def frame_rows(
     `latencies_ms`: of the frames that were looked at, as the harness measured them; else the time of their steps.
     """
     in_main = set(main.index.tolist())
+    claims = {m: claims_of(submap) for m, submap in system.atlas.submaps.items()}
     rows = [
         replace(
-            row,
+            _with_claim(system, row, claims),
             index=system.numbers.index_of(row.index),
             in_main_map=system.numbers.index_of(row.index) in in_main,
             latency_ms=row.latency_ms if latencies_ms is None else latencies_ms[n],
@@ -87,6 +89,16 @@ def frame_rows(
     if not late:
         return rows
     return sorted(rows + late, key=lambda row: system.numbers.number_of(row.index))
+
+
+def _with_claim(system: System, row: FrameRow, claims: Mapping[int, Mapping[int, Claim]]) -> FrameRow:
+    """Return a frame's row with what the map claims of the keyframe that it hangs on."""
+    pose = system.poses.get(row.index)
+    claim = claims.get(pose.submap_id, {}).get(pose.keyframe_id) if pose is not None else None
+    if claim is None:
+        return row
+    known = [None if np.isnan(sigma) else sigma for sigma in (claim.sigma_position_rel, claim.sigma_scale)]
+    return replace(row, sigma_position_rel=known[0], sigma_scale=known[1])
 
 
 def summarise(

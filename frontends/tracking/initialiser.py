@@ -38,8 +38,6 @@ MAX_CHI2 = 2.5
 """Mean squared whitened residual per degree of freedom after the bundle adjustment (1 is expected)."""
 MIN_SUPPORT = 0.6
 """Share of the points that the frames between the two views must confirm by their own pixels."""
-HOMOGRAPHY_RATIO = 0.45
-"""Share of the homography's score in both models' above which the scene is planar, or the motion as a turn."""
 MAX_VIEWS = 120
 """How many recent frames are kept as possible first views."""
 
@@ -151,9 +149,7 @@ class Initialiser:
         uv_a, uv_b = a.features.uv_rect_px[fa], b.features.uv_rect_px[fb]
         sigma = np.maximum(a.features.sigma_px[fa], b.features.sigma_px[fb])
         n_near = int(NEAR * self._config.min_points)
-        hypotheses = propose_relative_poses(
-            uv_a, uv_b, sigma, self._K, self._size_px, HOMOGRAPHY_RATIO, self._seed, n_near
-        )
+        hypotheses = propose_relative_poses(uv_a, uv_b, sigma, self._K, self._size_px, self._seed, n_near)
         if isinstance(hypotheses, Failure):
             return hypotheses
         pairs = [self._evaluate(a, b, matches, T_b_a) for T_b_a in hypotheses.T_b_a]

@@ -5,6 +5,7 @@ The tracker does not know in which direction time runs: it predicts from the las
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -210,8 +211,12 @@ class Tracker:
         self._local = self._local_map(found[1][found[1] >= 0])
         grid = FeatureGrid.build(features.uv_rect_px)
         track = self._pose_from_local_map(view, grid, *found, found[0], wide=True)
-        if not isinstance(track, Failure):
-            self.start(track)
+        if isinstance(track, Failure):
+            return track
+        refused = self._second_pose(track, about[:BEFORE_GAP])
+        if refused is not None:
+            return refused
+        self.start(track)
         return track
 
     def take(self, track: Track) -> None:
@@ -313,17 +318,21 @@ class Tracker:
         That is asked of the last keyframes, in the descriptors that they saw. A gap beyond which two poses stood once
         is not crossed any more: frames further on show ever less of what was seen, and one would pass by chance.
         """
-        if self._doubt is not None:
-            return self._doubt
+        if self._doubt is None:
+            self._doubt = self._second_pose(track, self._submap.keyframes_near(track.view.index)[:BEFORE_GAP])
+        return self._doubt
+
+    def _second_pose(self, track: Track, keyframe_ids: Sequence[int]) -> Failure | None:
+        """Return why a pose is not believed, if another explains nearly as much of what some keyframes see."""
         submap = self._submap
         features, ids, known = [], [], np.zeros(len(submap.landmarks), bool)
-        for k in submap.keyframes_near(track.view.index)[:BEFORE_GAP]:
+        for k in keyframe_ids:
             row = np.flatnonzero(submap.landmark_of[k] >= 0)
             row = row[~known[submap.landmark_of[k][row]]]
             ids.append(submap.landmark_of[k][row])
             features.append(submap.keyframes[k].features.descriptors[row])
             known[ids[-1]] = True
-        self._doubt = refuse_look_alike(
+        return refuse_look_alike(
             self._frontend,
             np.concatenate(features),
             submap.landmarks["xyz_mu"][np.concatenate(ids)],
@@ -333,7 +342,6 @@ class Tracker:
             self._size_px,
             self._seed,
         )
-        return self._doubt
 
     def _refine(
         self, view: View, T_start: FloatArray, ids: IntArray, xyz_mu: FloatArray, feature: IntArray

@@ -1,0 +1,109 @@
+"""Claimed against true: `python benchmarks/covariances.py --seeds 30001 30002` runs the embedded worlds and compares.
+
+For each kind of stretch (plain; blurred; beyond a gap; the first ten keyframes) it prints the root mean square of the
+true error over the claimed one, of positions and of the scale across a keyframe (`dualslam/run/claims.py`): 1 is
+honest, more is boasting. The truth of a position is its distance from the true one after the keyframes about it have
+been aligned; that of a scale the ratio of the scales before and after. `POSITION_INFLATION` was chosen on seeds 1 to 3.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import defaultdict
+
+import numpy as np
+
+import dualslam
+from dualslam.core.geometry import se3
+from dualslam.core.types import FloatArray, IntArray
+from dualslam.lab.disturbances import Corruption, CorruptionKind
+from dualslam.lab.metrics.alignment import align_points
+from dualslam.lab.synthetic import make_sequence
+from dualslam.map.submap import Submap
+from dualslam.run.claims import GROUP, claims_of
+
+AROUND = 4
+"""Keyframes before and after that a position is aligned with."""
+WORLDS = {"street": 220, "room": 220, "circuit": 220}
+BLUR, GAP = (90, 25), (150, 8)
+
+
+def main() -> None:
+    """Run all worlds with all seeds, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    arguments = parser.parse_args()
+    dualslam.limit_threads()
+    position: dict[str, list[float]] = defaultdict(list)
+    scale: dict[str, list[float]] = defaultdict(list)
+    for seed in arguments.seeds:
+        for world, n_frames in WORLDS.items():
+            collect(world, n_frames, seed, position, scale)
+            print(f"{world} {seed} done", flush=True)
+    print("true over claimed, root mean square (median)")
+    print(f"{'stretch':10s} {'positions':>14s} {'n':>6s} {'scales':>14s} {'n':>6s}")
+    for kind in sorted(position):
+        cells = []
+        for ratios in (position[kind], scale[kind]):
+            r = np.abs(ratios)
+            cells.append(f"{np.sqrt((r**2).mean()):6.2f} ({np.median(r):.2f}) {len(r):6d}" if len(r) else " " * 20)
+        print(f"{kind:10s} {cells[0]} {cells[1]}")
+
+
+def collect(
+    world: str, n_frames: int, seed: int, position: dict[str, list[float]], scale: dict[str, list[float]]
+) -> None:
+    """Run one world, blurred once and interrupted once, and add its ratios."""
+    events = [
+        Corruption(kind=CorruptionKind.BLUR, start=BLUR[0], length=BLUR[1]),
+        Corruption(kind=CorruptionKind.BLACKOUT, start=GAP[0], length=GAP[1]),
+    ]
+    sequence = make_sequence(
+        world, n_frames=n_frames, seed=seed, width=480, height=360, supersampling=1.0, events=events
+    )
+    system = dualslam.build_system(dualslam.load_config(overrides=[f"seed={seed}"]), sequence.camera)
+    for frame in sequence:
+        system.step(frame)
+    system.finish()
+    truth = sequence.ground_truth_T_world_cam[:, :3, 3]
+    for submap in system.atlas.submaps.values():
+        claims = claims_of(submap)
+        ids = np.array(sorted(submap.keyframes))
+        centres = submap.keyframe_poses(ids)[:, :3, 3]
+        for n in range(AROUND, len(ids) - AROUND):
+            k = int(ids[n])
+            about = np.arange(n - AROUND, n + AROUND + 1)
+            s, R, t = align_points(centres[about], truth[ids[about]])
+            error = float(np.linalg.norm(s * centres[n] @ R.T + t - truth[k]))
+            claimed = s * claims[k].sigma_position_rel * _depth(submap, k)
+            kind = _kind(n, k, ids)
+            if claimed > 0:
+                position[kind].append(error / claimed)
+        for begin in range(GROUP, len(ids) - 2 * GROUP, GROUP):
+            k, sigma = int(ids[begin]), claims[int(ids[begin])].sigma_scale
+            before, after = (_scale(centres, truth, ids, at) for at in (begin - GROUP, begin + GROUP))
+            if np.isfinite(sigma) and sigma > 0:
+                scale[_kind(begin, k, ids)].append(float(np.log(after / before)) / sigma)
+
+
+def _scale(centres: FloatArray, truth: FloatArray, ids: IntArray, begin: int) -> float:
+    part = slice(begin, begin + GROUP)
+    p, q = centres[part], truth[ids[part]]
+    return float(np.linalg.norm(q - q.mean(0)) / np.linalg.norm(p - p.mean(0)))
+
+
+def _depth(submap: Submap, k: int) -> float:
+    seen = submap.landmark_of[k][submap.landmark_of[k] >= 0]
+    return float(np.median(submap.depths(seen, se3.inverse(submap.T_submap_kf[k]))))
+
+
+def _kind(place: int, k: int, ids: IntArray) -> str:
+    if BLUR[0] <= k < sum(BLUR) + 3:
+        return "blurred"
+    if GAP[0] - 5 <= k < sum(GAP) + 10:
+        return "gap"
+    return "start" if place < 10 else "plain"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""What a map claims of its own accuracy, keyframe by keyframe: the columns ``sigma_*`` of ``frames.csv``.
+
+Both are read from the map as it is at the end of a run, whichever way a keyframe came into it: tracked, walked back to,
+or posed again by an audit. A frame claims what the keyframe does that it hangs on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.projection import projection_jacobians
+from dualslam.map.landmark_views import landmark_covariances
+from dualslam.map.submap import Submap
+from dualslam.recovery.linking.gates import PIXEL_CHI2
+from dualslam.recovery.linking.scale_observability import scale_sigma_between
+
+GROUP = 5
+"""Keyframes over which the scale is handed on from those before to those after: about as long as a landmark lives on a
+road, so that it is not the same ones that both see."""
+MIN_LANDMARKS = 6
+POSITION_INFLATION, SCALE_INFLATION = 1.1, 1.8
+"""Errors of neighbouring pixels and views are alike, and do not average out as the sigmas suppose. Chosen so that what
+is true comes to what is claimed on plain stretches (`benchmarks/covariances.py`, seeds 1 to 3)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """What a map says of one keyframe; NaN where it cannot tell.
+
+    Attributes
+    ----------
+    sigma_position_rel : float
+        Standard deviation of the position against what the keyframe sees, over the median depth of that.
+    sigma_scale : float
+        Standard deviation of the logarithm of the scale after the keyframe against that before it: how firmly the scale
+        is handed on across it. Infinite where it is not.
+    """
+
+    sigma_position_rel: float
+    sigma_scale: float
+
+
+def claims_of(submap: Submap) -> dict[int, Claim]:
+    """Return what a submap claims of its keyframes."""
+    scale = _scale_sigmas(submap)
+    return {k: Claim(_position_sigma(submap, k), scale[k]) for k in submap.keyframes}
+
+
+def _position_sigma(submap: Submap, keyframe_id: int) -> float:
+    """Resect the keyframe from its landmarks, each as uncertain as its views leave it."""
+    feature = np.flatnonzero(submap.landmark_of[keyframe_id] >= 0)
+    ids = submap.landmark_of[keyframe_id][feature]
+    covariance = landmark_covariances(submap, ids)
+    T_cam_submap = se3.inverse(submap.T_submap_kf[keyframe_id])
+    depth = submap.depths(ids, T_cam_submap)
+    known = np.isfinite(covariance).all((1, 2)) & (depth > 0)
+    if np.count_nonzero(known) < MIN_LANDMARKS:
+        return float("nan")
+    ids, covariance = ids[known], covariance[known]
+    sigma = submap.keyframes[keyframe_id].features.sigma_px[feature[known]]
+    J_pose, J_point = projection_jacobians(submap.K, T_cam_submap, submap.landmarks["xyz_mu"][ids])
+    spread = J_point @ covariance @ J_point.transpose(0, 2, 1) + sigma[:, None, None] ** 2 * np.eye(2)
+    H = (J_pose.transpose(0, 2, 1) @ np.linalg.solve(spread, J_pose)).sum(axis=0)
+    try:
+        variance = float(np.trace(np.linalg.inv(H)[3:, 3:]))
+    except np.linalg.LinAlgError:
+        return float("nan")
+    return POSITION_INFLATION * float(np.sqrt(max(variance, 0.0)) / np.median(depth[known]))
+
+
+def _scale_sigmas(submap: Submap) -> dict[int, float]:
+    """Ask, for each group of keyframes, how well those before and those after it hold one scale."""
+    ids = np.array(sorted(submap.keyframes), np.int64)
+    sigmas: dict[int, float] = {}
+    for begin in range(0, len(ids), GROUP):
+        group = ids[begin : begin + GROUP]
+        before, after = ids[max(begin - GROUP, 0) : begin], ids[begin + GROUP : begin + 2 * GROUP]
+        here, there = (before if len(before) else group), (after if len(after) else group)
+        sigma = (
+            float("nan") if here is there else SCALE_INFLATION * scale_sigma_between(submap, here, there, PIXEL_CHI2)
+        )
+        sigmas |= dict.fromkeys(group.tolist(), sigma)
+    return sigmas
