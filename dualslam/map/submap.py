@@ -163,6 +163,12 @@ class Submap:
         lm["condemned"][:] = lm["alive"]
         lm["condemned"][healthy] = False
 
+    def keyframe_for(self, keyframe_id: int) -> int:
+        """Return a keyframe, or the one that stands for it since it was culled."""
+        while keyframe_id not in self.T_submap_kf:
+            keyframe_id = self.anchors[keyframe_id].keyframe_id
+        return keyframe_id
+
     def resolve_anchor(self, keyframe_id: int, T_kf_cam: FloatArray) -> FloatArray:
         """Return ``T_submap_cam`` of a frame posed relative to a keyframe, also if that keyframe was culled since."""
         while keyframe_id not in self.T_submap_kf:

@@ -94,9 +94,9 @@ def frame_rows(
 def _with_claim(system: System, row: FrameRow, claims: Mapping[int, Mapping[int, Claim]]) -> FrameRow:
     """Return a frame's row with what the map claims of the keyframe that it hangs on."""
     pose = system.poses.get(row.index)
-    claim = claims.get(pose.submap_id, {}).get(pose.keyframe_id) if pose is not None else None
-    if claim is None:
+    if pose is None:
         return row
+    claim = claims[pose.submap_id][system.atlas.submaps[pose.submap_id].keyframe_for(pose.keyframe_id)]
     known = [None if np.isnan(sigma) else sigma for sigma in (claim.sigma_position_rel, claim.sigma_scale)]
     return replace(row, sigma_position_rel=known[0], sigma_scale=known[1])
 
