@@ -17,6 +17,7 @@ from dualslam.report.run_data import RunData
 from dualslam.report.statuses import WITHOUT_POSE, count
 from dualslam.report.timeline import timeline
 from dualslam.report.top_view import top_view
+from dualslam.report.trust import trust_section
 
 MAX_EVENTS = 500
 """A bound on the size of the page."""
@@ -30,6 +31,7 @@ def report_page(run: RunData) -> str:
         _section("Trajectory", top_view(run)),
         _section("Every frame", timeline(run)),
         _section("Failures and recoveries", failures_section(run)),
+        _section("Trust", trust_section(run)),
         _atlas(run),
         _section("Time", [pace_words(run), latency_histogram(run), stage_table(run), beside_table(run)]),
         _section("Configuration", _configuration(run)),

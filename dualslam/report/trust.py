@@ -1,0 +1,112 @@
+"""What a run trusts: stretches that were audited, answers that were not believed, and what the map claims of itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dualslam.core.types import FloatArray
+from dualslam.report.markup import Markup, join, number, tag
+from dualslam.report.run_data import RunData
+
+LOOSE_SCALE = 0.05
+"""From here on a scale counts as wrong (`linking.wrong_scale`): it may have been lost there."""
+N_BINS = 120
+_HEADS = ("frame", "submap", "what", "outcome")
+_DOUBTS = {
+    "look_alike": "two poses explain what is seen",
+    "leap": "the camera cannot have moved so",
+    "ambiguous_model": "two places, or two poses, look alike",
+    "contradiction": "the rest of the map contradicts it",
+    "unconfirmed": "nothing has confirmed it",
+}
+
+
+def trust_section(run: RunData) -> Markup:
+    """Return the words, the table of verdicts, and the strips of what is claimed."""
+    rows = [_row(event, *told) for event in run.events if (told := _told(event)) is not None]
+    words = (
+        "Once a map has matured it walks back over its own start, on points of its own: what agrees is confirmed, what "
+        "does not is cut off and posed again. Links, gaps and places that two answers explain alike are not believed."
+    )
+    head = tag("tr", [tag("th", name, scope="col") for name in _HEADS])
+    table = tag("table", tag("thead", head), tag("tbody", rows), cls="cards")
+    verdicts = tag("div", table, cls="scroll") if rows else tag("p", "Nothing was audited or doubted.", cls="empty")
+    strips = (
+        _strip(
+            run,
+            [row.sigma_scale for row in run.rows],
+            "sigma of the scale across a frame",
+            f"Where it is above {LOOSE_SCALE:g} the scale may have changed unseen.",
+        ),
+        _strip(
+            run,
+            [row.sigma_position_rel for row in run.rows],
+            "sigma of the position, over the depth of the scene",
+            "Against what the frame sees, not against where the run began.",
+        ),
+    )
+    return join([tag("p", words), verdicts, *strips])
+
+
+def _told(event: dict[str, Any]) -> tuple[str, str] | None:
+    """Return what was asked and what came of it, where an event is about trust."""
+    kind, detail = event.get("event"), str(event.get("detail") or "")
+    if kind == "audited":
+        return "its start, walked back over", " ".join(filter(None, [str(event["verdict"]), detail and f"({detail})"]))
+    if kind == "cut":
+        left = len(event.get("left", ()))
+        return "its start was wrong", f"cut off; {event['reposed']} frames posed again, {left} left without"
+    if kind in ("failed", "link_refused", "loop_refused", "recovery_failed") and event.get("reason") in _DOUBTS:
+        what = {"failed": "a pose", "loop_refused": "a place seen again"}.get(kind, "a link")
+        tries = f", {int(event['tries'])} tries" if "tries" in event else ""
+        return what, f"not believed: {_DOUBTS[event['reason']]}{tries}" + (f" ({detail})" if detail else "")
+    if kind == "linked" and event.get("tries", 1) > 1:
+        return "a link", f"believed at try {int(event['tries'])}"
+    return None
+
+
+def _row(event: dict[str, Any], what: str, outcome: str) -> Markup:
+    submap = event.get("submap")
+    values = (str(event["frame"]), "-" if submap is None else str(submap), what, outcome)
+    return tag("tr", [tag("td", value, data_label=name) for name, value in zip(_HEADS, values, strict=True)])
+
+
+def _strip(run: RunData, sigmas: list[float | None], name: str, note: str) -> Markup:
+    """Return the largest claim of each stretch of frames as bars, on a logarithmic scale."""
+    values = np.array([np.nan if sigma is None else sigma for sigma in sigmas])
+    known = values[np.isfinite(values) & (values > 0)]
+    if not len(known):
+        return tag("p", f"No {name} is known.", cls="empty")
+    low, high = np.floor(np.log10(known.min())), np.ceil(np.log10(known.max()) + 1e-9)
+    high = max(high, low + 1)
+    bars = []
+    parts = np.array_split(values, min(N_BINS, len(values)))
+    first = 0
+    for i, part in enumerate(parts):
+        if (worst := _worst(part)) is not None:
+            share = 1.0 if np.isinf(worst) else float((np.log10(worst) - low) / (high - low))
+            frames = f"frames {run.rows[first].index} to {run.rows[first + len(part) - 1].index}"
+            title = tag("title", f"{frames}: {'not handed on' if np.isinf(worst) else number(worst, 2)}")
+            share = max(share, 0.01)
+            bars.append(tag("rect", title, x=float(i), y=100 * (1 - share), width=0.9, height=100 * share, cls="bar"))
+        first += len(part)
+    label = f"{name}, frame by frame"
+    svg = tag(
+        "svg",
+        tag("title", label),
+        bars,
+        viewBox=f"0 0 {len(parts)} 100",
+        preserveAspectRatio="none",
+        role="img",
+        aria_label=label,
+    )
+    median, p95 = (number(float(np.percentile(known, q)), 2) for q in (50, 95))
+    caption = f"The {name}: median {median}, 95 % below {p95}; bars from {10.0**low:g} to {10.0**high:g}. {note}"
+    return tag("figure", tag("div", svg, cls="histogram"), tag("figcaption", caption))
+
+
+def _worst(part: FloatArray) -> float | None:
+    known = part[~np.isnan(part)]
+    return float(known.max()) if len(known) else None
