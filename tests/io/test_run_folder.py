@@ -16,7 +16,7 @@ from dualslam.io.run_folder import read_events, read_frames, unlinked_submaps
 
 ROWS = [
     FrameRow(0, 0.1, FrameStatus.INITIALISING, None, False, 0, 0, 12.3456),
-    FrameRow(2, 0.30000000000000004, FrameStatus.TRACKED, 0, True, 200, 150, 20.0),
+    FrameRow(2, 0.30000000000000004, FrameStatus.TRACKED, 0, True, 200, 150, 20.0, 0.0125, 0.03),
     FrameRow(4, 0.5, FrameStatus.UNREADABLE, None, False, 0, 0, 1.0),
 ]
 
@@ -55,9 +55,9 @@ def test_everything_is_written_and_reads_back(tmp_path: Path) -> None:
         "ratio": None,
     }, "on the disk while the run goes on"
     assert (run.path / "frames.csv").read_text().splitlines()[:3] == [
-        "index,timestamp_s,status,submap,in_main_map,n_matches,n_inliers,latency_ms",
-        "0,0.1,initialising,,0,0,0,12.346",
-        "2,0.30000000000000004,tracked,0,1,200,150,20.000",
+        "index,timestamp_s,status,submap,in_main_map,n_matches,n_inliers,latency_ms,sigma_position_rel,sigma_scale",
+        "0,0.1,initialising,,0,0,0,12.346,,",
+        "2,0.30000000000000004,tracked,0,1,200,150,20.000,0.0125,0.03",
     ]
     back = read_frames(run.path / "frames.csv")
     assert back[1:] == ROWS[1:]
@@ -143,3 +143,11 @@ def test_bad_frames_csv(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match="line 2"):
         read_frames(path)
+
+
+def test_frames_csv_of_before_sigmas_were_written(tmp_path: Path) -> None:
+    path = tmp_path / "frames.csv"
+    columns = "index,timestamp_s,status,submap,in_main_map,n_matches,n_inliers,latency_ms"
+    path.write_text(f"{columns}\n2,0.1,tracked,0,1,200,150,20.0\n")
+    (row,) = read_frames(path)
+    assert (row.n_inliers, row.sigma_position_rel, row.sigma_scale) == (150, None, None)
