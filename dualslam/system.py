@@ -174,6 +174,10 @@ class System:
         """The front end of the live submap; None while there is no map."""
         return self._live
 
+    def is_walking_back(self, submap_id: int) -> bool:
+        """Whether a walk back in time from a submap is under way."""
+        return self._recoveries.is_under_way(self.atlas.submaps[submap_id])
+
     def _front_ends(self) -> list[VisualOdometry]:
         """Those that go on in a submap, or may: what moves under them they must hear of."""
         return [front_end for front_end in (self._live, self._relocaliser.relocaliser) if front_end is not None]

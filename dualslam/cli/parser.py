@@ -12,6 +12,7 @@ from dualslam import __version__
 
 WORLDS = ("street", "room", "circuit", "eight", "terrace", "board", "parked", "takeoff", "standstill", "hover")
 EXPORTS = ("bal", "colmap", "g2o", "kitti", "nerfstudio", "ply", "tum")
+MAX_PORT = 65535
 SOURCE_HELP = (
     "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours), a folder of images or a video file with --camera or "
     "--fov, a webcam's number, or an embedded world: synthetic:street, room, circuit, eight, terrace, "
@@ -100,6 +101,14 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
         "--realtime",
         action="store_true",
         help="frames come at the source's rate and are dropped when late; otherwise every frame, as fast as it goes",
+    )
+    mode.add_argument(
+        "--live",
+        metavar="PORT",
+        type=_port,
+        nargs="?",
+        const=0,
+        help="watch the run in a browser, on a port of this machine (a free one without a number)",
     )
     processes = mode.add_mutually_exclusive_group()
     processes.add_argument("--inline", action="store_true", help="one process, deterministic: --workers 0, the default")
@@ -249,6 +258,13 @@ def _integer(text: str, at_least: int) -> int:
 
 def _count(text: str) -> int:
     return _integer(text, 0)
+
+
+def _port(text: str) -> int:
+    port = _integer(text, 0)
+    if port > MAX_PORT:
+        raise argparse.ArgumentTypeError(f"{text!r} is no port: they end at {MAX_PORT}")
+    return port
 
 
 def _positive(text: str) -> int:

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 from dualslam.cli import logs
 from dualslam.cli.configuration import config_of
 from dualslam.cli.console import final_line, progress, stage_table
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.errors import InputError, NoCalibrationError
+from dualslam.io.atomic import atomic_file
 from dualslam.run.focal import open_without_calibration
 from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import open_source
+from dualslam.viewer.live import LiveView
 
+PAGE = "live_map.html"
+"""In the run folder: the map as it stood when a person saved it in the live view."""
 EXIT_DONE, EXIT_NO_MAP, EXIT_INTERRUPTED = 0, 1, 130
 
 
@@ -34,7 +42,7 @@ def execute(args: argparse.Namespace) -> int:
         sequence, focal = open_without_calibration(config, args.source, **selection)
         _tell(focal, args.quiet)
     logs.release()
-    with progress(sequence, args.quiet) as on_frame:
+    with live_view(args) as live, progress(sequence, args.quiet) as on_frame:
         outcome = run_to_folder(
             config,
             sequence,
@@ -45,8 +53,32 @@ def execute(args: argparse.Namespace) -> int:
             saved_map=args.map,
             localise=args.localise,
             focal=focal,
+            watcher=live,
         )
     return conclude(outcome, args)
+
+
+@contextmanager
+def live_view(args: argparse.Namespace) -> Iterator[LiveView | None]:
+    """Open the view that --live asks for; where a person sits, it stays after the run until they end it."""
+    if args.live is None:
+        yield None
+        return
+    live = LiveView(args.live)
+    live.on_save = lambda page: _keep_page(Path(args.out) / PAGE, page)
+    print(f"live view: {live.url}", flush=True)
+    try:
+        yield live
+        if sys.stdin.isatty() and live.alive:
+            print(f"the live view stays at {live.url} until you press Ctrl-C", flush=True)
+            live.wait()
+    finally:
+        live.close()
+
+
+def _keep_page(path: Path, page: str) -> None:
+    with atomic_file(path) as file:
+        file.write(page.encode())
 
 
 def _tell(focal: FocalSearch, quiet: bool) -> None:

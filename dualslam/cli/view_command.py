@@ -8,7 +8,7 @@ from dualslam.cli.outputs import check_free
 from dualslam.core.errors import InputError
 from dualslam.io.atomic import atomic_file
 from dualslam.report.run_data import RunData, read_run
-from dualslam.report.viewer import has_display, open_viewer
+from dualslam.viewer.window import has_display, open_viewer
 
 
 def execute(args: argparse.Namespace) -> int:
@@ -30,7 +30,7 @@ def execute(args: argparse.Namespace) -> int:
 
 def _record(run: RunData) -> bytes:
     try:
-        from dualslam.report.recording import make_recording
+        from dualslam.viewer.recording import make_recording
     except ImportError as error:
         raise InputError('dualslam view needs the Rerun viewer: pip install "dualslam[view]".') from error
     return make_recording(run)

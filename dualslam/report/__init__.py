@@ -2,8 +2,6 @@
 
 In reading order: `run_data` (a run folder, read), `page` (the page, section by section), `top_view`, `timeline`,
 `failures`, `charts` (its figures), `compare` (several runs), `markup` (how HTML is made so that text cannot break it).
-Apart from the pages: `playback` (a run in time and space), `recording` (the same for the Rerun viewer, an extra that is
-imported there alone), `viewer` (its window).
 The figures are SVG written by hand: crisp at any size, a few kilobytes, and no library is needed to make them.
 """
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from dualslam.build import build_system
 from dualslam.config.files import dump_config
@@ -28,6 +28,22 @@ from dualslam.run.results import frame_rows, summarise, trajectories_of, truth_o
 from dualslam.run.runner import RunReport, run_sequence
 from dualslam.system import System
 from dualslam.workers.desk import WorkerDesk
+
+
+class Watcher(Protocol):
+    """Someone who looks on while a run goes on, such as a live view."""
+
+    def begin(self, system: System) -> None:
+        """Learn of the system, before its first frame."""
+        ...
+
+    def after(self, frame: Frame, result: FrameResult) -> None:
+        """Look at a frame and what became of it. While this does not return, the run waits."""
+        ...
+
+    def end(self) -> None:
+        """Look at the whole map, once the run has ended."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +83,7 @@ def run_to_folder(
     saved_map: str | Path | None = None,
     localise: bool = False,
     focal: FocalSearch | None = None,
+    watcher: Watcher | None = None,
 ) -> Outcome:
     """Run on a sequence and write a run folder. What an interrupted run, or one that crashed, has found is kept.
 
@@ -88,6 +105,7 @@ def run_to_folder(
         Find poses in it, and add nothing.
     focal : FocalSearch, optional
         How the camera was found, where nothing was known of it; for the summary.
+    watcher : Watcher, optional
 
     Raises
     ------
@@ -118,7 +136,7 @@ def run_to_folder(
 
         if realtime and isinstance(system.desk, WorkerDesk):
             system.desk.wait_until_ready()
-        watched = _Watched(system, SampleKeeper(folder.write_sample))
+        watched = _Watched(system, SampleKeeper(folder.write_sample), watcher)
         report = run_sequence(watched, sequence, realtime=realtime, pace=system.pace, on_frame=after_frame)
         if report.interrupted and system.rows:
             last = next(reversed(system.rows.values()))
@@ -166,19 +184,25 @@ def _write_results(
 
 
 class _Watched:
-    """A system whose frames are looked at for sample pictures."""
+    """A system whose frames are looked at: for sample pictures, and by who watches the run."""
 
-    def __init__(self, system: System, samples: SampleKeeper) -> None:
-        self._system, self._samples = system, samples
+    def __init__(self, system: System, samples: SampleKeeper, watcher: Watcher | None) -> None:
+        self._system, self._samples, self._watcher = system, samples, watcher
+        if watcher is not None:
+            watcher.begin(system)
 
     def step(self, frame: Frame) -> FrameResult:
         result = self._system.step(frame)
         self._samples.take(frame, result.status)
+        if self._watcher is not None:
+            self._watcher.after(frame, result)
         return result
 
     def finish(self, interrupted: bool = False) -> None:
         self._samples.finish()
         self._system.finish(interrupted)
+        if self._watcher is not None:
+            self._watcher.end()
 
 
 def _write_new_events(system: System, folder: RunFolder, n_written: int) -> int:

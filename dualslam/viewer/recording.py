@@ -19,26 +19,14 @@ from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, FrameStatus, IntArray
 from dualslam.report.event_words import event_words
-from dualslam.report.playback import Appearing, Playback, Space, camera_statuses, play, segments
 from dualslam.report.run_data import RunData
 from dualslam.report.statuses import MEANING, stretches
+from dualslam.viewer.colours import ELSEWHERE, MATCH_COLOUR, STATUS_COLOURS, SUBMAP_COLOURS, TRUTH_COLOUR
+from dualslam.viewer.playback import Appearing, Playback, Space, camera_statuses, play, segments
 
 APPLICATION = "dualslam"
 TIME, FRAME = "timestamp_s", "frame"
 EVENTS, STATUS, LATENCY, MATCHES, INLIERS = "events", "status", "latency_ms", "matches/n_matches", "matches/n_inliers"
-STATUS_COLOURS = {
-    FrameStatus.TRACKED: 0x3D8BE0FF,
-    FrameStatus.RECOVERED: 0x22A565FF,
-    FrameStatus.BYPASSED: 0xD08A1AFF,
-    FrameStatus.LOST: 0xE8505BFF,
-    FrameStatus.INITIALISING: 0x848D9BFF,
-    FrameStatus.DROPPED: 0x9A63E0FF,
-    FrameStatus.UNREADABLE: 0x6B7079FF,
-}
-"""The hues of the report, in tones that show on the viewer's light ground and on its dark one."""
-ELSEWHERE, TRUTH_COLOUR, MATCH_COLOUR = 0xA9AFB8FF, 0x808895FF, 0x94A9C4FF
-SUBMAP_COLOURS = (0x8DA0CBFF, 0xFC8D62FF, 0x66C2A5FF, 0xE78AC3FF, 0xA6D854FF, 0xFFD92FFF, 0xE5C494FF)
-"""One a submap, from the first again after the last: neighbours differ, for people who see few colours too."""
 LEVELS = {
     EventKind.FAILED: "ERROR",
     EventKind.RECOVERY_FAILED: "WARN",

@@ -26,11 +26,11 @@ from dualslam.io.trajectory_files import read_tum
 from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.submap import Submap
 from dualslam.report import RunData, read_run
-from dualslam.report.playback import play, segments
-from dualslam.report.recording import ELSEWHERE, STATUS_COLOURS, SUBMAP_COLOURS, make_recording
 from dualslam.report.run_data import PosedRows
-from dualslam.report.viewer import open_viewer
-from tests.cli.conftest import _own_environment  # noqa: F401 (used by every test)
+from dualslam.viewer.colours import ELSEWHERE, STATUS_COLOURS, SUBMAP_COLOURS
+from dualslam.viewer.playback import play, segments
+from dualslam.viewer.recording import make_recording
+from dualslam.viewer.window import open_viewer
 from tests.cli.fakes import NO_FEATURES
 from tests.cli.test_usage import one_sentence
 from tests.report.conftest import LOST, N_FRAMES, MakeRun
@@ -258,7 +258,7 @@ def test_without_rerun_it_says_how_to_get_it(
     broken_run: RunData, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    monkeypatch.delitem(sys.modules, "dualslam.report.recording")
+    monkeypatch.delitem(sys.modules, "dualslam.viewer.recording")
     assert main(["view", str(broken_run.path), "--save", str(tmp_path / "run.rrd")]) == 2
     assert 'pip install "dualslam[view]"' in one_sentence(capsys)
     assert list(tmp_path.iterdir()) == []
@@ -344,7 +344,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[list[str], d
         words = "INFO starting\nError: no graphics\n" if opened else ""
         return subprocess.CompletedProcess(command, int(opened), "", words)
 
-    monkeypatch.setattr("dualslam.report.viewer.subprocess.run", run)
+    monkeypatch.setattr("dualslam.viewer.window.subprocess.run", run)
     return calls
 
 

@@ -1,0 +1,243 @@
+"""What a live view is told of a run: arrays and words, and of the map only what has changed since the last message.
+
+Made in the tracking thread: a message costs a millisecond or two, five times a second.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.events import Event
+from dualslam.core.types import BoolArray, FloatArray, Frame, FrameStatus, IntArray, Track
+from dualslam.map.frame_records import FrameResult
+from dualslam.map.submap import Submap
+from dualslam.report.event_words import event_words
+from dualslam.system import System
+from dualslam.workers.jobs import JobKind
+
+WIDTH_PX = 480
+"""Of the picture: what a side panel shows."""
+MAX_LANDMARKS = 20_000
+"""Of one submap: the newest; FACTS of viser: 1.5 ms, and a browser draws ten times as many."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SubmapArrays:
+    """A submap's geometry in its own frame.
+
+    Attributes
+    ----------
+    submap_id : int
+    kf : (K,) int64
+        Keyframes, ascending.
+    T_submap_kf : (K, 4, 4) float32
+    condemned : (K,) bool
+        Keyframes that are not to be relied on.
+    landmarks_xyz : (L, 3) float32
+    """
+
+    submap_id: int
+    kf: IntArray
+    T_submap_kf: NDArray[np.float32]
+    condemned: BoolArray
+    landmarks_xyz: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinkLine:
+    """A connection, between two keyframes."""
+
+    kind: str
+    a: int
+    kf_a: int
+    b: int
+    kf_b: int
+    rejected: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """The newest frame, small.
+
+    Attributes
+    ----------
+    pixels : (H, W, 3) uint8
+        RGB.
+    uv_px : (N, 2) float32
+        Its features, in pixels of the picture.
+    matched : (N,) bool
+        Those that show a landmark.
+    """
+
+    pixels: NDArray[np.uint8]
+    uv_px: NDArray[np.float32]
+    matched: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EventWords:
+    """An event as a line."""
+
+    kind: str
+    frame: int
+    submap: int | None
+    words: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Message:
+    """A run as it stands after a frame.
+
+    Attributes
+    ----------
+    frame : int
+    timestamp_s : float
+    status : FrameStatus
+    latency_ms : float
+    submap_id : int or None
+    T_submap_cam : (4, 4) or None
+    picture : Picture or None
+        None where there is no image.
+    changed : tuple of SubmapArrays
+        Submaps of which anything but their place is new.
+    components : tuple of dict of int to (4, 4)
+        The linked sets of submaps: each submap's similarity into the frame of the set's first.
+    links : tuple of LinkLine
+    statuses : tuple of str
+        Of all frames so far, or of those after `n_statuses_before`.
+    n_statuses_before : int
+        0 where frames may have been posed later: then `statuses` has all.
+    events : tuple of EventWords
+        New ones.
+    walking : tuple of int
+        Submaps that are being walked back from.
+    backlog : int
+        Jobs that wait or are done beside the tracking.
+    over : bool
+        The run has ended.
+    """
+
+    frame: int
+    timestamp_s: float
+    status: FrameStatus
+    latency_ms: float
+    submap_id: int | None
+    T_submap_cam: FloatArray | None
+    picture: Picture | None
+    changed: tuple[SubmapArrays, ...]
+    components: tuple[dict[int, FloatArray], ...]
+    links: tuple[LinkLine, ...]
+    statuses: tuple[str, ...]
+    n_statuses_before: int
+    events: tuple[EventWords, ...]
+    walking: tuple[int, ...]
+    backlog: int
+    over: bool = False
+
+
+class Teller:
+    """Makes the messages of a run, each with what is new since the one before.
+
+    Parameters
+    ----------
+    system : System
+        Its `on_pose` is taken, in front of one that is there.
+    """
+
+    def __init__(self, system: System) -> None:
+        self._system = system
+        self._track: Track | None = None
+        self._n_events = 0
+        self._n_statuses = 0
+        self._sent: dict[int, tuple[object, ...]] = {}
+        earlier = system.on_pose
+
+        def keep(track: Track) -> None:
+            self._track = track
+            if earlier is not None:
+                earlier(track)
+
+        system.on_pose = keep
+
+    def tell(self, frame: Frame, result: FrameResult, over: bool = False) -> Message:
+        """Return what is to be told after a frame."""
+        system = self._system
+        events = self._new_events()
+        arrays = tuple(_arrays(s) for s in system.atlas.submaps.values() if self._has_changed(s))
+        before = 0 if events or over else self._n_statuses
+        statuses = tuple(str(row.status) for row in islice(system.rows.values(), before, None))
+        self._n_statuses = len(system.rows)
+        return Message(
+            result.index,
+            frame.timestamp_s,
+            result.status,
+            result.latency_ms,
+            result.submap_id,
+            result.T_submap_cam,
+            self._picture(frame),
+            arrays,
+            tuple(system.atlas.S_world_submap(component) for component in system.atlas.components()),
+            tuple(_lines(system)),
+            statuses,
+            before,
+            events,
+            tuple(m for m in system.atlas.submaps if system.is_walking_back(m)),
+            sum(system.desk.n_open(kind) for kind in JobKind),
+            over,
+        )
+
+    def _new_events(self) -> tuple[EventWords, ...]:
+        numbers = self._system.numbers
+        new = list(islice(self._system.events, self._n_events, None))
+        self._n_events += len(new)
+
+        def words(event: Event) -> EventWords:
+            told = replace(event, frame=numbers.index_of(event.frame), data=numbers.in_source(event.data))
+            return EventWords(str(told.event), told.frame, told.submap, event_words(told.as_dict()))
+
+        return tuple(map(words, new))
+
+    def _has_changed(self, submap: Submap) -> bool:
+        """Whether keyframes came, went or moved; the newest few tell of a move, as nothing moves by itself."""
+        newest = [T[:3, 3].tobytes() for T in list(submap.T_submap_kf.values())[-8:]]
+        stamp = (len(submap.keyframes), len(submap.landmarks), len(submap.condemned), *newest)
+        if self._sent.get(submap.id) == stamp:
+            return False
+        self._sent[submap.id] = stamp
+        return True
+
+    def _picture(self, frame: Frame) -> Picture | None:
+        if frame.image is None:
+            return None
+        height, width = frame.image.shape[:2]
+        factor = min(1.0, WIDTH_PX / width)
+        size = (max(1, round(width * factor)), max(1, round(height * factor)))
+        small = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+        if small.ndim == 2:
+            small = np.repeat(small[..., None], 3, axis=2)
+        track = self._track
+        if track is None or track.view.timestamp_s != frame.timestamp_s:
+            return Picture(np.asarray(small, np.uint8), np.zeros((0, 2), np.float32), np.zeros(0, bool))
+        uv = (track.view.features.uv_px * factor).astype(np.float32)
+        return Picture(np.asarray(small, np.uint8), uv, track.landmark_ids >= 0)
+
+
+def _arrays(submap: Submap) -> SubmapArrays:
+    ids = sorted(submap.keyframes)
+    T = np.array([submap.T_submap_kf[k] for k in ids], np.float32).reshape(-1, 4, 4)
+    condemned = np.isin(ids, list(submap.condemned))
+    xyz = submap.landmarks["xyz_mu"][submap.landmarks["alive"]][-MAX_LANDMARKS:]
+    return SubmapArrays(submap.id, np.array(ids, np.int64), T, condemned, xyz.astype(np.float32))
+
+
+def _lines(system: System) -> list[LinkLine]:
+    lines = []
+    for link in system.atlas.links:
+        kf_a, kf_b = link.attached(system.atlas)
+        lines.append(LinkLine(str(link.kind), link.a, kf_a, link.b, kf_b, link.rejected))
+    return lines

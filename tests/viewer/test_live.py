@@ -1,0 +1,249 @@
+"""The live view: what is told of a run is what its map holds, and nothing that the viewer does takes the run along."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import socket
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dualslam.cli import main
+from dualslam.core.errors import InputError, OutputError
+from dualslam.core.geometry import sim3
+from dualslam.core.types import Frame, FrameStatus
+from dualslam.map.frame_records import FrameResult
+from dualslam.system import System
+from dualslam.testing.point_world import PointWorld, system_in
+from dualslam.viewer import live
+from dualslam.viewer.colours import STATUS_COLOURS, rgb
+from dualslam.viewer.live import PAUSE, SAVE, LiveView
+from dualslam.viewer.live_scene import TIMELINE_PX, LiveScene, draw_features, draw_timeline
+from dualslam.viewer.messages import Message, Picture, Teller
+from tests.cli.test_usage import one_sentence
+from tests.places.worlds import N, lap
+
+COVERED = frozenset(range(60, 80))
+"""Nothing to see: the first map is lost, and a second one starts."""
+
+
+class Run:
+    """A run that was told of after every frame, and all that was told."""
+
+    def __init__(self) -> None:
+        self.world: PointWorld = lap(N + 12, covered=COVERED)
+        self.system: System = system_in(self.world, recovery={"enabled": True}, buffer={"duration_s": 0.3})
+        teller, self.messages = Teller(self.system), []
+        for frame in self.world.frames():
+            result = self.system.step(frame)
+            self.messages.append(teller.tell(frame, result))
+        self.system.finish()
+        self.messages.append(teller.tell(frame, result, over=True))
+
+
+@pytest.fixture(scope="module")
+def told() -> Run:
+    return Run()
+
+
+@pytest.fixture(scope="module")
+def scene(told: Run) -> LiveScene:
+    scene = LiveScene()
+    for message in told.messages:
+        scene.take(message)
+    return scene
+
+
+def test_the_scene_is_the_atlas(told: Run, scene: LiveScene) -> None:
+    atlas = told.system.atlas
+    (component,) = atlas.components()
+    S_world = atlas.S_world_submap(component)
+    assert set(scene.drawn) == set(atlas.submaps)
+    for m, submap in atlas.submaps.items():
+        drawn = scene.drawn[m]
+        T = np.array([submap.T_submap_kf[k] for k in sorted(submap.keyframes)])
+        assert np.allclose(drawn.centres, sim3.act(S_world[m], T[:, :3, 3]), atol=1e-4)
+        alive = submap.landmarks["xyz_mu"][submap.landmarks["alive"]]
+        assert np.allclose(drawn.points, sim3.act(S_world[m], alive), atol=1e-3)
+        assert len(drawn.lines) == 8 * len(T) + len(T) - 1
+    assert scene.statuses == [str(row.status) for row in told.system.rows.values()]
+    lines, _ = scene.link_lines()
+    assert len(lines) == len(atlas.links)
+
+
+def test_what_is_not_linked_stands_beside(told: Run) -> None:
+    """Between the start of the second map and the merge: two sets, which do not overlap from left to right."""
+    scene = LiveScene()
+    for message in told.messages:
+        scene.take(message)
+        if len(message.components) == 2 and len(scene.drawn) == 2:
+            break
+    first, second = scene.drawn[0], scene.drawn[1]
+    assert second.centres[:, 0].min() > first.centres[:, 0].max()
+    assert not told.messages[-1].components[1:], "it was linked later"
+
+
+def test_events_are_told_once_in_order(told: Run) -> None:
+    kinds = [event.kind for message in told.messages for event in message.events]
+    assert kinds == [str(event.event) for event in told.system.events]
+    assert {"initialised", "failed", "merged"} <= set(kinds)
+
+
+def test_only_what_changed_is_told_again(told: Run) -> None:
+    sizes = [len(message.changed) for message in told.messages]
+    assert sum(sizes) < len(sizes) / 2, "most frames are no keyframes"
+    lost = [m for m in told.messages if m.status is FrameStatus.LOST]
+    assert lost
+    assert not any(message.changed for message in lost[1:5])
+
+
+def test_features_on_the_picture() -> None:
+    picture = Picture(
+        np.zeros((20, 30, 3), np.uint8),
+        np.array([[5, 6], [20, 9], [29.6, -0.4]], np.float32),
+        np.array([1, 0, 1], bool),
+    )
+    image = draw_features(picture)
+    assert tuple(image[6, 5]) != tuple(image[9, 20]) != (0, 0, 0)
+    assert tuple(image[0, 29]) == tuple(image[6, 5]), "at the rim what is inside is drawn"
+    assert not picture.pixels.any(), "the frame itself stays"
+
+
+@pytest.mark.parametrize("n", [1, 7, 480, 5000])
+def test_the_timeline_has_every_status_in_its_place(n: int) -> None:
+    statuses = [str(FrameStatus.TRACKED)] * n + [str(FrameStatus.LOST)] * n
+    strip = draw_timeline(statuses)
+    half = TIMELINE_PX[0] // 2
+    assert (strip[:, : half - 1] == rgb(STATUS_COLOURS[FrameStatus.TRACKED])).all()
+    assert (strip[:, half + 1 :] == rgb(STATUS_COLOURS[FrameStatus.LOST])).all()
+
+
+# --- the process
+
+
+class Still:
+    """A system of which there is nothing new; `LiveView` asks its teller alone."""
+
+    def __init__(self, message: Message) -> None:
+        self.message = message
+        self.n_told = 0
+
+    def tell(self, frame: Frame, result: FrameResult, over: bool = False) -> Message:
+        self.n_told += 1
+        return self.message
+
+
+@pytest.fixture
+def view(told: Run, monkeypatch: pytest.MonkeyPatch) -> Iterator[LiveView]:
+    monkeypatch.setattr(live, "EVERY_S", 0.01)
+    monkeypatch.setattr(live, "END_S", 1.0)
+    monkeypatch.setattr(live, "Teller", lambda system: Still(told.messages[-1]))
+    view = LiveView()
+    view.begin(told.system)
+    yield view
+    view.close()
+
+
+def step(view: LiveView, told: Run) -> float:
+    """Let the view look at a frame; return how long the run was held up."""
+    began = time.monotonic()
+    view.after(Frame(0, 0.0, None), None)  # type: ignore[arg-type]
+    return time.monotonic() - began
+
+
+def test_a_page_is_served_to_this_machine_alone(view: LiveView, told: Run) -> None:
+    step(view, told)
+    with urllib.request.urlopen(view.url, timeout=10) as answer:
+        assert answer.status == 200
+        assert b"<html" in answer.read().lower()
+    assert view.url.startswith("http://127.0.0.1:")
+
+
+@pytest.mark.parametrize("sign", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "hung"])
+def test_a_viewer_that_is_killed_or_hangs_holds_nothing_up(view: LiveView, told: Run, sign: signal.Signals) -> None:
+    assert view._idle.wait(10)
+    step(view, told)
+    assert view._process.pid is not None
+    os.kill(view._process.pid, sign)
+    deadline = time.monotonic() + 1.0
+    while time.monotonic() < deadline:
+        assert step(view, told) < 0.5
+        time.sleep(0.01)
+    if sign is signal.SIGKILL:
+        assert not view.alive
+    began = time.monotonic()
+    view.end()
+    view.close()
+    assert time.monotonic() - began < 10
+
+
+def test_a_paused_run_goes_on_once_it_may_or_once_nobody_watches(view: LiveView, told: Run) -> None:
+    view._paused = True
+    view._process.kill()
+    assert step(view, told) < 10, "nobody could let it go on"
+
+
+def test_what_is_pressed_is_done_between_two_frames(view: LiveView, told: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    pages: list[str] = []
+    view.on_save = pages.append
+    monkeypatch.setattr(view, "_pipe", Pressing(view._pipe, [[(SAVE, "<html>")], [(PAUSE, True)], [(PAUSE, False)]]))
+    for _ in range(20):
+        step(view, told)
+        time.sleep(0.02)
+    assert pages == ["<html>"]
+    assert not view._paused
+
+
+class Pressing:
+    """A pipe whose other end presses what it is told to."""
+
+    def __init__(self, pipe: object, pressed: list[list[tuple[str, object]]]) -> None:
+        self._pipe, self._pressed = pipe, pressed
+
+    def send(self, message: object) -> None:
+        self._pipe.send(message)  # type: ignore[attr-defined]
+
+    def recv(self) -> list[tuple[str, object]]:
+        self._pipe.recv()  # type: ignore[attr-defined]
+        return self._pressed.pop(0) if self._pressed else []
+
+    def close(self) -> None:
+        self._pipe.close()  # type: ignore[attr-defined]
+
+
+def test_a_port_that_is_taken_is_one_sentence() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(OutputError, match=f"port {port} is in use"):
+            LiveView(port)
+
+
+def test_without_the_extra_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "viser" else find(name))
+    with pytest.raises(InputError, match=r'pip install "dualslam\[live\]"'):
+        LiveView()
+
+
+def test_the_view_of_a_whole_run(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The trajectory is what it is without a view, and viser is not imported by the run's process."""
+    assert main(["run", str(folder), "--out", str(tmp_path / "plain"), "--quiet"]) in (0, 1)
+    assert main(["run", str(folder), "--out", str(tmp_path / "seen"), "--quiet", "--live"]) in (0, 1)
+    assert "live view: http://127.0.0.1:" in capsys.readouterr().out
+    seen, plain = (tmp_path / name / "trajectory.txt" for name in ("seen", "plain"))
+    assert seen.read_bytes() == plain.read_bytes()
+    assert "viser" not in sys.modules
+
+
+def test_a_port_that_is_none(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", str(folder), "--out", str(tmp_path / "run"), "--live", "99999"]) == 2
+    assert "99999" in one_sentence(capsys)
