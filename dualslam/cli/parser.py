@@ -195,7 +195,7 @@ def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser, talk = _command(commands, "demo", "Lose track in a synthetic street: recovery off against on.")
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/demo"), help="default: runs/demo")
     parser.add_argument("--overwrite", action="store_true", help="replace the runs that are there")
-    parser.add_argument("--frames", metavar="N", type=_positive, default=200, help="how long a drive (default: 200)")
+    parser.add_argument("--frames", metavar="N", type=_positive, default=170, help="how long a drive (default: 170)")
     talk.add_argument("--profile", action="store_true", help="print where the time went, stage by stage")
     _add_fields(parser)
 

@@ -33,6 +33,7 @@ EVENTS = "events.jsonl"
 SUMMARY = "summary.json"
 CONFIG = "config.yaml"
 REPORT = "report.html"
+MAP_PAGE = "map.html"
 GROUND_TRUTH = "groundtruth.txt"
 SUBMAPS = "submaps"
 SAMPLES = "samples"
@@ -44,7 +45,18 @@ FRAME_COLUMNS = (
 )
 OLD_FRAME_COLUMNS = FRAME_COLUMNS[:8]
 """Of runs made before the map told what it claims."""
-_FILES = (TRAJECTORY, TRAJECTORY_KITTI, TRAJECTORY_KITTI_FRAMES, FRAMES, EVENTS, SUMMARY, CONFIG, REPORT, GROUND_TRUTH)
+_FILES = (
+    TRAJECTORY,
+    TRAJECTORY_KITTI,
+    TRAJECTORY_KITTI_FRAMES,
+    FRAMES,
+    EVENTS,
+    SUMMARY,
+    CONFIG,
+    REPORT,
+    MAP_PAGE,
+    GROUND_TRUTH,
+)
 _SUBMAP_NAME = re.compile(r"\d+\.txt")
 _SAMPLE_NAME = re.compile(r"\d+\.jpg")
 _MAP_NAME = re.compile(r"[\w.-]+\.(npz|json)")
@@ -133,6 +145,10 @@ class RunFolder:
         """Write a small picture of a frame."""
         with atomic_file(self.path / SAMPLES / f"{index:06d}.jpg") as file:
             file.write(jpeg)
+
+    def write_map_page(self, page: str) -> None:
+        """Write ``map.html``."""
+        write_text(self.path / MAP_PAGE, page)
 
     def write_report(self, page: str) -> None:
         """Write ``report.html``."""

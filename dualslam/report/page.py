@@ -7,7 +7,7 @@ from typing import Any
 
 from dualslam.config.settings import Config
 from dualslam.core.types import FrameStatus
-from dualslam.io.run_folder import EVENTS
+from dualslam.io.run_folder import EVENTS, MAP_PAGE
 from dualslam.report.atlas_table import atlas_section
 from dualslam.report.charts import beside_table, latency_histogram, pace_words, stage_table
 from dualslam.report.event_words import event_words
@@ -28,7 +28,7 @@ def report_page(run: RunData) -> str:
     sequence = run.summary.get("sequence", run.name)
     body = [
         tag("header", tag("h1", str(sequence)), tag("p", headline(run), cls="lead"), _warnings(run), _tiles(run)),
-        _section("Trajectory", top_view(run)),
+        _section("Trajectory", [top_view(run), _map_link(run)]),
         _section("Every frame", timeline(run)),
         _section("Failures and recoveries", failures_section(run)),
         _section("Trust", trust_section(run)),
@@ -39,6 +39,12 @@ def report_page(run: RunData) -> str:
         _footer(run),
     ]
     return document(f"{sequence} - dualslam report", body)
+
+
+def _map_link(run: RunData) -> Markup | None:
+    if not (run.path / MAP_PAGE).is_file():
+        return None
+    return tag("p", tag("a", "Turn the map in three dimensions", href=MAP_PAGE), ", frame by frame.")
 
 
 def _atlas(run: RunData) -> Markup | None:

@@ -27,6 +27,7 @@ from dualslam.report import SampleKeeper, read_run, report_page
 from dualslam.run.results import frame_rows, summarise, trajectories_of, truth_of_frames
 from dualslam.run.runner import RunReport, run_sequence
 from dualslam.system import System
+from dualslam.viewer.map_page import map_page
 from dualslam.workers.desk import WorkerDesk
 
 
@@ -179,7 +180,10 @@ def _write_results(
     if truth is not None:
         folder.write_truth(truth_of_frames(truth, rows))
     save_atlas(folder.map_path, system.atlas, system.poses, system.camera)
-    folder.write_report(report_page(read_run(folder.path)))
+    run = read_run(folder.path)
+    if (page := map_page(run)) is not None:
+        folder.write_map_page(page)
+    folder.write_report(report_page(run))
     return summary
 
 
