@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -34,45 +34,40 @@ def propagate_poses(poses: Iterable[FramePose], before: Submap, after: Submap) -
     list of FramePose
         Posed against keyframes of `after`; those that are keyframes there are left out.
     """
-    keyframe_ids = _in_both(before, after)
-    carried = []
-    for pose in poses:
-        if pose.submap_id != after.id or pose.index in after.keyframes:
-            continue
-        T_submap_cam = before.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
-        k, T_kf_cam = _propagate(pose.index, T_submap_cam, keyframe_ids, before, after)
-        carried.append(replace(pose, keyframe_id=k, T_kf_cam=T_kf_cam))
-    return carried
+    own = [pose for pose in poses if pose.submap_id == after.id and pose.index not in after.keyframes]
+    if not own:
+        return []
+    T_submap_cam = np.array([before.resolve_anchor(pose.keyframe_id, pose.T_kf_cam) for pose in own])
+    ids, T_kf_cam = _propagate([pose.index for pose in own], T_submap_cam, before, after)
+    return [replace(pose, keyframe_id=k, T_kf_cam=T) for pose, k, T in zip(own, ids.tolist(), T_kf_cam, strict=True)]
 
 
 def propagate_anchors(before: Submap, after: Submap) -> None:
     """Move the culled keyframes of `after` in the same way."""
-    keyframe_ids = _in_both(before, after)
-    for k in list(after.anchors):
-        if k not in before.anchors and k not in before.keyframes:
-            continue  # it came with the change
-        after.anchors[k] = Anchor(*_propagate(k, before.resolve_anchor(k, np.eye(4)), keyframe_ids, before, after))
-
-
-def _in_both(before: Submap, after: Submap) -> IntArray:
-    return np.array(sorted(before.keyframes.keys() & after.keyframes.keys()), np.int64)
+    # The others came with the change.
+    known = [k for k in after.anchors if k in before.anchors or k in before.keyframes]
+    if not known:
+        return
+    ids, T_kf_cam = _propagate(known, np.array([before.resolve_anchor(k, np.eye(4)) for k in known]), before, after)
+    for k, reference, T in zip(known, ids.tolist(), T_kf_cam, strict=True):
+        after.anchors[k] = Anchor(reference, T)
 
 
 def _propagate(
-    index: int, T_submap_cam: FloatArray, keyframe_ids: IntArray, before: Submap, after: Submap
-) -> tuple[int, FloatArray]:
-    """Return the keyframe and the pose against it of a frame that was at `T_submap_cam`."""
-    here = int(np.searchsorted(keyframe_ids, index))
-    last = len(keyframe_ids) - 1
-    a, b = int(keyframe_ids[max(here - 1, 0)]), int(keyframe_ids[min(here, last)])
-    T_a, T_b = (se3.inverse(before.T_submap_kf[k]) @ T_submap_cam for k in (a, b))
-    if a == b:
-        return a, T_a
-    from_a, from_b = float(np.linalg.norm(T_a[:3, 3])), float(np.linalg.norm(T_b[:3, 3]))
-    share = from_a / (from_a + from_b) if from_a + from_b > 0 else 0.0
-    T_a_b = se3.inverse(after.T_submap_kf[a]) @ after.T_submap_kf[b]
+    index: Sequence[int], T_submap_cam: FloatArray, before: Submap, after: Submap
+) -> tuple[IntArray, FloatArray]:
+    """Return keyframes (N,) and the poses against them (N, 4, 4) of frames that were at `T_submap_cam`."""
+    keyframe_ids = np.array(sorted(before.keyframes.keys() & after.keyframes.keys()), np.int64)
+    was, now = (np.array([s.T_submap_kf[k] for k in keyframe_ids.tolist()]) for s in (before, after))
+    here = np.searchsorted(keyframe_ids, np.asarray(index, np.int64))
+    a, b = np.maximum(here - 1, 0), np.minimum(here, len(keyframe_ids) - 1)
+    T_a, T_b = (se3.inverse(was[at]) @ T_submap_cam for at in (a, b))
+    from_a, from_b = (np.linalg.norm(T[:, :3, 3], axis=1) for T in (T_a, T_b))
+    share = np.divide(from_a, from_a + from_b, out=np.zeros(len(a)), where=from_a + from_b > 0)
+    share[a == b] = 0.0
+    T_a_b = se3.inverse(now[a]) @ now[b]
     gap = se3.log(se3.inverse(T_a) @ T_a_b @ T_b)
-    return a, T_a @ se3.exp(share * gap)
+    return keyframe_ids[a], T_a @ se3.exp(share[:, None] * gap)
 
 
 def propagate_links(atlas: Atlas, before: Submap, after: Submap) -> None:

@@ -30,7 +30,8 @@ class Warp:
 
     def at(self, index: ArrayLike) -> FloatArray:
         """Return (N, 4, 4) similarities of frames."""
-        i = np.clip(np.asarray(index, np.int64).reshape(-1), self.index[0], self.index[-1])
+        asked = np.clip(np.asarray(index, np.int64).reshape(-1), self.index[0], self.index[-1])
+        i, of_each = np.unique(asked, return_inverse=True)  # the landmarks of a keyframe all ask for the same
         before = np.searchsorted(self.index, i, side="right") - 1
         after = np.minimum(before + 1, len(self.index) - 1)
         start, width = self.index[before], self.index[after] - self.index[before]
@@ -41,7 +42,7 @@ class Warp:
             share = (i[between] - start[between]) / width[between]
             gap = sim3.log(sim3.inverse(self.S[a]) @ self.S[b])
             found[between] = self.S[a] @ sim3.exp(share[:, None] * gap)
-        return found
+        return found[of_each]
 
     def after(self, earlier: Warp) -> Warp:
         """Return this bending of what `earlier` has bent already, with the knots of both."""

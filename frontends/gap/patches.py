@@ -109,9 +109,7 @@ def match_patches(
     template = sample(levels_a, uv_a_px, axes_a, HALF_PX)
     window = sample(levels_b, uv_b_px, axes_b, HALF_PX + reach)
     found, offset = [], []
-    for n in range(len(uv_a_px)):
-        if template[n].std() < MIN_CONTRAST:
-            continue
+    for n in np.flatnonzero(template.std(axis=(1, 2)) >= MIN_CONTRAST).tolist():
         score = cv2.matchTemplate(window[n], template[n], cv2.TM_CCOEFF_NORMED)
         place = _peak(score)
         if place is not None:

@@ -95,7 +95,7 @@ class Initialiser:
         self._size_px = size_px
         self._seed = seed
         self._views: list[View] = []
-        self._turn = 0  # of `LAGS`
+        self._turn = self._top = len(LAGS) - 1  # of `LAGS`: the next, and the one that the turn began with
 
     def collect(self, view: View) -> None:
         """Keep a view as a possible first view, without trying to start from it."""
@@ -104,24 +104,29 @@ class Initialiser:
     def add(self, view: View, briefly: bool = False) -> Start | Failure:
         """Take a view in and try to start from it and an earlier one: with the next two in turn, `briefly` with one.
 
-        The nearest come first, and again as soon as there is too little in common with one that is farther back.
+        In turn come all that have enough in common with it, the farthest back first; where one shows too little
+        parallax those nearer show no more, and the turn begins anew, one farther back if there is one.
         """
         self.collect(view)
         best = Failure(FailureReason.TOO_FEW_MATCHES, "one view")
         if len(view.features) < self._config.min_matches:
             return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image")
-        lags = [lag for lag in LAGS if lag < len(self._views)]
-        for _ in range(min(1 if briefly else MAX_PAIRS, len(lags))):
-            lag = lags[self._turn % len(lags)]
-            self._turn = (self._turn + 1) % len(lags)
-            start = self.try_pair(len(self._views) - 1 - lag, len(self._views) - 1)
+        farthest = sum(lag < len(self._views) for lag in LAGS) - 1
+        for _ in range(1 if briefly else MAX_PAIRS):
+            if farthest < 0:
+                break
+            at = min(self._turn, farthest)
+            start = self.try_pair(len(self._views) - 1 - LAGS[at], len(self._views) - 1)
             if start:
                 return start
             assert isinstance(start, Failure)
             best = start
             if start.reason in (FailureReason.TOO_FEW_MATCHES, FailureReason.NO_TEXTURE):
-                self._turn = 0  # those farther back have less in common with it
-                break
+                self._top = max(at - 1, 0)
+            if at == 0 or start.reason is FailureReason.LOW_PARALLAX:
+                self._turn = self._top = min(self._top + 1, farthest)
+            else:
+                self._turn = at - 1
         return best
 
     def try_pair(self, first: int, last: int) -> Start | Failure:

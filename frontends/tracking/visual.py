@@ -230,7 +230,9 @@ class VisualFrontEnd:
             self._careful = True
             bridged = np.count_nonzero(track.landmark_ids >= 0) >= self._config.keyframes.weak_landmarks
             self._apart = frozenset() if bridged else frozenset(self.submap.keyframes)
-        if self._refinder is not None and (track.wide or self._after_gap):
+            if self._refinder is not None and not bridged:
+                self._refinder.begin(track.view.index)
+        if self._refinder is not None and self._after_gap:
             self._refinder.begin(track.view.index)
         self._after_gap = False
 

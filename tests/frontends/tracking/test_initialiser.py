@@ -211,3 +211,26 @@ def test_in_a_hurry_one_pair_is_tried_at_a_time_and_the_map_that_starts_is_right
     translation, rotation = pose_errors(start.T_first_cam, T_true)
     assert rotation.max() < ROTATION_RAD
     assert translation.max() < TRANSLATION * np.linalg.norm(T_true[-1, :3, 3] - T_true[0, :3, 3])
+
+
+@pytest.mark.parametrize("briefly", [False, True])
+def test_pairs_far_enough_apart_are_tried_and_no_nearer_ones_in_vain(
+    briefly: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Too little in common 30 frames back and more, too little parallax up to 5 frames back: 8 and 16 are tried."""
+    starter, tried = initialiser(), []
+
+    def judge(first: int, last: int) -> Failure:
+        lag = last - first
+        tried.append(lag)
+        if lag > 30:
+            return Failure(FailureReason.TOO_FEW_MATCHES, "")
+        return Failure(FailureReason.LOW_PARALLAX if lag < 6 else FailureReason.AMBIGUOUS_MODEL, "")
+
+    monkeypatch.setattr(starter, "try_pair", judge)
+    for view in PointWorld(cloud(), path(110, np.array([0.01, 0, 0]), np.zeros(3))).views():
+        starter.add(view, briefly)
+    late = tried[len(tried) // 2 :]
+    assert late.count(8) + late.count(16) > 0.45 * len(late)
+    assert {8, 16, 32} <= set(late), "farther ones are asked again: the camera may stand still meanwhile"
+    assert 2 not in late

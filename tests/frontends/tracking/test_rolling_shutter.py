@@ -78,6 +78,33 @@ def test_readout_is_found_from_pixels(seed: int) -> None:
     assert all(started[-20:])
 
 
+@pytest.mark.parametrize("dropped", [(), (7, 8), (20, 41, 42, 43, 77), tuple(range(5, 160, 11))], ids=str)
+def test_readout_gets_better_while_no_map_starts_whichever_frames_are_missing(dropped: tuple[int, ...]) -> None:
+    world = PointWorld(cloud(seed=2), shaken(180), seed=2)
+    shutter = RollingShutter(OrbFrontend(), CameraConfig(), 0)
+    found: list[float] = []
+    for i in set(range(180)) - set(dropped):
+        shutter.may_start(shutter.shutter_corrected(read_row_by_row(world, i, READOUT_S), CAMERA), CAMERA)
+        if shutter.readout_s and shutter.readout_s not in found:
+            found.append(shutter.readout_s)
+    assert found[-1] == pytest.approx(READOUT_S, abs=0.003)
+    assert abs(found[-1] - READOUT_S) <= abs(found[0] - READOUT_S) + 0.001
+
+
+def test_frames_that_were_corrected_are_corrected_anew() -> None:
+    """By twice the readout from what was read, not from what was corrected."""
+    world = PointWorld(cloud(seed=1), shaken(30), seed=1)
+    views = [read_row_by_row(world, i, READOUT_S) for i in range(30)]
+    shutter = RollingShutter(OrbFrontend(), CameraConfig(readout_s=READOUT_S / 2), 0)
+    half = [shutter.shutter_corrected(view, CAMERA) for view in views]
+    shutter._was_s, shutter.readout_s = READOUT_S / 2, READOUT_S
+    anew = shutter.all_corrected(half, CAMERA)
+    direct = RollingShutter(OrbFrontend(), CameraConfig(readout_s=READOUT_S), 0)
+    for view, again in zip(views, anew, strict=True):
+        expected = direct.shutter_corrected(view, CAMERA)
+        assert np.allclose(again.features.uv_px, expected.features.uv_px, atol=0.01)
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_global_shutter_is_left_alone(seed: int) -> None:
     world = PointWorld(cloud(seed=seed), shaken(120), seed=seed)
