@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from dualslam.cli.outputs import check_free
 from dualslam.core.errors import InputError, OutputError
+from dualslam.core.types import FloatArray
 from dualslam.export.exported_map import ExportedMap, flatten, read_stored
 from dualslam.export.formats import FORMATS
 from dualslam.export.images import with_images
+from dualslam.export.metric import by_distance
 from dualslam.io.atomic import write_text
 from dualslam.io.map_store import StoredMap
+from dualslam.io.metric_scale import read_scale
 from dualslam.io.run_folder import TRAJECTORY, TRAJECTORY_KITTI, read_summary
+from dualslam.io.trajectory_files import read_kitti, read_tum, write_tum
 from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.run.sources import open_source
 
@@ -30,16 +35,20 @@ def execute(args: argparse.Namespace) -> int:
     stored = read_stored(args.run)
     numbers = _numbers(args.run)
     exported = flatten(stored)
+    metres = read_scale(args.run)
     if args.distance is not None:
-        exported = exported.scaled(_metres_per_unit(exported, numbers, *args.distance))
+        metres = by_distance(exported, numbers, *args.distance).metres_per_unit
+    if metres is not None:
+        exported = exported.scaled(metres)
     chosen = FORMATS[args.to]
     if args.images is not None:
         exported = _with_images(args, stored, exported, numbers)
     chosen.write(exported, args.out)
     if not args.quiet:
         errors = exported.reprojection_errors_px()
+        unit = "the map's unit" if metres is None else "metres"
         print(
-            f"{len(exported.frame)} views, {len(exported.xyz)} points, {len(exported.view)} observations, "
+            f"{len(exported.frame)} views, {len(exported.xyz)} points, {len(exported.view)} observations, in {unit}, "
             f"mean reprojection error {np.nanmean(errors):.3f} px; {args.to} in {args.out}",
             flush=True,
         )
@@ -66,30 +75,29 @@ def _copy_trajectory(args: argparse.Namespace) -> int:
     source = args.run / TRAJECTORIES[args.to]
     if not source.is_file():
         raise InputError(f"{args.run} has no {source.name}; give a run folder.")
-    write_text(args.out, source.read_text())
+    metres = read_scale(args.run)
+    if metres is None:
+        write_text(args.out, source.read_text())
+    elif args.to == "tum":
+        trajectory = read_tum(source)
+        write_tum(args.out, replace(trajectory, T_world_cam=_in_metres(trajectory.T_world_cam, metres)))
+    else:
+        rows = [" ".join(f"{x:.9g}" for x in T[:3].ravel()) for T in _in_metres(read_kitti(source), metres)]
+        write_text(args.out, "".join(f"{row}\n" for row in rows))
     if not args.quiet:
         print(f"trajectory in {args.out}", flush=True)
     return 0
 
 
+def _in_metres(T_world_cam: FloatArray, metres: float) -> FloatArray:
+    T = np.array(T_world_cam)
+    T[:, :3, 3] *= metres
+    return T
+
+
 def _numbers(run: Path) -> FrameNumbers:
     summary = read_summary(run)
     return FrameNumbers(summary.get("first_id", 0), summary.get("first_index"))
-
-
-def _metres_per_unit(exported: ExportedMap, numbers: FrameNumbers, a: int, b: int, metres: float) -> float:
-    row_of = {k: v for v, k in enumerate(exported.frame.tolist())}
-    nearest = [min(row_of, key=lambda k: abs(k - numbers.number_of(i))) for i in (a, b)]
-    for index, k in zip((a, b), nearest, strict=True):
-        if k != numbers.number_of(index):
-            raise InputError(
-                f"--distance: frame {index} is no keyframe of the map; the nearest is {numbers.index_of(k)}."
-            )
-    p, q = (exported.T_world_cam[row_of[k], :3, 3] for k in nearest)
-    length = float(np.linalg.norm(p - q))
-    if not length > 0 or not metres > 0:
-        raise InputError("--distance: give two frames that lie apart, and a distance above 0.")
-    return metres / length
 
 
 def _with_images(

@@ -12,6 +12,10 @@ from dualslam import __version__
 
 WORLDS = ("street", "room", "circuit", "eight", "terrace", "board", "parked", "takeoff", "standstill", "hover")
 EXPORTS = ("bal", "colmap", "g2o", "kitti", "nerfstudio", "ply", "tum")
+DICTIONARIES = (
+    *("apriltag_36h11", "apriltag_25h9", "apriltag_16h5"),
+    *("aruco_4x4", "aruco_5x5", "aruco_6x6", "aruco_original"),
+)
 MAX_PORT = 65535
 SOURCE_HELP = (
     "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours), a folder of images or a video file with --camera or "
@@ -47,6 +51,7 @@ def _build_parser() -> _Parser:
     _add_compare(commands)
     _add_view(commands)
     _add_export(commands)
+    _add_scale(commands)
     _add_render(commands)
     _add_config(commands)
     _add_demo(commands)
@@ -167,6 +172,30 @@ def _add_export(commands: argparse._SubParsersAction[_Parser]) -> None:
     camera.add_argument("--fov", metavar="DEGREES", type=_angle, help="horizontal field of view, as it was given")
 
 
+def _add_scale(commands: argparse._SubParsersAction[_Parser]) -> None:
+    parser, _ = _command(commands, "scale", "Tell a map how long its unit is: its exports are in metres from then on.")
+    parser.add_argument("run", metavar="RUN", type=Path, help="a run folder")
+    known = parser.add_mutually_exclusive_group(required=True)
+    known.add_argument(
+        "--distance",
+        metavar=("FRAME", "FRAME", "METRES"),
+        nargs=3,
+        action=_Distance,
+        help="true distance between two keyframes",
+    )
+    known.add_argument(
+        "--height", metavar="METRES", type=_length, help="of a level camera over the ground that it sees"
+    )
+    known.add_argument("--marker", metavar="METRES", type=_length, help="side of the black square of a marker")
+    parser.add_argument("--images", metavar="SOURCE", help="what the run was made of, to look for markers")
+    parser.add_argument(
+        "--dictionary", choices=DICTIONARIES, default=DICTIONARIES[0], help=f"of markers (default: {DICTIONARIES[0]})"
+    )
+    camera = parser.add_mutually_exclusive_group()
+    camera.add_argument("--camera", metavar="FILE", type=Path, help="calibration, as it was given to the run")
+    camera.add_argument("--fov", metavar="DEGREES", type=_angle, help="horizontal field of view, as it was given")
+
+
 class _Distance(argparse.Action):
     """Two frames and a length."""
 
@@ -269,6 +298,16 @@ def _port(text: str) -> int:
 
 def _positive(text: str) -> int:
     return _integer(text, 1)
+
+
+def _length(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be a length in metres above 0, not {text!r}")
+    return value
 
 
 def _angle(text: str) -> float:

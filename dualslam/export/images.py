@@ -47,7 +47,7 @@ def with_images(
             continue
         c = int(exported.camera[v])
         if c not in maps:
-            maps[c] = _undistortion(camera, exported.K[c], exported.size_px)
+            maps[c] = undistortion(camera, exported.K[c], exported.size_px)
         image = cv2.remap(frame.image, *maps[c], cv2.INTER_LINEAR)
         image = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
         if out is not None:
@@ -60,9 +60,10 @@ def with_images(
     return replace(exported, colour=_medians(exported, seen, known))
 
 
-def _undistortion(
+def undistortion(
     camera: Camera, K: FloatArray, size_px: tuple[int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return for each pixel of the pinhole image K its place in the camera's image: columns and rows, (H, W) each."""
     u, v = np.meshgrid(np.arange(size_px[0], dtype=float), np.arange(size_px[1], dtype=float))
     rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], 1) @ np.linalg.inv(K).T
     raw = np.nan_to_num(camera.project(rays), nan=-1e4).astype(np.float32).reshape(*u.shape, 2)

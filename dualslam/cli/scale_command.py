@@ -1,0 +1,41 @@
+"""`dualslam scale`: tells a map how long its unit is, so that exports are in metres."""
+
+from __future__ import annotations
+
+import argparse
+
+from dualslam.core.errors import InputError
+from dualslam.export.exported_map import flatten, read_stored
+from dualslam.export.metric import MetricScale, by_distance, by_height, by_marker
+from dualslam.io.metric_scale import write_scale
+from dualslam.io.run_folder import read_summary
+from dualslam.map.frame_numbers import FrameNumbers
+from dualslam.run.sources import open_source
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Work out metres per unit of a run's map, and keep it in its run folder."""
+    stored = read_stored(args.run)
+    exported = flatten(stored)
+    summary = read_summary(args.run)
+    numbers = FrameNumbers(summary.get("first_id", 0), summary.get("first_index"))
+    if args.images is not None and args.marker is None:
+        raise InputError("--images goes with --marker: the others need none.")
+    scale: MetricScale
+    if args.distance is not None:
+        scale = by_distance(exported, numbers, *args.distance)
+    elif args.height is not None:
+        scale = by_height(exported, args.height)
+    else:
+        if args.images is None:
+            raise InputError("--marker looks for markers in the run's images: name what it was made of with --images.")
+        assert stored.camera is not None
+        source = open_source(args.images, camera_file=args.camera, fov_degrees=args.fov)
+        if (source.camera.width, source.camera.height) != exported.size_px:
+            raise InputError(f"{args.images} has images of another size than the run's.")
+        scale = by_marker(exported, stored.camera, source, numbers, args.marker, args.dictionary)
+    write_scale(args.run, scale.metres_per_unit, scale.sigma_rel, scale.words)
+    if not args.quiet:
+        how_sure = "" if scale.sigma_rel is None else f" (sigma {100 * scale.sigma_rel:.2g} %)"
+        print(f"a unit of the map is {scale.metres_per_unit:.5g} m{how_sure}: {scale.words}", flush=True)
+    return 0
