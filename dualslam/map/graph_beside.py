@@ -236,7 +236,10 @@ class BesideGraphs:
             self._send(submaps)
             if self._under_way is None:
                 return
-            for ended in self._desk.drain(JobKind.GRAPH):
+            answers = self._desk.drain(JobKind.GRAPH)
+            if not answers:
+                return  # the desk has lost what it was given
+            for ended in answers:
                 if isinstance(ended.result, Failure):
                     log.warning("a graph was left behind at the end: %s", ended.result.detail)
                     return

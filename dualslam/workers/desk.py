@@ -27,6 +27,7 @@ from queue import Empty, SimpleQueue
 from threading import Event, Thread
 from typing import Any
 
+from dualslam.core.errors import ConfigError
 from dualslam.core.memory import keep_freed_memory, peak_rss_mb
 from dualslam.core.types import Failure, FailureReason
 from dualslam.workers.jobs import Ended, Handlers, JobKind
@@ -43,6 +44,8 @@ START_S = 60.0
 """How long a run in real time waits for its workers at most: seconds on a free machine."""
 PAUSE_S = 0.01
 """Between two looks at whether the last jobs have ended, when nothing else is left to do."""
+MAX_STILLBORN = 3
+"""Workers in a row that may end before they were ready: memory may be short for a moment; a script stays wrong."""
 MAX_WAITING = 8
 """Jobs of a kind that may wait: more are nothing but a back end that is behind, and hold their snapshots in memory."""
 
@@ -101,6 +104,11 @@ class Worker:
     def alive(self) -> bool:
         """Whether the process is there to take a job."""
         return self._process.is_alive()
+
+    @property
+    def was_ready(self) -> bool:
+        """Whether the process has ever come as far as to take a job."""
+        return self._ready.is_set()
 
     def wait_until_ready(self, limit_s: float) -> bool:
         """Wait until the process has imported what it needs; return whether it has."""
@@ -211,6 +219,25 @@ class _Queue:
     idle: list[Worker]
     busy: list[_Task] = field(default_factory=list)
     waiting: list[_Job] = field(default_factory=list)
+    n_stillborn: int = 0
+
+    def replaced(self, worker: Worker) -> Worker:
+        """Return a new worker for one that is lost.
+
+        Raises
+        ------
+        ConfigError
+            If several in a row have ended before they were ready.
+        """
+        self.n_stillborn = 0 if worker.was_ready else self.n_stillborn + 1
+        worker.stop()
+        if self.n_stillborn > MAX_STILLBORN:
+            raise ConfigError(
+                f"the {self.lane.name} process ends as it starts, {self.n_stillborn} times in a row. A script that "
+                'uses workers runs its code below `if __name__ == "__main__":`, as every process imports it; or set '
+                "recovery.workers to 0."
+            )
+        return _worker(self.lane)
 
 
 @dataclass(slots=True)
@@ -333,12 +360,11 @@ class WorkerDesk:
             if answer is None:
                 continue
             queue.busy.remove(task)
-            lost = _is_lost(answer.result)
-            queue.idle.append(_replaced(task.worker, queue.lane) if lost else task.worker)
             wall_s = time.monotonic() - task.job.submitted_s
             self._end(task.job.kind, Ended(task.job.work, answer.result, answer.cpu_s, wall_s))
             statistics = self.statistics[task.job.kind]
             statistics.peak_rss_mb = max(statistics.peak_rss_mb, answer.peak_rss_mb)
+            queue.idle.append(queue.replaced(task.worker) if _is_lost(answer.result) else task.worker)
         self._hand_out(queue)
 
     def _end(self, kind: JobKind, ended: Ended) -> None:
@@ -355,7 +381,7 @@ class WorkerDesk:
             worker = queue.idle.pop(0)
             if not worker.alive:
                 log.warning("a %s process had ended while idle; starting another one", queue.lane.name)
-                worker = _replaced(worker, queue.lane)
+                worker = queue.replaced(worker)
             job = min(queue.waiting, key=lambda job: queue.lane.kinds.index(job.kind))  # the first of equals
             queue.waiting.remove(job)
             worker.give(job.kind, job.work)
@@ -372,8 +398,3 @@ def _is_lost(result: Any) -> bool:
 
 def _worker(lane: Lane) -> Worker:
     return Worker(lane.make_handlers, lane.niceness, f"dualslam {lane.name}")
-
-
-def _replaced(worker: Worker, lane: Lane) -> Worker:
-    worker.stop()
-    return _worker(lane)

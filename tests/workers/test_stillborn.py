@@ -1,0 +1,31 @@
+"""Workers that end as they start: a script that is not guarded, most often. Said, not tried for ever."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from dualslam.core.errors import ConfigError
+from dualslam.core.types import Failure
+from dualslam.workers.desk import MAX_STILLBORN, Lane, WorkerDesk
+from dualslam.workers.jobs import Ended, Handlers, JobKind
+
+
+def end_at_once() -> Handlers:
+    raise SystemExit(7)
+
+
+def test_workers_that_end_as_they_start_are_told_of_and_cost_their_jobs() -> None:
+    desk = WorkerDesk([Lane("walks", (JobKind.WALK,), end_at_once, 1, 60.0)], 0.0)
+    ended: list[Ended] = []
+    began = time.monotonic()
+    with pytest.raises(ConfigError, match=r'walks process ends as it starts.*if __name__ == "__main__"'):
+        while time.monotonic() - began < 120:
+            desk.submit(JobKind.WALK, len(ended))
+            while not (answers := desk.poll(JobKind.WALK)):
+                time.sleep(0.01)
+            ended += answers
+    assert len(ended) <= MAX_STILLBORN
+    assert all(isinstance(each.result, Failure) for each in ended)
+    desk.close()
