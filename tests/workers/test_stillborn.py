@@ -16,16 +16,19 @@ def end_at_once() -> Handlers:
     raise SystemExit(7)
 
 
+def submit_until(desk: WorkerDesk, until_s: float, ended: list[Ended]) -> None:
+    while time.monotonic() < until_s:
+        desk.submit(JobKind.WALK, len(ended))
+        while not (answers := desk.poll(JobKind.WALK)):
+            time.sleep(0.01)
+        ended += answers
+
+
 def test_workers_that_end_as_they_start_are_told_of_and_cost_their_jobs() -> None:
     desk = WorkerDesk([Lane("walks", (JobKind.WALK,), end_at_once, 1, 60.0)], 0.0)
     ended: list[Ended] = []
-    began = time.monotonic()
     with pytest.raises(ConfigError, match=r'walks process ends as it starts.*if __name__ == "__main__"'):
-        while time.monotonic() - began < 120:
-            desk.submit(JobKind.WALK, len(ended))
-            while not (answers := desk.poll(JobKind.WALK)):
-                time.sleep(0.01)
-            ended += answers
+        submit_until(desk, time.monotonic() + 120, ended)
     assert len(ended) <= MAX_STILLBORN
     assert all(isinstance(each.result, Failure) for each in ended)
     desk.close()
