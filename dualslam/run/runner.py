@@ -23,6 +23,8 @@ MAX_LATE_S = 1 / 15
 """So late a frame may be while the next one waits: two frames of a camera at 30 Hz, which most often are what a
 keyframe takes more than other frames, and are caught up on after it. At 10 Hz a frame that the next one has overtaken
 is later."""
+PAUSE_S = 0.05
+"""Between two looks at whether a run is to go on."""
 LATE_S = 2e-3
 """What a sleeping process wakes up too late by is no lateness of ours."""
 
@@ -93,6 +95,7 @@ def run_sequence(
     realtime: bool = False,
     pace: Pace | None = None,
     on_frame: Callable[[FrameResult], None] | None = None,
+    is_paused: Callable[[], bool] | None = None,
     clock: Callable[[], float] = time.perf_counter,
     sleep: Callable[[float], None] = time.sleep,
 ) -> RunReport:
@@ -114,6 +117,8 @@ def run_sequence(
         Is told, in real time, how late each frame is.
     on_frame : callable, optional
         Called with the result of each step.
+    is_paused : callable, optional
+        Asked before each frame; the run waits for as long as it says so, or until a signal ends it.
     clock, sleep : callables
         For tests.
 
@@ -138,6 +143,10 @@ def run_sequence(
     frames = schedule.hand_out(source, dropped) if realtime else source
     with _closing(source), _stop_on_signal() as stop:
         while not stop.is_set():
+            while is_paused is not None and is_paused() and not stop.is_set():
+                sleep(PAUSE_S)
+            if stop.is_set():
+                break
             try:
                 frame = next(frames)
             except StopIteration:

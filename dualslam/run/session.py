@@ -39,7 +39,11 @@ class Watcher(Protocol):
         ...
 
     def after(self, frame: Frame, result: FrameResult) -> None:
-        """Look at a frame and what became of it. While this does not return, the run waits."""
+        """Look at a frame and what became of it."""
+        ...
+
+    def is_paused(self) -> bool:
+        """Whether the run is to wait before its next frame."""
         ...
 
     def end(self) -> None:
@@ -138,7 +142,14 @@ def run_to_folder(
         if realtime and isinstance(system.desk, WorkerDesk):
             system.desk.wait_until_ready()
         watched = _Watched(system, SampleKeeper(folder.write_sample), watcher)
-        report = run_sequence(watched, sequence, realtime=realtime, pace=system.pace, on_frame=after_frame)
+        report = run_sequence(
+            watched,
+            sequence,
+            realtime=realtime,
+            pace=system.pace,
+            on_frame=after_frame,
+            is_paused=None if watcher is None else watcher.is_paused,
+        )
         if report.interrupted and system.rows:
             last = next(reversed(system.rows.values()))
             system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap)

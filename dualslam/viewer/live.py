@@ -98,14 +98,17 @@ class LiveView:
         self._teller = Teller(system)
 
     def after(self, frame: Frame, result: FrameResult) -> None:
-        """Tell of a frame, where there is time; wait while a person has paused the run."""
+        """Tell of a frame, where there is time."""
         self._last = frame, result
         self._tell_if_due()
         self._save()
-        while self._paused and self.alive:
+
+    def is_paused(self) -> bool:
+        """Whether a person wants the run to wait; asked for as long as it does. Nobody does once the viewer is gone."""
+        if self._paused and self._last is not None:
             self._tell_if_due()
             self._save()
-            time.sleep(EVERY_S / 4)
+        return self._paused and self.alive
 
     def end(self) -> None:
         """Show how the run ended; the page stays as long as this process does, or until `close`."""

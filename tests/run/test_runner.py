@@ -215,3 +215,27 @@ def test_on_frame_is_told_every_result() -> None:
     seen = []
     run_sequence(FakeSystem(EVERYWHERE), Frames([4, 2]), on_frame=seen.append)  # type: ignore[arg-type]
     assert [result.index for result in seen] == [4, 2]
+
+
+def test_a_paused_run_waits_and_an_interrupt_ends_the_pause() -> None:
+    clock, asked = Clock(), 0
+
+    def paused_at_the_third() -> bool:
+        nonlocal asked
+        asked += 1
+        return 3 <= asked < 13
+
+    report = run_sequence(
+        FakeSystem(EVERYWHERE), Frames(list(range(5))), is_paused=paused_at_the_third, clock=clock, sleep=clock.sleep
+    )
+    assert report.n_frames == 5
+    assert len(clock.slept_s) == 10
+    assert max(report.steps_ms) == 0, "a pause is no latency"
+
+    def pause_and_interrupt() -> bool:
+        signal.raise_signal(signal.SIGINT)
+        return True
+
+    report = run_sequence(FakeSystem(EVERYWHERE), Frames(list(range(5))), is_paused=pause_and_interrupt)
+    assert report.interrupted
+    assert report.n_frames == 0
