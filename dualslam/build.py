@@ -52,6 +52,7 @@ from dualslam.recovery.linking.gates import DESCRIPTOR_RADIUS_PX
 from dualslam.recovery.reverse_tracking import Attempt, RecoveryJob, RecoveryParts, run_recovery
 from dualslam.system import Components, System
 from dualslam.workers.desk import Lane, WorkerDesk
+from dualslam.workers.features_beside import FeaturesBeside
 from dualslam.workers.jobs import Handlers, InlineDesk, JobKind
 
 log = logging.getLogger(__name__)
@@ -65,7 +66,9 @@ WORKER_BUDGET = 0.75
 
 GRAPH_LIMIT_S = 30.0
 """After which the process that has the graphs counts as hung: a batch over a full submap takes a second."""
-WALK_NICENESS = 5
+FEATURES_LIMIT_S = 10.0
+"""After which the process that finds features counts as hung: networks take a second or two on a large image."""
+WALK_NICENESS = 8
 """Of the processes for long work: a third of the share of what tracks, where cores are short."""
 
 
@@ -157,6 +160,7 @@ def build_system(
             adjust_bundle=_adjuster(config),
             graphs=graphs,
             places=places,
+            open_features=partial(_features_beside, desk, config.frontend) if isinstance(desk, WorkerDesk) else None,
         ),
         config,
         saved,
@@ -302,6 +306,11 @@ def walk_handlers(config: Config, size_px: tuple[int, int], n_threads: int) -> H
     }
 
 
+def feature_handlers(config: FrontendConfig) -> Handlers:
+    """Build what the worker for features does: it finds those of one image after the other."""
+    return {JobKind.FEATURES: create_frontend(config).extract}
+
+
 def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript) -> WorkerDesk:
     """Build the desk whose work is done in processes, which are started at once."""
     recovery = config.recovery
@@ -315,8 +324,13 @@ def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript) -
         recovery.time_limit_s,
         niceness=WALK_NICENESS,
     )
-    graphs = Lane("map", (JobKind.GRAPH,), partial(graph_handlers, config), 1, GRAPH_LIMIT_S)
+    graphs = Lane("map", (JobKind.GRAPH,), partial(graph_handlers, config), 1, GRAPH_LIMIT_S, niceness=3)
     return WorkerDesk([graphs, walks], recovery.finish_wait_s, faults.kill_worker)
+
+
+def _features_beside(desk: WorkerDesk, config: FrontendConfig) -> FeaturesBeside:
+    desk.open(Lane("features", (JobKind.FEATURES,), partial(feature_handlers, config), 1, FEATURES_LIMIT_S))
+    return FeaturesBeside(desk)
 
 
 def find_focal(config: Config, frames: Iterable[Frame], size_px: tuple[int, int]) -> FocalSearch | Failure:

@@ -55,7 +55,8 @@ class Components:
 
     `new_relocaliser`: a front end that finds its submap again wherever it is seen, and goes on from there. `desk`:
     where work beside the tracking is done; walks back have an executor of their own, which may stand at the same desk.
-    `graphs`: where submaps' graphs are solved in another process, what brings changes there and back.
+    `graphs`: where submaps' graphs are solved in another process, what brings changes there and back. `open_features`:
+    starts a process more, and returns what has the features of a frame found there.
     """
 
     view_of: Callable[[Frame], View | Failure]
@@ -71,6 +72,7 @@ class Components:
     places: PlaceParts
     desk: Desk
     graphs: BesideGraphs | None = None
+    open_features: Callable[[], Callable[[Frame], Frame]] | None = None
 
     @property
     def K(self) -> FloatArray:
@@ -173,6 +175,17 @@ class System:
     def live(self) -> VisualOdometry | None:
         """The front end of the live submap; None while there is no map."""
         return self._live
+
+    def features_beside(self) -> Callable[[Frame], Frame] | None:
+        """Start a process that finds the features of the frame to come while another is tracked.
+
+        Returns
+        -------
+        callable or None
+            Waits for a frame's features, on a thread of the caller's, and returns the frame with them, to be given to
+            `step`. None where all is done in one process.
+        """
+        return None if self._parts.open_features is None else self._parts.open_features()
 
     def is_walking_back(self, submap_id: int) -> bool:
         """Whether a walk back in time from a submap is under way."""

@@ -34,7 +34,7 @@ class FrameReader:
     def __call__(self, frame: Frame) -> View | Failure:
         """Return the frame's view; a failure where there is no image, or one of another size."""
         camera = self._camera()
-        # 1. Features of the image, and 2. the lens taken out of their pixels.
+        # 1. Features of the image (in real time found beside the tracking), and 2. the lens taken out of their pixels.
         view = view_of(frame, self._frontend, camera, self._model_sigma_px)
         # 3. The rows' times taken out, where the shutter is known to roll.
         return view if isinstance(view, Failure) else self._shutter.shutter_corrected(view, camera)
@@ -50,5 +50,6 @@ def view_of(frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: fl
             FailureReason.UNREADABLE,
             f"frame {frame.index} is {width}x{height}, the calibration is for {camera.width}x{camera.height}",
         )
-    features = rectify(frontend.extract(frame.image), camera, model_sigma_px)
+    found = frontend.extract(frame.image) if frame.features is None else frame.features
+    features = rectify(found, camera, model_sigma_px)
     return View(frame.index, frame.timestamp_s, features, GreyImage.of(to_grey(frame.image)))

@@ -46,12 +46,15 @@ class Frame:
         (H, W) or (H, W, 3) RGB uint8; None where the file could not be read (`error` says why).
     error : str
         Empty, or the reason why the image is missing.
+    features : Features or None
+        What was found in the image already, as the front end's `extract` returns it.
     """
 
     index: int
     timestamp_s: float
     image: NDArray[np.uint8] | None
     error: str = ""
+    features: Features | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)

@@ -21,7 +21,7 @@ def read_ahead(items: Iterator[T], depth: int = 8, *, drop_oldest: bool = False)
     items : iterator
         Closed on its own thread if it is a generator.
     depth : int
-        How many items may wait.
+        How many items may wait: the next one is produced once one of so many has been consumed.
     drop_oldest : bool
         For live sources: a full queue drops its oldest item instead of making the producer wait.
     """
@@ -33,6 +33,13 @@ def read_ahead(items: Iterator[T], depth: int = 8, *, drop_oldest: bool = False)
     finally:
         channel.stop()
         thread.join()
+
+
+class _End:
+    """What stands for the end of the items."""
+
+
+_END = _End()
 
 
 class _Channel(Generic[T]):
@@ -49,9 +56,11 @@ class _Channel(Generic[T]):
 
     def produce(self, items: Iterator[T]) -> None:
         try:
-            for item in items:
-                if not self._put(item):
+            while self._wait_for_room():
+                item = next(items, _END)
+                if isinstance(item, _End):
                     break
+                self._put(item)
         except BaseException as e:  # handed to the consumer, which raises it
             self._error = e
         finally:
@@ -63,17 +72,19 @@ class _Channel(Generic[T]):
                     self._ended = True
                     self._changed.notify_all()
 
-    def _put(self, item: T) -> bool:
+    def _wait_for_room(self) -> bool:
+        """Wait until there is room for an item, before it is produced; return False once nobody wants one any more."""
         with self._changed:
-            if self._drop_oldest and len(self._waiting) >= self._depth:
-                self._waiting.popleft()
-            while len(self._waiting) >= self._depth and not self._stopped:
+            while len(self._waiting) >= self._depth and not self._drop_oldest and not self._stopped:
                 self._changed.wait()
-            if self._stopped:
-                return False
+            return not self._stopped
+
+    def _put(self, item: T) -> None:
+        with self._changed:
+            if len(self._waiting) >= self._depth:
+                self._waiting.popleft()
             self._waiting.append(item)
             self._changed.notify_all()
-            return True
 
     def consume(self) -> Iterator[T]:
         while True:

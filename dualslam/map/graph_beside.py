@@ -127,6 +127,7 @@ class BesideGraph:
     ) -> None:
         self.id = graph_id
         self.is_behind = False
+        self.holds_refused = False  # observations that its own answer refused: they go with the next keyframe
         self.rebuild_asked: bool | None = None  # near the optimum, or not
         self.mirror = SubmapMirror()
         self.noise2 = 1.0
@@ -233,6 +234,8 @@ class BesideGraphs:
     def finish(self, submaps: Mapping[int, Submap]) -> Iterator[Moved]:
         """Let all graphs take in what they lack, as long as that ends soon."""
         while True:
+            for graph in self._graphs.values():
+                graph.is_behind |= graph.holds_refused
             self._send(submaps)
             if self._under_way is None:
                 return
@@ -259,7 +262,7 @@ class BesideGraphs:
             return
         submap, graph = submaps[max(waiting)], self._graphs[max(waiting)]
         near, graph.rebuild_asked = graph.rebuild_asked, None
-        graph.is_behind = False
+        graph.is_behind = graph.holds_refused = False
         self._under_way = submap.id, graph, submap.K
         self._desk.submit(JobKind.GRAPH, GraphJob(graph.id, graph.mirror.delta(submap), near is not None, bool(near)))
 
@@ -283,5 +286,5 @@ class BesideGraphs:
         before = apply_late(submap, *estimate.values)
         rows = estimate.outlier_rows[submap.observations["alive"][estimate.outlier_rows]]
         submap.remove_outliers(rows)
-        graph.is_behind = graph.is_behind or len(rows) > 0
+        graph.holds_refused = len(rows) > 0
         return Moved(submap, before, estimate.rebuilt)

@@ -11,11 +11,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import FrameType
-from typing import Protocol
+from typing import Any, Protocol
 
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame
+from dualslam.io.read_ahead import read_ahead
 from dualslam.map.frame_records import FrameResult
 from dualslam.pace import Pace
 
@@ -23,8 +24,12 @@ MAX_LATE_S = 1 / 15
 """So late a frame may be while the next one waits: two frames of a camera at 30 Hz, which most often are what a
 keyframe takes more than other frames, and are caught up on after it. At 10 Hz a frame that the next one has overtaken
 is later."""
+CATCH_UP_S = 1.0
+"""Who has not been in time for so long does not catch up: the newest frame is then the one to look at."""
 PAUSE_S = 0.05
 """Between two looks at whether a run is to go on."""
+SWITCH_S = 5e-4
+"""How long a thread computes while another waits for its turn, in real time: features would wait 5 ms at each step."""
 LATE_S = 2e-3
 """What a sleeping process wakes up too late by is no lateness of ours."""
 
@@ -93,6 +98,7 @@ def run_sequence(
     sequence: Sequence,
     *,
     realtime: bool = False,
+    prepare: Callable[[Frame], Frame] | None = None,
     pace: Pace | None = None,
     on_frame: Callable[[FrameResult], None] | None = None,
     is_paused: Callable[[], bool] | None = None,
@@ -112,7 +118,10 @@ def run_sequence(
     realtime : bool
         Frames come at the times that their timestamps tell, and those that are too late are dropped before anything is
         done with them: a frame is, if it is more than `MAX_LATE_S` late when the system is ready for it, and the next
-        one is due already.
+        one is due already. A system that has not been in time for `CATCH_UP_S` is given the newest frame.
+    prepare : callable, optional
+        In real time: called with a frame, on a thread of its own, while the one before it is in its step; returns what
+        the system is given.
     pace : Pace, optional
         Is told, in real time, how late each frame is.
     on_frame : callable, optional
@@ -134,45 +143,46 @@ def run_sequence(
     dropped: list[tuple[int, float]] = []
     latencies_ms: list[float] = []
     steps_ms: list[float] = []
-    n_late = 0
     error: InputError | None = None
     bug: Exception | None = None
     began, cpu_began = clock(), _cpu_s()
     source = iter(sequence)
     schedule = _Schedule(clock, sleep)
-    frames = schedule.hand_out(source, dropped) if realtime else source
-    with _closing(source), _stop_on_signal() as stop:
-        while not stop.is_set():
-            while is_paused is not None and is_paused() and not stop.is_set():
-                sleep(PAUSE_S)
-            if stop.is_set():
-                break
-            try:
-                frame = next(frames)
-            except StopIteration:
-                break
-            except InputError as problem:
-                if not latencies_ms:
-                    raise
-                error = problem
-                break
-            before = clock()
-            late_s = schedule.late_s(frame, before) if realtime else 0.0
-            n_late += late_s > LATE_S
-            if pace is not None and realtime:
-                pace.note(late_s)
-            pose_ms = None
-            try:
-                result = system.step(frame)
-                pose_ms = result.pose_ms if realtime else None
-            except Exception as problem:
-                bug = problem
-                break
-            finally:
-                steps_ms.append(1e3 * (clock() - before))
-                latencies_ms.append(1e3 * max(late_s, 0.0) + (steps_ms[-1] if pose_ms is None else pose_ms))
-            if on_frame is not None:
-                on_frame(replace(result, latency_ms=latencies_ms[-1]))
+    frames: Iterator[tuple[Frame, float]] = ((frame, 0.0) for frame in source)
+    if realtime:
+        frames = _prepared(schedule.hand_out(source, dropped), prepare, schedule, clock)
+    with _stop_on_signal() as stop, _switching_quickly(realtime):
+        with _closing(source), _closing(frames):
+            while not stop.is_set():
+                while is_paused is not None and is_paused() and not stop.is_set():
+                    sleep(PAUSE_S)
+                if stop.is_set():
+                    break
+                try:
+                    frame, spent_s = next(frames)
+                except StopIteration:
+                    break
+                except InputError as problem:
+                    if not latencies_ms:
+                        raise
+                    error = problem
+                    break
+                before = clock()
+                late_s = schedule.late_s(frame, before) if realtime else 0.0
+                if pace is not None and realtime:
+                    pace.note(late_s - spent_s)
+                pose_ms = None
+                try:
+                    result = system.step(frame)
+                    pose_ms = result.pose_ms if realtime else None
+                except Exception as problem:
+                    bug = problem
+                    break
+                finally:
+                    steps_ms.append(1e3 * (clock() - before))
+                    latencies_ms.append(1e3 * max(late_s, 0.0) + (steps_ms[-1] if pose_ms is None else pose_ms))
+                if on_frame is not None:
+                    on_frame(replace(result, latency_ms=latencies_ms[-1]))
         interrupted = stop.is_set()
         if not latencies_ms and not interrupted:
             raise InputError(f"{sequence.name} gave no frame; check the source and which frames were asked for.")
@@ -185,7 +195,7 @@ def run_sequence(
         dropped=tuple(dropped),
         latencies_ms=tuple(latencies_ms),
         steps_ms=tuple(steps_ms),
-        n_late=n_late,
+        n_late=schedule.n_late,
         wall_s=clock() - began,
         cpu_s=_cpu_s() - cpu_began,
         peak_rss_mb=_peak_rss_mb(),
@@ -203,6 +213,8 @@ class _Schedule:
         self._sleep = sleep
         self._first_s = 0.0
         self._began = 0.0
+        self._in_time_at = 0.0
+        self.n_late = 0
 
     def late_s(self, frame: Frame, now: float) -> float:
         """Return how long ago a frame was due."""
@@ -215,21 +227,62 @@ class _Schedule:
         if frame is None:
             return
         self._first_s, self._began = frame.timestamp_s, self._clock()
+        self._in_time_at = self._began
         while frame is not None:
-            upcoming = next(frames, None)
+            broken: InputError | None = None
+            try:
+                upcoming = next(frames, None)
+            except InputError as error:  # after the frame in hand
+                upcoming, broken = None, error
             now = self._clock()
             late_s = self.late_s(frame, now)
-            if upcoming is not None and late_s > MAX_LATE_S and self.late_s(upcoming, now) >= 0:
+            if late_s <= LATE_S:
+                self._in_time_at = now
+            may_be_late_s = MAX_LATE_S if now - self._in_time_at < CATCH_UP_S else 0.0
+            if upcoming is not None and late_s > may_be_late_s and self.late_s(upcoming, now) >= 0:
                 dropped.append((frame.index, frame.timestamp_s))
             else:
                 if late_s < 0:
                     self._sleep(-late_s)
+                self.n_late += late_s > LATE_S
                 yield frame
+            if broken is not None:
+                raise broken
             frame = upcoming
 
 
+def _prepared(
+    frames: Iterator[Frame], prepare: Callable[[Frame], Frame] | None, schedule: _Schedule, clock: Callable[[], float]
+) -> Iterator[tuple[Frame, float]]:
+    """Yield frames, and how long each was prepared: the next one is begun when the last was taken.
+
+    One that comes in time finds nothing else to be done: it goes as it is, and leaves the other cores alone.
+    """
+    if prepare is None:
+        return ((frame, 0.0) for frame in frames)
+
+    def prepared() -> Iterator[tuple[Frame, float]]:
+        for frame in frames:
+            began = clock()
+            late = schedule.late_s(frame, began) > LATE_S
+            yield prepare(frame) if late else frame, clock() - began
+
+    return read_ahead(prepared(), depth=1)
+
+
 @contextmanager
-def _closing(frames: Iterator[Frame]) -> Iterator[None]:
+def _switching_quickly(realtime: bool) -> Iterator[None]:
+    """Let threads that wait for a pipe come to their turn soon, beside one that computes."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_S if realtime else before)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+@contextmanager
+def _closing(frames: Iterator[Any]) -> Iterator[None]:
     """Close a source that can be closed: one that reads ahead on a thread ends it then."""
     try:
         yield

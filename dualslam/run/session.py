@@ -16,6 +16,7 @@ from dualslam.core.camera.models import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Sequence
+from dualslam.core.threads import spare_cores
 from dualslam.core.types import Frame
 from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.run_folder import RunFolder, RunRecord
@@ -139,6 +140,7 @@ def run_to_folder(
             if on_frame is not None:
                 on_frame(result)
 
+        prepare = system.features_beside() if realtime and spare_cores(1) else None
         if realtime and isinstance(system.desk, WorkerDesk):
             system.desk.wait_until_ready()
         watched = _Watched(system, SampleKeeper(folder.write_sample), watcher)
@@ -146,6 +148,7 @@ def run_to_folder(
             watched,
             sequence,
             realtime=realtime,
+            prepare=prepare,
             pace=system.pace,
             on_frame=after_frame,
             is_paused=None if watcher is None else watcher.is_paused,

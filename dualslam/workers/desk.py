@@ -93,10 +93,10 @@ class Worker:
         """Hand over a job; one at a time."""
         self._jobs.put((kind, work))
 
-    def result(self) -> _Answer | None:
+    def result(self, wait_s: float = 0.0) -> _Answer | None:
         """Return the outcome of the job, or None while it runs. A worker that has died says so by a `Failure`."""
         try:
-            return self._results.get_nowait()
+            return self._results.get(block=wait_s > 0, timeout=wait_s)
         except Empty:
             return None
 
@@ -292,9 +292,11 @@ class WorkerDesk:
         self.on_start = on_start
         self.statistics: defaultdict[JobKind, QueueStatistics] = defaultdict(QueueStatistics)
         self._finish_wait_s = finish_wait_s
-        self._queues = [_Queue(lane, [_worker(lane) for _ in range(lane.n_workers)]) for lane in lanes]
-        self._by_kind = {kind: queue for queue in self._queues for kind in queue.lane.kinds}
+        self._queues: list[_Queue] = []
+        self._by_kind: dict[JobKind, _Queue] = {}
         self._ended: defaultdict[JobKind, list[Ended]] = defaultdict(list)
+        for lane in lanes:
+            self.open(lane)
 
     @property
     def pids(self) -> list[int | None]:
@@ -304,6 +306,22 @@ class WorkerDesk:
     def wait_until_ready(self) -> bool:
         """Wait, so long and no longer, until all workers are warm: a clock that has begun does not wait for imports."""
         return all(worker.wait_until_ready(START_S) for queue in self._queues for worker in queue.idle)
+
+    def open(self, lane: Lane) -> None:
+        """Start the processes of one more lane."""
+        queue = _Queue(lane, [_worker(lane) for _ in range(lane.n_workers)])
+        self._queues.append(queue)
+        self._by_kind |= dict.fromkeys(lane.kinds, queue)
+
+    def ask(self, kind: JobKind, work: Any) -> Ended:
+        """Have a job done and wait for it, for as long as the lane allows. For one thread, which alone asks for it."""
+        self.submit(kind, work)
+        queue = self._by_kind[kind]
+        while not (ended := self._ended.pop(kind, [])):
+            if not queue.busy:
+                return Ended(work, Failure(FailureReason.WORKER, "the processes were told to end"))
+            self._look(queue, wait=True)
+        return ended[0]
 
     def submit(self, kind: JobKind, work: Any) -> None:
         """Give the job to an idle worker, or let it wait for one."""
@@ -324,7 +342,9 @@ class WorkerDesk:
 
     def n_open(self, kind: JobKind) -> int:
         """Count the jobs of a kind that wait or run."""
-        queue = self._by_kind[kind]
+        queue = self._by_kind.get(kind)
+        if queue is None:
+            return 0
         return sum(job.kind is kind for job in [*queue.waiting, *(task.job for task in queue.busy)])
 
     def drain(self, kind: JobKind) -> list[Ended]:
@@ -351,10 +371,11 @@ class WorkerDesk:
                 worker.stop(STOP_S)
             queue.busy, queue.idle, queue.waiting = [], [], []
 
-    def _look(self, queue: _Queue) -> None:
-        """See what has ended in a lane, and give its idle workers what waits."""
+    def _look(self, queue: _Queue, wait: bool = False) -> None:
+        """See what has ended in a lane, and give its idle workers what waits; `wait`: for as long as a job may take."""
         for task in list(queue.busy):
-            answer, limit_s = task.worker.result(), queue.lane.time_limit_s
+            limit_s = queue.lane.time_limit_s
+            answer = task.worker.result(limit_s if wait else 0.0)
             if answer is None and time.monotonic() - task.began_s > limit_s:
                 answer = _Answer(Failure(FailureReason.TIMEOUT, f"the {task.job.kind} took longer than {limit_s:g} s"))
             if answer is None:

@@ -21,6 +21,7 @@ from dualslam.core.types import Failure
 class JobKind(StrEnum):
     """What is made of a snapshot, the most urgent first."""
 
+    FEATURES = "features"
     GRAPH = "graph"
     CALIBRATION = "calibration"
     LOOP = "loop search"

@@ -285,15 +285,10 @@ def _empty_runs(
 ) -> list[tuple[int, int, int, int]]:
     """Join neighbouring empty cells of a row into windows: FAST costs more per call than per pixel."""
     left, top, right, bottom = window
-    edges = np.diff(np.pad(~occupied, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    rows, starts = np.nonzero(edges == 1)
-    _, stops = np.nonzero(edges == -1)
-    return [
-        (
-            left + start * cell_px,
-            top + row * cell_px,
-            min(left + stop * cell_px, right),
-            min(top + (row + 1) * cell_px, bottom),
-        )
-        for row, start, stop in zip(rows.tolist(), starts.tolist(), stops.tolist(), strict=True)
-    ]
+    empty = np.zeros((occupied.shape[0], occupied.shape[1] + 2), np.bool_)
+    np.logical_not(occupied, out=empty[:, 1:-1])
+    rows, edges = np.nonzero(empty[:, 1:] != empty[:, :-1])  # of each run where it starts, then where it stops
+    rows, starts, stops = rows[::2], edges[::2], edges[1::2]
+    right_of, below = np.minimum(left + stops * cell_px, right), np.minimum(top + (rows + 1) * cell_px, bottom)
+    sides = (left + starts * cell_px, top + rows * cell_px, right_of, below)
+    return list(zip(*(side.tolist() for side in sides), strict=True))

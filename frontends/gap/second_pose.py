@@ -19,6 +19,7 @@ from dualslam.core.chi_square import CHI2_99
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray
+from dualslam.frontends.features.groups import rank_in_runs
 from dualslam.frontends.gates import MIN_CONSENSUS
 from dualslam.frontends.tracking.resection import resect
 
@@ -168,9 +169,11 @@ def _alike(frontend: Frontend, a: NDArray[np.generic], b: NDArray[np.generic]) -
     if not len(a) or not len(b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     distance = np.stack([frontend.distance(np.broadcast_to(row, b.shape), b) for row in a])
-    nearest = np.argsort(distance, axis=1, kind="stable")[:, :N_ALIKE]
-    i, column = np.nonzero(np.take_along_axis(distance, nearest, axis=1) <= frontend.max_distance_strict)
-    return i, nearest[i, column]
+    i, j = np.nonzero(distance <= frontend.max_distance_strict)
+    nearest_first = np.lexsort((distance[i, j], i))
+    i, j = i[nearest_first], j[nearest_first]
+    among_nearest = rank_in_runs(i) < N_ALIKE
+    return i[among_nearest], j[among_nearest]
 
 
 def _explained(T_cam_w: FloatArray, xyz: FloatArray, features: Features, feature: IntArray, K: FloatArray) -> BoolArray:

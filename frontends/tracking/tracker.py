@@ -29,6 +29,12 @@ LOCAL_RADIUS_PX = 4.0
 
 WIDER = 2.5  # second guided search: this many times the first radius
 MAX_EXTRAPOLATION = 3.0  # intervals for which the motion between the last two frames says something
+STEADY_S = 1 / 6
+"""For so long it says something in any case: what carries a camera does not turn round in less. Up to four frames of
+30 Hz that came too late are no gap, whatever the interval before them was."""
+GUIDE_TOLERANCE, POSE_TOLERANCE = 0.1, 1e-3
+"""Chi-square that a step may still promise when a pose counts as found (`refine_pose`): a third of its standard
+deviation where it only guides the search in the local map, a thirtieth where it is the frame's."""
 BEFORE_GAP = 3  # keyframes whose landmarks are asked for a second pose beyond a gap
 GIVEN_POSE_CHI2 = 4 * CHI2_99[2]  # 99 % with 2 degrees of freedom, and the pose off by as much as a pixel
 
@@ -154,7 +160,7 @@ class Tracker:
 
     def lies_beyond_gap(self, view: View) -> bool:
         """Whether so much time has passed since the last posed frame that its motion does not lead to this one."""
-        return self._velocity is not None and self._n_intervals(view.timestamp_s) > MAX_EXTRAPOLATION
+        return self._velocity is not None and self._n_intervals(view.timestamp_s) > self._max_extrapolation
 
     def track_at(self, view: View, pose: GivenPose) -> Track:
         """Take a pose as it is, and look for the landmarks of the keyframes nearest in time under it."""
@@ -231,8 +237,15 @@ class Tracker:
         if self._velocity is None:
             return self._last.T_cam_submap
         # Far beyond the measured interval (frames were lost) the velocity says little.
-        n_intervals = np.clip(self._n_intervals(timestamp_s), 0.0, MAX_EXTRAPOLATION)
+        n_intervals = np.clip(self._n_intervals(timestamp_s), 0.0, self._max_extrapolation)
         return se3.exp(self._velocity[0] * n_intervals) @ self._last.T_cam_submap
+
+    @property
+    def _max_extrapolation(self) -> float:
+        """Intervals over which the velocity says something."""
+        assert self._velocity is not None
+        dt = abs(self._velocity[1])
+        return max(MAX_EXTRAPOLATION, STEADY_S / dt) if dt > 0 else MAX_EXTRAPOLATION
 
     def _n_intervals(self, timestamp_s: float) -> float:
         """Return the time since the last frame, over that in which its velocity was measured."""
@@ -351,7 +364,12 @@ class Tracker:
             return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(ids)} matches, {minimum} needed")
         features = view.features
         estimate = refine_pose(
-            self._submap.K, T_start, xyz_mu, features.uv_rect_px[feature], features.sigma_px[feature]
+            self._submap.K,
+            T_start,
+            xyz_mu,
+            features.uv_rect_px[feature],
+            features.sigma_px[feature],
+            tolerance=GUIDE_TOLERANCE,
         )
         if isinstance(estimate, Failure):
             return estimate
@@ -381,6 +399,7 @@ class Tracker:
             submap.landmarks["xyz_mu"][ids],
             features.uv_rect_px[feature],
             features.sigma_px[feature],
+            tolerance=POSE_TOLERANCE,
         )
         if isinstance(estimate, Failure):
             return estimate

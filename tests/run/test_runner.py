@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -102,6 +103,70 @@ def test_a_frame_may_be_as_late_as_two_of_a_quick_camera() -> None:
     seen, report = quick_run(Quick(list(range(12))), {1: 0.160})
     assert [i for i, _ in report.dropped] == [2, 3]
     assert report.latencies_ms[2] == pytest.approx(1e3 * (1 / 30 + 0.160 - 4 / 30) + 10, abs=0.2)
+
+
+def test_who_is_never_in_time_gets_the_newest_frame() -> None:
+    class Quick(Frames):
+        def __iter__(self) -> Iterator[Frame]:
+            for i in self.indices:
+                yield Frame(i, i / 30, None)
+
+    # 50 ms a step: within a second two of three frames are looked at, up to 1/15 s late; later ones are the newest.
+    seen, report = quick_run(Quick(list(range(120))), dict.fromkeys(range(120), 0.050))
+    late_ms = {i: latency - 50 for i, latency in zip(seen, report.latencies_ms, strict=True)}
+    assert max(late for i, late in late_ms.items() if i < 30) > 50
+    assert max(late for i, late in late_ms.items() if i > 40) < 1e3 / 30
+    assert len(seen) == pytest.approx(120 * (1 / 30) / 0.050, abs=3)
+
+
+def test_late_frames_are_prepared_on_another_thread_and_timely_ones_are_not() -> None:
+    class AtOnce(Frames):
+        def __iter__(self) -> Iterator[Frame]:
+            for i in self.indices:
+                yield Frame(i, 0.0, None)
+
+    def run(frames: Frames, step_s: float) -> tuple[list[int], list[str]]:
+        clock, prepared, threads = Clock(), [], []
+
+        def work(frame: Frame) -> None:
+            clock.now_s += step_s
+
+        def prepare(frame: Frame) -> Frame:
+            prepared.append(frame.index)
+            threads.append(threading.current_thread().name)
+            return frame
+
+        report = run_sequence(
+            FakeSystem(EVERYWHERE, before_step=work),
+            frames,  # type: ignore[arg-type]
+            realtime=True,
+            prepare=prepare,
+            clock=clock,
+            sleep=clock.sleep,
+        )
+        assert len(report.latencies_ms) == len(frames)
+        return prepared, threads
+
+    prepared, threads = run(AtOnce(list(range(5))), 0.010)
+    # The first finds the system idle, and so may the second, which is fetched as the first one's step begins.
+    assert prepared[-3:] == [2, 3, 4]
+    assert threading.current_thread().name not in threads
+    assert run(Frames(list(range(5))), 0.0) == ([], [])
+
+
+def test_a_source_that_breaks_while_frames_are_prepared_ends_the_run_with_what_there_is() -> None:
+    clock, frames = Clock(), Frames([0, 1, 2, 3], break_after=2)
+    report = run_sequence(
+        FakeSystem(EVERYWHERE),
+        frames,  # type: ignore[arg-type]
+        realtime=True,
+        prepare=lambda frame: frame,
+        clock=clock,
+        sleep=clock.sleep,
+    )
+    assert len(report.latencies_ms) == 2
+    assert report.error is not None
+    assert frames.closed
 
 
 def test_the_latency_of_a_keyframe_ends_with_its_pose_and_not_with_the_map() -> None:

@@ -1,0 +1,38 @@
+"""Features of the frame to come, found in a process of their own while the frame before it is tracked."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+from dualslam.core.types import Failure, Frame
+from dualslam.workers.desk import WorkerDesk
+from dualslam.workers.jobs import JobKind
+
+log = logging.getLogger(__name__)
+
+
+class FeaturesBeside:
+    """Has the features of one frame after the other found in another process.
+
+    Called on one thread that is not the tracking's. A process that has died or hangs costs nothing but time: the frame
+    comes back without features, and whoever tracks it finds them.
+
+    Parameters
+    ----------
+    desk : WorkerDesk
+        With a lane for features.
+    """
+
+    def __init__(self, desk: WorkerDesk) -> None:
+        self._desk = desk
+
+    def __call__(self, frame: Frame) -> Frame:
+        """Return the frame with its features."""
+        if frame.image is None:
+            return frame
+        found = self._desk.ask(JobKind.FEATURES, frame.image).result
+        if isinstance(found, Failure):
+            log.warning("frame %d: %s; its features are found beside nothing", frame.index, found.detail)
+            return frame
+        return replace(frame, features=found)
