@@ -17,6 +17,7 @@ import re
 import statistics
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5, help="of each whole sequence")
     parser.add_argument("--trials", type=int, default=4, help="of each sequence and condition of the failure bench")
     parser.add_argument("--worlds", type=int, default=8, help="of each kind of failure in rendered worlds")
-    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=1, help="runs at the same time: their CPU times suffer from it")
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "results")
     parser.add_argument("--write-only", action="store_true", help="from what was measured so far")
     args = parser.parse_args()
@@ -68,12 +69,14 @@ def _begin(out: Path, commit: str) -> None:
 
 def measure_sequences(args: argparse.Namespace) -> None:
     """Run each whole sequence with each seed, with recovery and without; two of them with black frames half-way."""
-    for folder in sorted(path for path in args.data.iterdir() if (path / "images").is_dir()):
-        for condition, options in [*CONDITIONS.items(), *_black(folder, args.out)]:
-            for seed in range(FIRST_SEED, FIRST_SEED + args.seeds):
-                out = args.out / "sequences" / folder.name / (condition or "as it is") / str(seed)
-                if not (out / "summary.json").exists():
-                    _run("run", str(folder), "--out", out, "--overwrite", "--quiet", "--seed", seed, *options)
+    with ThreadPoolExecutor(args.jobs) as pool:
+        for folder in sorted(path for path in args.data.iterdir() if (path / "images").is_dir()):
+            for condition, options in [*CONDITIONS.items(), *_black(folder, args.out)]:
+                for seed in range(FIRST_SEED, FIRST_SEED + args.seeds):
+                    out = args.out / "sequences" / folder.name / (condition or "as it is") / str(seed)
+                    if not (out / "summary.json").exists():
+                        run = ("run", str(folder), "--out", out, "--overwrite", "--quiet", "--seed", seed, *options)
+                        pool.submit(_run, *run)
 
 
 def _black(folder: Path, out: Path) -> list[tuple[str, list[str]]]:
