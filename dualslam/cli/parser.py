@@ -121,7 +121,7 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
         "--workers",
         metavar="N",
         type=_count,
-        help="processes for long work beside the tracking, and one for its graph; in real time (default 1) one for features",
+        help="processes for long work beside the tracking, and one for its graph; --realtime: 1, and one for features",
     )
 
 
