@@ -12,8 +12,8 @@ from dualslam.core.camera.models import Camera
 from dualslam.io.images import ImageReader, ImageStore
 
 MAX_SIDE_PX = 2048
-"""Longer side of images that are read as they are. A frame has a thousand features whatever its size: one of 3840 x 2160
-pixels costs time and memory above all."""
+"""Longer side of images that are read as they are. A frame has a thousand features whatever its size: an image of
+3840 x 2160 pixels costs time and memory above all."""
 
 
 def reduction(camera: Camera, max_side_px: int | None) -> int:
