@@ -105,7 +105,7 @@ def _with_images(
 ) -> ExportedMap:
     assert stored.camera is not None
     camera = stored.camera
-    source = open_source(args.images, camera_file=args.camera, fov_degrees=args.fov)
+    source = open_source(args.images, camera_file=args.camera, fov_degrees=args.fov, max_side_px=max(exported.size_px))
     if (source.camera.width, source.camera.height) != exported.size_px:
         raise InputError(f"{args.images} has images of another size than the run's.")
     has_images = FORMATS[args.to].has_images

@@ -93,9 +93,11 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
         type=Path,
         help="YAML list of corruptions and faults for this run (corruptions), as - {kind: blur, start: 50, length: 9}",
     )
-    camera = parser.add_argument_group("camera").add_mutually_exclusive_group()
+    images = parser.add_argument_group("camera")
+    camera = images.add_mutually_exclusive_group()
     camera.add_argument("--camera", metavar="FILE", type=Path, help="calibration, instead of the source's own")
     camera.add_argument("--fov", metavar="DEGREES", type=_angle, help="horizontal field of view, without a calibration")
+    images.add_argument("--full-size", action="store_true", help="read images of more than 2048 pixels as they are")
     saved = parser.add_argument_group("saved map")
     saved.add_argument(
         "--map", metavar="DIR", type=Path, help="run folder whose map this run finds its frames in, and extends"
@@ -121,7 +123,7 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
         "--workers",
         metavar="N",
         type=_count,
-        help="processes for long work beside the tracking, and one for its graph; in real time (default 1) one for features",
+        help="processes for long work beside the tracking, and one for its graph; --realtime: 1, and one for features",
     )
 
 

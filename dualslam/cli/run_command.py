@@ -14,6 +14,7 @@ from dualslam.cli.console import final_line, progress, stage_table
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.errors import InputError, NoCalibrationError
 from dualslam.io.atomic import atomic_file
+from dualslam.io.reduced import MAX_SIDE_PX
 from dualslam.run.focal import open_without_calibration
 from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import open_source
@@ -34,6 +35,7 @@ def execute(args: argparse.Namespace) -> int:
         "stride": args.stride,
         "max_frames": args.max_frames,
         "reverse": args.reverse,
+        "max_side_px": None if args.full_size else MAX_SIDE_PX,
     }
     focal: FocalSearch | None = None
     try:

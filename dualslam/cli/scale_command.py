@@ -30,7 +30,9 @@ def execute(args: argparse.Namespace) -> int:
         if args.images is None:
             raise InputError("--marker looks for markers in the run's images: name what it was made of with --images.")
         assert stored.camera is not None
-        source = open_source(args.images, camera_file=args.camera, fov_degrees=args.fov)
+        source = open_source(
+            args.images, camera_file=args.camera, fov_degrees=args.fov, max_side_px=max(exported.size_px)
+        )
         if (source.camera.width, source.camera.height) != exported.size_px:
             raise InputError(f"{args.images} has images of another size than the run's.")
         scale = by_marker(exported, stored.camera, source, numbers, args.marker, args.dictionary)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
@@ -12,6 +13,7 @@ from dualslam.core.camera.models import Camera, camera_from_fov
 from dualslam.core.errors import InputError, NoCalibrationError
 from dualslam.io import dataset_folder, euroc, folder, kitti, tum_mono, tum_rgbd, video
 from dualslam.io.camera_files import make_camera, read_camera_file
+from dualslam.io.reduced import MAX_SIDE_PX, ReducedImages, reduced_camera, reduction
 from dualslam.io.sequence import Given, RecordedSequence, Recording, Selection, check_image_size, image_size
 from dualslam.io.video import WebcamSequence
 
@@ -46,6 +48,7 @@ def open_sequence(
     times: str | Path | ArrayLike | None = None,
     rate_hz: float | None = None,
     grey: bool = True,
+    max_side_px: int | None = MAX_SIDE_PX,
 ) -> RecordedSequence | WebcamSequence:
     """Open a source of frames, whatever it is.
 
@@ -68,6 +71,8 @@ def open_sequence(
         Frames a second of a plain folder without times.
     grey : bool
         Decode to (H, W) grey; otherwise (H, W, 3) RGB.
+    max_side_px : int or None
+        Larger recorded images are read smaller, by a whole factor, and their camera with them; None: never.
 
     Raises
     ------
@@ -90,6 +95,7 @@ def open_sequence(
     else:
         calibration = recording.calibration if camera_file is None else str(camera_file)
         check_image_size(recording.images, recording.name, camera, calibration)
+    recording, camera = _reduced(recording, camera, max_side_px)
     log.info("%s: %d frames, %s", recording.name, len(recording.images), camera)
     return RecordedSequence(recording, camera, selection, grey=grey)
 
@@ -107,6 +113,16 @@ def _open_recording(source: Path, given: Given) -> Recording:
         f"{source} is no sequence that can be read: it holds neither images nor a layout of ours, KITTI odometry, "
         "TUM RGB-D, TUM-Mono or EuRoC; check the path."
     )
+
+
+def _reduced(recording: Recording, camera: Camera, max_side_px: int | None) -> tuple[Recording, Camera]:
+    factor = reduction(camera, max_side_px)
+    if factor == 1:
+        return recording, camera
+    small = reduced_camera(camera, factor)
+    sizes = camera.width, camera.height, small.width, small.height
+    log.warning("%s: its images of %d x %d pixels are read as %d x %d", recording.name, *sizes)
+    return replace(recording, images=ReducedImages(recording.images, factor)), small
 
 
 def _camera_from_fov(recording: Recording, fov_degrees: float | None) -> Camera:

@@ -15,6 +15,7 @@ from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame
 from dualslam.io.open_sequence import open_sequence
 from dualslam.io.read_ahead import read_ahead
+from dualslam.io.reduced import MAX_SIDE_PX
 from dualslam.io.sequence import Selection
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.lab.synthetic import SyntheticSequence, make_sequence, parse_events
@@ -34,6 +35,7 @@ def open_source(
     stride: int = 1,
     max_frames: int | None = None,
     reverse: bool = False,
+    max_side_px: int | None = MAX_SIDE_PX,
 ) -> Sequence:
     """Open a source of frames.
 
@@ -46,6 +48,8 @@ def open_source(
         Calibration of a source that has none.
     start, stride, max_frames, reverse : optional
         Which frames, counted in the source.
+    max_side_px : int or None
+        Larger recorded images are read smaller, by a whole factor; None: never.
 
     Raises
     ------
@@ -63,6 +67,7 @@ def open_source(
         stride=stride,
         max_frames=max_frames,
         reverse=reverse,
+        max_side_px=max_side_px,
     )
 
 

@@ -1,0 +1,73 @@
+"""Large images read smaller: by whole factors, each pixel the mean of those that it covers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.camera.models import Camera
+from dualslam.io.images import ImageReader, ImageStore
+
+MAX_SIDE_PX = 2048
+"""Longer side of images that are read as they are. A frame has a thousand features whatever its size: an image of
+3840 x 2160 pixels costs time and memory above all."""
+
+
+def reduction(camera: Camera, max_side_px: int | None) -> int:
+    """Return the least whole factor by which a camera's images fit; 1 without a limit."""
+    if max_side_px is None:
+        return 1
+    side, factor = max(camera.width, camera.height), 1
+    while side // factor > max_side_px:
+        factor += 1
+    return factor
+
+
+def reduced_camera(camera: Camera, factor: int) -> Camera:
+    """Return the camera of images of which `factor` x `factor` pixels became one; what is left over is cut off."""
+    return replace(
+        camera,
+        width=camera.width // factor,
+        height=camera.height // factor,
+        fx=camera.fx / factor,
+        fy=camera.fy / factor,
+        cx=(camera.cx + 0.5) / factor - 0.5,
+        cy=(camera.cy + 0.5) / factor - 0.5,
+    )
+
+
+class ReducedImages:
+    """The images of another store, smaller.
+
+    Parameters
+    ----------
+    images : ImageStore
+    factor : int
+    """
+
+    def __init__(self, images: ImageStore, factor: int) -> None:
+        self._images, self._factor = images, factor
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def reader(self, grey: bool) -> ImageReader:
+        """Return a reader of these images."""
+        return _ReducedReader(self._images.reader(grey), self._factor)
+
+
+class _ReducedReader:
+    def __init__(self, reader: ImageReader, factor: int) -> None:
+        self._reader, self._factor = reader, factor
+
+    def read(self, index: int) -> NDArray[np.uint8]:
+        image, n = self._reader.read(index), self._factor
+        height, width = image.shape[0] // n, image.shape[1] // n
+        whole = image[: height * n, : width * n]
+        return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+    def close(self) -> None:
+        self._reader.close()

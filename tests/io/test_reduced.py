@@ -1,0 +1,69 @@
+"""Large images are read smaller, and their camera with them."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dualslam.core.camera.models import PinholeCamera
+from dualslam.io import open_sequence
+from dualslam.io.reduced import MAX_SIDE_PX, reduced_camera, reduction
+
+CALIB = "50 52 20.5 14.5 43 31\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three images of 43 x 31 pixels whose grey level is the column."""
+    (tmp_path / "images").mkdir()
+    image = np.tile(np.arange(43, dtype=np.uint8), (31, 1))
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), image)
+    (tmp_path / "times.txt").write_text("0\n1\n2\n")
+    (tmp_path / "calib.txt").write_text(CALIB)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "factor"),
+    [(640, 480, 1), (2048, 1536, 1), (2704, 1520, 2), (2160, 3840, 2), (3840, 2160, 2), (5999, 4000, 3), (8192, 4, 4)],
+)
+def test_images_are_reduced_no_further_than_they_must(width: int, height: int, factor: int) -> None:
+    camera = PinholeCamera(width=width, height=height, fx=1.0, fy=1.0, cx=0.0, cy=0.0)
+    assert reduction(camera, MAX_SIDE_PX) == factor
+    small = reduced_camera(camera, factor)
+    # Whoever names the size of the small ones gets the same again: an export, of a run's images.
+    assert reduction(camera, max(small.width, small.height)) == factor
+    assert reduction(camera, None) == 1
+
+
+def test_a_point_falls_on_the_pixel_that_covers_it() -> None:
+    camera = PinholeCamera(width=43, height=31, fx=50.0, fy=52.0, cx=20.5, cy=14.5)
+    point = np.array([[0.1, -0.05, 1.0]])
+    large, small = camera.project(point), reduced_camera(camera, 3).project(point)
+    np.testing.assert_allclose(small + 0.5, (large + 0.5) / 3)
+
+
+def test_a_sequence_of_large_images_is_read_smaller_and_says_so(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        sequence = open_sequence(folder, max_side_px=21)
+    assert (sequence.camera.width, sequence.camera.height) == (21, 15)
+    assert sequence.camera.fx == 25.0
+    assert "43 x 31 pixels are read as 21 x 15" in caplog.text
+    frames = list(sequence)
+    assert [frame.error for frame in frames] == ["", "", ""]
+    image = frames[0].image
+    assert image is not None
+    np.testing.assert_allclose(image[0], np.arange(21) * 2 + 0.5, atol=0.51)
+
+
+def test_small_images_and_those_that_are_wanted_whole_stay_as_they_are(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for sequence in (open_sequence(folder), open_sequence(folder, max_side_px=None)):
+        assert sequence.camera.width == 43
+    assert not caplog.text
