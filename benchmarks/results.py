@@ -17,7 +17,7 @@ import re
 import statistics
 import subprocess
 import sys
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -69,17 +69,16 @@ def _begin(out: Path, commit: str) -> None:
 
 def measure_sequences(args: argparse.Namespace) -> None:
     """Run each whole sequence with each seed, with recovery and without; two of them with black frames half-way."""
-    runs: list[Future[None]] = []
+    runs: list[tuple[object, ...]] = []
+    for folder in sorted(path for path in args.data.iterdir() if (path / "images").is_dir()):
+        for condition, options in [*CONDITIONS.items(), *_black(folder, args.out)]:
+            for seed in range(FIRST_SEED, FIRST_SEED + args.seeds):
+                out = args.out / "sequences" / folder.name / (condition or "as it is") / str(seed)
+                if not (out / "summary.json").exists():
+                    runs.append(("run", str(folder), "--out", out, "--overwrite", "--quiet", "--seed", seed, *options))
     with ThreadPoolExecutor(args.jobs) as pool:
-        for folder in sorted(path for path in args.data.iterdir() if (path / "images").is_dir()):
-            for condition, options in [*CONDITIONS.items(), *_black(folder, args.out)]:
-                for seed in range(FIRST_SEED, FIRST_SEED + args.seeds):
-                    out = args.out / "sequences" / folder.name / (condition or "as it is") / str(seed)
-                    if not (out / "summary.json").exists():
-                        run = ("run", str(folder), "--out", out, "--overwrite", "--quiet", "--seed", seed, *options)
-                        runs.append(pool.submit(_run, *run))
-        for each in runs:
-            each.result()
+        for _ in pool.map(lambda run: _run(*run), runs):  # one that fails ends those that have not begun
+            pass
 
 
 def _black(folder: Path, out: Path) -> list[tuple[str, list[str]]]:

@@ -68,8 +68,9 @@ GRAPH_LIMIT_S = 30.0
 """After which the process that has the graphs counts as hung: a batch over a full submap takes a second."""
 FEATURES_LIMIT_S = 10.0
 """After which the process that finds features counts as hung: networks take a second or two on a large image."""
-WALK_NICENESS = 8
-"""Of the processes for long work: a third of the share of what tracks, where cores are short."""
+GRAPH_NICENESS, WALK_NICENESS = 3, 8
+"""Of the process that has the graphs, and of those for long work: half and a sixth of the share of what tracks,
+where cores are short."""
 
 
 def check_config(config: Config) -> None:
@@ -324,7 +325,7 @@ def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript) -
         recovery.time_limit_s,
         niceness=WALK_NICENESS,
     )
-    graphs = Lane("map", (JobKind.GRAPH,), partial(graph_handlers, config), 1, GRAPH_LIMIT_S, niceness=3)
+    graphs = Lane("map", (JobKind.GRAPH,), partial(graph_handlers, config), 1, GRAPH_LIMIT_S, niceness=GRAPH_NICENESS)
     return WorkerDesk([graphs, walks], recovery.finish_wait_s, faults.kill_worker)
 
 

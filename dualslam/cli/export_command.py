@@ -21,7 +21,7 @@ from dualslam.io.metric_scale import read_scale
 from dualslam.io.run_folder import TRAJECTORY, TRAJECTORY_KITTI, read_summary
 from dualslam.io.trajectory_files import read_kitti, read_tum, write_tum
 from dualslam.map.frame_numbers import FrameNumbers
-from dualslam.run.sources import open_source
+from dualslam.run.sources import open_images_of_run
 
 TRAJECTORIES = {"tum": TRAJECTORY, "kitti": TRAJECTORY_KITTI}
 """Formats of which a run folder has the file already."""
@@ -105,8 +105,6 @@ def _with_images(
 ) -> ExportedMap:
     assert stored.camera is not None
     camera = stored.camera
-    source = open_source(args.images, camera_file=args.camera, fov_degrees=args.fov, max_side_px=max(exported.size_px))
-    if (source.camera.width, source.camera.height) != exported.size_px:
-        raise InputError(f"{args.images} has images of another size than the run's.")
+    source = open_images_of_run(args.images, exported.size_px, args.camera, args.fov)
     has_images = FORMATS[args.to].has_images
     return with_images(exported, camera, source, numbers, args.out if has_images else None)

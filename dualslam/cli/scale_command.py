@@ -10,7 +10,7 @@ from dualslam.export.metric import MetricScale, by_distance, by_height, by_marke
 from dualslam.io.metric_scale import write_scale
 from dualslam.io.run_folder import read_summary
 from dualslam.map.frame_numbers import FrameNumbers
-from dualslam.run.sources import open_source
+from dualslam.run.sources import open_images_of_run
 
 
 def execute(args: argparse.Namespace) -> int:
@@ -30,11 +30,7 @@ def execute(args: argparse.Namespace) -> int:
         if args.images is None:
             raise InputError("--marker looks for markers in the run's images: name what it was made of with --images.")
         assert stored.camera is not None
-        source = open_source(
-            args.images, camera_file=args.camera, fov_degrees=args.fov, max_side_px=max(exported.size_px)
-        )
-        if (source.camera.width, source.camera.height) != exported.size_px:
-            raise InputError(f"{args.images} has images of another size than the run's.")
+        source = open_images_of_run(args.images, exported.size_px, args.camera, args.fov)
         scale = by_marker(exported, stored.camera, source, numbers, args.marker, args.dictionary)
     write_scale(args.run, scale.metres_per_unit, scale.sigma_rel, scale.words)
     if not args.quiet:

@@ -35,13 +35,6 @@ def read_ahead(items: Iterator[T], depth: int = 8, *, drop_oldest: bool = False)
         thread.join()
 
 
-class _End:
-    """What stands for the end of the items."""
-
-
-_END = _End()
-
-
 class _Channel(Generic[T]):
     """The queue between the two threads, with an end and a stop that neither side can miss."""
 
@@ -56,11 +49,10 @@ class _Channel(Generic[T]):
 
     def produce(self, items: Iterator[T]) -> None:
         try:
-            while self._wait_for_room():
-                item = next(items, _END)
-                if isinstance(item, _End):
-                    break
+            for item in items:
                 self._put(item)
+                if not self._wait_for_room():
+                    break
         except BaseException as e:  # handed to the consumer, which raises it
             self._error = e
         finally:

@@ -71,6 +71,29 @@ def open_source(
     )
 
 
+def open_images_of_run(
+    source: str | Path, size_px: tuple[int, int], camera_file: str | Path | None, fov_degrees: float | None
+) -> Sequence:
+    """Open what a run was made of, in the size in which the run has read it.
+
+    Parameters
+    ----------
+    source, camera_file, fov_degrees
+        As in `open_source`.
+    size_px : (width, height)
+        Of the run's images.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or has images of another size.
+    """
+    opened = open_source(source, camera_file=camera_file, fov_degrees=fov_degrees, max_side_px=max(size_px))
+    if (opened.camera.width, opened.camera.height) != size_px:
+        raise InputError(f"{source} has images of another size than the run's.")
+    return opened
+
+
 class WorldSequence:
     """Frames of a synthetic world, rendered ahead on a thread, with what a recording offers.
 

@@ -4,12 +4,30 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from dualslam.core.types import Features
+from dualslam.workers.desk import Lane, WorkerDesk
 from dualslam.workers.jobs import Handlers, JobKind
+
+
+@contextmanager
+def working(*lanes: Lane, finish_wait_s: float = 30.0) -> Iterator[WorkerDesk]:
+    """Open a desk, and close it."""
+    desk = WorkerDesk(lanes, finish_wait_s)
+    try:
+        yield desk
+    finally:
+        desk.close()
+
+
+def lane(*kinds: JobKind, time_limit_s: float = 60.0, **settings: Any) -> Lane:
+    """Return a lane of one process that does toy work."""
+    return Lane("toys", kinds, handlers, 1, time_limit_s, **settings)
 
 
 def handlers() -> Handlers:

@@ -7,8 +7,7 @@ import multiprocessing
 import os
 import signal
 import weakref
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from threading import Thread
 from typing import Any
@@ -18,10 +17,10 @@ import pytest
 
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.types import Failure, FailureReason
-from dualslam.testing.desk_work import handlers
+from dualslam.testing.desk_work import handlers, lane, working
 from dualslam.testing.point_world import PointWorld, cloud, hand_held
 from dualslam.testing.waiting import wait_until
-from dualslam.workers.desk import Lane, WorkerDesk
+from dualslam.workers.desk import WorkerDesk
 from dualslam.workers.jobs import Ended, InlineDesk, JobKind
 from dualslam.workers.transport import Channel
 
@@ -98,19 +97,6 @@ def test_what_nobody_holds_any_more_is_let_go_at_the_other_end(ends: tuple[Chann
     through(here, there, "next")
     gc.collect()
     assert held() is None
-
-
-@contextmanager
-def working(*lanes: Lane, finish_wait_s: float = 30.0) -> Iterator[WorkerDesk]:
-    desk = WorkerDesk(lanes, finish_wait_s)
-    try:
-        yield desk
-    finally:
-        desk.close()
-
-
-def lane(*kinds: JobKind, time_limit_s: float = 60.0, **settings: Any) -> Lane:
-    return Lane("toys", kinds, handlers, 1, time_limit_s, **settings)
 
 
 def collect(desk: WorkerDesk, kind: JobKind, n: int = 1) -> list[Ended]:

@@ -8,14 +8,9 @@ from dualslam.build import feature_handlers
 from dualslam.config.settings import FrontendConfig
 from dualslam.core.types import Failure, Frame
 from dualslam.frontends.features.orb import OrbFrontend
-from dualslam.testing.desk_work import handlers
-from dualslam.workers.desk import Lane, WorkerDesk
+from dualslam.testing.desk_work import lane, working
 from dualslam.workers.features_beside import FeaturesBeside
 from dualslam.workers.jobs import JobKind
-
-
-def lane(*kinds: JobKind) -> Lane:
-    return Lane("toys", kinds, handlers, 1, 20.0)
 
 
 def frame(index: int, brightness: int) -> Frame:
@@ -23,23 +18,17 @@ def frame(index: int, brightness: int) -> Frame:
 
 
 def test_a_frame_comes_back_with_its_features() -> None:
-    desk = WorkerDesk([lane(JobKind.FEATURES)], 1.0)
-    try:
+    with working(lane(JobKind.FEATURES)) as desk:
         found = [FeaturesBeside(desk)(frame(i, i + 1)) for i in range(3)]
-    finally:
-        desk.close()
     assert [f.index for f in found] == [0, 1, 2]
     assert [int(f.features.descriptors[0, 0]) for f in found if f.features is not None] == [1, 2, 3]
     assert desk.statistics[JobKind.FEATURES].n_done == 3
 
 
 def test_a_process_that_dies_costs_no_frame() -> None:
-    desk = WorkerDesk([lane(JobKind.FEATURES)], 1.0)
-    try:
+    with working(lane(JobKind.FEATURES)) as desk:
         find = FeaturesBeside(desk)
         dead, after = find(frame(0, 0)), find(frame(1, 9))
-    finally:
-        desk.close()
     assert dead.features is None
     assert dead.image is not None
     assert after.features is not None
@@ -47,24 +36,18 @@ def test_a_process_that_dies_costs_no_frame() -> None:
 
 
 def test_a_frame_without_an_image_stays_as_it_is() -> None:
-    desk = WorkerDesk([lane(JobKind.FEATURES)], 1.0)
-    try:
+    with working(lane(JobKind.FEATURES)) as desk:
         unread = Frame(0, 0.0, None, "cut off")
         assert FeaturesBeside(desk)(unread) is unread
-    finally:
-        desk.close()
 
 
 def test_a_lane_opens_later_and_whoever_asks_waits_for_the_answer() -> None:
-    desk = WorkerDesk([lane(JobKind.GRAPH)], 1.0)
-    try:
+    with working(lane(JobKind.GRAPH)) as desk:
         assert desk.n_open(JobKind.WALK) == 0
         desk.open(lane(JobKind.WALK))
         pid, _ = desk.ask(JobKind.WALK, ("sleep", 0.05)).result
         assert pid in desk.pids
         assert isinstance(desk.ask(JobKind.WALK, ("die", 0.0)).result, Failure)
-    finally:
-        desk.close()
 
 
 def test_the_worker_finds_what_the_front_end_finds() -> None:
