@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import Failure
+from dualslam.core.types import Failure, FloatArray
 from dualslam.map.submap import Submap
 from dualslam.places.recogniser import PlaceCandidate
 from dualslam.places.verification import PlaceMatch, PlaceVerifier
@@ -46,17 +46,25 @@ def search_places(search: PlaceSearch, verifier: PlaceVerifier) -> list[PlaceMat
     ]
 
 
-def follow_maps(match: PlaceMatch, search: PlaceSearch, submaps: Mapping[int, Submap]) -> PlaceMatch | None:
-    """Return a match between submaps as they are now, which have been solved again since the snapshots were made.
+def poses_of(match: PlaceMatch, submaps: Mapping[int, Submap]) -> tuple[FloatArray, FloatArray] | None:
+    """Return the poses (4, 4) of a match's two keyframes in their submaps; None where one of them is no more."""
+    (a, k_a), (b, k_b) = match.place, match.query
+    if a not in submaps or k_a not in submaps[a].keyframes or b not in submaps or k_b not in submaps[b].keyframes:
+        return None
+    return submaps[a].T_submap_kf[k_a], submaps[b].T_submap_kf[k_b]
 
-    What holds is how the two keyframes lie to each other. None where one of them is no more.
+
+def follow_maps(
+    match: PlaceMatch, then: tuple[FloatArray, FloatArray], submaps: Mapping[int, Submap]
+) -> PlaceMatch | None:
+    """Return a match between submaps as they are now, which have been solved again since it was made.
+
+    What holds is how the two keyframes lie to each other. None where one of them is no more. `then`: their poses when
+    the match was made.
     """
-    now, then = [], []
-    for m, k in (match.place, match.query):
-        if m not in submaps or k not in submaps[m].keyframes:
-            return None
-        now.append(submaps[m].T_submap_kf[k])
-        then.append(search.submaps[m].T_submap_kf[k])
+    now = poses_of(match, submaps)
+    if now is None:
+        return None
     if all(np.array_equal(a, b) for a, b in zip(now, then, strict=True)):
         return match
     (place_now, query_now), (place_then, query_then) = now, then
