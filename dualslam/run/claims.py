@@ -15,11 +15,14 @@ from dualslam.core.geometry.projection import projection_jacobians
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking.gates import PIXEL_CHI2
-from dualslam.recovery.linking.scale_observability import scale_sigma_between
+from dualslam.recovery.linking.scale_observability import scale_sigmas_between
 
 GROUP = 5
 """Keyframes over which the scale is handed on from those before to those after: about as long as a landmark lives on a
 road, so that it is not the same ones that both see."""
+TOGETHER = 2
+"""Groups that are asked of one set of normal equations, which takes little longer than for one. With more the sigmas
+sink, by a quarter with 6 (a room), since more of the map holds the scale: the inflation below is not made for that."""
 MIN_LANDMARKS = 6
 POSITION_INFLATION, SCALE_INFLATION = 1.1, 1.8
 """Errors of neighbouring pixels and views are alike, and do not average out as the sigmas suppose. Chosen so that what
@@ -74,13 +77,12 @@ def _position_sigma(submap: Submap, keyframe_id: int) -> float:
 def _scale_sigmas(submap: Submap) -> dict[int, float]:
     """Ask, for each group of keyframes, how well those before and those after it hold one scale."""
     ids = np.array(sorted(submap.keyframes), np.int64)
-    sigmas: dict[int, float] = {}
-    for begin in range(0, len(ids), GROUP):
-        group = ids[begin : begin + GROUP]
-        before, after = ids[max(begin - GROUP, 0) : begin], ids[begin + GROUP : begin + 2 * GROUP]
-        here, there = (before if len(before) else group), (after if len(after) else group)
-        sigma = (
-            float("nan") if here is there else SCALE_INFLATION * scale_sigma_between(submap, here, there, PIXEL_CHI2)
-        )
-        sigmas |= dict.fromkeys(group.tolist(), sigma)
-    return sigmas
+    groups = [ids[begin : begin + GROUP] for begin in range(0, len(ids), GROUP)]
+    sigma_of: dict[int, float] = {}
+    for begin in range(0, len(groups), TOGETHER):
+        asked = range(begin, min(begin + TOGETHER, len(groups)))
+        # At either end of the map the group itself stands for those that are missing.
+        around = [(groups[max(g - 1, 0)], groups[min(g + 1, len(groups) - 1)]) for g in asked]
+        for g, sigma in zip(asked, scale_sigmas_between(submap, around, PIXEL_CHI2), strict=True):
+            sigma_of |= dict.fromkeys(groups[g].tolist(), SCALE_INFLATION * sigma)
+    return sigma_of if len(groups) > 1 else dict.fromkeys(sigma_of, float("nan"))

@@ -9,6 +9,7 @@ their points. That ratio does not depend on the gauge.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,12 +48,24 @@ def scale_sigma_between(submap: Submap, here: IntArray, there: IntArray, pixel_c
     float
         Inflated as the links' own covariances are. Infinite where the places do not hang together, or one is empty.
     """
+    return scale_sigmas_between(submap, [(here, there)], pixel_chi2)[0]
+
+
+def scale_sigmas_between(submap: Submap, places: Sequence[tuple[IntArray, IntArray]], pixel_chi2: float) -> list[float]:
+    """Return the same for several pairs of places that lie near each other, from one set of normal equations."""
     held = np.array(sorted(submap.keyframes))
-    here, there = (ids[np.isin(ids, held)] for ids in (here, there))
-    if not len(here) or not len(there):
-        return np.inf
-    place = np.searchsorted(held, [min(here.min(), there.min()), max(here.max(), there.max())])
-    problem = _linearise(submap, held[max(place[0] - N_AROUND, 0) : place[1] + N_AROUND + 1], pixel_chi2)
+    pairs = [[ids[np.isin(ids, held)] for ids in pair] for pair in places]
+    asked = np.concatenate([ids for pair in pairs for ids in pair])
+    if not len(asked):
+        return [np.inf] * len(pairs)
+    first, last = np.searchsorted(held, [asked.min(), asked.max()])
+    problem = _linearise(submap, held[max(first - N_AROUND, 0) : last + N_AROUND + 1], pixel_chi2)
+    values, vectors = np.linalg.eigh(problem.reduced)
+    return [_sigma(problem, values, vectors, here, there) for here, there in pairs]
+
+
+def _sigma(problem: _Problem, values: FloatArray, vectors: FloatArray, here: IntArray, there: IntArray) -> float:
+    """Ask the normal equations, whose reduced part has these eigenvalues and eigenvectors, for one pair of places."""
     g = [_scale_at(problem, ids) for ids in (there, here)]
     if g[0] is None or g[1] is None:
         return np.inf
@@ -60,7 +73,6 @@ def scale_sigma_between(submap: Submap, here: IntArray, there: IntArray, pixel_c
     # The points are eliminated: what remains of the functional is one of the poses.
     through = np.einsum("nij,nj->ni", problem.inverse, g_point)
     g_pose = g_pose - problem.H_cross @ through.reshape(-1)
-    values, vectors = np.linalg.eigh(problem.reduced)
     along = vectors.T @ g_pose
     stiff = values > NO_TIE * float(np.median(values))
     stiff[:N_GAUGE] = False
