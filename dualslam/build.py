@@ -42,6 +42,7 @@ from dualslam.health import judge_track
 from dualslam.io.map_store import StoredMap
 from dualslam.lab.disturbances import FaultScript
 from dualslam.map.graph_beside import BesideGraphs, GraphServer
+from dualslam.map.skeleton import answer_edges
 from dualslam.map.submap import Submap
 from dualslam.places import FaissRecogniser, PlaceVerifier
 from dualslam.places.revisits import PlaceParts
@@ -54,6 +55,7 @@ from dualslam.system import Components, System
 from dualslam.workers.desk import Lane, WorkerDesk
 from dualslam.workers.features_beside import FeaturesBeside
 from dualslam.workers.jobs import Handlers, InlineDesk, JobKind
+from dualslam.workers.start_beside import StartBeside, StartServer
 
 log = logging.getLogger(__name__)
 
@@ -149,7 +151,7 @@ def build_system(
     return System(
         Components(
             view_of=faults.around_views(reader),
-            new_starter=live.new_starter,
+            new_starter=partial(_starter_beside, desk, live) if isinstance(desk, WorkerDesk) else live.new_starter,
             new_graph=graphs.new_graph if graphs is not None else live.new_graph,
             new_odometry=faults.around_odometry(live.new_odometry),
             new_relocaliser=faults.around_odometry(live.new_relocaliser),
@@ -188,10 +190,7 @@ class LiveParts:
 
     def new_starter(self) -> Initialiser:
         """Make what collects views until two of them start a map."""
-        config = self.config
-        return Initialiser(
-            self.frontend, _adjuster(config), config.initialiser, self.camera().K, self.size_px, config.seed
-        )
+        return new_initialiser(self.config, self.frontend, self.size_px, self.camera().K)
 
     def new_graph(self) -> ISam2SubmapGraph:
         """Make the factor graph of a submap, solved in this process."""
@@ -210,6 +209,11 @@ class LiveParts:
         refinder = Refinder(submap, frontend, self.camera, config.camera.model_sigma_px)
         window = window_solver(config)
         return VisualFrontEnd(frontend, config, submap, graph, self.size_px, refinder, n_covering, window)
+
+
+def new_initialiser(config: Config, frontend: Frontend, size_px: tuple[int, int], K: FloatArray) -> Initialiser:
+    """Build what starts a map from frames with these intrinsics."""
+    return Initialiser(frontend, _adjuster(config), config.initialiser, K, size_px, config.seed)
 
 
 def place_parts(config: Config, frontend: Frontend, size_px: tuple[int, int]) -> PlaceParts:
@@ -284,24 +288,40 @@ def place_handlers(verifier: PlaceVerifier) -> Handlers:
     return {JobKind.LOOP: lambda search: search_places(search, verifier)}
 
 
+def edge_handlers(config: Config) -> Handlers:
+    """Build what gives covariances of edges within submaps."""
+    solver = atlas_solver(config)
+    return {JobKind.EDGES: lambda question: answer_edges(question, solver.edge_covariances)}
+
+
 def inline_handlers(config: Config, verifier: PlaceVerifier) -> Handlers:
     """Build what is done at once where there are no workers; walks back have an executor of their own."""
-    return {**calibration_handlers(config), **place_handlers(verifier)}
+    return {**edge_handlers(config), **calibration_handlers(config), **place_handlers(verifier)}
 
 
 def graph_handlers(config: Config) -> Handlers:
-    """Build what the worker for the live map does: it keeps and solves the graphs of submaps."""
+    """Build what keeps and solves the graphs of submaps."""
     return {JobKind.GRAPH: GraphServer(lambda: ISam2SubmapGraph(config.graph))}
 
 
+def map_handlers(config: Config, size_px: tuple[int, int]) -> Handlers:
+    """Build what the worker for the live map does: it looks for its start, and has its graph from then on."""
+    frontend = create_frontend(config.frontend)
+    return {
+        JobKind.START: StartServer(partial(new_initialiser, config, frontend, size_px)),
+        **graph_handlers(config),
+    }
+
+
 def walk_handlers(config: Config, size_px: tuple[int, int], n_threads: int) -> Handlers:
-    """Build what a worker for long work does: walks back, calibrations, and the search for places."""
+    """Build what a worker for long work does: walks back, calibrations, the search for places, and for the atlas."""
     budget_s = WORKER_BUDGET * config.recovery.time_limit_s
     frontend = create_frontend(config.frontend)
     parts = recovery_parts(config, size_px, budget_s, frontend, n_threads)
     verifier = place_parts(config, frontend, size_px).verifier
     return {
         JobKind.WALK: lambda job: run_recovery(job, parts),
+        **edge_handlers(config),
         **calibration_handlers(config),
         **place_handlers(verifier),
     }
@@ -319,14 +339,25 @@ def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript) -
     n_threads = min(FEATURE_THREADS, spare_cores(1 + recovery.workers))
     walks = Lane(
         "walks",
-        (JobKind.CALIBRATION, JobKind.LOOP, JobKind.WALK),
+        (JobKind.EDGES, JobKind.CALIBRATION, JobKind.LOOP, JobKind.WALK),
         partial(walk_handlers, config, size_px, n_threads),
         recovery.workers,
         recovery.time_limit_s,
         niceness=WALK_NICENESS,
     )
-    graphs = Lane("map", (JobKind.GRAPH,), partial(graph_handlers, config), 1, GRAPH_LIMIT_S, niceness=GRAPH_NICENESS)
-    return WorkerDesk([graphs, walks], recovery.finish_wait_s, faults.kill_worker)
+    live_map = Lane(
+        "map",
+        (JobKind.START, JobKind.GRAPH),
+        partial(map_handlers, config, size_px),
+        1,
+        GRAPH_LIMIT_S,
+        niceness=GRAPH_NICENESS,
+    )
+    return WorkerDesk([live_map, walks], recovery.finish_wait_s, faults.kill_worker)
+
+
+def _starter_beside(desk: WorkerDesk, live: LiveParts) -> StartBeside:
+    return StartBeside(desk, live.new_starter(), live.camera().K)
 
 
 def _features_beside(desk: WorkerDesk, config: FrontendConfig) -> FeaturesBeside:

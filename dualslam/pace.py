@@ -3,8 +3,8 @@
 Two things can be behind: the tracking, when frames are looked at after their time, and the back end, when keyframes
 wait for the graph that runs beside. In either case new keyframes are what there is to save: each costs the tracking its
 insertion and the back end its solution. A keyframe that is due but not urgent is put off until both have caught up.
-While there is no map, one pair of frames is tried at a time: a start that comes late costs more than frames that are
-dropped.
+While there is no map, a start is looked for beside the frames (`workers/start_beside.py`), or, without processes, by
+one pair of frames at a time: a start that comes late costs more than frames that are dropped.
 
 Only real time has a pace. Without it nothing here ever changes what a run does.
 """

@@ -126,7 +126,12 @@ class System:
         self._health = HealthMonitor(config.health)
         self._leaps = LeapWatch()
         self._connections = Connections(
-            record, components.atlas_solver, components.new_graph, components.adjust_bundle, self._front_ends
+            record,
+            components.atlas_solver,
+            components.new_graph,
+            components.adjust_bundle,
+            components.desk,
+            self._front_ends,
         )
         self._weak_landmarks = config.keyframes.weak_landmarks
         self.pace = Pace()
@@ -273,7 +278,13 @@ class System:
             if start.reason is FailureReason.DOUBTFUL_INITIALISATION:
                 self._record.event(EventKind.INITIALISATION_REFUSED, view, None, reason=start.detail, **start.numbers)
             return start
-        return self._begin_submap(start, view)
+        outcome = self._begin_submap(start, start.views[-1])
+        # A search beside the tracking finds a start that ends some frames back: go on from there.
+        for later in [v for v in self.buffer if start.views[-1].index < v.index <= view.index]:
+            if self._live is None:
+                break
+            outcome = self._track(self._live, later)
+        return outcome
 
     def _relocalise(self, view: View) -> Track | None:
         """Go on in the map that was lost last, where two frames in a row show it."""

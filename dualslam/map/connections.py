@@ -37,8 +37,9 @@ from dualslam.map.bending import Move, bend_frames, bend_link, bend_submap, hold
 from dualslam.map.overlap_sides import OverlapRefinement, apply_overlap, overlap_problem
 from dualslam.map.propagation import propagate_anchors, propagate_links, propagate_poses
 from dualslam.map.record import FrameStamp, Record
-from dualslam.map.skeleton import EdgeCovariances, Skeleton, build_skeleton, skeleton_knots
+from dualslam.map.skeleton import Covariances, EdgeCovariances, Skeleton, build_skeleton, skeleton_knots
 from dualslam.map.submap import Submap
+from dualslam.workers.jobs import Desk
 
 log = logging.getLogger(__name__)
 
@@ -54,6 +55,8 @@ class Connections:
         Makes an empty graph, for a front end whose submap has been bent.
     adjust : BundleAdjuster
         Of overlaps.
+    desk : Desk
+        Where covariances are computed that are needed soon.
     front_ends : callable
         Gives those that go on, or may go on, in a submap of the atlas.
     """
@@ -64,6 +67,7 @@ class Connections:
         solver: AtlasSolver,
         new_graph: Callable[[], SubmapGraph],
         adjust: BundleAdjuster,
+        desk: Desk,
         front_ends: Callable[[], Iterable[VisualOdometry]] = tuple,
     ) -> None:
         self._record = record
@@ -71,7 +75,7 @@ class Connections:
         self._new_graph = new_graph
         self._adjust = adjust
         self._front_ends = front_ends
-        self._covariances = EdgeCovariances(solver.edge_covariances)
+        self._covariances = EdgeCovariances(solver.edge_covariances, desk)
 
     @property
     def _atlas(self) -> Atlas:
@@ -97,8 +101,17 @@ class Connections:
         report = self._solve(touched, links, now)
         for link in links if report else ():
             if link.kind is LinkKind.ROLLOVER:
-                self._prepare(link.a)
+                self._foresee_rollover(link.a)
         return report
+
+    def foresee(self, link: Link) -> None:
+        """Have computed beside the tracking what the solution with a connection to come needs of the submaps."""
+        self._skeleton({link.a, link.b}, (link,), self._covariances.foresee)
+
+    @property
+    def foreseeing(self) -> bool:
+        """Whether that is still being computed."""
+        return self._covariances.foreseeing
 
     def follow(self, before: Submap, after: Submap, now: FrameStamp) -> None:
         """Let all that is known against a submap follow a change that its own graph has made.
@@ -239,7 +252,7 @@ class Connections:
 
     # --- solving
 
-    def _skeleton(self, touched: set[int], new: Sequence[Link]) -> Skeleton:
+    def _skeleton(self, touched: set[int], new: Sequence[Link], covariances: Covariances | None = None) -> Skeleton:
         """Make the problem of the linked set that new connections make of what they touch."""
         links = [*self._atlas.links, *new]
         component = next(c for c in joined(self._atlas.submaps, links) if touched & set(c))
@@ -249,7 +262,7 @@ class Connections:
             self._atlas,
             component,
             within,
-            self._covariances,
+            covariances or self._covariances,
             lambda link: id(link) not in fresh and not link.rejected,
         )
 
@@ -275,14 +288,11 @@ class Connections:
         self._tell(report, solved, now)
         return report
 
-    def _prepare(self, submap_id: int) -> None:
+    def _foresee_rollover(self, submap_id: int) -> None:
         """Ask a full submap for its covariances now: the first loop of a long run would wait for those of all."""
-        try:
-            knots = skeleton_knots(self._atlas.submaps[submap_id])
-            held = self._atlas.held.get(submap_id, frozenset())
-            self._covariances(self._atlas.submaps[submap_id], list(pairwise(knots)), held)
-        except SolverError as error:
-            log.warning("submap %d: %s", submap_id, error)
+        submap = self._atlas.submaps[submap_id]
+        pairs = list(pairwise(skeleton_knots(submap)))
+        self._covariances.foresee(submap, pairs, self._atlas.held.get(submap_id, frozenset()))
 
     def _to_hold(self, skeleton: Skeleton, submap_id: int) -> tuple[list[int], FloatArray]:
         """Return the knots that are to hold a submap's bend, and what its own factors say from one to the next."""

@@ -8,6 +8,7 @@ out of these measurements (`Atlas.warps`): a bend is no evidence.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 
@@ -15,11 +16,15 @@ import numpy as np
 
 from dualslam.core.atlas_problem import AtlasEdge, AtlasProblem
 from dualslam.core.chi_square import CHI2_999
+from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, sim3, so3
-from dualslam.core.types import FloatArray
+from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.atlas import Atlas, Link, joined
 from dualslam.map.submap import Submap
 from dualslam.map.warp import Warp
+from dualslam.workers.jobs import Desk, JobKind
+
+log = logging.getLogger(__name__)
 
 WITHIN = "within"
 """The kind of an edge between keyframes of one submap."""
@@ -90,27 +95,85 @@ class _Known:
         return seen and bool(change[:3, :3].max() < SAME_TURN_RAD and change[:3, 3].max() < SAME_WAY * way)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeQuestion:
+    """Edges of a submap whose covariances are asked for, and a snapshot of it.
+
+    Attributes
+    ----------
+    submap : Submap
+    pairs : tuple of (int, int)
+        Keyframe ids.
+    held : frozenset of int
+        Keyframes whose relative pose is no evidence.
+    """
+
+    submap: Submap
+    pairs: tuple[tuple[int, int], ...]
+    held: frozenset[int]
+
+
+def answer_edges(question: EdgeQuestion, compute: Covariances) -> FloatArray | Failure:
+    """Return the covariances (E, 7, 7) that a question asks for: a job beside the tracking."""
+    try:
+        return compute(question.submap, question.pairs, question.held)
+    except SolverError as error:
+        log.warning("submap %d: %s", question.submap.id, error)
+        return Failure(FailureReason.SOLVER, str(error))
+
+
 class EdgeCovariances:
     """Covariances of edges within submaps, remembered as long as the edge's keyframes are much as they were.
 
-    `compute`: gives them from a submap's factors.
+    Parameters
+    ----------
+    compute : callable
+        Gives them from a submap's factors, here and now.
+    desk : Desk
+        Where they are computed that `foresee` asks for.
     """
 
-    def __init__(self, compute: Covariances) -> None:
+    def __init__(self, compute: Covariances, desk: Desk) -> None:
         self._compute = compute
+        self._desk = desk
         self._known: dict[tuple[int, int, int], _Known] = {}
 
     def __call__(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
         """Return (E, 7, 7)."""
+        self._collect()
+        if new := self._missing(submap, pairs):
+            self._note(submap, new, self._compute(submap, new, held))
+        return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, 7, 7)
+
+    def foresee(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
+        """Have those that are missing computed beside the tracking; return anything of the right shape."""
+        self._collect()
+        if new := self._missing(submap, pairs):
+            self._desk.submit(JobKind.EDGES, EdgeQuestion(submap.copy(), tuple(new), held))
+        return np.broadcast_to(np.eye(7), (len(pairs), 7, 7))
+
+    @property
+    def foreseeing(self) -> bool:
+        """Whether some are still being computed."""
+        self._collect()
+        return self._desk.n_open(JobKind.EDGES) > 0
+
+    def _missing(self, submap: Submap, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
         new = []
         for pair in pairs:
             known = self._known.get((submap.id, *pair))
             if known is None or not known.holds(*_state(submap, pair)):
                 new.append(pair)
-        if new:
-            for pair, C in zip(new, self._compute(submap, new, held), strict=True):
-                self._known[(submap.id, *pair)] = _Known(*_state(submap, pair), C)
-        return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, 7, 7)
+        return new
+
+    def _collect(self) -> None:
+        for ended in self._desk.poll(JobKind.EDGES):
+            if not isinstance(ended.result, Failure):  # else they are computed when they are needed
+                self._note(ended.work.submap, ended.work.pairs, ended.result)
+
+    def _note(self, submap: Submap, pairs: Sequence[tuple[int, int]], covariances: FloatArray) -> None:
+        for pair, C in zip(pairs, covariances, strict=True):
+            self._known[(submap.id, *pair)] = _Known(*_state(submap, pair), C)
 
     def bent(self, submap: Submap, warp: Warp) -> None:
         """Take in that a submap stands otherwise by a solution of the atlas: its own factors say what they said."""

@@ -2,7 +2,7 @@
 
 In reading order: `recogniser` (what recognises, as others see it), `faiss_index` (votes of landmarks), `verification`
 (is it the same place?), `second_pose` (would another pose explain it as well?), `revisits` (when is it asked, believed,
-linked?). faiss is imported here alone.
+linked?).
 """
 
 from dualslam.places.faiss_index import FaissRecogniser

@@ -24,7 +24,7 @@ from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import compose
 from dualslam.places.recogniser import PlaceRecogniser
-from dualslam.places.search import PlaceSearch, follow_maps
+from dualslam.places.search import PlaceSearch, follow_maps, poses_of
 from dualslam.places.verification import PlaceMatch, PlaceVerifier
 from dualslam.recovery.leaps import refuse_leaps
 from dualslam.workers.jobs import Desk, Ended, JobKind
@@ -69,6 +69,18 @@ class _Provisional:
     match: PlaceMatch
     seconds: int = 0
     misses: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Believed:
+    """A place that enough keyframes have confirmed, and where its two keyframes stood then.
+
+    It waits for what the atlas needs to be solved with it.
+    """
+
+    match: PlaceMatch
+    seconds: int
+    then: tuple[FloatArray, FloatArray]
 
 
 @dataclass(slots=True)
@@ -140,6 +152,7 @@ class Revisits:
         self._new_frontend = new_relocaliser
         self._config = config
         self._provisional: _Provisional | None = None
+        self._believed: _Believed | None = None
         self._n_asked = 0
         self._linked_at: dict[tuple[int, int], int] = {}  # counted in `_n_asked`, by pairs of submaps
         self._frontend: _Seeker | None = None
@@ -172,21 +185,21 @@ class Revisits:
         AtlasReport or None
             Of the link that was made.
         """
-        return self._take_answers(self._desk.poll(JobKind.LOOP), live, now)
+        self._take_answers(self._desk.poll(JobKind.LOOP), live, now)
+        return None if self._connections.foreseeing else self._link_believed(live, now)
 
     def finish(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
         """Do the same at the end of the run, with what is under way."""
-        return self._take_answers(self._desk.drain(JobKind.LOOP), live, now)
+        self._take_answers(self._desk.drain(JobKind.LOOP), live, now)
+        return self._link_believed(live, now)
 
-    def _take_answers(self, answers: list[Ended], live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
-        report = None
+    def _take_answers(self, answers: list[Ended], live: VisualOdometry | None, now: FrameStamp) -> None:
         for ended in answers:
             search: PlaceSearch = ended.work
             self._record.timer.add("loop search", ended.cpu_s)
             if isinstance(ended.result, Failure) or live is None or live.submap.id != search.submap_id:
                 continue  # it costs its search
-            report = self._weigh(self._judged(search, ended.result, now), live, now) or report
-        return report
+            self._weigh(self._judged(search, ended.result, now), live.submap, now)
 
     def _judged(self, search: PlaceSearch, results: list[PlaceMatch | Failure], now: FrameStamp) -> PlaceMatch | None:
         """Return the verified place that a keyframe shows, where there is one and nothing contradicts it."""
@@ -195,7 +208,8 @@ class Revisits:
         for candidate, result in zip(search.candidates, results, strict=True):
             match = result
             if not isinstance(match, Failure):
-                followed = follow_maps(match, search, self._record.atlas.submaps)
+                then = poses_of(match, search.submaps)
+                followed = None if then is None else follow_maps(match, then, self._record.atlas.submaps)
                 if followed is None:
                     continue
                 match = self._plausible(followed)
@@ -237,9 +251,9 @@ class Revisits:
 
         return may_be
 
-    def _weigh(self, match: PlaceMatch | None, live: VisualOdometry, now: FrameStamp) -> AtlasReport | None:
-        """Second what is provisional, or begin anew; link once enough keyframes say the same."""
-        waiting, submap = self._provisional, live.submap
+    def _weigh(self, match: PlaceMatch | None, submap: Submap, now: FrameStamp) -> None:
+        """Second what is provisional, or begin anew; believe it once enough keyframes say the same."""
+        waiting = self._provisional
         if waiting is not None and waiting.match.query[0] != submap.id:
             waiting = self._provisional = None
         if match is None:
@@ -249,26 +263,45 @@ class Revisits:
                     why = Failure(FailureReason.UNCONFIRMED, f"seconded {waiting.seconds} times, {N_SECONDS} needed")
                     self._refused(now, submap.id, *waiting.match.place, why)
                     self._provisional = None
-            return None
+            return
         if waiting is None or match.place[0] != waiting.match.place[0] or not self._agree(waiting.match, match):
             self._provisional = _Provisional(match)
-            return None
+            return
         waiting.match = match
         waiting.seconds += 1
         if waiting.seconds < N_SECONDS:
-            return None
+            return
         self._provisional = None
-        return self._link(match, waiting.seconds, live, now)
+        self._believe(match, waiting.seconds)
+
+    def _believe(self, match: PlaceMatch, seconds: int) -> None:
+        """Ask for what the atlas needs to be solved with a place; between its submaps no other is looked for now."""
+        then = poses_of(match, self._record.atlas.submaps)
+        assert then is not None, "it was followed to the submaps as they are"
+        self._believed = _Believed(match, seconds, then)
+        self._linked_at[match.query[0], match.place[0]] = self._n_asked
+        self._connections.foresee(self._link_of(match))
+
+    def _link_believed(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
+        """Link the place that is believed, unless one of its keyframes, or the map that saw it, is no more."""
+        believed, self._believed = self._believed, None
+        if believed is None or live is None or live.submap.id != believed.match.query[0]:
+            return None
+        match = follow_maps(believed.match, believed.then, self._record.atlas.submaps)
+        return None if match is None else self._link(match, believed.seconds, live, now)
+
+    def _link_of(self, match: PlaceMatch) -> Link:
+        (a, keyframe_a), (b, keyframe_b) = match.place, match.query
+        together = any(a in component and b in component for component in self._record.atlas.components())
+        kind = LinkKind.LOOP if together else LinkKind.MERGE
+        return Link(a, b, match.S_place_query, match.covariance, kind, (), keyframe_a, keyframe_b, doubtful=False)
 
     def _link(self, match: PlaceMatch, seconds: int, live: VisualOdometry, now: FrameStamp) -> AtlasReport | None:
         """Hand a link to the atlas, and record whether it was taken."""
         atlas = self._record.atlas
         (a, keyframe_a), (b, keyframe_b) = match.place, match.query
-        together = any(a in component and b in component for component in atlas.components())
-        kind = LinkKind.LOOP if together else LinkKind.MERGE
-        link = Link(a, b, match.S_place_query, match.covariance, kind, (), keyframe_a, keyframe_b, doubtful=False)
+        link = self._link_of(match)
         verdict = self._connections.judge(link)
-        self._linked_at[(b, a)] = self._n_asked
         report = self._connections.connect([link], now)
         if not report:
             assert report.failure is not None
@@ -279,7 +312,7 @@ class Revisits:
             live.adopt(live.graph, live.submap)  # its last frame holds ids that are no more
         chi2 = None if isinstance(verdict, Failure) or not verdict.redundant else verdict.chi2
         self._record.event(
-            EventKind.LOOP_CLOSED if together else EventKind.MERGED,
+            EventKind.LOOP_CLOSED if link.kind is LinkKind.LOOP else EventKind.MERGED,
             now,
             b,
             other_submap=a,

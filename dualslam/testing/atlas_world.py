@@ -18,10 +18,12 @@ from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.connections import Connections
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.record import Record
+from dualslam.map.skeleton import answer_edges
 from dualslam.map.split import next_submap
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose, compose
 from dualslam.testing.point_world import CAMERA, SIZE_PX, make_features
+from dualslam.workers.jobs import InlineDesk, JobKind
 
 N_SHARED = 8
 LINK_SIGMAS = np.array([2e-3] * 3 + [5e-3] * 3 + [5e-3])
@@ -66,11 +68,13 @@ class DriftingMap:
             T.append(T[-1] @ steps[k] @ se3.inverse(self.T_true[k - 1]) @ self.T_true[k])
         self.S_drifted = np.array(T)
         self.record = Record()
+        solver = GtsamAtlasSolver(self.robust, 0.8)
         self.connections = Connections(
             self.record,
-            GtsamAtlasSolver(self.robust, 0.8),
+            solver,
             lambda: ISam2SubmapGraph(GraphConfig()),
             bundle_adjust_arrays,
+            InlineDesk({JobKind.EDGES: lambda question: answer_edges(question, solver.edge_covariances)}),
             lambda: self.front_ends,
         )
         self.front_ends: list[Any] = []

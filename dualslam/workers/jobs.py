@@ -22,7 +22,9 @@ class JobKind(StrEnum):
     """What is made of a snapshot, the most urgent first."""
 
     FEATURES = "features"
+    START = "start search"
     GRAPH = "graph"
+    EDGES = "edge covariances"
     CALIBRATION = "calibration"
     LOOP = "loop search"
     WALK = "walk back"

@@ -12,7 +12,9 @@ from dualslam.core.types import FloatArray, FrameStatus
 from dualslam.map.atlas import LinkKind
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
-from dualslam.testing.point_world import PointWorld, pose_errors
+from dualslam.testing.late_desk import LateDesk
+from dualslam.testing.point_world import PointWorld, pose_errors, system_in
+from dualslam.workers.jobs import JobKind
 from tests.places.worlds import N_LAP, N, driven_lap, lap, ring, run, wall
 
 ROLLING = {"graph": {"max_keyframes": 25, "rollover_keyframes": 6}}
@@ -109,3 +111,34 @@ def test_frames_without_a_map_are_found_in_any_submap() -> None:
     main = trajectories_of(system).main
     assert main.index[-1] == 153
     assert np.linalg.norm(main.T_world_cam[-1, :3, 3] - main.T_world_cam[10, :3, 3]) < 0.05
+
+
+@pytest.mark.parametrize("polls", [3, 12])
+def test_a_loop_whose_covariances_come_late_is_closed_when_they_have_come(polls: int) -> None:
+    world = lap()
+    system = system_in(world)
+    system._connections._covariances._desk = desk = LateDesk(system._parts.desk, polls)
+    closed_at = None
+    for frame in world.frames():
+        system.step(frame)
+        if closed_at is None and system.atlas.links:
+            closed_at = frame.index
+    system.finish()
+    first = closed_lap().events.of_kind(EventKind.LOOP_CLOSED)[0]
+    assert desk.n_polls[JobKind.EDGES] > polls
+    assert closed_at is not None
+    assert closed_at > first.frame, "not before they were there"
+    loop = system.events.of_kind(EventKind.LOOP_CLOSED)[0]
+    assert (loop.data["keyframe"], loop.data["other_frame"]) == (first.data["keyframe"], first.data["other_frame"])
+    assert errors(system).max() < errors(driven_lap()).max()
+
+
+def test_a_loop_that_still_waits_when_the_run_ends_is_closed_then() -> None:
+    world = lap()
+    system = system_in(world)
+    system._connections._covariances._desk = LateDesk(system._parts.desk, 100_000)
+    for frame in world.frames():
+        system.step(frame)
+    assert not system.atlas.links
+    system.finish()
+    assert [link.kind for link in system.atlas.believed] == [LinkKind.LOOP]

@@ -1,0 +1,125 @@
+"""The search for a start in another process: frames without a map are collected there, and tried while others come."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import count
+
+from dualslam.core.interfaces import MapStarter
+from dualslam.core.types import Failure, FailureReason, FloatArray, Start, View
+from dualslam.workers.jobs import Desk, JobKind
+
+MAX_VIEWS = 128
+"""Frames that can be sent once more, to a process that takes the place of another: a start looks no farther back."""
+LOST = (FailureReason.WORKER, FailureReason.TIMEOUT, FailureReason.BUSY)
+"""Ends of a search with which what was collected is lost, too."""
+_SESSIONS = count()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StartQuestion:
+    """Frames to be collected, the last of which is to be tried.
+
+    Attributes
+    ----------
+    session : int
+        Of one search: with another one all that was collected is forgotten.
+    K : (3, 3) float64
+        Intrinsics of the frames.
+    views : tuple of View
+        Those that the search does not know yet, without their images.
+    """
+
+    session: int
+    K: FloatArray
+    views: tuple[View, ...]
+
+
+class StartServer:
+    """Collects and tries, in the process that searches.
+
+    Parameters
+    ----------
+    new_starter : callable
+        Makes what searches among frames of these intrinsics.
+    """
+
+    def __init__(self, new_starter: Callable[[FloatArray], MapStarter]) -> None:
+        self._new_starter = new_starter
+        self._session = -1
+        self._starter: MapStarter | None = None
+
+    def __call__(self, question: StartQuestion) -> Start | Failure:
+        """Try the newest frame."""
+        if self._starter is None or question.session != self._session:
+            self._session, self._starter = question.session, self._new_starter(question.K)
+        *earlier, newest = question.views
+        for view in earlier:
+            self._starter.collect(view)
+        return self._starter.add(newest)
+
+
+class StartBeside:
+    """A `MapStarter` that, where it is to be brief, searches in another process: one frame at a time, the newest.
+
+    Frames that come while one is tried are collected with the next. A start that is found ends with a frame some frames
+    back, and who asked has to go on from there.
+
+    Parameters
+    ----------
+    desk : Desk
+    starter : MapStarter
+        Searches here and now where there is no hurry.
+    K : (3, 3) float64
+        Intrinsics of the frames.
+    """
+
+    def __init__(self, desk: Desk, starter: MapStarter, K: FloatArray) -> None:
+        self._desk = desk
+        self._starter = starter
+        self._K = K
+        self._session = next(_SESSIONS)
+        self._views: deque[View] = deque(maxlen=MAX_VIEWS)
+        self._n_new = 0  # of these, the last ones, that the process does not know
+
+    def collect(self, view: View) -> None:
+        """Keep a view as a possible first view, without trying to start from it."""
+        self._starter.collect(view)
+        self._note(view)
+
+    def add(self, view: View, briefly: bool = False) -> Start | Failure:
+        """Take a view in; return what was found for one that has been tried meanwhile."""
+        if not briefly:
+            self._note(view)
+            return self._starter.add(view)
+        self.collect(view)
+        found = self._found()
+        if not found and not self._desk.n_open(JobKind.START):
+            views = list(self._views)[-self._n_new :]
+            question = StartQuestion(self._session, self._K, tuple(replace(v, image=None) for v in views))
+            self._desk.submit(JobKind.START, question)
+            self._n_new = 0
+        return found
+
+    def _note(self, view: View) -> None:
+        self._views.append(view)
+        self._n_new = min(self._n_new + 1, len(self._views))
+
+    def _found(self) -> Start | Failure:
+        found: Start | Failure = Failure(FailureReason.TOO_FEW_MATCHES, "a start is being looked for")
+        for ended in self._desk.poll(JobKind.START):
+            if ended.work.session != self._session:
+                continue
+            found = ended.result if isinstance(ended.result, Failure) else self._own(ended.result)
+            if isinstance(found, Failure) and found.reason in LOST:
+                self._session, self._n_new = next(_SESSIONS), len(self._views)
+        return found
+
+    def _own(self, start: Start) -> Start | Failure:
+        """Return a start of the views that were sent, with their images."""
+        own = {view.index: view for view in self._views}
+        if any(view.index not in own for view in start.views):
+            return Failure(FailureReason.TIMEOUT, "the start that was found is of frames long ago")
+        return replace(start, views=[own[view.index] for view in start.views])
