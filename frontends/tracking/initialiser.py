@@ -13,7 +13,7 @@ import numpy as np
 
 from dualslam.config.settings import InitialiserConfig
 from dualslam.core.bundle import BundleAdjuster, BundleProblem
-from dualslam.core.chi_square import CHI2_95
+from dualslam.core.chi_square import CHI2_95, CHI2_99, MEDIAN_CHI2
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians, refine_pose
@@ -32,7 +32,7 @@ from dualslam.core.types import (
 )
 from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
 from dualslam.frontends.tracking.resection import resect
-from dualslam.frontends.tracking.two_view_hypotheses import propose_relative_poses
+from dualslam.frontends.tracking.two_view_hypotheses import MIN_NOISE2, propose_relative_poses
 
 MAX_CHI2 = 2.5
 """Mean squared whitened residual per degree of freedom after the bundle adjustment (1 is expected)."""
@@ -44,6 +44,8 @@ MAX_VIEWS = 120
 LAGS = (2, 4, 8, 16, 32, 64)  # frames back that are tried as the first view
 MAX_PAIRS = 2  # tried with each view, in turn: what two views farther apart lack, the next two lack most often as well
 N_WITNESSES = 3  # frames between the two views that must agree
+N_PROOF = 3  # views that prove a point
+PROVEN = 0.5  # share of the points, and of those that a start needs, that are proven: what is most of them decides
 NEAR = 0.5  # share of the points that a start needs at least which must be near: on a road these fix the motion
 RUNNER_UP = 0.75  # a pose that explains less than this share of what the best one does is out of the question,
 UNEXPLAINED_TIMES, UNEXPLAINED_MORE = 2, 20  # and so is one that leaves more than twice as many, and a layer's worth
@@ -260,19 +262,24 @@ class Initialiser:
         except SolverError as error:
             return Failure(FailureReason.SOLVER, str(error), numbers)
         inlier = result.chi2 < CHI2_95[2]
-        n_bad = np.bincount(point_of[~inlier], minlength=len(xyz))
         direction = direction_sigma_deg(problem, result.T_submap_kf, result.xyz_mu, inlier)
-        numbers = {**numbers, "chi2": float(np.median(result.chi2) / 1.386), "direction_sigma_deg": direction}
-        # A point must agree with both ends, and may miss at most one witness.
-        ends_ok = np.ones(len(xyz), bool)
-        ends_ok[point_of[~inlier & ((view_of == 0) | (view_of == len(views) - 1))]] = False
+        chi2 = float(np.median(result.chi2)) / MEDIAN_CHI2[2]
+        numbers = {**numbers, "chi2": chi2, "direction_sigma_deg": direction}
         in_front = np.all(se3.act(se3.inverse(result.T_submap_kf), result.xyz_mu)[..., 2] > 0, axis=0)
-        keep = ends_ok & (n_bad <= 1) & in_front & result.adjusted
+        keep = _agreeing(problem, inlier) & in_front & result.adjusted
         numbers["n_points"] = float(keep.sum())
         if keep.sum() < self._config.min_points or keep.mean() < MIN_SUPPORT:
             return Failure(
                 FailureReason.DOUBTFUL_INITIALISATION, f"{keep.sum()} of {len(xyz)} points survive adjustment", numbers
             )
+        # What repeats itself along the epipolar line fits two views always, and a third, by chance, where pixels are
+        # less noisy than supposed: as a point right before the camera, which pins it. So a point is taken on the word
+        # of three views, by a gate in the residuals' own variance.
+        inlier &= result.chi2 < CHI2_99[2] * float(np.clip(chi2, MIN_NOISE2, 1.0))
+        proven = keep & _agreeing(problem, inlier) & (np.bincount(problem.point[inlier], minlength=len(xyz)) >= N_PROOF)
+        if proven.sum() < PROVEN * max(int(keep.sum()), self._config.min_points):
+            detail = f"three views prove {proven.sum()} of {keep.sum()} points"
+            return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers)
         if not numbers["chi2"] < MAX_CHI2:
             return Failure(FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {numbers['chi2']:.1f}", numbers)
         if not direction < self._config.max_direction_sigma_deg:
@@ -281,10 +288,18 @@ class Initialiser:
             )
         feature = feature.copy()
         feature[view_of[~inlier], point_of[~inlier]] = -1
-        depth = float(np.median(result.xyz_mu[keep, 2]))
+        depth = float(np.median(result.xyz_mu[proven, 2]))
         T = result.T_submap_kf.copy()
         T[:, :3, 3] /= depth
-        return Start(views, T, result.xyz_mu[keep] / depth, feature[:, keep], numbers)
+        return Start(views, T, result.xyz_mu[proven] / depth, feature[:, proven], numbers)
+
+
+def _agreeing(problem: BundleProblem, inlier: BoolArray) -> BoolArray:
+    """Return which points agree with both ends, and miss at most one witness."""
+    n, last = len(problem.xyz_mu), len(problem.T_submap_kf) - 1
+    agrees = np.bincount(problem.point[~inlier], minlength=n) <= 1
+    agrees[problem.point[~inlier & ((problem.kf == 0) | (problem.kf == last))]] = False
+    return agrees
 
 
 def direction_sigma_deg(problem: BundleProblem, T_w_cam: FloatArray, xyz: FloatArray, inlier: BoolArray) -> float:

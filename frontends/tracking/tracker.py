@@ -15,7 +15,7 @@ from dualslam.core.chi_square import CHI2_99
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
-from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
+from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray, Track, View
 from dualslam.frontends.features.matching import FeatureGrid, match_projected
 from dualslam.frontends.gap.second_pose import refuse_look_alike
 from dualslam.frontends.gap.uncertainty import SMALL_STEP, pose_uncertainty
@@ -35,6 +35,13 @@ STEADY_S = 1 / 6
 GUIDE_TOLERANCE, POSE_TOLERANCE = 0.1, 1e-3
 """Chi-square that a step may still promise when a pose counts as found (`refine_pose`): a third of its standard
 deviation where it only guides the search in the local map, a thirtieth where it is the frame's."""
+N_PROOF = 3
+"""Keyframes that prove a landmark: two show it on the epipolar line of each other, where anything may be."""
+SAFE, MOST = 2, 0.5
+"""With fewer proven landmarks than so many times the inliers that are asked for, or than this share, all have a say."""
+NEARER, NEAREST = 0.5, 0.05
+"""Of those that nothing proves, those have none that are nearer than so many times the depth of the nearest proven ones
+(this share): their lever is twice as long."""
 BEFORE_GAP = 3  # keyframes whose landmarks are asked for a second pose beyond a gap
 GIVEN_POSE_CHI2 = 4 * CHI2_99[2]  # 99 % with 2 degrees of freedom, and the pose off by as much as a pixel
 
@@ -400,6 +407,7 @@ class Tracker:
             features.uv_rect_px[feature],
             features.sigma_px[feature],
             tolerance=POSE_TOLERANCE,
+            counted=self._with_a_say(ids, T_cam_submap),
         )
         if isinstance(estimate, Failure):
             return estimate
@@ -418,6 +426,19 @@ class Tracker:
             wide=wide,
             covariance=estimate.covariance,
         )
+
+    def _with_a_say(self, ids: IntArray, T_cam_submap: FloatArray) -> BoolArray:
+        """Return which of the landmarks found a pose goes by: not those right before the camera that nothing proves.
+
+        What two views show is on the epipolar line of either, and may be anything. Of the wrong ones those with the
+        longest lever weigh most, which are nearer than all that three keyframes see: they hold the camera where it
+        is, and a turn takes the place of its motion.
+        """
+        proven = np.asarray(self._submap.n_observations(ids) >= N_PROOF)
+        if np.count_nonzero(proven) < max(SAFE * self._config.min_inliers, MOST * len(ids)):
+            return np.ones(len(ids), np.bool_)
+        depth = self._submap.depths(ids, T_cam_submap)
+        return np.asarray(proven | (depth > NEARER * np.quantile(depth[proven], NEAREST)))
 
     def _search_local_map(
         self, view: View, grid: FeatureGrid, T_cam_submap: FloatArray, landmark_ids: IntArray

@@ -168,3 +168,19 @@ def test_failures_have_reasons(case: str, reason: FailureReason) -> None:
     assert isinstance(failure, Failure)
     assert failure.reason == reason
     assert not failure
+
+
+def test_points_without_a_say_are_judged_and_move_nothing() -> None:
+    rng = np.random.default_rng(5)
+    xyz = np.column_stack([rng.uniform(-0.5, 0.5, (60, 2)), np.full(60, 1.0) + rng.uniform(-0.05, 0.05, 60)])
+    xyz[:12] *= 0.08  # right before the camera
+    T_true = se3.exp(np.array([0.0, 0.0, 0.0, -0.01, 0.0, 0.0]))
+    uv, _ = project_points(K, T_true, xyz)
+    uv[:12], _ = project_points(K, np.eye(4), xyz[:12])  # these say that it did not move
+    counted = np.arange(60) >= 12
+    kept, held = (refine_pose(K, np.eye(4), xyz, uv, np.full(60, 0.5), counted=c) for c in (counted, None))
+    assert kept
+    assert held
+    np.testing.assert_allclose(kept.T_cam_w, T_true, atol=1e-6)
+    np.testing.assert_array_equal(kept.inliers, counted)
+    assert np.linalg.norm(held.T_cam_w[:3, 3]) < 0.005, "with a say they hold the camera, and it turns"

@@ -132,9 +132,9 @@ class OutOfTimeAtFirst:
 
 class TestRetry:
     @staticmethod
-    def run(n_failing: int, **recovery: object) -> System:
-        world = PointWorld(cloud(), hand_held(90), covered=COVERED)
-        system = system_in(world, recovery={"attempts": ["live"], "retry_keyframes": [4], **recovery})
+    def run(n_failing: int, n_frames: int = 90) -> System:
+        world = PointWorld(cloud(), hand_held(n_frames), covered=COVERED)
+        system = system_in(world, recovery={"attempts": ["live"], "retry_keyframes": [4]})
         system._recoveries._executor = OutOfTimeAtFirst(system, n_failing)
         for frame in world.frames():
             system.step(frame)
@@ -153,9 +153,9 @@ class TestRetry:
         assert set(main.index.tolist()) == set(range(90)) - COVERED
 
     def test_it_ends_with_the_last_of_the_sizes_and_once_more_with_the_run(self) -> None:
-        system = self.run(n_failing=9)
+        system = self.run(n_failing=9, n_frames=110)  # so many that the new map grows beyond the size
         started = system.events.of_kind(EventKind.RECOVERY_STARTED)
-        assert [event.frame for event in started[2:]] == [89]
+        assert [event.frame for event in started[2:]] == [109]
         assert not system.atlas.links
 
     @pytest.mark.slow

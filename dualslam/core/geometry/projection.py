@@ -198,6 +198,7 @@ def refine_pose(
     n_iterations: int = 5,
     chi2_gate: float = CHI2_95[2],
     tolerance: float = 1e-4,
+    counted: BoolArray | None = None,
 ) -> PoseEstimate | Failure:
     """Refine a camera pose against known points, with outliers.
 
@@ -228,6 +229,8 @@ def refine_pose(
     tolerance : float
         Decrease of the summed chi-square promised by a step, under which a round has converged. Unit-free: its root is
         the length of the step in standard deviations of the pose.
+    counted : (N,) bool, optional
+        Points that the pose goes by; the others are judged by it, and have no say.
 
     Returns
     -------
@@ -240,12 +243,13 @@ def refine_pose(
     problem = _PoseProblem(K, np.asarray(xyz), np.asarray(uv), np.asarray(sigma))
     T = T_prior = np.array(T_cam_w, np.float64)
     chi2 = problem.evaluate(T)
+    counted = np.ones(n, np.bool_) if counted is None else counted
     inliers = np.isfinite(chi2)  # the first round trusts Huber alone
     n_steps = 0
     for _ in range(n_rounds):
         largest_gain = 0.0
         for _ in range(n_iterations):
-            G = problem.normal_equations(_huber_weights(chi2, chi2_gate, inliers))
+            G = problem.normal_equations(_huber_weights(chi2, chi2_gate, inliers & counted))
             if prior_information is not None:
                 _add_prior(G, T, T_prior, prior_information)
             step = _solve(G)
@@ -265,7 +269,7 @@ def refine_pose(
             return Failure(FailureReason.TOO_FEW_INLIERS, f"{n_inliers} of {n} points, {min_inliers} needed", numbers)
         if largest_gain < tolerance and np.array_equal(previous, inliers):
             break
-    return _finish(problem, T, T_prior, prior_information, chi2, inliers, n_steps)
+    return _finish(problem, T, T_prior, prior_information, chi2, inliers, n_steps, counted)
 
 
 def _huber_weights(chi2: FloatArray, gate: float, inliers: BoolArray) -> FloatArray:
@@ -292,9 +296,10 @@ def _finish(
     chi2: FloatArray,
     inliers: BoolArray,
     n_steps: int,
+    counted: BoolArray,
 ) -> PoseEstimate | Failure:
     """Compute the covariance at the final pose and pack the result."""
-    G = problem.normal_equations(inliers.astype(np.float64))
+    G = problem.normal_equations((inliers & counted).astype(np.float64))
     if prior_information is not None:
         _add_prior(G, T, T_prior, prior_information)
     H = G[:6, :6]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.core.types import FloatArray
+from dualslam.core.types import BoolArray, FloatArray
 from dualslam.lab.metrics.alignment import align_points
 
 STRETCH_S = 2.0
@@ -47,8 +47,36 @@ class SilentBreaks:
     first_broken_s: float | None = None
 
 
-def find_silent_breaks(times_s: FloatArray, p: FloatArray, q: FloatArray, frame_dt_s: float) -> SilentBreaks | None:
-    """Judge all stretches of a trajectory.
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretches:
+    """The stretches of a trajectory, each laid on the truth by itself.
+
+    Attributes
+    ----------
+    first_s : (S,) float64
+        When each begins, in seconds from the sequence's first frame.
+    judged : (S,) bool
+        Whether the truth moves in it.
+    scale_ratio : (S,) float64
+        Its own scale over the median of those that are judged.
+    shape : (S,) float64
+        RMS distance that its own alignment leaves, over the way there.
+    """
+
+    first_s: FloatArray
+    judged: BoolArray
+    scale_ratio: FloatArray
+    shape: FloatArray
+
+    @property
+    def broken(self) -> BoolArray:
+        """(S,) which do not fit the truth."""
+        off = np.abs(np.log(np.maximum(self.scale_ratio, _TINY))) > np.log(MAX_SCALE_RATIO)
+        return np.asarray(self.judged & (off | (self.shape > MAX_SHAPE_ERROR)))
+
+
+def judge_stretches(times_s: FloatArray, p: FloatArray, q: FloatArray, frame_dt_s: float) -> Stretches | None:
+    """Lay all stretches of a trajectory on the truth.
 
     Parameters
     ----------
@@ -61,7 +89,7 @@ def find_silent_breaks(times_s: FloatArray, p: FloatArray, q: FloatArray, frame_
 
     Returns
     -------
-    SilentBreaks or None
+    Stretches or None
         None where there are too few poses for a single stretch.
     """
     n, step = max(MIN_STRETCH_POSES, round(STRETCH_S / frame_dt_s)), max(1, round(STEP_S / frame_dt_s))
@@ -71,12 +99,20 @@ def find_silent_breaks(times_s: FloatArray, p: FloatArray, q: FloatArray, frame_
     fits = np.array([_fit(p[k : k + n], q[k : k + n]) for k in firsts.tolist()])
     spread, scale, rms, way = fits.T
     judged = spread > max(MIN_SPREAD_SHARE * float(np.median(spread)), MIN_SPREAD_M)
-    if not judged.any():
+    usual = max(float(np.median(scale[judged])), _TINY) if judged.any() else 1.0
+    return Stretches(times_s[firsts], judged, scale / usual, rms / np.maximum(way, _TINY))
+
+
+def find_silent_breaks(times_s: FloatArray, p: FloatArray, q: FloatArray, frame_dt_s: float) -> SilentBreaks | None:
+    """Count the stretches that do not fit the truth; parameters as of `judge_stretches`."""
+    stretches = judge_stretches(times_s, p, q, frame_dt_s)
+    if stretches is None:
+        return None
+    judged, broken = int(stretches.judged.sum()), stretches.broken
+    if not judged:
         return SilentBreaks(0)
-    log_ratio = np.log(np.maximum(scale, _TINY)) - np.log(max(float(np.median(scale[judged])), _TINY))
-    broken = judged & ((np.abs(log_ratio) > np.log(MAX_SCALE_RATIO)) | (rms > MAX_SHAPE_ERROR * way))
-    first = float(times_s[firsts[np.argmax(broken)]]) if broken.any() else None
-    return SilentBreaks(int(judged.sum()), int(broken.sum()), 100.0 * float(broken.sum() / judged.sum()), first)
+    first = float(stretches.first_s[np.argmax(broken)]) if broken.any() else None
+    return SilentBreaks(judged, int(broken.sum()), 100.0 * float(broken.sum() / judged), first)
 
 
 def _fit(p: FloatArray, q: FloatArray) -> tuple[float, float, float, float]:
