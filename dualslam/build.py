@@ -34,7 +34,6 @@ from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.place_matcher import FrontendPlaceMatcher
 from dualslam.frontends.registry import check_frontend
 from dualslam.frontends.registry import create_frontend as create_frontend  # part of the Python interface
-from dualslam.frontends.tracking.focal_search import search_focal
 from dualslam.frontends.tracking.initialiser import Initialiser
 from dualslam.frontends.tracking.rolling_shutter import RollingShutter
 from dualslam.frontends.tracking.visual import VisualFrontEnd
@@ -373,6 +372,8 @@ def find_focal(config: Config, frames: Iterable[Frame], size_px: tuple[int, int]
     ConfigError
         If the front end is not known, or its options are wrong.
     """
+    from dualslam.frontends.tracking.focal_search import search_focal  # an optimiser that no other run needs
+
     frontend = create_frontend(config.frontend)
     features = [frontend.extract(frame.image) for frame in frames if frame.image is not None]
     return search_focal(frontend, features, size_px, config.seed)

@@ -172,6 +172,12 @@ class System:
         return self._parts.calibration.camera
 
     @property
+    def log_focal_sigma(self) -> float | None:
+        """Standard deviation of the logarithm of that camera's focal length; None where it is as it was given."""
+        covariance = self._parts.calibration.covariance
+        return None if covariance is None else float(np.sqrt(covariance[0, 0]))
+
+    @property
     def world(self) -> int | None:
         """The submap in whose frame the saved map's world is; None without one."""
         return self._world

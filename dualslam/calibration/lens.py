@@ -26,6 +26,8 @@ UPDATE_SIGMA_RATIO = 0.7
 """A camera that was changed on an answer that was not even sure by `max_sigma_ratio` is changed again, however little,
 where the new sigma of the focal length is below this share of that answer's: twice the information. One that was
 sure stays, until another is significantly different."""
+SURE_SIGMA = 0.01
+"""Of the log focal length: an answer that is no surer than this is not the last, however little was known before."""
 
 log = logging.getLogger(__name__)
 
@@ -223,7 +225,7 @@ class Calibration:
         if self._covariance is None:
             return False
         config, present, found = self._config, *(float(np.sqrt(C[0, 0])) for C in (self._covariance, covariance))
-        hardly_sure = present > config.max_sigma_ratio * config.log_focal_sigma
+        hardly_sure = present > min(config.max_sigma_ratio * config.log_focal_sigma, SURE_SIGMA)
         return hardly_sure and found < UPDATE_SIGMA_RATIO * present
 
     def rectified(self, view: View) -> View:

@@ -63,6 +63,9 @@ def final_line(outcome: Outcome) -> str:
         parts.append(f"{s['dropped']} frames dropped")
     if s.get("ate_rmse_m") is not None:
         parts.append(f"ATE {s['ate_rmse_m']:.3g} m")
+    if "focal_search" in s and (refined := s["refined"]) is not None:
+        sigma_px = refined["focal_px"] * refined["log_focal_sigma"]
+        parts.append(f"focal length {refined['focal_px']:.0f} ± {sigma_px:.0f} px")
     parts.append(f"{s['fps']:.1f} frames/s")
     nothing = "not found in the saved map: " if s["first_id"] else "no map: "
     lead = "interrupted: " if s["interrupted"] else "" if outcome.has_map else nothing

@@ -15,7 +15,7 @@ from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.errors import InputError, NoCalibrationError
 from dualslam.io.atomic import atomic_file
 from dualslam.io.reduced import MAX_SIDE_PX
-from dualslam.run.focal import open_without_calibration
+from dualslam.run.focal import open_without_calibration, with_prior
 from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import open_source
 from dualslam.viewer.live import LiveView
@@ -42,6 +42,7 @@ def execute(args: argparse.Namespace) -> int:
         sequence = open_source(args.source, camera_file=args.camera, fov_degrees=args.fov, **selection)
     except NoCalibrationError:
         sequence, focal = open_without_calibration(config, args.source, **selection)
+        config = with_prior(config, focal)
         _tell(focal, args.quiet)
     logs.release()
     with live_view(args) as live, progress(sequence, args.quiet) as on_frame:
@@ -87,8 +88,9 @@ def _tell(focal: FocalSearch, quiet: bool) -> None:
     if not quiet:
         low, high = focal.fov_range_deg
         print(
-            f"no calibration: the frames show a field of view of {focal.fov_deg:.0f} degrees (likely {low:.0f} to "
-            f"{high:.0f}); self-calibration goes on from there, --fov or --camera know better",
+            f"no calibration: the frames show a field of view of {focal.fov_deg:.0f} degrees ({low:.0f} to {high:.0f}, "
+            f"to 90 %){', and a lens that bends' if focal.lens else ''}; self-calibration goes on from there, --fov or "
+            "--camera know better",
             flush=True,
         )
 

@@ -25,7 +25,7 @@ FOLLOWS = {
 """Limits that follow from another one."""
 
 CONSTANTS = {
-    "calibration.far_sigma_ratio": "dualslam.backend.self_calibration.FAR_SIGMA_RATIO",
+    "calibration.far_sigma_ratio": "dualslam.backend.self_calibration.MAX_SIGMA",
     "calibration.far_sigmas": "dualslam.backend.self_calibration.FAR_SIGMAS",
     "calibration.growth": "dualslam.calibration.lens.GROWTH",
     "calibration.k1_sigma": "dualslam.backend.self_calibration.K1_SIGMA",

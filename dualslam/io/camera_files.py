@@ -2,7 +2,7 @@
 
 Our own format is the dictionary of the camera's class as YAML or JSON::
 
-    model: pinhole            # or radtan, kannala_brandt, fov: see dualslam.core.camera.models
+    model: pinhole            # or radtan, kannala_brandt, fov, division: see dualslam.core.camera.models
     fx: 718.856
     fy: 718.856
     cx: 607.193

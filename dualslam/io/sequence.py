@@ -124,7 +124,7 @@ class RecordedSequence:
     def __init__(
         self, recording: Recording, camera: Camera, selection: Selection | None = None, *, grey: bool = True
     ) -> None:
-        self._images = recording.images
+        self._recording = recording
         self._grey = grey
         self.name = recording.name
         self.camera = camera
@@ -136,6 +136,10 @@ class RecordedSequence:
         self.exposure_s = None if recording.exposure_s is None else recording.exposure_s[self.source_indices]
         self.rate_hz = _rate(self.frame_timestamps)
 
+    def with_camera(self, camera: Camera) -> RecordedSequence:
+        """Return the same frames as those of another camera, of images of the same size."""
+        return RecordedSequence(self._recording, camera, self.selection, grey=self._grey)
+
     def __len__(self) -> int:
         return len(self.source_indices)
 
@@ -143,7 +147,7 @@ class RecordedSequence:
         return read_ahead(self._read(), READ_AHEAD_FRAMES)
 
     def _read(self) -> Iterator[Frame]:
-        reader = self._images.reader(self._grey)
+        reader = self._recording.images.reader(self._grey)
         try:
             for index, timestamp_s in zip(self.source_indices.tolist(), self.frame_timestamps.tolist(), strict=True):
                 yield self._frame(reader, index, timestamp_s)

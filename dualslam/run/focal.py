@@ -1,4 +1,4 @@
-"""A source without a calibration: its focal length is searched for before the run."""
+"""A source without a calibration: its camera is searched for before the run."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Failure
+from dualslam.io.sequence import RecordedSequence
 from dualslam.run.sources import open_source
 
 SEARCHED_FRAMES = 200
-"""From the beginning: some seconds, in which a camera in a hand or on a car has moved."""
+"""The first ones: some seconds, in which a camera in a hand or on a car has moved."""
 ANY_FOV_DEG = 60.0
 """To read the images by; the search asks nothing of it."""
 
 
 def open_without_calibration(config: Config, source: str, **selection: Any) -> tuple[Sequence, FocalSearch]:
-    """Open a source that has no calibration with the focal length that its first frames tell.
+    """Open a source that has no calibration with the camera that its first frames tell.
 
     Parameters
     ----------
@@ -35,12 +36,20 @@ def open_without_calibration(config: Config, source: str, **selection: Any) -> t
     InputError
         If the source cannot be read, or its beginning does not tell.
     """
-    first = open_source(source, fov_degrees=ANY_FOV_DEG, **selection | {"reverse": False})
-    size_px = first.camera.width, first.camera.height
-    found = find_focal(config, islice(first, SEARCHED_FRAMES), size_px)
+    sequence = open_source(source, fov_degrees=ANY_FOV_DEG, **selection)
+    assert isinstance(sequence, RecordedSequence)  # a world has a camera of its own
+    size_px = sequence.camera.width, sequence.camera.height
+    found = find_focal(config, islice(sequence, SEARCHED_FRAMES), size_px)
     if isinstance(found, Failure):
         raise InputError(
-            f"{first.name} has no calibration, and its first {SEARCHED_FRAMES} frames do not tell the focal length "
+            f"{sequence.name} has no calibration, and its first {SEARCHED_FRAMES} frames do not tell the focal length "
             f"({found.detail}); give a camera file, or a field of view in degrees."
         )
-    return open_source(source, fov_degrees=found.fov_deg, **selection), found
+    return sequence.with_camera(found.camera()), found
+
+
+def with_prior(config: Config, found: FocalSearch) -> Config:
+    """Return a config whose self-calibration trusts the focal length as far as it was found."""
+    sigma = max(config.calibration.log_focal_sigma, found.log_sigma)
+    calibration = config.calibration.model_copy(update={"log_focal_sigma": sigma})
+    return config.model_copy(update={"calibration": calibration})

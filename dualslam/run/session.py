@@ -182,13 +182,21 @@ def _given(sequence: Sequence, realtime: bool) -> dict[str, Any]:
     }
 
 
+def _refined(system: System) -> dict[str, Any] | None:
+    """Return what self-calibration has made of the camera, and how sure it is; None where nothing."""
+    sigma = system.log_focal_sigma
+    if sigma is None:
+        return None
+    return {"focal_px": float(system.camera.K[0, 0]), "log_focal_sigma": sigma, "camera": system.camera.to_dict()}
+
+
 def _write_results(
     system: System, report: RunReport, config: Config, sequence: Sequence, folder: RunFolder, given: dict[str, Any]
 ) -> dict[str, Any]:
     """Write all that comes at the end of a run, and return the summary, which begins with what was given."""
     trajectories = trajectories_of(system)
     truth: Trajectory | None = getattr(sequence, "ground_truth", None)
-    summary = given | summarise(system, report, trajectories, config, truth)
+    summary = given | {"refined": _refined(system)} | summarise(system, report, trajectories, config, truth)
     rows = frame_rows(system, trajectories.main, report.dropped, report.latencies_ms)
     folder.write(RunRecord(rows, trajectories.main, trajectories.unlinked, summary))
     if truth is not None:

@@ -153,8 +153,10 @@ def _map_parts(run: RunData, rows: Sequence[FrameRow], submap: int | None) -> tu
         component, S_world_submap = linked_submaps(folder, {row.submap for row in rows if row.in_main_map})
     else:
         component, S_world_submap = [submap] if (folder / METADATA).is_file() else [], {submap: np.eye(4)}
-    number_of = FrameNumbers(run.summary.get("first_id", 0), run.summary.get("first_index")).number_of
-    row_of = {number_of(row.index): i for i, row in enumerate(rows)}
+    first_id = run.summary.get("first_id", 0)
+    number_of = FrameNumbers(first_id, run.summary.get("first_index")).number_of
+    row_of = dict.fromkeys(range(first_id), 0)  # what earlier runs have left in the saved map was there from the start
+    row_of |= {number_of(row.index): i for i, row in enumerate(rows)}
     keyframes, landmarks = [], []
     for m in component:
         arrays, S = load_arrays(submap_path(folder, m), _ARRAYS, (CONDEMNED,)), S_world_submap[m]

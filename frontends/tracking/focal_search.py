@@ -1,38 +1,65 @@
-"""The focal length of a camera of which nothing is known, from the first seconds of its video.
+"""The focal length and the lens of a camera of which nothing is known, from the first seconds of its video.
 
-Pairs of frames some way apart are asked for a relative pose and one focal length (six-point solver and refinement of
-PoseLib). A pair by itself may be wrong by half: a turn, a plane or a straight drive leave the focal length open. Many
-pairs agree about the right one, which is where their estimates are densest. Self-calibration goes on from there.
+Pairs of frames are each asked how well they are explained by every camera of a grid: a focal length, and one number for
+the lens (the division model of Fitzgibbon, 2001). For each camera the relative pose is estimated (RANSAC and refinement
+of PoseLib) and the robust cost of the epipolar constraint is kept. A pair that cannot tell (a straight drive, a plane,
+a turn on the spot) has a flat cost and says nothing, where a solver for its focal length would return some number; the
+sum over the pairs has its best place where the camera is. Self-calibration goes on from there.
+
+The lens has to be asked for with the focal length: without it, a wide lens (EuRoC's) is taken for a camera of twice the
+focal length.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import poselib
+from scipy.optimize import minimize
 
 from dualslam.core.camera.focal import FocalSearch
+from dualslam.core.chi_square import CHI2_999
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray
 
-LAGS = (5, 10, 20, 40)
-"""Frames between the two of a pair."""
-MIN_MATCHES, MIN_INLIERS, MIN_PAIRS = 100, 60, 8
-MIN_MOTION = 0.02
-"""Median way of the matches, of the image's width: less says nothing."""
-RANGE = (0.3, 3.0)
-"""Focal lengths of cameras, over the width: 118 to 19 degrees."""
-BANDWIDTH = 0.08
-"""Of the density over the logarithm: about what one good pair is off by."""
-SPREAD_PCT = (16.0, 84.0)
-"""Percentiles of the pairs between which the focal length is said to lie."""
+LAGS = (1, 2, 5, 10, 20, 40)
+"""Frames between the two of a pair: a car at 10 Hz loses sight of most points within five."""
+MAX_PAIRS, MIN_PAIRS = 30, 8
+MIN_MATCHES = 60
+MAX_MATCHES = 200
+"""Of a pair, for time's sake."""
+MIN_MOTION, MAX_MOTION = 0.01, 0.15
+"""Median way of a pair's matches, of the image's width: less says nothing, and more says no more."""
+
+LOG_FOCAL_STEP, LENS_STEP, COARSE = 0.04, 0.025, 4
+"""Of the grid of cameras; every fourth is asked first, then those around the best."""
+LOG_FOCALS: FloatArray = np.array([math.log(0.35) + LOG_FOCAL_STEP * i for i in range(13 * COARSE)])
+"""Over the image's width: fields of view of 110 to 22 degrees."""
+LENSES: FloatArray = np.array([LENS_STEP * i for i in range(-12, 5)])
+"""Of the division model, at half the image's width: an undistorted radius is r / (1 + lens r^2). EuRoC's is -0.22."""
+FINE_CELLS = 10
+"""Of the coarse grid, that are asked finely."""
+
+LOG_FOCAL_PRIOR, LENS_PRIOR = (np.log(0.75), 0.3), (0.0, 0.1)
+"""Mean and sigma, of cameras that people film with: telephones 0.7 to 0.8 of the width, webcams 0.9 to 1, action
+cameras 0.45 to 0.6."""
+DEGREES_OF_FREEDOM, INFLATION = 3.0, 4.0
+"""Of the Student distribution of a pair's cost, as some pairs are wrong altogether; and how much larger than their
+residuals errors are taken to be, as neighbouring points err alike (`CalibrationConfig.inflation`)."""
+MODEL_SIGMA = 0.03
+"""Of the log focal length: what a lens of one number and a principal point in the middle leave."""
+RESAMPLES = 100
+MAX_STEPS = 40
+"""Of the search between the grid's cameras."""
 
 
 def search_focal(
     frontend: Frontend, features: Sequence[Features], size_px: tuple[int, int], seed: int
 ) -> FocalSearch | Failure:
-    """Search for the focal length that pairs of frames agree about.
+    """Search for the camera that pairs of frames agree about.
 
     Parameters
     ----------
@@ -47,40 +74,230 @@ def search_focal(
     Returns
     -------
     FocalSearch or Failure
-        Fewer than `MIN_PAIRS` pairs had an answer: `LOW_PARALLAX`.
+        Fewer than `MIN_PAIRS` pairs moved enough: `LOW_PARALLAX`.
     """
-    found = []
-    for lag in LAGS:
-        for first in range(0, len(features) - lag, max(lag // 2, LAGS[0])):
-            focal = _of_pair(frontend, features[first], features[first + lag], size_px, seed)
-            if focal is not None:
-                found.append(focal)
-    if len(found) < MIN_PAIRS:
+    pairs = list(_find_pairs(frontend, features, size_px, seed))
+    if len(pairs) < MIN_PAIRS:
         return Failure(
-            FailureReason.LOW_PARALLAX, f"{len(found)} pairs of frames tell the focal length, {MIN_PAIRS} needed"
+            FailureReason.LOW_PARALLAX, f"{len(pairs)} pairs of frames tell the focal length, {MIN_PAIRS} needed"
         )
-    log_focal = np.log(np.array(found))
-    grid = np.linspace(log_focal.min(), log_focal.max(), 400)
-    density = np.exp(-0.5 * ((grid[:, None] - log_focal) / BANDWIDTH) ** 2).sum(axis=1)
-    best = float(np.exp(grid[int(np.argmax(density))]))
-    low, high = np.exp(np.percentile(log_focal, SPREAD_PCT)).tolist()
-    return FocalSearch(best, min(low, best), max(high, best), size_px[0], len(found))
+    focals = size_px[0] * np.exp(LOG_FOCALS)
+    costs = np.array([_costs_on_coarse_grid(pair, focals, seed) for pair in pairs])
+    prior = _log_prior()
+    coarse = (_log_likelihood(costs, pairs).sum(axis=0) + prior)[::COARSE, ::COARSE]
+    for cell in np.argsort(coarse.ravel(), kind="stable")[::-1][:FINE_CELLS]:
+        row, column = np.unravel_index(cell, coarse.shape)
+        for pair, of_pair in zip(pairs, costs, strict=True):
+            _refine_cell(pair, of_pair, focals, int(row) * COARSE, int(column) * COARSE)
+    of_pairs = _log_likelihood(costs, pairs)
+    straight = np.flatnonzero(np.isclose(LENSES, 0.0))
+    total = of_pairs.sum(axis=0) + prior
+    bent = 2.0 * float(total.max() - total[straight].max()) > CHI2_999[1]
+    rows = np.arange(len(LENSES)) if bent else straight
+    log_focal, sigma, lens = _estimate(of_pairs[:, rows], prior[rows], LENSES[rows], seed)
+    if sigma < LOG_FOCAL_STEP:
+        log_focal, lens = _between_nodes(pairs, costs, size_px[0], log_focal, lens if bent else None)
+    return FocalSearch(float(size_px[0] * np.exp(log_focal)), sigma, lens, size_px[0], size_px[1], len(pairs))
 
 
-def _of_pair(frontend: Frontend, a: Features, b: Features, size_px: tuple[int, int], seed: int) -> float | None:
-    if min(len(a), len(b)) < MIN_MATCHES:
-        return None
-    index = frontend.match_wide(a, b).index
-    if len(index) < MIN_MATCHES:
-        return None
-    uv_a, uv_b = a.uv_px[index[:, 0]], b.uv_px[index[:, 1]]
-    if np.median(np.linalg.norm(uv_a - uv_b, axis=1)) < MIN_MOTION * size_px[0]:
-        return None
-    sigma = float(np.median(np.concatenate([a.sigma_px[index[:, 0]], b.sigma_px[index[:, 1]]])))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Matched pixels (N, 2) from the middle of the image, their sigma, and the half width that the lens is told at."""
+
+    uv_a: FloatArray
+    uv_b: FloatArray
+    sigma_px: float
+    half_width_px: float
+
+    def straightened(self, lens: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the pixels without the lens, and by how much it has shrunk their surroundings (N,)."""
+        (a, zoom_a), (b, zoom_b) = (_straighten(uv, lens, self.half_width_px) for uv in (self.uv_a, self.uv_b))
+        return a, b, 0.5 * (zoom_a + zoom_b)
+
+
+def _straighten(uv_px: FloatArray, lens: float, half_width_px: float) -> tuple[FloatArray, FloatArray]:
+    r2 = (uv_px * uv_px).sum(axis=1) / half_width_px**2
+    gain = 1.0 / (1.0 + lens * r2)
+    return uv_px * gain[:, None], np.sqrt(np.abs(gain**3 * (1.0 - lens * r2)))
+
+
+def _find_pairs(
+    frontend: Frontend, features: Sequence[Features], size_px: tuple[int, int], seed: int
+) -> Iterator[_Pair]:
+    """Yield for frames spread over all the pair that is likely to tell most: many matches that have gone far."""
+    rng = np.random.default_rng(seed)
     middle: FloatArray = 0.5 * (np.array(size_px, float) - 1.0)
-    options = {"max_epipolar_error": 2.0 * sigma, "max_iterations": 500, "min_iterations": 100, "seed": seed}
-    pair, info = poselib.estimate_shared_focal_relative_pose(uv_a, uv_b, middle, options, {})
-    focal = float(pair.camera1.params[0])
-    if np.count_nonzero(info["inliers"]) < MIN_INLIERS or not RANGE[0] < focal / size_px[0] < RANGE[1]:
-        return None
-    return focal
+    for first in range(0, len(features) - 1, max(1, -(-len(features) // MAX_PAIRS))):
+        best, most = None, 0.0
+        for lag in LAGS:
+            if first + lag >= len(features):
+                break
+            a, b = features[first], features[first + lag]
+            index = frontend.match_wide(a, b).index
+            if len(index) < MIN_MATCHES:
+                continue
+            uv_a, uv_b = a.uv_px[index[:, 0]], b.uv_px[index[:, 1]]
+            motion = float(np.median(np.linalg.norm(uv_a - uv_b, axis=1))) / size_px[0]
+            worth = len(index) * min(motion, MAX_MOTION) ** 2
+            if motion >= MIN_MOTION and worth > most:
+                sigma = float(np.median(np.concatenate([a.sigma_px[index[:, 0]], b.sigma_px[index[:, 1]]])))
+                best, most = (uv_a, uv_b, sigma), worth
+        if best is None:
+            continue
+        uv_a, uv_b, sigma = best
+        options = {"max_epipolar_error": 3.0 * sigma, "max_iterations": 300, "min_iterations": 50, "seed": seed}
+        inlier = np.array(poselib.estimate_fundamental(uv_a, uv_b, options, {})[1]["inliers"], bool)
+        chosen = rng.permutation(np.flatnonzero(inlier))[:MAX_MATCHES]
+        if len(chosen) >= MIN_MATCHES:
+            yield _Pair(uv_a[chosen] - middle, uv_b[chosen] - middle, sigma, 0.5 * size_px[0])
+
+
+# --- how well a camera explains a pair
+
+
+def _costs_on_coarse_grid(pair: _Pair, focals: FloatArray, seed: int) -> FloatArray:
+    """Return the pair's cost at every camera, (lenses, focals): that of the coarse grid's nearest."""
+    costs = np.empty((len(LENSES), len(focals)))
+    for row in range(0, len(LENSES), COARSE):
+        a, b, zoom = pair.straightened(LENSES[row])
+        pose = None
+        for column in range(0, len(focals), COARSE):
+            camera = _pinhole(focals[column])
+            options = {"max_epipolar_error": 3.0 * pair.sigma_px, "max_iterations": 60, "min_iterations": 30}
+            starts = [] if pose is None else [pose]
+            if column % (2 * COARSE) == 0:
+                starts.append(poselib.estimate_relative_pose(a, b, camera, camera, options | {"seed": seed}, {})[0])
+            cost, pose = _best_cost(a, b, zoom, focals[column], pair.sigma_px, starts)
+            costs[row : row + COARSE, column : column + COARSE] = cost
+    return costs
+
+
+def _refine_cell(pair: _Pair, costs: FloatArray, focals: FloatArray, row: int, column: int) -> None:
+    """Ask a pair about all cameras of a cell of the coarse grid, from the pose of its corner on."""
+    pose = None
+    for i in range(row, min(row + COARSE, len(LENSES))):
+        a, b, zoom = pair.straightened(LENSES[i])
+        along = range(column, column + COARSE)
+        for j in along if (i - row) % 2 == 0 else reversed(along):
+            starts = [pose] if pose is not None else [_pose_at(pair, a, b, focals[j])]
+            costs[i, j], pose = _best_cost(a, b, zoom, focals[j], pair.sigma_px, starts)
+
+
+def _pose_at(pair: _Pair, a: FloatArray, b: FloatArray, focal: float) -> poselib.CameraPose:
+    camera = _pinhole(focal)
+    options = {"max_epipolar_error": 3.0 * pair.sigma_px, "max_iterations": 200, "min_iterations": 50, "seed": 0}
+    return poselib.estimate_relative_pose(a, b, camera, camera, options, {})[0]
+
+
+def _best_cost(
+    a: FloatArray,
+    b: FloatArray,
+    zoom: FloatArray,
+    focal: float,
+    sigma_px: float,
+    starts: Sequence[poselib.CameraPose],
+) -> tuple[float, poselib.CameraPose]:
+    """Return the least robust cost of the epipolar constraint from some poses on, and its pose."""
+    camera = _pinhole(focal)
+    best: tuple[float, poselib.CameraPose] | None = None
+    for start in starts:
+        options = {"loss_type": "CAUCHY", "loss_scale": sigma_px, "max_iterations": 15}
+        pose, _ = poselib.refine_relative_pose(a, b, start, camera, camera, options)
+        x, y, z = pose.t
+        E = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ pose.R
+        in_a, in_b = (np.column_stack([uv / focal, np.ones(len(uv))]) for uv in (a, b))
+        line_b, line_a = in_a @ E.T, in_b @ E
+        slope = np.sqrt((line_a[:, :2] ** 2).sum(axis=1) + (line_b[:, :2] ** 2).sum(axis=1))
+        error = focal * (in_b * line_b).sum(axis=1) / np.maximum(slope, 1e-12) / (zoom * sigma_px)
+        cost = float(np.log1p(error * error).sum())
+        if best is None or cost < best[0]:
+            best = cost, pose
+    assert best is not None
+    return best
+
+
+def _pinhole(focal: float) -> dict[str, object]:
+    return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [focal, 0.0, 0.0]}
+
+
+# --- what all pairs say together
+
+
+def _log_prior() -> FloatArray:
+    """Return the logarithm of the prior at every camera, (lenses, focals)."""
+    of_focal, of_lens = (
+        -0.5 * ((values - mean) / sigma) ** 2
+        for values, (mean, sigma) in ((LOG_FOCALS, LOG_FOCAL_PRIOR), (LENSES, LENS_PRIOR))
+    )
+    return np.asarray(of_lens[:, None] + of_focal[None, :], np.float64)
+
+
+def _log_likelihood(costs: FloatArray, pairs: Sequence[_Pair]) -> FloatArray:
+    """Return what each pair's costs (pairs, lenses, focals) say, in its own noise."""
+    least = costs.min(axis=(1, 2), keepdims=True)
+    n = np.array([len(pair.uv_a) for pair in pairs])[:, None, None]
+    return _student(costs, least, np.maximum(least / n, 1e-3))
+
+
+def _student(costs: FloatArray, least: FloatArray, noise: FloatArray) -> FloatArray:
+    nu = DEGREES_OF_FREEDOM
+    excess = np.maximum(costs - least, 0.0) / noise
+    return np.asarray(-0.5 * (nu + 1.0) * np.log1p(excess / (nu * INFLATION**2)), np.float64)
+
+
+def _between_nodes(
+    pairs: Sequence[_Pair], costs: FloatArray, width: int, log_focal: float, lens: float | None
+) -> tuple[float, float]:
+    """Return the best log focal length and lens near a node of the grid, which is coarser than many pairs are sure.
+
+    Without a lens none is looked for.
+    """
+    least = costs.min(axis=(1, 2))
+    noise = np.maximum(least / np.array([len(pair.uv_a) for pair in pairs]), 1e-3)
+    focal = width * np.exp(log_focal)
+    poses = []
+    for pair in pairs:
+        a, b, _ = pair.straightened(lens or 0.0)
+        poses.append(_pose_at(pair, a, b, focal))
+
+    def misfit(x: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+        log_f, bend = float(x[0]), float(x[1]) if lens is not None else 0.0
+        found = np.empty(len(pairs))
+        for i, pair in enumerate(pairs):
+            a, b, zoom = pair.straightened(bend)
+            found[i], poses[i] = _best_cost(a, b, zoom, width * np.exp(log_f), pair.sigma_px, [poses[i]])
+        (focal_mean, focal_sigma), (lens_mean, lens_sigma) = LOG_FOCAL_PRIOR, LENS_PRIOR
+        prior = ((log_f - focal_mean) / focal_sigma) ** 2 + ((bend - lens_mean) / lens_sigma) ** 2
+        return 0.5 * float(prior) - float(_student(found, least, noise).sum())
+
+    start = np.array([log_focal] if lens is None else [log_focal, lens])
+    corners = start + np.vstack([np.zeros(len(start)), np.diag([LOG_FOCAL_STEP, LENS_STEP][: len(start)])])
+    best = minimize(
+        misfit,
+        start,
+        method="Nelder-Mead",
+        options={"initial_simplex": corners, "maxfev": MAX_STEPS, "xatol": 0.1 * LENS_STEP, "fatol": 0.1},
+    ).x
+    return float(best[0]), float(best[1]) if lens is not None else 0.0
+
+
+def _estimate(of_pairs: FloatArray, prior: FloatArray, lenses: FloatArray, seed: int) -> tuple[float, float, float]:
+    """Return the log focal length, its sigma, and the lens.
+
+    The sigma is of the posterior, of pairs drawn again (they may share an error), and of what the model leaves.
+    """
+    rng = np.random.default_rng(seed)
+    n = len(of_pairs)
+    drawn = [_moments(of_pairs[rng.integers(0, n, n)].sum(axis=0) + prior, lenses) for _ in range(RESAMPLES)]
+    mean, variance, lens = _moments(of_pairs.sum(axis=0) + prior, lenses)
+    means = np.array([m for m, _, _ in drawn])
+    return mean, float(np.sqrt(variance + means.var() + MODEL_SIGMA**2)), lens
+
+
+def _moments(log_posterior: FloatArray, lenses: FloatArray) -> tuple[float, float, float]:
+    """Return the mean and the variance of the log focal length over the width, and the mean of the lens."""
+    weight = np.exp(log_posterior - log_posterior.max())
+    weight /= weight.sum()
+    of_focal = weight.sum(axis=0)
+    mean = float(of_focal @ LOG_FOCALS)
+    return mean, float(of_focal @ (LOG_FOCALS - mean) ** 2), float(weight.sum(axis=1) @ lenses)

@@ -50,7 +50,7 @@ class FakeSystem:
         self.desk = InlineDesk({})
         self.n_finished = 0
         self.numbers = FrameNumbers()
-        self.world = self.saved = self.camera = None
+        self.world = self.saved = self.camera = self.log_focal_sigma = None
         self.was_interrupted = False
         self._truth, self._lost, self._before_step = truth, lost, before_step
         self._submap: Submap | None = None

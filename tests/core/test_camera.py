@@ -11,6 +11,7 @@ import pytest
 
 from dualslam.core.camera.models import (
     Camera,
+    DivisionCamera,
     FovCamera,
     KannalaBrandtCamera,
     PinholeCamera,
@@ -32,8 +33,9 @@ TUMVI = KannalaBrandtCamera(
 )
 TUMMONO = FovCamera.from_tum_mono(0.535719308086809, 0.669566858850269, 0.493248545285398, 0.500408664348414,
                                   0.897966326944875, 1280, 1024)  # fmt: skip
-CAMERAS = [PINHOLE, FR1, EUROC, TUMVI, TUMMONO]
-IDS = ["pinhole", "fr1", "euroc", "tumvi", "tummono"]
+BARREL = DivisionCamera(752, 480, 461.0, 461.0, 375.5, 239.5, k=-0.3)
+CAMERAS = [PINHOLE, FR1, EUROC, TUMVI, TUMMONO, BARREL]
+IDS = ["pinhole", "fr1", "euroc", "tumvi", "tummono", "division"]
 
 
 def pixels(camera: Camera, seed: int = 0, n: int = 400, middle: float = 1.0) -> np.ndarray:
@@ -121,6 +123,14 @@ def test_rectification_ends_at_eighty_degrees(degrees: float) -> None:
     """On either side of the limit."""
     ray = np.array([[math.sin(math.radians(degrees)), 0.0, math.cos(math.radians(degrees))]])
     assert np.isnan(TUMVI.rectify(TUMVI.project(ray))[0]).any() == (degrees > 80)
+
+
+@pytest.mark.parametrize("k", [-0.3, 0.1], ids=["barrel", "pincushion"])
+def test_division_follows_its_formula(k: float) -> None:
+    """r_u = r_d / (1 + k r_d^2), written out."""
+    camera = DivisionCamera(640, 480, 500.0, 500.0, 319.5, 239.5, k=k)
+    ray = camera.unproject([[319.5 + 500.0 * 0.3, 239.5 - 500.0 * 0.4]])[0]
+    np.testing.assert_allclose(ray[:2] / ray[2], np.array([0.3, -0.4]) / (1 + k * 0.25), atol=1e-12)
 
 
 def test_fov_follows_its_formula() -> None:

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from dualslam.config.settings import Config
+from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.errors import InputError
 from dualslam.lab.synthetic import make_sequence
-from dualslam.run.focal import open_without_calibration
+from dualslam.run.focal import open_without_calibration, with_prior
 
 
 def write(folder: Path, images: list[np.ndarray]) -> Path:
@@ -27,9 +28,18 @@ def test_the_beginning_tells_the_field_of_view(tmp_path: Path) -> None:
     config = Config.model_validate({"frontend": {"n_features": 800}})
     sequence, found = open_without_calibration(config, str(folder), start=0, stride=1, max_frames=None)
     assert sequence.camera.K[0, 0] == pytest.approx(found.focal_px)
-    assert found.low_px <= world.camera.K[0, 0] <= found.high_px
-    assert found.focal_px == pytest.approx(world.camera.K[0, 0], rel=0.2)
+    low, high = found.range_px
+    assert low <= world.camera.K[0, 0] <= high
+    assert found.focal_px == pytest.approx(world.camera.K[0, 0], rel=0.1)
     assert len(sequence) == 70
+
+
+def test_self_calibration_trusts_a_focal_length_as_far_as_it_was_found() -> None:
+    config = Config()
+    for log_sigma in (0.01, 0.2):
+        found = FocalSearch(500.0, log_sigma, 0.0, 640, 480, 20)
+        sigma = with_prior(config, found).calibration.log_focal_sigma
+        assert sigma == max(config.calibration.log_focal_sigma, log_sigma)
 
 
 def test_where_nothing_moves_the_person_is_asked(tmp_path: Path) -> None:

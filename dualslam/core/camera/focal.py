@@ -1,11 +1,17 @@
-"""What a search for an unknown focal length has found."""
+"""What a search for an unknown camera has found."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from dualslam.core.camera.models import Camera, DivisionCamera, PinholeCamera
+
+SIGMAS_90 = 1.645
+"""Of the normal distribution: 90 % lie between."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,39 +20,58 @@ class FocalSearch:
 
     Attributes
     ----------
-    focal_px, low_px, high_px : float
-        The best, and between what it is likely to lie.
-    width_px : int
+    focal_px : float
+    log_sigma : float
+        Standard deviation of its logarithm.
+    lens : float
+        Of the division model, at half the image's width: an undistorted radius is r / (1 + lens r^2); zero: none.
+    width, height : int
+        Of the image, pixels.
     n_pairs : int
         Of frames, that had an answer.
     """
 
     focal_px: float
-    low_px: float
-    high_px: float
-    width_px: int
+    log_sigma: float
+    lens: float
+    width: int
+    height: int
     n_pairs: int
 
     @property
+    def range_px(self) -> tuple[float, float]:
+        """Between what the focal length lies, to 90 %."""
+        factor = math.exp(SIGMAS_90 * self.log_sigma)
+        return self.focal_px / factor, self.focal_px * factor
+
+    @property
     def fov_deg(self) -> float:
-        """Horizontal field of view."""
+        """Horizontal field of view, the lens left out."""
         return self._fov_deg(self.focal_px)
 
     @property
     def fov_range_deg(self) -> tuple[float, float]:
         """The field of view's range: the smallest belongs to the largest focal length."""
-        return self._fov_deg(self.high_px), self._fov_deg(self.low_px)
+        low, high = self.range_px
+        return self._fov_deg(high), self._fov_deg(low)
 
     def _fov_deg(self, focal_px: float) -> float:
-        return float(np.degrees(2.0 * np.arctan(0.5 * self.width_px / focal_px)))
+        return float(np.degrees(2.0 * np.arctan(0.5 * self.width / focal_px)))
+
+    def camera(self) -> Camera:
+        """Return the camera, with its principal point in the middle."""
+        f, middle = self.focal_px, (0.5 * (self.width - 1), 0.5 * (self.height - 1))
+        if self.lens == 0.0:
+            return PinholeCamera(self.width, self.height, f, f, *middle)
+        return DivisionCamera(self.width, self.height, f, f, *middle, k=self.lens * (2.0 * f / self.width) ** 2)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as ``summary.json`` has it."""
-        low, high = self.fov_range_deg
         return {
             "focal_px": self.focal_px,
-            "focal_range_px": [self.low_px, self.high_px],
+            "focal_range_px": list(self.range_px),
             "fov_deg": self.fov_deg,
-            "fov_range_deg": [low, high],
+            "fov_range_deg": list(self.fov_range_deg),
+            "lens": self.lens,
             "pairs": self.n_pairs,
         }

@@ -371,7 +371,40 @@ class FovCamera(_RadialCamera):
         return np.arctan(np.tan(angle) / (2.0 * math.tan(0.5 * self.omega)))
 
 
-MODELS: dict[str, type[Camera]] = {c.model: c for c in (PinholeCamera, RadTanCamera, KannalaBrandtCamera, FovCamera)}
+@dataclass(frozen=True)
+class DivisionCamera(Camera):
+    """The division model of Fitzgibbon (2001), which one number says: what is found where nothing is known of a lens.
+
+    Attributes
+    ----------
+    k : float
+        Undistorted radius = r / (1 + k r^2) of the distorted one, on the normalised plane; a barrel's is negative.
+    """
+
+    model: ClassVar[str] = "division"
+
+    k: float = 0.0
+
+    def _distort(self, p_cam: FloatArray) -> FloatArray:
+        xy = _plane(p_cam)
+        root2 = 1.0 - 4.0 * self.k * (xy * xy).sum(1)
+        root = np.sqrt(np.where(root2 > 0.0, root2, np.nan))
+        return xy * (2.0 / (1.0 + root))[:, None]
+
+    def _undistort(self, xy_distorted: FloatArray) -> FloatArray:
+        r2 = (xy_distorted * xy_distorted).sum(1)
+        inside = (1.0 + self.k * r2 > 0.0) & (self.k * r2 < 1.0)
+        return _lift(xy_distorted / np.where(inside, 1.0 + self.k * r2, np.nan)[:, None])
+
+    def _area_ratio(self, xy: FloatArray) -> FloatArray:
+        distorted = self._distort(_lift(xy))
+        kr2 = self.k * (distorted * distorted).sum(1)
+        return np.asarray((1.0 + kr2) ** 3 / (1.0 - kr2), np.float64)
+
+
+MODELS: dict[str, type[Camera]] = {
+    c.model: c for c in (PinholeCamera, RadTanCamera, KannalaBrandtCamera, FovCamera, DivisionCamera)
+}
 
 
 def camera_from_dict(values: Mapping[str, Any]) -> Camera:

@@ -1,6 +1,8 @@
-"""The focal length of a camera of which nothing is known."""
+"""The camera of which nothing is known: focal length, lens, and how sure both are."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,25 +10,62 @@ import pytest
 from dualslam.build import create_frontend
 from dualslam.config.settings import FrontendConfig
 from dualslam.core.camera.focal import FocalSearch
-from dualslam.core.types import Failure
+from dualslam.core.camera.models import Camera, DivisionCamera, PinholeCamera
+from dualslam.core.types import Failure, Features
 from dualslam.frontends.tracking.focal_search import search_focal
 from dualslam.testing.point_world import CAMERA, SIZE_PX, PointWorld, cloud, hand_held, path
 
 
+def features_of(world: PointWorld, camera: Camera = CAMERA) -> list[Features]:
+    """Return what another lens in the same place makes of the world's features."""
+    seen = [world.features(i) for i in range(len(world.T_world_cam))]
+    return [replace(each, uv_px=camera.project(CAMERA.unproject(each.uv_px))) for each in seen]
+
+
+def search(features: list[Features], seed: int = 0) -> FocalSearch | Failure:
+    return search_focal(create_frontend(FrontendConfig()), features, SIZE_PX, seed)
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_hand_held_camera_tells_its_focal_length(seed: int) -> None:
-    world = PointWorld(cloud(seed=seed), hand_held(60), seed=seed)
-    features = [world.features(i) for i in range(60)]
-    found = search_focal(create_frontend(FrontendConfig()), features, SIZE_PX, seed)
+    found = search(features_of(PointWorld(cloud(seed=seed), hand_held(60), seed=seed)), seed)
     assert isinstance(found, FocalSearch)
-    assert found.focal_px == pytest.approx(CAMERA.fx, rel=0.08)
-    assert found.low_px <= CAMERA.fx <= found.high_px
+    assert found.focal_px == pytest.approx(CAMERA.fx, rel=0.05)
+    low, high = found.range_px
+    assert low <= CAMERA.fx <= high
+    assert high / low < 1.3
+    assert isinstance(found.camera(), PinholeCamera)
     low, high = found.fov_range_deg
     assert low <= found.fov_deg <= high
 
 
-@pytest.mark.parametrize("turn_rad", [[0, 0, 0], [0, 0.0005, 0]], ids=["still", "hardly"])
+def test_a_lens_is_found_with_the_focal_length() -> None:
+    camera = DivisionCamera(*SIZE_PX, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, k=-0.3)
+    found = search(features_of(PointWorld(cloud(), hand_held(60)), camera))
+    assert isinstance(found, FocalSearch)
+    assert found.focal_px == pytest.approx(CAMERA.fx, rel=0.06)
+    assert found.lens == pytest.approx(-0.3 / (2 * CAMERA.fx / CAMERA.width) ** 2, abs=0.04)
+    made = found.camera()
+    assert isinstance(made, DivisionCamera)
+    ray = made.unproject([[30.0, 30.0]])[0]
+    true = camera.unproject([[30.0, 30.0]])[0]
+    assert np.degrees(np.arccos(ray @ true)) < 3.0
+
+
+def test_a_straight_drive_does_not_claim_to_know() -> None:
+    """It leaves the focal length to what cameras are like, and says so."""
+    turning, straight = (
+        search(features_of(PointWorld(cloud(length_m=20.0), poses)))
+        for poses in (hand_held(60), path(60, np.array([0.0, 0.0, 0.12]), np.zeros(3)))
+    )
+    assert isinstance(turning, FocalSearch)
+    assert isinstance(straight, FocalSearch)
+    assert straight.log_sigma > 2.0 * turning.log_sigma
+    low, high = straight.range_px
+    assert low <= CAMERA.fx <= high
+
+
+@pytest.mark.parametrize("turn_rad", [[0, 0, 0], [0, 0.0002, 0]], ids=["still", "hardly"])
 def test_a_camera_that_stands_still_tells_nothing(turn_rad: list[float]) -> None:
     world = PointWorld(cloud(), path(60, np.zeros(3), np.array(turn_rad)))
-    found = search_focal(create_frontend(FrontendConfig()), [world.features(i) for i in range(60)], SIZE_PX, 0)
-    assert isinstance(found, Failure)
+    assert isinstance(search(features_of(world)), Failure)

@@ -1,0 +1,36 @@
+"""A run on the map of an earlier one, from the source to the run folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dualslam.cli import main
+from dualslam.report.run_data import read_run
+from dualslam.viewer.playback import play
+
+SOURCE = "synthetic:street,frames=80,seed=3,width=320,height=240"
+SETTINGS = ["--quiet", "--set", "frontend.n_features=500"]
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of a walk's first part."""
+    out = tmp_path_factory.mktemp("first") / "run"
+    assert main(["run", SOURCE, "--max-frames", "60", "--out", str(out), *SETTINGS]) == 0
+    return out
+
+
+@pytest.mark.parametrize("localise", [False, True], ids=["extended", "localised"])
+def test_a_run_on_a_saved_map_ends_with_all_its_pages(first: Path, localise: bool, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    options = ["--start", "40", "--map", str(first), *(["--localise"] if localise else [])]
+    assert main(["run", SOURCE, *options, "--out", str(out), *SETTINGS]) == 0
+    assert {path.name for path in out.iterdir()} >= {"map.html", "report.html", "trajectory.txt", "summary.json"}
+    run, before = read_run(out), play(read_run(first)).spaces[0]
+    assert run.summary["posed"] >= 10
+    space = play(run).spaces[0]
+    there = (space.keyframes.row == 0).sum()
+    assert there >= len(before.keyframes.row), "the first run's keyframes are in the picture from the start"
+    assert (len(space.keyframes.row) == there) == localise
