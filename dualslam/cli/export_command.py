@@ -105,6 +105,6 @@ def _with_images(
 ) -> ExportedMap:
     assert stored.camera is not None
     camera = stored.camera
-    source = open_images_of_run(args.images, exported.size_px, args.camera, args.fov)
+    source = open_images_of_run(args.images, exported.size_px)
     has_images = FORMATS[args.to].has_images
     return with_images(exported, camera, source, numbers, args.out if has_images else None)

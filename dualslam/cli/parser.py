@@ -169,9 +169,6 @@ def _add_export(commands: argparse._SubParsersAction[_Parser]) -> None:
     images.add_argument(
         "--images", metavar="SOURCE", help="what the run was made of: colours, and images without the lens (a folder)"
     )
-    camera = images.add_mutually_exclusive_group()
-    camera.add_argument("--camera", metavar="FILE", type=Path, help="calibration, as it was given to the run")
-    camera.add_argument("--fov", metavar="DEGREES", type=_angle, help="horizontal field of view, as it was given")
 
 
 def _add_scale(commands: argparse._SubParsersAction[_Parser]) -> None:
@@ -193,9 +190,6 @@ def _add_scale(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument(
         "--dictionary", choices=DICTIONARIES, default=DICTIONARIES[0], help=f"of markers (default: {DICTIONARIES[0]})"
     )
-    camera = parser.add_mutually_exclusive_group()
-    camera.add_argument("--camera", metavar="FILE", type=Path, help="calibration, as it was given to the run")
-    camera.add_argument("--fov", metavar="DEGREES", type=_angle, help="horizontal field of view, as it was given")
 
 
 class _Distance(argparse.Action):

@@ -41,6 +41,7 @@ def execute(args: argparse.Namespace) -> int:
     try:
         sequence = open_source(args.source, camera_file=args.camera, fov_degrees=args.fov, **selection)
     except NoCalibrationError:
+        logs.discard()  # it is opened again
         sequence, focal = open_without_calibration(config, args.source, **selection)
         config = with_prior(config, focal)
         _tell(focal, args.quiet)

@@ -30,7 +30,7 @@ def execute(args: argparse.Namespace) -> int:
         if args.images is None:
             raise InputError("--marker looks for markers in the run's images: name what it was made of with --images.")
         assert stored.camera is not None
-        source = open_images_of_run(args.images, exported.size_px, args.camera, args.fov)
+        source = open_images_of_run(args.images, exported.size_px)
         scale = by_marker(exported, stored.camera, source, numbers, args.marker, args.dictionary)
     write_scale(args.run, scale.metres_per_unit, scale.sigma_rel, scale.words)
     if not args.quiet:

@@ -12,12 +12,10 @@ from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Failure
 from dualslam.io.sequence import RecordedSequence
-from dualslam.run.sources import open_source
+from dualslam.run.sources import ANY_FOV_DEG, open_source
 
 SEARCHED_FRAMES = 200
 """The first ones: some seconds, in which a camera in a hand or on a car has moved."""
-ANY_FOV_DEG = 60.0
-"""To read the images by; the search asks nothing of it."""
 
 
 def open_without_calibration(config: Config, source: str, **selection: Any) -> tuple[Sequence, FocalSearch]:

@@ -24,6 +24,8 @@ SYNTHETIC = "synthetic:"
 WORLD_NUMBERS = {"frames": 300, "seed": 0, "width": 640, "height": 480}
 """What a synthetic source states in numbers, and what it takes where it does not."""
 RENDER_AHEAD_FRAMES = 4
+ANY_FOV_DEG = 60.0
+"""To read images by of whose camera nothing is known yet, or nothing is asked."""
 
 
 def open_source(
@@ -71,14 +73,14 @@ def open_source(
     )
 
 
-def open_images_of_run(
-    source: str | Path, size_px: tuple[int, int], camera_file: str | Path | None, fov_degrees: float | None
-) -> Sequence:
+def open_images_of_run(source: str | Path, size_px: tuple[int, int]) -> Sequence:
     """Open what a run was made of, in the size in which the run has read it.
+
+    Its camera is not the run's: that is in the map.
 
     Parameters
     ----------
-    source, camera_file, fov_degrees
+    source : path or str
         As in `open_source`.
     size_px : (width, height)
         Of the run's images.
@@ -88,7 +90,10 @@ def open_images_of_run(
     InputError
         If it cannot be read, or has images of another size.
     """
-    opened = open_source(source, camera_file=camera_file, fov_degrees=fov_degrees, max_side_px=max(size_px))
+    any_camera = (
+        None if str(source).startswith(SYNTHETIC) else ANY_FOV_DEG
+    )  # a calibration of the source's own comes first
+    opened = open_source(source, fov_degrees=any_camera, max_side_px=max(size_px))
     if (opened.camera.width, opened.camera.height) != size_px:
         raise InputError(f"{source} has images of another size than the run's.")
     return opened
