@@ -12,7 +12,13 @@ from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray, Frame, View
 from dualslam.frontends.features.orb import OrbFrontend
-from dualslam.frontends.tracking.rolling_shutter import RollingShutter, TurnMeter, correct_shutter
+from dualslam.frontends.tracking.rolling_shutter import (
+    READOUTS_S,
+    RollingShutter,
+    TurnMeter,
+    _mean,
+    correct_shutter,
+)
 from dualslam.frontends.tracking.turning import turn_between
 from dualslam.system import System
 from dualslam.testing.point_world import (
@@ -220,3 +226,12 @@ def test_a_turn_alone_starts_no_map() -> None:
     assert rotation.max() < 0.5 * row_shift
     taken_for_global, _ = run_over_a_turn(readout_s=0.0)
     assert first(taken_for_global, EventKind.INITIALISED).frame < N_TURNING
+
+
+def test_between_two_readout_times_that_fit_alike_lies_the_mean() -> None:
+    """The better of both is chance, and the rim of what is tried is no minimum."""
+    chi2 = 40.0 * np.array([9.0, 5.0, 3.0, 2.0, 0.1, 0.3, 0.2, 0.0])
+    assert READOUTS_S[4] < _mean(chi2) < READOUTS_S[-1]
+    chi2[-1] = 400.0
+    chi2[5:] = 400.0
+    assert _mean(chi2) == pytest.approx(READOUTS_S[4], abs=1e-3)
