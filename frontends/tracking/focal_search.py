@@ -32,19 +32,19 @@ MIN_MATCHES = 60
 MAX_MATCHES = 200
 """Of a pair, for time's sake."""
 MIN_MOTION, MAX_MOTION = 0.01, 0.15
-"""Median way of a pair's matches, of the image's width: less says nothing, and more says no more."""
+"""Median way of a pair's matches, of the image's longer side: less says nothing, and more says no more."""
 
 LOG_FOCAL_STEP, LENS_STEP, COARSE = 0.04, 0.025, 4
 """Of the grid of cameras; every fourth is asked first, then those around the best."""
 LOG_FOCALS: FloatArray = np.array([math.log(0.35) + LOG_FOCAL_STEP * i for i in range(13 * COARSE)])
-"""Over the image's width: fields of view of 110 to 22 degrees."""
+"""Over the image's longer side, however the telephone was held: fields of view of 110 to 22 degrees."""
 LENSES: FloatArray = np.array([LENS_STEP * i for i in range(-12, 5)])
-"""Of the division model, at half the image's width: an undistorted radius is r / (1 + lens r^2). EuRoC's is -0.22."""
+"""Of the division model, at half that side: an undistorted radius is r / (1 + lens r^2). EuRoC's is -0.22."""
 FINE_CELLS = 10
 """Of the coarse grid, that are asked finely."""
 
 LOG_FOCAL_PRIOR, LENS_PRIOR = (np.log(0.75), 0.3), (0.0, 0.1)
-"""Mean and sigma, of cameras that people film with: telephones 0.7 to 0.8 of the width, webcams 0.9 to 1, action
+"""Mean and sigma, of cameras that people film with: telephones 0.7 to 0.8 of that side, webcams 0.9 to 1, action
 cameras 0.45 to 0.6."""
 DEGREES_OF_FREEDOM, INFLATION = 3.0, 4.0
 """Of the Student distribution of a pair's cost, as some pairs are wrong altogether; and how much larger than their
@@ -81,7 +81,8 @@ def search_focal(
         return Failure(
             FailureReason.LOW_PARALLAX, f"{len(pairs)} pairs of frames tell the focal length, {MIN_PAIRS} needed"
         )
-    focals = size_px[0] * np.exp(LOG_FOCALS)
+    side = max(size_px)
+    focals = side * np.exp(LOG_FOCALS)
     costs = np.array([_costs_on_coarse_grid(pair, focals, seed) for pair in pairs])
     prior = _log_prior()
     coarse = (_log_likelihood(costs, pairs).sum(axis=0) + prior)[::COARSE, ::COARSE]
@@ -96,27 +97,27 @@ def search_focal(
     rows = np.arange(len(LENSES)) if bent else straight
     log_focal, sigma, lens = _estimate(of_pairs[:, rows], prior[rows], LENSES[rows], seed)
     if sigma < LOG_FOCAL_STEP:
-        log_focal, lens = _between_nodes(pairs, costs, size_px[0], log_focal, lens if bent else None)
-    return FocalSearch(float(size_px[0] * np.exp(log_focal)), sigma, lens, size_px[0], size_px[1], len(pairs))
+        log_focal, lens = _between_nodes(pairs, costs, side, log_focal, lens if bent else None)
+    return FocalSearch(float(side * np.exp(log_focal)), sigma, lens, *size_px, len(pairs))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pair:
-    """Matched pixels (N, 2) from the middle of the image, their sigma, and the half width that the lens is told at."""
+    """Matched pixels (N, 2) from the middle of the image, their sigma, and the radius at which the lens is told."""
 
     uv_a: FloatArray
     uv_b: FloatArray
     sigma_px: float
-    half_width_px: float
+    radius_px: float
 
     def straightened(self, lens: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the pixels without the lens, and by how much it has shrunk their surroundings (N,)."""
-        (a, zoom_a), (b, zoom_b) = (_straighten(uv, lens, self.half_width_px) for uv in (self.uv_a, self.uv_b))
+        (a, zoom_a), (b, zoom_b) = (_straighten(uv, lens, self.radius_px) for uv in (self.uv_a, self.uv_b))
         return a, b, 0.5 * (zoom_a + zoom_b)
 
 
-def _straighten(uv_px: FloatArray, lens: float, half_width_px: float) -> tuple[FloatArray, FloatArray]:
-    r2 = (uv_px * uv_px).sum(axis=1) / half_width_px**2
+def _straighten(uv_px: FloatArray, lens: float, radius_px: float) -> tuple[FloatArray, FloatArray]:
+    r2 = (uv_px * uv_px).sum(axis=1) / radius_px**2
     gain = 1.0 / (1.0 + lens * r2)
     return uv_px * gain[:, None], np.sqrt(np.abs(gain**3 * (1.0 - lens * r2)))
 
@@ -137,7 +138,7 @@ def _find_pairs(
             if len(index) < MIN_MATCHES:
                 continue
             uv_a, uv_b = a.uv_px[index[:, 0]], b.uv_px[index[:, 1]]
-            motion = float(np.median(np.linalg.norm(uv_a - uv_b, axis=1))) / size_px[0]
+            motion = float(np.median(np.linalg.norm(uv_a - uv_b, axis=1))) / max(size_px)
             worth = len(index) * min(motion, MAX_MOTION) ** 2
             if motion >= MIN_MOTION and worth > most:
                 sigma = float(np.median(np.concatenate([a.sigma_px[index[:, 0]], b.sigma_px[index[:, 1]]])))
@@ -149,7 +150,7 @@ def _find_pairs(
         inlier = np.array(poselib.estimate_fundamental(uv_a, uv_b, options, {})[1]["inliers"], bool)
         chosen = rng.permutation(np.flatnonzero(inlier))[:MAX_MATCHES]
         if len(chosen) >= MIN_MATCHES:
-            yield _Pair(uv_a[chosen] - middle, uv_b[chosen] - middle, sigma, 0.5 * size_px[0])
+            yield _Pair(uv_a[chosen] - middle, uv_b[chosen] - middle, sigma, 0.5 * max(size_px))
 
 
 # --- how well a camera explains a pair
@@ -246,7 +247,7 @@ def _student(costs: FloatArray, least: FloatArray, noise: FloatArray) -> FloatAr
 
 
 def _between_nodes(
-    pairs: Sequence[_Pair], costs: FloatArray, width: int, log_focal: float, lens: float | None
+    pairs: Sequence[_Pair], costs: FloatArray, side: int, log_focal: float, lens: float | None
 ) -> tuple[float, float]:
     """Return the best log focal length and lens near a node of the grid, which is coarser than many pairs are sure.
 
@@ -254,7 +255,7 @@ def _between_nodes(
     """
     least = costs.min(axis=(1, 2))
     noise = np.maximum(least / np.array([len(pair.uv_a) for pair in pairs]), 1e-3)
-    focal = width * np.exp(log_focal)
+    focal = side * np.exp(log_focal)
     poses = []
     for pair in pairs:
         a, b, _ = pair.straightened(lens or 0.0)
@@ -265,7 +266,7 @@ def _between_nodes(
         found = np.empty(len(pairs))
         for i, pair in enumerate(pairs):
             a, b, zoom = pair.straightened(bend)
-            found[i], poses[i] = _best_cost(a, b, zoom, width * np.exp(log_f), pair.sigma_px, [poses[i]])
+            found[i], poses[i] = _best_cost(a, b, zoom, side * np.exp(log_f), pair.sigma_px, [poses[i]])
         (focal_mean, focal_sigma), (lens_mean, lens_sigma) = LOG_FOCAL_PRIOR, LENS_PRIOR
         prior = ((log_f - focal_mean) / focal_sigma) ** 2 + ((bend - lens_mean) / lens_sigma) ** 2
         return 0.5 * float(prior) - float(_student(found, least, noise).sum())
@@ -295,7 +296,7 @@ def _estimate(of_pairs: FloatArray, prior: FloatArray, lenses: FloatArray, seed:
 
 
 def _moments(log_posterior: FloatArray, lenses: FloatArray) -> tuple[float, float, float]:
-    """Return the mean and the variance of the log focal length over the width, and the mean of the lens."""
+    """Return the mean and the variance of the log focal length over the longer side, and the mean of the lens."""
     weight = np.exp(log_posterior - log_posterior.max())
     weight /= weight.sum()
     of_focal = weight.sum(axis=0)

@@ -24,7 +24,7 @@ class FocalSearch:
     log_sigma : float
         Standard deviation of its logarithm.
     lens : float
-        Of the division model, at half the image's width: an undistorted radius is r / (1 + lens r^2); zero: none.
+        Of the division model, at half the image's longer side: an undistorted radius is r / (1 + lens r^2); zero: none.
     width, height : int
         Of the image, pixels.
     n_pairs : int
@@ -60,10 +60,11 @@ class FocalSearch:
 
     def camera(self) -> Camera:
         """Return the camera, with its principal point in the middle."""
-        f, middle = self.focal_px, (0.5 * (self.width - 1), 0.5 * (self.height - 1))
+        f, radius = self.focal_px, 0.5 * max(self.width, self.height)
+        middle = (0.5 * (self.width - 1), 0.5 * (self.height - 1))
         if self.lens == 0.0:
             return PinholeCamera(self.width, self.height, f, f, *middle)
-        return DivisionCamera(self.width, self.height, f, f, *middle, k=self.lens * (2.0 * f / self.width) ** 2)
+        return DivisionCamera(self.width, self.height, f, f, *middle, k=self.lens * (f / radius) ** 2)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as ``summary.json`` has it."""

@@ -22,11 +22,11 @@ def features_of(world: PointWorld, camera: Camera = CAMERA) -> list[Features]:
     return [replace(each, uv_px=camera.project(CAMERA.unproject(each.uv_px))) for each in seen]
 
 
-def search(features: list[Features], seed: int = 0) -> FocalSearch | Failure:
-    return search_focal(create_frontend(FrontendConfig()), features, SIZE_PX, seed)
+def search(features: list[Features], seed: int = 0, size_px: tuple[int, int] = SIZE_PX) -> FocalSearch | Failure:
+    return search_focal(create_frontend(FrontendConfig()), features, size_px, seed)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_hand_held_camera_tells_its_focal_length(seed: int) -> None:
     found = search(features_of(PointWorld(cloud(seed=seed), hand_held(60), seed=seed)), seed)
     assert isinstance(found, FocalSearch)
@@ -52,6 +52,18 @@ def test_a_lens_is_found_with_the_focal_length() -> None:
     assert np.degrees(np.arccos(ray @ true)) < 3.0
 
 
+@pytest.mark.slow
+def test_it_does_not_matter_how_a_telephone_was_held() -> None:
+    level = features_of(PointWorld(cloud(), hand_held(60)))
+    upright = [replace(each, uv_px=each.uv_px[:, ::-1] * (-1, 1) + (CAMERA.height - 1, 0)) for each in level]
+    a, b = search(level), search(upright, size_px=(CAMERA.height, CAMERA.width))
+    assert isinstance(a, FocalSearch)
+    assert isinstance(b, FocalSearch)
+    assert b.focal_px == pytest.approx(a.focal_px, rel=0.02)
+    assert b.fov_deg < a.fov_deg
+
+
+@pytest.mark.slow
 def test_a_straight_drive_does_not_claim_to_know() -> None:
     """It leaves the focal length to what cameras are like, and says so."""
     turning, straight = (
