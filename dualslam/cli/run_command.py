@@ -15,7 +15,7 @@ from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.errors import InputError, NoCalibrationError
 from dualslam.io.atomic import atomic_file
 from dualslam.io.reduced import MAX_SIDE_PX
-from dualslam.run.focal import open_without_calibration, with_prior
+from dualslam.run.focal import open_with_camera_of, open_without_calibration, with_prior
 from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import open_source
 from dualslam.viewer.live import LiveView
@@ -42,8 +42,12 @@ def execute(args: argparse.Namespace) -> int:
         sequence = open_source(args.source, camera_file=args.camera, fov_degrees=args.fov, **selection)
     except NoCalibrationError:
         logs.discard()  # it is opened again
-        sequence, focal = open_without_calibration(config, args.source, **selection)
-        config = with_prior(config, focal)
+        of_map = None if args.map is None else open_with_camera_of(args.map, args.source, **selection)
+        if of_map is not None:
+            sequence = of_map
+        else:
+            sequence, focal = open_without_calibration(config, args.source, **selection)
+            config = with_prior(config, focal)
         _tell(focal, args.quiet)
     logs.release()
     with live_view(args) as live, progress(sequence, args.quiet) as on_frame:
@@ -85,8 +89,12 @@ def _keep_page(path: Path, page: str) -> None:
         file.write(page.encode())
 
 
-def _tell(focal: FocalSearch, quiet: bool) -> None:
-    if not quiet:
+def _tell(focal: FocalSearch | None, quiet: bool) -> None:
+    if quiet:
+        return
+    if focal is None:
+        print("no calibration: taken to be by the camera of the saved map; --fov or --camera know better", flush=True)
+    else:
         low, high = focal.fov_range_deg
         print(
             f"no calibration: the frames show a field of view of {focal.fov_deg:.0f} degrees ({low:.0f} to {high:.0f}, "

@@ -141,6 +141,24 @@ def load_atlas(folder: str | Path) -> StoredMap:
     return StoredMap(atlas, poses, camera)
 
 
+def load_camera(folder: str | Path) -> Camera | None:
+    """Read the camera of a map, from a run folder or its ``map`` folder, and nothing larger; None where it has none.
+
+    Raises
+    ------
+    InputError
+        If there is no map, or it is damaged.
+    """
+    folder = Path(folder)
+    if (folder / MAP).is_dir():
+        folder = folder / MAP
+    _, metadata = load_metadata(folder)
+    try:
+        return camera_from_dict(metadata["camera"]) if metadata.get("camera") else None
+    except _DAMAGE as error:
+        raise InputError(f"{folder} is no map of this version, or is damaged: {error}.") from error
+
+
 def load_joints(folder: str | Path) -> tuple[list[int], Atlas]:
     """Read the ids of a map's submaps and how they are joined, from its ``map`` folder, and nothing larger.
 

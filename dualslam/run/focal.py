@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 from dualslam.build import find_focal
 from dualslam.config.settings import Config
+from dualslam.core.camera.corrected import given_camera
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Failure
+from dualslam.io.map_store import load_camera
 from dualslam.io.sequence import RecordedSequence
 from dualslam.run.sources import ANY_FOV_DEG, open_source
 
@@ -44,6 +47,26 @@ def open_without_calibration(config: Config, source: str, **selection: Any) -> t
             f"({found.detail}); give a camera file, or a field of view in degrees."
         )
     return sequence.with_camera(found.camera()), found
+
+
+def open_with_camera_of(saved_map: str | Path, source: str, **selection: Any) -> Sequence | None:
+    """Open a source that has no calibration with the camera that a saved map was made by.
+
+    None where the map has no camera, or one of images of another size: then it was another.
+
+    Raises
+    ------
+    InputError
+        If the source or the map cannot be read.
+    """
+    sequence = open_source(source, fov_degrees=ANY_FOV_DEG, **selection)
+    assert isinstance(sequence, RecordedSequence)  # a world has a camera of its own
+    camera = load_camera(saved_map)
+    if camera is None:
+        return None
+    given = given_camera(camera)
+    same_size = (given.width, given.height) == (sequence.camera.width, sequence.camera.height)
+    return sequence.with_camera(given) if same_size else None
 
 
 def with_prior(config: Config, found: FocalSearch) -> Config:

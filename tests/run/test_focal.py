@@ -9,10 +9,14 @@ import numpy as np
 import pytest
 
 from dualslam.config.settings import Config
+from dualslam.core.camera.corrected import LensCorrection, correct
 from dualslam.core.camera.focal import FocalSearch
+from dualslam.core.camera.models import DivisionCamera
 from dualslam.core.errors import InputError
+from dualslam.io.map_store import save_atlas
 from dualslam.lab.synthetic import make_sequence
-from dualslam.run.focal import open_without_calibration, with_prior
+from dualslam.map.atlas import Atlas
+from dualslam.run.focal import open_with_camera_of, open_without_calibration, with_prior
 
 
 def write(folder: Path, images: list[np.ndarray]) -> Path:
@@ -47,3 +51,15 @@ def test_where_nothing_moves_the_person_is_asked(tmp_path: Path) -> None:
     folder = write(tmp_path / "images", [image] * 12)
     with pytest.raises(InputError, match="give a camera file, or a field of view"):
         open_without_calibration(Config(), str(folder), start=0, stride=1, max_frames=None)
+
+
+def test_on_a_saved_map_an_unknown_camera_is_the_one_that_made_it(tmp_path: Path) -> None:
+    folder = write(tmp_path / "images", [np.zeros((48, 64), np.uint8)] * 3)
+    made_by = DivisionCamera(64, 48, 50.0, 50.0, 31.5, 23.5, k=-0.2)
+    save_atlas(tmp_path / "map", Atlas(), {}, correct(made_by, LensCorrection(log_focal=0.02)))
+    sequence = open_with_camera_of(tmp_path / "map", str(folder))
+    assert sequence is not None
+    assert sequence.camera == made_by, "self-calibration's part comes with the map"
+    assert len(list(sequence)) == 3
+    save_atlas(tmp_path / "other", Atlas(), {}, DivisionCamera(128, 96, 50.0, 50.0, 63.5, 47.5))
+    assert open_with_camera_of(tmp_path / "other", str(folder)) is None
