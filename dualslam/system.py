@@ -174,8 +174,7 @@ class System:
     @property
     def log_focal_sigma(self) -> float | None:
         """Standard deviation of the logarithm of that camera's focal length; None where it is as it was given."""
-        covariance = self._parts.calibration.covariance
-        return None if covariance is None else float(np.sqrt(covariance[0, 0]))
+        return self._parts.calibration.log_focal_sigma
 
     @property
     def world(self) -> int | None:

@@ -139,6 +139,11 @@ class Calibration:
         """(5, 5) of the correction that it has; none where it is as it was given."""
         return self._covariance
 
+    @property
+    def log_focal_sigma(self) -> float | None:
+        """Standard deviation of the logarithm of its focal length; None where it is as it was given."""
+        return None if self._covariance is None else float(np.sqrt(self._covariance[0, 0]))
+
     def is_due(self, submap: Submap) -> bool:
         """Whether it is time to ask this submap."""
         if self._refined_in not in (None, submap.id):
@@ -222,9 +227,9 @@ class Calibration:
 
     def _is_much_surer(self, covariance: FloatArray) -> bool:
         """Whether an answer is worth a change that is not significant: only where the present one was hardly sure."""
-        if self._covariance is None:
+        config, present, found = self._config, self.log_focal_sigma, float(np.sqrt(covariance[0, 0]))
+        if present is None:
             return False
-        config, present, found = self._config, *(float(np.sqrt(C[0, 0])) for C in (self._covariance, covariance))
         hardly_sure = present > min(config.max_sigma_ratio * config.log_focal_sigma, SURE_SIGMA)
         return hardly_sure and found < UPDATE_SIGMA_RATIO * present
 

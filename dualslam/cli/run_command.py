@@ -15,7 +15,7 @@ from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.errors import InputError, NoCalibrationError
 from dualslam.io.atomic import atomic_file
 from dualslam.io.reduced import MAX_SIDE_PX
-from dualslam.run.focal import open_with_camera_of, open_without_calibration, with_prior
+from dualslam.run.focal import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
 from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import open_source
 from dualslam.viewer.live import LiveView
@@ -42,11 +42,12 @@ def execute(args: argparse.Namespace) -> int:
         sequence = open_source(args.source, camera_file=args.camera, fov_degrees=args.fov, **selection)
     except NoCalibrationError:
         logs.discard()  # it is opened again
-        of_map = None if args.map is None else open_with_camera_of(args.map, args.source, **selection)
+        recorded = open_without_calibration(args.source, **selection)
+        of_map = None if args.map is None else with_camera_of_map(args.map, recorded)
         if of_map is not None:
             sequence = of_map
         else:
-            sequence, focal = open_without_calibration(config, args.source, **selection)
+            sequence, focal = with_camera_found(config, recorded)
             config = with_prior(config, focal)
         _tell(focal, args.quiet)
     logs.release()

@@ -122,9 +122,7 @@ def load_atlas(folder: str | Path) -> StoredMap:
     InputError
         If there is no map, or it is damaged.
     """
-    folder = Path(folder)
-    if (folder / MAP).is_dir():
-        folder = folder / MAP
+    folder = _map_folder(folder)
     groups, metadata = load_map(folder)
     try:
         atlas = Atlas()
@@ -135,7 +133,7 @@ def load_atlas(folder: str | Path) -> StoredMap:
         columns = (frames[name].tolist() for name in ("index", "timestamp_s", "submap", "keyframe"))
         rows = zip(*columns, frames["T_kf_cam"], strict=True)
         poses = {index: FramePose(index, t, m, k, T_kf_cam) for index, t, m, k, T_kf_cam in rows}
-        camera = camera_from_dict(metadata["camera"]) if metadata.get("camera") else None
+        camera = _camera(metadata)
     except _DAMAGE as error:
         raise InputError(f"{folder} is no map of this version, or is damaged: {error}.") from error
     return StoredMap(atlas, poses, camera)
@@ -149,12 +147,10 @@ def load_camera(folder: str | Path) -> Camera | None:
     InputError
         If there is no map, or it is damaged.
     """
-    folder = Path(folder)
-    if (folder / MAP).is_dir():
-        folder = folder / MAP
+    folder = _map_folder(folder)
     _, metadata = load_metadata(folder)
     try:
-        return camera_from_dict(metadata["camera"]) if metadata.get("camera") else None
+        return _camera(metadata)
     except _DAMAGE as error:
         raise InputError(f"{folder} is no map of this version, or is damaged: {error}.") from error
 
@@ -224,3 +220,13 @@ def _links(arrays: Arrays, metadata: Mapping[str, Any]) -> list[Link]:
             C = np.diag(ROLLOVER_SIGMAS**2)
         links.append(Link(a, b, S, C, kind, tuple(shared), k_a, k_b, may_doubt, refused))
     return links
+
+
+def _map_folder(folder: str | Path) -> Path:
+    """Return the map's own folder, given that or the run's."""
+    folder = Path(folder)
+    return folder / MAP if (folder / MAP).is_dir() else folder
+
+
+def _camera(metadata: Mapping[str, Any]) -> Camera | None:
+    return camera_from_dict(metadata["camera"]) if metadata.get("camera") else None

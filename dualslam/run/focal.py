@@ -11,7 +11,6 @@ from dualslam.config.settings import Config
 from dualslam.core.camera.corrected import given_camera
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.errors import InputError
-from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Failure
 from dualslam.io.map_store import load_camera
 from dualslam.io.sequence import RecordedSequence
@@ -21,12 +20,11 @@ SEARCHED_FRAMES = 200
 """The first ones: some seconds, in which a camera in a hand or on a car has moved."""
 
 
-def open_without_calibration(config: Config, source: str, **selection: Any) -> tuple[Sequence, FocalSearch]:
-    """Open a source that has no calibration with the camera that its first frames tell.
+def open_without_calibration(source: str, **selection: Any) -> RecordedSequence:
+    """Open a source that has no calibration, by a camera that only has the size of its images.
 
     Parameters
     ----------
-    config : Config
     source : str
         Not a webcam: what it shows is gone once it has been looked at.
     **selection
@@ -35,10 +33,21 @@ def open_without_calibration(config: Config, source: str, **selection: Any) -> t
     Raises
     ------
     InputError
-        If the source cannot be read, or its beginning does not tell.
+        If the source cannot be read.
     """
     sequence = open_source(source, fov_degrees=ANY_FOV_DEG, **selection)
     assert isinstance(sequence, RecordedSequence)  # a world has a camera of its own
+    return sequence
+
+
+def with_camera_found(config: Config, sequence: RecordedSequence) -> tuple[RecordedSequence, FocalSearch]:
+    """Return a sequence with the camera that its first frames tell, and what they tell.
+
+    Raises
+    ------
+    InputError
+        If they do not tell.
+    """
     size_px = sequence.camera.width, sequence.camera.height
     found = find_focal(config, islice(sequence, SEARCHED_FRAMES), size_px)
     if isinstance(found, Failure):
@@ -49,18 +58,16 @@ def open_without_calibration(config: Config, source: str, **selection: Any) -> t
     return sequence.with_camera(found.camera()), found
 
 
-def open_with_camera_of(saved_map: str | Path, source: str, **selection: Any) -> Sequence | None:
-    """Open a source that has no calibration with the camera that a saved map was made by.
+def with_camera_of_map(saved_map: str | Path, sequence: RecordedSequence) -> RecordedSequence | None:
+    """Return a sequence with the camera, as it was given, that a saved map was made by.
 
     None where the map has no camera, or one of images of another size: then it was another.
 
     Raises
     ------
     InputError
-        If the source or the map cannot be read.
+        If the map cannot be read.
     """
-    sequence = open_source(source, fov_degrees=ANY_FOV_DEG, **selection)
-    assert isinstance(sequence, RecordedSequence)  # a world has a camera of its own
     camera = load_camera(saved_map)
     if camera is None:
         return None

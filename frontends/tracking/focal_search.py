@@ -22,8 +22,12 @@ from scipy.optimize import minimize
 
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.chi_square import CHI2_999
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.distortion import division_area_ratio, undistort_division
+from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray
+from dualslam.frontends.tracking.resection import poselib_camera
 
 LAGS = (1, 2, 5, 10, 20, 40)
 """Frames between the two of a pair: a car at 10 Hz loses sight of most points within five."""
@@ -51,6 +55,8 @@ DEGREES_OF_FREEDOM, INFLATION = 3.0, 4.0
 residuals errors are taken to be, as neighbouring points err alike (`CalibrationConfig.inflation`)."""
 MODEL_SIGMA = 0.03
 """Of the log focal length: what a lens of one number and a principal point in the middle leave."""
+COARSE_ITERATIONS, FINE_ITERATIONS = (30, 60), (50, 200)
+"""Of RANSAC, at least and at most."""
 RESAMPLES = 100
 MAX_STEPS = 40
 """Of the search between the grid's cameras."""
@@ -84,13 +90,13 @@ def search_focal(
     side = max(size_px)
     focals = side * np.exp(LOG_FOCALS)
     costs = np.array([_costs_on_coarse_grid(pair, focals, seed) for pair in pairs])
-    prior = _log_prior()
-    coarse = (_log_likelihood(costs, pairs).sum(axis=0) + prior)[::COARSE, ::COARSE]
+    prior = _log_prior(LOG_FOCALS[None, :], LENSES[:, None])
+    coarse = (_log_likelihood(costs, costs, pairs).sum(axis=0) + prior)[::COARSE, ::COARSE]
     for cell in np.argsort(coarse.ravel(), kind="stable")[::-1][:FINE_CELLS]:
         row, column = np.unravel_index(cell, coarse.shape)
         for pair, of_pair in zip(pairs, costs, strict=True):
             _refine_cell(pair, of_pair, focals, int(row) * COARSE, int(column) * COARSE)
-    of_pairs = _log_likelihood(costs, pairs)
+    of_pairs = _log_likelihood(costs, costs, pairs)
     straight = np.flatnonzero(np.isclose(LENSES, 0.0))
     total = of_pairs.sum(axis=0) + prior
     bent = 2.0 * float(total.max() - total[straight].max()) > CHI2_999[1]
@@ -117,9 +123,8 @@ class _Pair:
 
 
 def _straighten(uv_px: FloatArray, lens: float, radius_px: float) -> tuple[FloatArray, FloatArray]:
-    r2 = (uv_px * uv_px).sum(axis=1) / radius_px**2
-    gain = 1.0 / (1.0 + lens * r2)
-    return uv_px * gain[:, None], np.sqrt(np.abs(gain**3 * (1.0 - lens * r2)))
+    xy = uv_px / radius_px
+    return radius_px * undistort_division(xy, lens), np.abs(division_area_ratio(xy, lens)) ** -0.5
 
 
 def _find_pairs(
@@ -163,11 +168,9 @@ def _costs_on_coarse_grid(pair: _Pair, focals: FloatArray, seed: int) -> FloatAr
         a, b, zoom = pair.straightened(LENSES[row])
         pose = None
         for column in range(0, len(focals), COARSE):
-            camera = _pinhole(focals[column])
-            options = {"max_epipolar_error": 3.0 * pair.sigma_px, "max_iterations": 60, "min_iterations": 30}
             starts = [] if pose is None else [pose]
             if column % (2 * COARSE) == 0:
-                starts.append(poselib.estimate_relative_pose(a, b, camera, camera, options | {"seed": seed}, {})[0])
+                starts.append(_fresh_pose(a, b, focals[column], pair.sigma_px, COARSE_ITERATIONS, seed))
             cost, pose = _best_cost(a, b, zoom, focals[column], pair.sigma_px, starts)
             costs[row : row + COARSE, column : column + COARSE] = cost
     return costs
@@ -180,13 +183,23 @@ def _refine_cell(pair: _Pair, costs: FloatArray, focals: FloatArray, row: int, c
         a, b, zoom = pair.straightened(LENSES[i])
         along = range(column, column + COARSE)
         for j in along if (i - row) % 2 == 0 else reversed(along):
-            starts = [pose] if pose is not None else [_pose_at(pair, a, b, focals[j])]
-            costs[i, j], pose = _best_cost(a, b, zoom, focals[j], pair.sigma_px, starts)
+            if pose is None:
+                pose = _fresh_pose(a, b, focals[j], pair.sigma_px)
+            costs[i, j], pose = _best_cost(a, b, zoom, focals[j], pair.sigma_px, [pose])
 
 
-def _pose_at(pair: _Pair, a: FloatArray, b: FloatArray, focal: float) -> poselib.CameraPose:
-    camera = _pinhole(focal)
-    options = {"max_epipolar_error": 3.0 * pair.sigma_px, "max_iterations": 200, "min_iterations": 50, "seed": 0}
+def _fresh_pose(
+    a: FloatArray,
+    b: FloatArray,
+    focal: float,
+    sigma_px: float,
+    iterations: tuple[int, int] = FINE_ITERATIONS,
+    seed: int = 0,
+) -> poselib.CameraPose:
+    """Return a relative pose by RANSAC, of at least and at most so many iterations."""
+    least, most = iterations
+    options = {"max_epipolar_error": 3.0 * sigma_px, "min_iterations": least, "max_iterations": most, "seed": seed}
+    camera = poselib_camera(_K(focal), (1, 1))
     return poselib.estimate_relative_pose(a, b, camera, camera, options, {})[0]
 
 
@@ -199,50 +212,43 @@ def _best_cost(
     starts: Sequence[poselib.CameraPose],
 ) -> tuple[float, poselib.CameraPose]:
     """Return the least robust cost of the epipolar constraint from some poses on, and its pose."""
-    camera = _pinhole(focal)
+    K = _K(focal)
+    camera = poselib_camera(K, (1, 1))
     best: tuple[float, poselib.CameraPose] | None = None
     for start in starts:
         options = {"loss_type": "CAUCHY", "loss_scale": sigma_px, "max_iterations": 15}
         pose, _ = poselib.refine_relative_pose(a, b, start, camera, camera, options)
-        x, y, z = pose.t
-        E = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ pose.R
-        in_a, in_b = (np.column_stack([uv / focal, np.ones(len(uv))]) for uv in (a, b))
-        line_b, line_a = in_a @ E.T, in_b @ E
-        slope = np.sqrt((line_a[:, :2] ** 2).sum(axis=1) + (line_b[:, :2] ** 2).sum(axis=1))
-        error = focal * (in_b * line_b).sum(axis=1) / np.maximum(slope, 1e-12) / (zoom * sigma_px)
-        cost = float(np.log1p(error * error).sum())
+        F = fundamental_from_pose(K, se3.from_parts(pose.R, pose.t))
+        cost = float(np.log1p(sampson_error(F, a, b) / (zoom * sigma_px) ** 2).sum())
         if best is None or cost < best[0]:
             best = cost, pose
     assert best is not None
     return best
 
 
-def _pinhole(focal: float) -> dict[str, object]:
-    return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [focal, 0.0, 0.0]}
+def _K(focal: float) -> FloatArray:
+    """Return the intrinsics of pixels that count from the middle of the image."""
+    return np.diag([focal, focal, 1.0])
 
 
 # --- what all pairs say together
 
 
-def _log_prior() -> FloatArray:
-    """Return the logarithm of the prior at every camera, (lenses, focals)."""
+def _log_prior(log_focal: FloatArray, lens: FloatArray) -> FloatArray:
+    """Return the logarithm of the prior of cameras, of the shape that both make together."""
     of_focal, of_lens = (
         -0.5 * ((values - mean) / sigma) ** 2
-        for values, (mean, sigma) in ((LOG_FOCALS, LOG_FOCAL_PRIOR), (LENSES, LENS_PRIOR))
+        for values, (mean, sigma) in ((log_focal, LOG_FOCAL_PRIOR), (lens, LENS_PRIOR))
     )
-    return np.asarray(of_lens[:, None] + of_focal[None, :], np.float64)
+    return np.asarray(of_focal + of_lens, np.float64)
 
 
-def _log_likelihood(costs: FloatArray, pairs: Sequence[_Pair]) -> FloatArray:
-    """Return what each pair's costs (pairs, lenses, focals) say, in its own noise."""
-    least = costs.min(axis=(1, 2), keepdims=True)
-    n = np.array([len(pair.uv_a) for pair in pairs])[:, None, None]
-    return _student(costs, least, np.maximum(least / n, 1e-3))
-
-
-def _student(costs: FloatArray, least: FloatArray, noise: FloatArray) -> FloatArray:
-    nu = DEGREES_OF_FREEDOM
-    excess = np.maximum(costs - least, 0.0) / noise
+def _log_likelihood(costs: FloatArray, on_grid: FloatArray, pairs: Sequence[_Pair]) -> FloatArray:
+    """Return what each pair's costs (pairs, ...) say, in the noise that its costs (pairs, lenses, focals) show."""
+    shape = (-1,) + (1,) * (costs.ndim - 1)
+    least = on_grid.min(axis=(1, 2)).reshape(shape)
+    noise = np.maximum(least / np.array([len(pair.uv_a) for pair in pairs]).reshape(shape), 1e-3)
+    excess, nu = np.maximum(costs - least, 0.0) / noise, DEGREES_OF_FREEDOM
     return np.asarray(-0.5 * (nu + 1.0) * np.log1p(excess / (nu * INFLATION**2)), np.float64)
 
 
@@ -253,13 +259,10 @@ def _between_nodes(
 
     Without a lens none is looked for.
     """
-    least = costs.min(axis=(1, 2))
-    noise = np.maximum(least / np.array([len(pair.uv_a) for pair in pairs]), 1e-3)
-    focal = side * np.exp(log_focal)
     poses = []
     for pair in pairs:
         a, b, _ = pair.straightened(lens or 0.0)
-        poses.append(_pose_at(pair, a, b, focal))
+        poses.append(_fresh_pose(a, b, side * np.exp(log_focal), pair.sigma_px))
 
     def misfit(x: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
         log_f, bend = float(x[0]), float(x[1]) if lens is not None else 0.0
@@ -267,9 +270,8 @@ def _between_nodes(
         for i, pair in enumerate(pairs):
             a, b, zoom = pair.straightened(bend)
             found[i], poses[i] = _best_cost(a, b, zoom, side * np.exp(log_f), pair.sigma_px, [poses[i]])
-        (focal_mean, focal_sigma), (lens_mean, lens_sigma) = LOG_FOCAL_PRIOR, LENS_PRIOR
-        prior = ((log_f - focal_mean) / focal_sigma) ** 2 + ((bend - lens_mean) / lens_sigma) ** 2
-        return 0.5 * float(prior) - float(_student(found, least, noise).sum())
+        prior = _log_prior(np.array(log_f), np.array(bend))
+        return -float(prior) - float(_log_likelihood(found, costs, pairs).sum())
 
     start = np.array([log_focal] if lens is None else [log_focal, lens])
     corners = start + np.vstack([np.zeros(len(start)), np.diag([LOG_FOCAL_STEP, LENS_STEP][: len(start)])])

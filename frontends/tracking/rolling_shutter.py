@@ -22,9 +22,11 @@ from dualslam.core.types import Features, FloatArray, View
 from dualslam.frontends.tracking.resection import poselib_camera
 from dualslam.frontends.tracking.turning import turn_between
 
-READOUT_EVIDENCE = 144.0
+INFLATION = 4.0
+"""How much larger errors are taken to be than they seem, as neighbouring pixels err alike."""
+READOUT_EVIDENCE = (3.0 * INFLATION) ** 2
 """Chi-square by which a rolling shutter must explain frames better than a global one, or a global one better than 0.02
-s, to be known: three sigmas, with errors four times what they seem, as neighbouring pixels err alike."""
+s, to be known: three sigmas of inflated errors."""
 
 STEP_S = 0.005
 READOUTS_S = STEP_S * np.arange(8)
@@ -40,8 +42,6 @@ SUSPICION = 1 / 9
 """Share of the evidence that makes a rolling shutter likely: one sigma of three."""
 MAX_PAIRS = 60
 """Pairs after which a readout time is taken, however unsure: waiting costs more then."""
-INFLATION = 4.0
-"""How much larger errors are taken to be than they seem, as neighbouring pixels err alike."""
 ENOUGH_PAIRS, ENOUGH_CURVATURE = 150, 50.0
 """Pairs after which the time that is known is good enough; or the second difference of chi-square at it, by steps: a
 sigma of 0.004 s with errors four times what they seem. On the first 200 frames of a hand-held turn the times that

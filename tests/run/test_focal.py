@@ -16,7 +16,7 @@ from dualslam.core.errors import InputError
 from dualslam.io.map_store import save_atlas
 from dualslam.lab.synthetic import make_sequence
 from dualslam.map.atlas import Atlas
-from dualslam.run.focal import open_with_camera_of, open_without_calibration, with_prior
+from dualslam.run.focal import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
 
 
 def write(folder: Path, images: list[np.ndarray]) -> Path:
@@ -30,7 +30,8 @@ def test_the_beginning_tells_the_field_of_view(tmp_path: Path) -> None:
     world = make_sequence("room", 70, 3, 320, 240)
     folder = write(tmp_path / "images", [world.frame(i).image for i in range(70)])
     config = Config.model_validate({"frontend": {"n_features": 800}})
-    sequence, found = open_without_calibration(config, str(folder), start=0, stride=1, max_frames=None)
+    opened = open_without_calibration(str(folder), start=0, stride=1, max_frames=None)
+    sequence, found = with_camera_found(config, opened)
     assert sequence.camera.K[0, 0] == pytest.approx(found.focal_px)
     low, high = found.range_px
     assert low <= world.camera.K[0, 0] <= high
@@ -50,16 +51,17 @@ def test_where_nothing_moves_the_person_is_asked(tmp_path: Path) -> None:
     image = make_sequence("room", 2, 3, 320, 240).frame(0).image
     folder = write(tmp_path / "images", [image] * 12)
     with pytest.raises(InputError, match="give a camera file, or a field of view"):
-        open_without_calibration(Config(), str(folder), start=0, stride=1, max_frames=None)
+        with_camera_found(Config(), open_without_calibration(str(folder), start=0, stride=1, max_frames=None))
 
 
 def test_on_a_saved_map_an_unknown_camera_is_the_one_that_made_it(tmp_path: Path) -> None:
     folder = write(tmp_path / "images", [np.zeros((48, 64), np.uint8)] * 3)
     made_by = DivisionCamera(64, 48, 50.0, 50.0, 31.5, 23.5, k=-0.2)
     save_atlas(tmp_path / "map", Atlas(), {}, correct(made_by, LensCorrection(log_focal=0.02)))
-    sequence = open_with_camera_of(tmp_path / "map", str(folder))
+    opened = open_without_calibration(str(folder))
+    sequence = with_camera_of_map(tmp_path / "map", opened)
     assert sequence is not None
     assert sequence.camera == made_by, "self-calibration's part comes with the map"
     assert len(list(sequence)) == 3
     save_atlas(tmp_path / "other", Atlas(), {}, DivisionCamera(128, 96, 50.0, 50.0, 63.5, 47.5))
-    assert open_with_camera_of(tmp_path / "other", str(folder)) is None
+    assert with_camera_of_map(tmp_path / "other", opened) is None

@@ -392,14 +392,11 @@ class DivisionCamera(Camera):
         return xy * (2.0 / (1.0 + root))[:, None]
 
     def _undistort(self, xy_distorted: FloatArray) -> FloatArray:
-        r2 = (xy_distorted * xy_distorted).sum(1)
-        inside = (1.0 + self.k * r2 > 0.0) & (self.k * r2 < 1.0)
-        return _lift(xy_distorted / np.where(inside, 1.0 + self.k * r2, np.nan)[:, None])
+        inside = np.abs(self.k * (xy_distorted * xy_distorted).sum(1)) < 1.0
+        return _lift(distortion.undistort_division(np.where(inside[:, None], xy_distorted, np.nan), self.k))
 
     def _area_ratio(self, xy: FloatArray) -> FloatArray:
-        distorted = self._distort(_lift(xy))
-        kr2 = self.k * (distorted * distorted).sum(1)
-        return np.asarray((1.0 + kr2) ** 3 / (1.0 - kr2), np.float64)
+        return distortion.division_area_ratio(self._distort(_lift(xy)), self.k)
 
 
 MODELS: dict[str, type[Camera]] = {

@@ -95,6 +95,18 @@ def radtan_jacobian(xy: FloatArray, k: tuple[float, ...], p1: float, p2: float) 
     return J
 
 
+def undistort_division(xy_distorted: FloatArray, k: float) -> FloatArray:
+    """Return where points (N, 2) would be without a lens of the division model, for any k r^2 above -1."""
+    r2 = (xy_distorted * xy_distorted).sum(1)
+    return np.asarray(xy_distorted / (1.0 + k * r2)[:, None], np.float64)
+
+
+def division_area_ratio(xy_distorted: FloatArray, k: float) -> FloatArray:
+    """Return the determinant (N,) of d(distorted)/d(undistorted) of the division model at distorted points (N, 2)."""
+    kr2 = k * (xy_distorted * xy_distorted).sum(1)
+    return np.asarray((1.0 + kr2) ** 3 / (1.0 - kr2), np.float64)
+
+
 def undistort_radtan(xy_distorted: FloatArray, k: tuple[float, ...], p1: float, p2: float) -> FloatArray:
     """Return undistorted points (N, 2), NaN where the model has no inverse: radial first, then Newton in both axes."""
     r_distorted = np.sqrt((xy_distorted**2).sum(1))
