@@ -30,7 +30,7 @@ from dualslam.map.frame_records import FrameResult, FrameRow
 from dualslam.map.graph_beside import N_FREE, N_FREE_BEHIND, BesideGraphs, Moved
 from dualslam.map.propagation import propagate_links
 from dualslam.map.record import FrameStamp, Record
-from dualslam.map.split import next_submap
+from dualslam.map.split import next_submap, submap_of, take_out
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
 from dualslam.pace import Pace
@@ -41,6 +41,7 @@ from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.leaps import LeapWatch
 from dualslam.recovery.manager import Recoveries
 from dualslam.recovery.relocaliser import Relocaliser
+from dualslam.recovery.scale_watch import ScaleLoss, ScaleWatch
 from dualslam.workers.jobs import Desk
 
 log = logging.getLogger(__name__)
@@ -125,6 +126,7 @@ class System:
         self._lost: list[View] = []
         self._health = HealthMonitor(config.health)
         self._leaps = LeapWatch()
+        self._scale_watch = ScaleWatch(config.linking) if config.audit.enabled else None
         self._connections = Connections(
             record,
             components.atlas_solver,
@@ -403,6 +405,8 @@ class System:
                 return contradicted
             if live.reference_id != view.index:
                 return track
+            if (loss := self._scale_lost(live.submap)) is not None and self._part_at(live, view, loss):
+                return track
             self._calibrations.ask_if_due(live, view, self._recoveries.waiting)
             if len(live.submap.keyframes) >= self._config.graph.max_keyframes:
                 self._roll_over(live, view)
@@ -537,6 +541,59 @@ class System:
         drop_corrupted(self._record, live.submap.id, first)
         live.submap.condemn({k for k in live.submap.keyframes if k >= first})
         self._give_up(live, view, failure)
+
+    def _scale_lost(self, submap: Submap) -> ScaleLoss | None:
+        """Return where a live map has lost its scale; not while a walk back is about to change it."""
+        if self._scale_watch is None or self._recoveries.is_under_way(submap):
+            return None
+        with self.timer.measure("audit"):
+            return self._scale_watch.judge(submap, self.atlas.believed)
+
+    def _part_at(self, live: VisualOdometry, view: View, loss: ScaleLoss) -> bool:
+        """End a map where it has lost its scale, and go on in another that begins there; return whether it was done.
+
+        A walk back from the new one may join the two.
+        """
+        old, graph = live.submap, self._parts.new_graph()
+        rest = [k for k in old.keyframes if k >= loss.first]
+        submap = submap_of(old, len(self.atlas.submaps), rest)
+        try:
+            graph.rebuild(submap)
+        except SolverError as error:
+            log.warning("submap %d is not parted where it has lost its scale: %s", old.id, error)
+            return False
+        self._record.event(
+            EventKind.FAILED,
+            view,
+            old.id,
+            reason=str(FailureReason.SCALE_LOST),
+            detail=f"the scale from here on is known to {loss.sigma:.0%} by what was mapped before",
+            lost_since=loss.first,
+            suspected_since=loss.since,
+            sigma_scale=loss.sigma,
+        )
+        self._archive(live, "scale lost")
+        anchored = {p.index: old.keyframe_for(p.keyframe_id) for p in self.poses.values() if p.submap_id == old.id}
+        for i, k in anchored.items():
+            if k in submap.keyframes:
+                pose = self.poses[i]
+                T_kf_cam = se3.inverse(old.T_submap_kf[k]) @ old.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
+                self.poses[i] = replace(pose, submap_id=submap.id, keyframe_id=k, T_kf_cam=T_kf_cam)
+                if i in self.rows:  # it may be another run's
+                    self.rows[i].submap = submap.id
+        take_out(old, rest, max(old.keyframes.keys() - submap.keyframes.keys()))
+        self.atlas.add(submap)
+        n = int(submap.landmarks["alive"].sum())
+        self._record.event(EventKind.REINITIALISED, view, submap.id, first_view=loss.first, n_points=float(n))
+        self._live = self._parts.new_odometry(submap, graph)
+        self._live.start_at(view.index)
+        self._leaps.end()
+        self._recoveries.declare_lost(old.id, loss.since, str(FailureReason.SCALE_LOST), loss.first)
+        first = next((buffered for buffered in self.buffer if buffered.index == loss.first), None)
+        if first is not None:
+            self._recoveries.start(submap, first)
+            self._recoveries.collect(self._live, view)
+        return True
 
     def _archive(self, live: VisualOdometry, why: str) -> None:
         submap = live.submap

@@ -293,11 +293,12 @@ class FusionConfig(StrictModel):
 
 
 class AuditConfig(StrictModel):
-    """The start of each map, asked again once the map has matured."""
+    """Whether a map is asked, once it has matured, if it is right."""
 
     enabled: bool = True
-    """Whether the younger part of a map walks back over its start, confirms it or cuts it off. Costs a walk over some
-    ten keyframes a map; off as well where recovery is (`recovery.enabled`)."""
+    """Whether the younger part of a map walks back over its start, confirms it or cuts it off (a walk over some ten
+    keyframes a map; off as well where recovery is, `recovery.enabled`), and whether a map is parted where it has not
+    handed its scale on."""
 
 
 class AtlasConfig(StrictModel):

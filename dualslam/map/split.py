@@ -1,6 +1,8 @@
-"""A full submap hands on to the next: shared keyframes and landmarks, one common frame, an exact link."""
+"""Submaps out of submaps: a full one hands on to the next, and one that is broken falls into two."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -36,25 +38,42 @@ def next_submap(full: Submap, submap_id: int, n_shared: int, newest_id: int | No
         if np.isin(shared, covisible).sum() < min(len(shared), len(covisible)) / 2:
             wanted = {newest_id, *covisible[:n_shared]}
             shared = [k for k in full.keyframes if k in wanted]
-    twin = Submap(submap_id, full.K, full.landmarks["descriptor"][0])
-    for k in shared:
-        twin.add_keyframe(full.keyframes[k], full.T_submap_kf[k])
-    old = full.landmarks_of_keyframes(shared)
-    n_seen = np.zeros(len(full.landmarks), np.int64)
-    for k in shared:
-        ids = full.landmark_of[k]
+    return submap_of(full, submap_id, shared)
+
+
+def submap_of(submap: Submap, submap_id: int, keyframe_ids: list[int]) -> Submap:
+    """Copy some keyframes of a submap, and of their landmarks those that at least two of them see, to a new one.
+
+    In the same coordinates; its gauge is the pair of these keyframes that stand farthest apart.
+    """
+    twin = Submap(submap_id, submap.K, submap.landmarks["descriptor"][0])
+    for k in keyframe_ids:
+        twin.add_keyframe(submap.keyframes[k], submap.T_submap_kf[k])
+    old = submap.landmarks_of_keyframes(keyframe_ids)
+    n_seen = np.zeros(len(submap.landmarks), np.int64)
+    for k in keyframe_ids:
+        ids = submap.landmark_of[k]
         n_seen[ids[ids >= 0]] += 1
     old = old[n_seen[old] >= 2]
-    twin.copy_landmarks(full, old)
-    new_id = np.full(len(full.landmarks), NO_LANDMARK, np.int64)
+    twin.copy_landmarks(submap, old)
+    new_id = np.full(len(submap.landmarks), NO_LANDMARK, np.int64)
     new_id[old] = np.arange(len(old))
-    for k in shared:
-        ids = full.landmark_of[k]
+    for k in keyframe_ids:
+        ids = submap.landmark_of[k]
         feature = np.flatnonzero(ids >= 0)
         kept = new_id[ids[feature]] >= 0
         twin.add_observations(k, feature[kept], new_id[ids[feature[kept]]])
-    twin.gauge = _widest_pair(full, shared)
+    twin.gauge = _widest_pair(submap, keyframe_ids)
     return twin
+
+
+def take_out(submap: Submap, keyframe_ids: Iterable[int], anchor: int) -> None:
+    """Take keyframes out of a map: they are anchored to the keyframe `anchor`, and what they alone hold dies."""
+    for k in keyframe_ids:
+        submap.remove_keyframe(k, anchor)
+    alive = np.flatnonzero(submap.landmarks["alive"])
+    submap.remove_landmarks(alive[submap.n_observations(alive) < 2])
+    submap.gauge = _widest_pair(submap, sorted(submap.keyframes))
 
 
 def _widest_pair(submap: Submap, keyframe_ids: list[int]) -> tuple[int, int]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.map.split import take_out
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 from dualslam.map.trajectory import FramePose
@@ -93,15 +94,7 @@ def without_start(submap: Submap, first: int) -> Submap:
 
 def cut_start(submap: Submap, first: int) -> None:
     """Take the keyframes before `first` out of a map: they are anchored to it, and what they alone hold dies."""
-    for k in [k for k in submap.keyframes if k < first]:
-        submap.remove_keyframe(k, first)
-    alive = np.flatnonzero(submap.landmarks["alive"])
-    submap.remove_landmarks(alive[submap.n_observations(alive) < 2])
-    ids = sorted(submap.keyframes)
-    centres = submap.keyframe_poses(ids)[:, :3, 3]
-    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
-    a, b = np.unravel_index(int(apart.argmax()), apart.shape)
-    submap.gauge = (ids[int(a)], ids[int(b)])
+    take_out(submap, [k for k in submap.keyframes if k < first], first)
 
 
 def judge_start(

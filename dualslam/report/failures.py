@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from dualslam.core.types import FailureReason
 from dualslam.report.attempts import attempt_table, link_table
 from dualslam.report.markup import Markup, join, number, tag
 from dualslam.report.placement import PlacedRun, place
@@ -145,6 +146,9 @@ def _told(run: RunData, story: FailureStory) -> str:
     told = [
         f"Tracking was lost at frame {story.lost_since} and given up at frame {failed['frame']} ({reason}{detail}); "
         f"submap {failed.get('submap')} was archived whole."
+        if failed.get("reason") != FailureReason.SCALE_LOST
+        else f"The scale was lost at frame {story.lost_since}, which frame {failed['frame']} has shown{detail}; "
+        f"submap {failed.get('submap')} ends before it."
     ]
     suspected = failed.get("suspected_since")
     if suspected is not None and suspected != story.lost_since:

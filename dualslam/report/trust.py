@@ -58,6 +58,8 @@ def _told(event: dict[str, Any]) -> tuple[str, str] | None:
     if kind == "cut":
         left = len(event.get("left", ()))
         return "its start was wrong", f"cut off; {event['reposed']} frames posed again, {left} left without"
+    if kind == "failed" and event.get("reason") == "scale_lost":
+        return "its scale", f"not handed on: parted ({detail})"
     if kind in ("failed", "link_refused", "loop_refused", "recovery_failed") and event.get("reason") in _DOUBTS:
         what = {"failed": "a pose", "loop_refused": "a place seen again"}.get(kind, "a link")
         tries = f", {int(event['tries'])} tries" if "tries" in event else ""

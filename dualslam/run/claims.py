@@ -16,17 +16,14 @@ from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking.gates import PIXEL_CHI2
 from dualslam.recovery.linking.scale_observability import scale_sigmas_between
+from dualslam.recovery.scale_watch import GROUP, SCALE_INFLATION
 
-GROUP = 5
-"""Keyframes over which the scale is handed on from those before to those after: about as long as a landmark lives on a
-road, so that it is not the same ones that both see."""
 TOGETHER = 2
 """Groups that are asked of one set of normal equations, which takes little longer than for one. With more the sigmas
 sink, by a quarter with 6 (a room), since more of the map holds the scale: the inflation below is not made for that."""
 MIN_LANDMARKS = 6
-POSITION_INFLATION, SCALE_INFLATION = 1.1, 1.8
-"""Errors of neighbouring pixels and views are alike, and do not average out as the sigmas suppose. Chosen so that what
-is true comes to what is claimed on plain stretches (`benchmarks/covariances.py`, seeds 1 to 3)."""
+POSITION_INFLATION = 1.1
+"""As `SCALE_INFLATION`, for positions."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -158,6 +158,17 @@ def add_points(
             submap.add_observations(FRAME_STEP * g, world.feature_of[g, points[new[here]]], ids[here])
 
 
+def thinned(submap: Submap, place: int, n_ties: int) -> Submap:
+    """Return a copy in which only so many landmarks are seen on both sides of the keyframe `place` (id)."""
+    thin = submap.copy()
+    obs = thin.observations
+    after = obs["kf"] >= place
+    both = np.intersect1d(obs["landmark"][after], obs["landmark"][~after])
+    cut = np.flatnonzero(np.isin(obs["landmark"], both[n_ties:]) & after)
+    thin.remove_observations(cut)
+    return thin
+
+
 @dataclass(frozen=True)
 class Case:
     """Two submaps and the truth. `extent_mu`: size of the overlap in the old map."""

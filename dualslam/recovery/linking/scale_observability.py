@@ -51,15 +51,20 @@ def scale_sigma_between(submap: Submap, here: IntArray, there: IntArray, pixel_c
     return scale_sigmas_between(submap, [(here, there)], pixel_chi2)[0]
 
 
-def scale_sigmas_between(submap: Submap, places: Sequence[tuple[IntArray, IntArray]], pixel_chi2: float) -> list[float]:
-    """Return the same for several pairs of places that lie near each other, from one set of normal equations."""
+def scale_sigmas_between(
+    submap: Submap, places: Sequence[tuple[IntArray, IntArray]], pixel_chi2: float, n_around: int = N_AROUND
+) -> list[float]:
+    """Return the same for several pairs of places that lie near each other, from one set of normal equations.
+
+    `n_around`: keyframes before and after them that count as well.
+    """
     held = np.array(sorted(submap.keyframes))
     pairs = [[ids[np.isin(ids, held)] for ids in pair] for pair in places]
     asked = np.concatenate([ids for pair in pairs for ids in pair])
     if not len(asked):
         return [np.inf] * len(pairs)
     first, last = np.searchsorted(held, [asked.min(), asked.max()])
-    problem = _linearise(submap, held[max(first - N_AROUND, 0) : last + N_AROUND + 1], pixel_chi2)
+    problem = _linearise(submap, held[max(first - n_around, 0) : last + n_around + 1], pixel_chi2)
     values, vectors = np.linalg.eigh(problem.reduced)
     return [_sigma(problem, values, vectors, here, there) for here, there in pairs]
 

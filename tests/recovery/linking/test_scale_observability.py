@@ -30,6 +30,7 @@ from dualslam.testing.link_worlds import (
     hamming,
     make_case,
     make_world,
+    thinned,
 )
 
 CONFIG = LinkingConfig()
@@ -67,17 +68,6 @@ def test_the_sigma_is_that_of_the_error(layout: str) -> None:
         sigma = scale_sigma_between(submap, HERE, THERE, PIXEL_CHI2)
         whitened.append((log_scale(world, submap, THERE) - log_scale(world, submap, HERE)) / sigma)
     assert 0.2 < np.sqrt(np.mean(np.square(whitened))) < 2.0, whitened
-
-
-def thinned(submap: Submap, place: int, n_ties: int) -> Submap:
-    """Let only so many landmarks be seen on both sides of the keyframe `place` (id)."""
-    thin = submap.copy()
-    obs = thin.observations
-    after = obs["kf"] >= place
-    both = np.intersect1d(obs["landmark"][after], obs["landmark"][~after])
-    cut = np.flatnonzero(np.isin(obs["landmark"], both[n_ties:]) & after)
-    thin.remove_observations(cut)
-    return thin
 
 
 def test_fewer_ties_hold_less_and_none_hold_nothing() -> None:

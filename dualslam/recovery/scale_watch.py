@@ -1,0 +1,129 @@
+"""Whether a live map still hands its scale on: where it does not, what comes after is another map.
+
+A camera that turns faster than it sees leaves few landmarks that both sides of the turn have seen, and where their
+depths are hardly known the scale behind the turn is another one; yet every frame finds its inliers, and nothing looks
+wrong. The map's own normal equations tell (`linking/scale_observability.py`), once some keyframes behind the turn have
+seen the same: a verdict at once would cut a map at each turn on the spot, from which the camera comes back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm
+
+from dualslam.config.settings import LinkingConfig
+from dualslam.core.types import IntArray
+from dualslam.map.atlas import Link
+from dualslam.map.submap import Submap
+from dualslam.recovery.linking.gates import PIXEL_CHI2
+from dualslam.recovery.linking.scale_observability import N_AROUND, scale_sigmas_between
+
+GROUP = 5
+"""Keyframes over which the scale is handed on from those before to those after: about as long as a landmark lives on a
+road, so that it is not the same ones that both see."""
+SCALE_INFLATION = 1.8
+"""Errors of neighbouring pixels and views are alike, and do not average out as the sigmas suppose. Chosen so that what
+is true comes to what is claimed on plain stretches (`benchmarks/covariances.py`, seeds 1 to 3)."""
+BEHIND = 2 * GROUP
+"""Keyframes after a group before it is asked about."""
+HONEST = 0.7
+"""What is true, over what is claimed, at the least (docs/notes, "What a map claims, and what is true")."""
+FIRM_TIES = 20
+"""Landmarks that two keyframes before the group and two after it have seen, from which on nothing is asked: each would
+have to be off by half its depth for the scale to be lost. They are counted in a hundredth of the time."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleLoss:
+    """A place in a map across which the scale is not handed on.
+
+    Attributes
+    ----------
+    since : int
+        The first keyframe that may be of either scale.
+    first : int
+        The first one of the map that begins there: where the fewest landmarks are seen from both sides.
+    sigma : float
+        Standard deviation of the logarithm of the scale, after against before.
+    """
+
+    since: int
+    first: int
+    sigma: float
+
+
+class ScaleWatch:
+    """Asks about each group of a live map's keyframes, once, when `BEHIND` have come after it.
+
+    Parameters
+    ----------
+    config : LinkingConfig
+        Says by how much a scale must be off to be wrong.
+    """
+
+    def __init__(self, config: LinkingConfig) -> None:
+        self.max_sigma = config.wrong_scale / (float(norm.ppf(0.75)) * HONEST)
+        """From here on the scale is more likely wrong than right, if the claim is as large as an honest one may be."""
+        self._asked: dict[int, int] = {}  # by submap: the newest keyframe that was in a group
+
+    def judge(self, submap: Submap, links: Iterable[Link]) -> ScaleLoss | None:
+        """Return where a map has lost its scale, if its newest keyframes show that.
+
+        Parameters
+        ----------
+        submap : Submap
+            Its keyframes ascend as they came.
+        links : iterable of Link
+            Those that are believed: what one of them holds is not lost.
+        """
+        ids = np.array(sorted(submap.keyframes), np.int64)
+        if len(ids) < BEHIND + 2 * GROUP:
+            return None
+        asked = self._asked.get(submap.id, int(ids[-BEHIND - GROUP - 1]))
+        begin = int(np.searchsorted(ids, asked, side="right"))
+        if len(ids) < begin + GROUP + BEHIND:
+            return None
+        before, group = ids[begin - GROUP : begin], ids[begin : begin + GROUP]
+        after = ids[begin + GROUP : begin + 2 * GROUP]
+        self._asked[submap.id] = int(group[-1])
+        if len(before) < GROUP or _n_ties(submap, ids, begin, begin + GROUP, n_views=2) >= FIRM_TIES:
+            return None
+        sigma = self._claimed(submap, ids, before, after)
+        if sigma <= self.max_sigma:
+            return None
+        seam = min(range(begin, begin + GROUP + 1), key=lambda place: _n_ties(submap, ids, place, place))
+        first = int(ids[seam])
+        return None if _is_linked(submap.id, first, links) else ScaleLoss(int(group[0]), first, sigma)
+
+    @staticmethod
+    def _claimed(submap: Submap, ids: IntArray, before: IntArray, after: IntArray) -> float:
+        """Return what the map claims of its scale after a group, against that before it."""
+        seen = submap.covisible(submap.landmarks_of_keyframes(ids[ids >= after[0]]))[0]
+        earliest = ids[max(int(np.searchsorted(ids, before[0])) - N_AROUND, 0)]
+        # Where others than those just before them have seen the same, they may hold the places together.
+        n_around = len(ids) if (seen < earliest).any() else N_AROUND
+        return SCALE_INFLATION * scale_sigmas_between(submap, [(before, after)], PIXEL_CHI2, n_around)[0]
+
+
+def _n_ties(submap: Submap, ids: IntArray, end: int, begin: int, n_views: int = 1) -> int:
+    """Return how many landmarks are seen by `n_views` or more of the keyframes before `end`, and from `begin` on."""
+    held = np.ones(len(submap.landmarks), bool)
+    for side in (ids[max(end - N_AROUND, 0) : end], ids[begin : begin + N_AROUND]):
+        n_seen = np.zeros(len(submap.landmarks), np.int64)
+        for k in side.tolist():
+            of_keyframe = submap.landmark_of[k]
+            n_seen[of_keyframe[of_keyframe >= 0]] += 1
+        held &= n_seen >= n_views
+    return int(held.sum())
+
+
+def _is_linked(submap_id: int, first: int, links: Iterable[Link]) -> bool:
+    """Whether a link stands on keyframes of a submap from `first` on."""
+    for link in links:
+        for m, k in ((link.a, link.keyframe_a), (link.b, link.keyframe_b)):
+            if m == submap_id and max((k, *link.keyframes)) >= first:
+                return True
+    return False

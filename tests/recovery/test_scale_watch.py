@@ -1,0 +1,138 @@
+"""A map that does not hand its scale on is parted there, and only there; a walk back may join the two again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dualslam.backend.submap_graph import ISam2SubmapGraph
+from dualslam.config.settings import GraphConfig, LinkingConfig
+from dualslam.core.events import EventKind
+from dualslam.map.atlas import Link, LinkKind
+from dualslam.map.solving import solve
+from dualslam.map.submap import Submap
+from dualslam.recovery.linking.scale_observability import N_AROUND
+from dualslam.recovery.scale_watch import BEHIND, GROUP, ScaleLoss, ScaleWatch
+from dualslam.run.results import trajectories_of
+from dualslam.system import System
+from dualslam.testing.link_worlds import FRAME_STEP, Recipe, build, make_world, thinned
+from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
+
+N = 24
+PLACE = 11 * FRAME_STEP
+"""In the group that is asked about first: the 15 newest keyframes of the 24 begin with it."""
+
+
+def solved(layout: str, n: int = N) -> Submap:
+    submap = build(
+        make_world(layout, 0, n_frames=n), Recipe(list(range(n)), 0, outliers=0.0), 0, np.random.default_rng(0)
+    )
+    solve(submap, ISam2SubmapGraph(GraphConfig()))
+    return submap
+
+
+@pytest.mark.parametrize("layout", ["street", "room"])
+def test_a_healthy_map_is_left_alone(layout: str) -> None:
+    assert ScaleWatch(LinkingConfig()).judge(solved(layout), []) is None
+
+
+@pytest.mark.parametrize("n_ties", [0, 1])
+def test_a_map_that_hangs_by_next_to_nothing_is_parted_there(n_ties: int) -> None:
+    watch = ScaleWatch(LinkingConfig())
+    submap = thinned(solved("street"), PLACE, n_ties)
+    loss = watch.judge(submap, [])
+    assert isinstance(loss, ScaleLoss)
+    ids = sorted(submap.keyframes)
+    group = ids[-BEHIND - GROUP : -BEHIND]
+    assert PLACE in group
+    assert loss.since == group[0]
+    assert loss.first == PLACE
+    assert loss.sigma > watch.max_sigma > LinkingConfig().wrong_scale
+    assert watch.judge(submap, []) is None  # a group is asked about once
+
+
+def test_ties_that_hold_the_scale_are_enough() -> None:
+    assert ScaleWatch(LinkingConfig()).judge(thinned(solved("street"), PLACE, 12), []) is None
+
+
+def test_what_a_link_holds_is_not_lost() -> None:
+    submap = thinned(solved("street"), PLACE, 0)
+    newest = max(submap.keyframes)
+    loop = Link(0, 0, np.eye(4), np.eye(7), LinkKind.LOOP, keyframe_a=newest, keyframe_b=0)
+    assert ScaleWatch(LinkingConfig()).judge(submap, [loop]) is None
+    elsewhere = Link(3, 4, np.eye(4), np.eye(7), LinkKind.LOOP, keyframe_a=newest, keyframe_b=newest)
+    assert ScaleWatch(LinkingConfig()).judge(submap, [elsewhere]) is not None
+
+
+def test_what_older_keyframes_hold_is_not_lost() -> None:
+    """The camera is back where it was long before: neighbours in time share nothing, and yet hang together."""
+    n = 2 * N_AROUND + N
+    submap = solved("room", n)
+    place = n - BEHIND - GROUP + 2
+    obs = submap.observations
+    after, at = obs["kf"] >= place * FRAME_STEP, obs["kf"]
+    seen_after = np.isin(obs["landmark"], obs["landmark"][after])
+    recent = (at < place * FRAME_STEP) & (at >= (place - N_AROUND - 2 * GROUP) * FRAME_STEP)
+    apart = submap.copy()
+    apart.remove_observations(np.flatnonzero(seen_after & recent))
+    assert ScaleWatch(LinkingConfig()).judge(apart, []) is None
+    apart.remove_observations(np.flatnonzero(seen_after & ~after & apart.observations["alive"]))
+    assert ScaleWatch(LinkingConfig()).judge(apart, []) is not None
+
+
+# --- the system
+
+
+def parted(monkeypatch: pytest.MonkeyPatch, recovery: bool) -> tuple[System, PointWorld, ScaleLoss]:
+    """Run a healthy world, of which one place is said to have lost its scale."""
+    said: list[ScaleLoss] = []
+
+    def judge(watch: ScaleWatch, submap: Submap, links: list[Link]) -> ScaleLoss | None:
+        ids = sorted(submap.keyframes)
+        if said or ids[-1] < 60:
+            return None
+        said.append(ScaleLoss(ids[-12], ids[-10], 0.2))
+        return said[0]
+
+    monkeypatch.setattr(ScaleWatch, "judge", judge)
+    world = PointWorld(cloud(), hand_held(90))
+    system = system_in(
+        world,
+        recovery={"enabled": recovery, "attempts": ["live"]},
+        loops={"enabled": False},
+        keyframes={"max_parallax_deg": 1.0},
+        mapping={"redundant_ratio": 1.0},
+    )
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    (loss,) = said
+    return system, world, loss
+
+
+def test_both_parts_are_joined_by_a_walk_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    system, world, loss = parted(monkeypatch, recovery=True)
+    (failed,) = system.events.of_kind(EventKind.FAILED)
+    assert failed.data["reason"] == "scale_lost"
+    assert (failed.data["lost_since"], failed.data["suspected_since"]) == (loss.first, loss.since)
+    (link,) = system.atlas.links
+    assert link.kind is LinkKind.RECOVERY
+    main = trajectories_of(system).main
+    assert main.index.tolist() == list(range(90))
+    translation, rotation = pose_errors(main.T_world_cam, world.T_world_cam)
+    assert translation.max() < 0.08
+    assert rotation.max() < 0.01
+
+
+def test_without_recovery_both_are_kept_and_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    system, world, loss = parted(monkeypatch, recovery=False)
+    old, new = (system.atlas.submaps[m] for m in (0, 1))
+    assert max(old.keyframes) < loss.first == min(new.keyframes)
+    assert not system.atlas.links
+    found = trajectories_of(system)
+    (other,) = found.unlinked.values()
+    assert sorted([*found.main.index.tolist(), *other.index.tolist()]) == list(range(90))
+    for part in (found.main, other):
+        translation, rotation = pose_errors(part.T_world_cam, world.T_world_cam[part.index])
+        assert translation.max() < 0.08
+        assert rotation.max() < 0.01
