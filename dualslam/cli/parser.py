@@ -10,7 +10,10 @@ from typing import NoReturn
 
 from dualslam import __version__
 
-WORLDS = ("street", "room", "circuit", "eight", "terrace", "board", "parked", "takeoff", "standstill", "hover")
+WORLDS = (
+    *("street", "room", "circuit", "eight", "terrace", "corridors", "posters"),
+    *("board", "parked", "takeoff", "standstill", "hover"),
+)
 EXPORTS = ("bal", "colmap", "g2o", "kitti", "nerfstudio", "ply", "tum")
 DICTIONARIES = (
     *("apriltag_36h11", "apriltag_25h9", "apriltag_16h5"),
@@ -20,7 +23,8 @@ MAX_PORT = 65535
 SOURCE_HELP = (
     "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours), a folder of images or a video file with --camera or "
     "--fov, a webcam's number, or an embedded world: synthetic:street, room, circuit, eight, terrace, "
-    "board, parked, takeoff, standstill, hover, with options as in synthetic:street,frames=300,seed=1,events=FILE"
+    "corridors, posters, board, parked, takeoff, standstill, hover, with options as in "
+    "synthetic:street,frames=300,seed=1,events=FILE"
 )
 
 

@@ -58,6 +58,8 @@ class ScaleLoss:
 class ScaleWatch:
     """Asks about each group of a live map's keyframes, once, when `BEHIND` have come after it.
 
+    What the map held when it was first shown is not asked about: a start is audited, a link has gates of its own.
+
     Parameters
     ----------
     config : LinkingConfig
@@ -75,15 +77,12 @@ class ScaleWatch:
         Parameters
         ----------
         submap : Submap
-            Its keyframes ascend as they came.
+            At each new keyframe.
         links : iterable of Link
             Those that are believed: what one of them holds is not lost.
         """
         ids = np.array(sorted(submap.keyframes), np.int64)
-        if len(ids) < BEHIND + 2 * GROUP:
-            return None
-        asked = self._asked.get(submap.id, int(ids[-BEHIND - GROUP - 1]))
-        begin = int(np.searchsorted(ids, asked, side="right"))
+        begin = int(np.searchsorted(ids, self._asked.setdefault(submap.id, int(ids[-1])), side="right"))
         if len(ids) < begin + GROUP + BEHIND:
             return None
         before, group = ids[begin - GROUP : begin], ids[begin : begin + GROUP]

@@ -10,6 +10,7 @@ from dualslam.config.settings import GraphConfig, LinkingConfig
 from dualslam.core.events import EventKind
 from dualslam.map.atlas import Link, LinkKind
 from dualslam.map.solving import solve
+from dualslam.map.split import submap_of
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking.scale_observability import N_AROUND
 from dualslam.recovery.scale_watch import BEHIND, GROUP, ScaleLoss, ScaleWatch
@@ -20,7 +21,7 @@ from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_erro
 
 N = 24
 PLACE = 11 * FRAME_STEP
-"""In the group that is asked about first: the 15 newest keyframes of the 24 begin with it."""
+"""In the group that is asked about: it begins with the 15 newest keyframes of the 24."""
 
 
 def solved(layout: str, n: int = N) -> Submap:
@@ -31,15 +32,23 @@ def solved(layout: str, n: int = N) -> Submap:
     return submap
 
 
+def watch_since(submap: Submap) -> ScaleWatch:
+    """Return one that has seen the map grow up to the group."""
+    watch, ids = ScaleWatch(LinkingConfig()), sorted(submap.keyframes)
+    assert watch.judge(submap_of(submap, submap.id, ids[: -BEHIND - GROUP]), []) is None
+    return watch
+
+
 @pytest.mark.parametrize("layout", ["street", "room"])
 def test_a_healthy_map_is_left_alone(layout: str) -> None:
-    assert ScaleWatch(LinkingConfig()).judge(solved(layout), []) is None
+    submap = solved(layout)
+    assert watch_since(submap).judge(submap, []) is None
 
 
 @pytest.mark.parametrize("n_ties", [0, 1])
 def test_a_map_that_hangs_by_next_to_nothing_is_parted_there(n_ties: int) -> None:
-    watch = ScaleWatch(LinkingConfig())
     submap = thinned(solved("street"), PLACE, n_ties)
+    watch = watch_since(submap)
     loss = watch.judge(submap, [])
     assert isinstance(loss, ScaleLoss)
     ids = sorted(submap.keyframes)
@@ -52,16 +61,21 @@ def test_a_map_that_hangs_by_next_to_nothing_is_parted_there(n_ties: int) -> Non
 
 
 def test_ties_that_hold_the_scale_are_enough() -> None:
-    assert ScaleWatch(LinkingConfig()).judge(thinned(solved("street"), PLACE, 12), []) is None
+    submap = thinned(solved("street"), PLACE, 12)
+    assert watch_since(submap).judge(submap, []) is None
+
+
+def test_what_a_map_began_with_is_not_asked_about() -> None:
+    assert ScaleWatch(LinkingConfig()).judge(thinned(solved("street"), PLACE, 0), []) is None
 
 
 def test_what_a_link_holds_is_not_lost() -> None:
     submap = thinned(solved("street"), PLACE, 0)
     newest = max(submap.keyframes)
     loop = Link(0, 0, np.eye(4), np.eye(7), LinkKind.LOOP, keyframe_a=newest, keyframe_b=0)
-    assert ScaleWatch(LinkingConfig()).judge(submap, [loop]) is None
+    assert watch_since(submap).judge(submap, [loop]) is None
     elsewhere = Link(3, 4, np.eye(4), np.eye(7), LinkKind.LOOP, keyframe_a=newest, keyframe_b=newest)
-    assert ScaleWatch(LinkingConfig()).judge(submap, [elsewhere]) is not None
+    assert watch_since(submap).judge(submap, [elsewhere]) is not None
 
 
 def test_what_older_keyframes_hold_is_not_lost() -> None:
@@ -75,9 +89,9 @@ def test_what_older_keyframes_hold_is_not_lost() -> None:
     recent = (at < place * FRAME_STEP) & (at >= (place - N_AROUND - 2 * GROUP) * FRAME_STEP)
     apart = submap.copy()
     apart.remove_observations(np.flatnonzero(seen_after & recent))
-    assert ScaleWatch(LinkingConfig()).judge(apart, []) is None
+    assert watch_since(apart).judge(apart, []) is None
     apart.remove_observations(np.flatnonzero(seen_after & ~after & apart.observations["alive"]))
-    assert ScaleWatch(LinkingConfig()).judge(apart, []) is not None
+    assert watch_since(apart).judge(apart, []) is not None
 
 
 # --- the system

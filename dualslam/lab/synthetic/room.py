@@ -28,7 +28,7 @@ def make_room(seed: int) -> Scene:
         left, right = corners[i], corners[(i + 1) % 4]
         material = paint.tiles if rng.random() < 0.3 else paint.plaster
         surfaces.append(wall(left, right, 0, _HEIGHT_M, material, _DENSITY))
-        surfaces += _along_wall(rng, left, right, has_door=i == doors)
+        surfaces += along_wall(rng, left, right, has_door=i == doors)
     surfaces += _table(rng)
     return Scene(tuple(surfaces), background=128, seed=seed)
 
@@ -39,8 +39,20 @@ def _carpet(rng: np.random.Generator) -> list[Surface]:
     return [Surface(np.array([-w / 2, -0.012, d / 2]), np.array([w, 0, 0]), np.array([0, 0, -d]), paint.carpet, 200)]
 
 
-def _along_wall(rng: np.random.Generator, left: FloatArray, right: FloatArray, has_door: bool) -> list[Surface]:
-    """Return furniture that stands against a wall, and what hangs over it."""
+def along_wall(
+    rng: np.random.Generator, left: FloatArray, right: FloatArray, has_door: bool, tall: bool = True
+) -> list[Surface]:
+    """Return furniture that stands against a wall, and what hangs over it.
+
+    Parameters
+    ----------
+    rng : numpy Generator
+    left, right : (2,)
+        World (x, z) of the wall's ends, as seen from its front.
+    has_door : bool
+    tall : bool
+        Without, nothing stands higher than a sideboard, and nothing hangs.
+    """
     surfaces: list[Surface] = []
     length = float(np.linalg.norm(right - left))
     along = (right - left) / length
@@ -62,7 +74,7 @@ def _along_wall(rng: np.random.Generator, left: FloatArray, right: FloatArray, h
         hang(x, 0, (0.95, 2.1), paint.door, 0.02)
         x += 1.15
     while x < length - 0.9:
-        kind, room = rng.random(), length - 0.45 - x
+        kind, room = rng.random() if tall else 0.5, length - 0.45 - x
         width = min(rng.uniform(0.7, 1.5), room)
         if kind < 0.35:  # a book case
             depth, height = rng.uniform(0.25, 0.35), rng.uniform(1.0, 2.2)
@@ -74,11 +86,11 @@ def _along_wall(rng: np.random.Generator, left: FloatArray, right: FloatArray, h
             place(x, (width, depth, height), 0, [paint.cupboard, *[paint.wood] * 3, paint.table_top], _DENSITY)
             surfaces += _things(rng, left + along * x + inward * depth * 0.35, along, width, height)
             surfaces += _things(rng, left + along * x + inward * depth * 0.75, along, width, height, 0.5)
-            if rng.random() < 0.5:
+            if tall and rng.random() < 0.5:
                 shelf = rng.uniform(1.35, 1.6)
                 place(x, (width, 0.22, 0.03), shelf, [paint.wood] * 6, _DENSITY)
                 surfaces += _things(rng, left + along * x + inward * 0.12, along, width, shelf + 0.03)
-            else:
+            elif tall:
                 hang(x + 0.1, 1.3, (width * 0.7, rng.uniform(0.5, 0.9)), paint.picture)
         elif kind < 0.88 and width > 0.9:
             hang(x, 0.9, (width, rng.uniform(1.1, 1.4)), paint.outdoors)

@@ -20,13 +20,14 @@ from dualslam.lab.synthetic.room import HALF_SIZE_M, make_room
 from dualslam.lab.synthetic.sensor import Sensor
 from dualslam.lab.synthetic.street import make_street
 from dualslam.lab.synthetic.traps import TRAPS
+from dualslam.lab.synthetic.twins import TWINS
 
 if TYPE_CHECKING:
     from dualslam.core.camera.models import PinholeCamera
 
 # A smear of motion blur is the average of images about three pixels apart, within these bounds on their number.
 _N_SUBFRAMES = (9, 33)
-SCENES = ("street", "room", "circuit", "eight", "terrace", *TRAPS)
+SCENES = ("street", "room", "circuit", "eight", "terrace", *TWINS, *TRAPS)
 ON_WHEELS = ("street", "circuit", "eight", "terrace", "standstill")
 
 
@@ -162,9 +163,10 @@ def make_sequence(
 
     Parameters
     ----------
-    scene : {"street", "room", "circuit", "eight", "terrace", "board", "parked", "takeoff", "standstill", "hover"}
-        A drive of about 9 m/s between houses, or a hand-held camera in a furnished room; a block of houses driven round
-        and round, a figure of eight, and a straight street of houses that are all the same; the others are told in
+    scene : str
+        One of `SCENES`. A drive of about 9 m/s between houses, or a hand-held camera in a furnished room; a block of
+        houses driven round and round, a figure of eight, and a straight street of houses that are all the same; two
+        corridors that are alike, and two rooms with the same posters; the others are told in
         `dualslam/lab/synthetic/traps.py`.
     n_frames : int
     seed : int
@@ -199,8 +201,10 @@ def make_sequence(
     duration_s = n_frames / rate_hz
     rng = np.random.default_rng([seed, 0xCA4])
     path: CameraPath
-    in_hand = scene == "room"
-    if scene in TRAPS:
+    in_hand = scene == "room" or scene in TWINS
+    if scene in TWINS:
+        world, path = TWINS[scene](seed)
+    elif scene in TRAPS:
         trap = TRAPS[scene](seed, duration_s)
         world, path, in_hand = trap.scene, trap.path, trap.in_hand
     elif not in_hand:
