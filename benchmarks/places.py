@@ -24,7 +24,7 @@ from dualslam.map.submap import Submap
 from dualslam.places.faiss_index import FaissRecogniser
 
 N_FEATURES, N_SEEN, N_NEW = 1000, 250, 40
-"""Of a keyframe: features, landmarks that it sees, and those that it is the first to see; 7-Scenes has about as many."""
+"""Of a keyframe: features, landmarks that it sees, and those that it is the first to see. 7-Scenes has the like."""
 PER_SUBMAP = 200
 NEW_BITS, SIGHT_BITS = 30, 16
 N_POOLED = 10

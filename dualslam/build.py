@@ -364,8 +364,12 @@ def _features_beside(desk: WorkerDesk, config: FrontendConfig) -> FeaturesBeside
     return FeaturesBeside(desk)
 
 
-def find_focal(config: Config, frames: Iterable[Frame], size_px: tuple[int, int]) -> FocalSearch | Failure:
-    """Search for the focal length of a camera of which nothing is known, by frames from its beginning.
+def find_focal(
+    config: Config, frames: Iterable[Frame], size_px: tuple[int, int], told: float | None = None
+) -> FocalSearch | Failure:
+    """Search for the focal length of a camera that has no calibration, by frames from its beginning.
+
+    `told`: the focal length over the image's longer side that the source tells, if it does.
 
     Raises
     ------
@@ -376,7 +380,7 @@ def find_focal(config: Config, frames: Iterable[Frame], size_px: tuple[int, int]
 
     frontend = create_frontend(config.frontend)
     features = [frontend.extract(frame.image) for frame in frames if frame.image is not None]
-    return search_focal(frontend, features, size_px, config.seed)
+    return search_focal(frontend, features, size_px, config.seed, told)
 
 
 def recovery_parts(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.errors import InputError
+from dualslam.io.exif import focal_over_longer_side
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
 # How the files of a format end; a file without its ending was cut off, which decoders fill with grey and do not tell.
@@ -47,6 +48,10 @@ class ImageStore(Protocol):
 
     def reader(self, grey: bool) -> ImageReader:
         """Return a new reader; `grey` images are (H, W), others (H, W, 3) RGB."""
+        ...
+
+    def told_focal(self) -> float | None:
+        """Return the focal length over the image's longer side that the images' own data tell, or None."""
         ...
 
 
@@ -119,6 +124,10 @@ class ImageFiles:
         """Return a reader of these files."""
         return _FileReader(self.paths, grey)
 
+    def told_focal(self) -> float | None:
+        """Return what the EXIF data of the first image tell."""
+        return focal_over_longer_side(self.paths[0])
+
 
 class _FileReader:
     def __init__(self, paths: list[Path], grey: bool) -> None:
@@ -160,6 +169,9 @@ class ZippedImages:
     def reader(self, grey: bool) -> ImageReader:
         """Return a reader with its own handle of the archive."""
         return _ZipReader(self.archive, self.names, grey)
+
+    def told_focal(self) -> None:
+        """Return nothing: recordings in archives have a calibration."""
 
 
 class _ZipReader:

@@ -58,6 +58,10 @@ class ReducedImages:
         """Return a reader of these images."""
         return _ReducedReader(self._images.reader(grey), self._factor)
 
+    def told_focal(self) -> float | None:
+        """Return what is told of the large images: a share of their side."""
+        return self._images.told_focal()
+
 
 class _ReducedReader:
     def __init__(self, reader: ImageReader, factor: int) -> None:

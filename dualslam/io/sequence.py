@@ -140,6 +140,10 @@ class RecordedSequence:
         """Return the same frames as those of another camera, of images of the same size."""
         return RecordedSequence(self._recording, camera, self.selection, grey=self._grey)
 
+    def told_focal(self) -> float | None:
+        """Return the focal length over the image's longer side that the images' own data tell, or None."""
+        return self._recording.images.told_focal()
+
     def __len__(self) -> int:
         return len(self.source_indices)
 

@@ -88,6 +88,9 @@ class VideoFile:
         """Return a reader with its own decoder."""
         return _VideoReader(self.path, self.media_s, grey)
 
+    def told_focal(self) -> None:
+        """Return nothing: what a container says of its camera, OpenCV does not read."""
+
 
 class _VideoReader:
     """Random access over a decoder that can only go forwards."""

@@ -41,7 +41,7 @@ def open_without_calibration(source: str, **selection: Any) -> RecordedSequence:
 
 
 def with_camera_found(config: Config, sequence: RecordedSequence) -> tuple[RecordedSequence, FocalSearch]:
-    """Return a sequence with the camera that its first frames tell, and what they tell.
+    """Return a sequence with the camera that its first frames tell, and the EXIF data of the first, and what they tell.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def with_camera_found(config: Config, sequence: RecordedSequence) -> tuple[Recor
         If they do not tell.
     """
     size_px = sequence.camera.width, sequence.camera.height
-    found = find_focal(config, islice(sequence, SEARCHED_FRAMES), size_px)
+    found = find_focal(config, islice(sequence, SEARCHED_FRAMES), size_px, sequence.told_focal())
     if isinstance(found, Failure):
         raise InputError(
             f"{sequence.name} has no calibration, and its first {SEARCHED_FRAMES} frames do not tell the focal length "

@@ -50,6 +50,9 @@ FINE_CELLS = 10
 LOG_FOCAL_PRIOR, LENS_PRIOR = (np.log(0.75), 0.3), (0.0, 0.1)
 """Mean and sigma, of cameras that people film with: telephones 0.7 to 0.8 of that side, webcams 0.9 to 1, action
 cameras 0.45 to 0.6."""
+TOLD_SIGMA, TOLD_RIGHT = 0.05, 0.9
+"""Of the log focal length that EXIF data tell: whole millimetres of 26 leave 2 %, and what is meant, the image's
+diagonal or its width, 4 %. And how likely they tell of these images: one may have been cropped since."""
 DEGREES_OF_FREEDOM, INFLATION = 3.0, 4.0
 """Of the Student distribution of a pair's cost, as some pairs are wrong altogether; and how much larger than their
 residuals errors are taken to be, as neighbouring points err alike (`CalibrationConfig.inflation`)."""
@@ -63,7 +66,7 @@ MAX_STEPS = 40
 
 
 def search_focal(
-    frontend: Frontend, features: Sequence[Features], size_px: tuple[int, int], seed: int
+    frontend: Frontend, features: Sequence[Features], size_px: tuple[int, int], seed: int, told: float | None = None
 ) -> FocalSearch | Failure:
     """Search for the camera that pairs of frames agree about.
 
@@ -76,13 +79,18 @@ def search_focal(
     size_px : (int, int)
         Width and height.
     seed : int
+    told : float, optional
+        The focal length over the image's longer side, as the images' own data tell it.
 
     Returns
     -------
     FocalSearch or Failure
-        Fewer than `MIN_PAIRS` pairs moved enough: `LOW_PARALLAX`.
+        Fewer than `MIN_PAIRS` pairs moved enough, and nothing was told: `LOW_PARALLAX`.
     """
     pairs = list(_find_pairs(frontend, features, size_px, seed))
+    told_px = None if told is None else told * max(size_px)
+    if len(pairs) < MIN_PAIRS and told_px is not None:
+        return FocalSearch(told_px, TOLD_SIGMA, 0.0, *size_px, len(pairs), told_px)
     if len(pairs) < MIN_PAIRS:
         return Failure(
             FailureReason.LOW_PARALLAX, f"{len(pairs)} pairs of frames tell the focal length, {MIN_PAIRS} needed"
@@ -90,7 +98,7 @@ def search_focal(
     side = max(size_px)
     focals = side * np.exp(LOG_FOCALS)
     costs = np.array([_costs_on_coarse_grid(pair, focals, seed) for pair in pairs])
-    prior = _log_prior(LOG_FOCALS[None, :], LENSES[:, None])
+    prior = _log_prior(LOG_FOCALS[None, :], LENSES[:, None], told)
     coarse = (_log_likelihood(costs, costs, pairs).sum(axis=0) + prior)[::COARSE, ::COARSE]
     for cell in np.argsort(coarse.ravel(), kind="stable")[::-1][:FINE_CELLS]:
         row, column = np.unravel_index(cell, coarse.shape)
@@ -103,8 +111,8 @@ def search_focal(
     rows = np.arange(len(LENSES)) if bent else straight
     log_focal, sigma, lens = _estimate(of_pairs[:, rows], prior[rows], LENSES[rows], seed)
     if sigma < LOG_FOCAL_STEP:
-        log_focal, lens = _between_nodes(pairs, costs, side, log_focal, lens if bent else None)
-    return FocalSearch(float(side * np.exp(log_focal)), sigma, lens, *size_px, len(pairs))
+        log_focal, lens = _between_nodes(pairs, costs, side, log_focal, lens if bent else None, told)
+    return FocalSearch(float(side * np.exp(log_focal)), sigma, lens, *size_px, len(pairs), told_px)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -234,13 +242,20 @@ def _K(focal: float) -> FloatArray:
 # --- what all pairs say together
 
 
-def _log_prior(log_focal: FloatArray, lens: FloatArray) -> FloatArray:
-    """Return the logarithm of the prior of cameras, of the shape that both make together."""
-    of_focal, of_lens = (
-        -0.5 * ((values - mean) / sigma) ** 2
-        for values, (mean, sigma) in ((log_focal, LOG_FOCAL_PRIOR), (lens, LENS_PRIOR))
-    )
-    return np.asarray(of_focal + of_lens, np.float64)
+def _log_prior(log_focal: FloatArray, lens: FloatArray, told: float | None) -> FloatArray:
+    """Return the logarithm of the prior of cameras, of the shape that both make together.
+
+    `told`: the focal length over the longer side that the images tell, which are right about it as a rule.
+    """
+    of_focal = _log_normal(log_focal, *LOG_FOCAL_PRIOR)
+    if told is not None:
+        right, wrong = _log_normal(log_focal, math.log(told), TOLD_SIGMA), of_focal
+        of_focal = np.logaddexp(right + math.log(TOLD_RIGHT), wrong + math.log(1.0 - TOLD_RIGHT))
+    return of_focal + _log_normal(lens, *LENS_PRIOR)
+
+
+def _log_normal(values: FloatArray, mean: float, sigma: float) -> FloatArray:
+    return np.asarray(-0.5 * ((values - mean) / sigma) ** 2 - math.log(sigma), np.float64)
 
 
 def _log_likelihood(costs: FloatArray, on_grid: FloatArray, pairs: Sequence[_Pair]) -> FloatArray:
@@ -253,7 +268,12 @@ def _log_likelihood(costs: FloatArray, on_grid: FloatArray, pairs: Sequence[_Pai
 
 
 def _between_nodes(
-    pairs: Sequence[_Pair], costs: FloatArray, side: int, log_focal: float, lens: float | None
+    pairs: Sequence[_Pair],
+    costs: FloatArray,
+    side: int,
+    log_focal: float,
+    lens: float | None,
+    told: float | None,
 ) -> tuple[float, float]:
     """Return the best log focal length and lens near a node of the grid, which is coarser than many pairs are sure.
 
@@ -270,7 +290,7 @@ def _between_nodes(
         for i, pair in enumerate(pairs):
             a, b, zoom = pair.straightened(bend)
             found[i], poses[i] = _best_cost(a, b, zoom, side * np.exp(log_f), pair.sigma_px, [poses[i]])
-        prior = _log_prior(np.array(log_f), np.array(bend))
+        prior = _log_prior(np.array(log_f), np.array(bend), told)
         return -float(prior) - float(_log_likelihood(found, costs, pairs).sum())
 
     start = np.array([log_focal] if lens is None else [log_focal, lens])

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 
 from dualslam.config.settings import Config
 from dualslam.core.camera.corrected import LensCorrection, correct
@@ -19,10 +19,10 @@ from dualslam.map.atlas import Atlas
 from dualslam.run.focal import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
 
 
-def write(folder: Path, images: list[np.ndarray]) -> Path:
+def write(folder: Path, images: list[np.ndarray], exif: Image.Exif | bytes = b"") -> Path:
     folder.mkdir()
     for i, image in enumerate(images):
-        cv2.imwrite(str(folder / f"{i:04d}.png"), image)
+        Image.fromarray(image).save(folder / f"{i:04d}.png", exif=exif)
     return folder
 
 
@@ -52,6 +52,37 @@ def test_where_nothing_moves_the_person_is_asked(tmp_path: Path) -> None:
     folder = write(tmp_path / "images", [image] * 12)
     with pytest.raises(InputError, match="give a camera file, or a field of view"):
         with_camera_found(Config(), open_without_calibration(str(folder), start=0, stride=1, max_frames=None))
+
+
+def told(equivalent_mm: float) -> Image.Exif:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make] = "a camera"
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = equivalent_mm
+    return exif
+
+
+def test_where_nothing_moves_exif_data_are_taken_at_their_word(tmp_path: Path) -> None:
+    image = make_sequence("room", 2, 3, 320, 240).frame(0).image
+    folder = write(tmp_path / "images", [image] * 12, told(30))
+    opened = open_without_calibration(str(folder), start=0, stride=1, max_frames=None)
+    sequence, found = with_camera_found(Config(), opened)
+    assert found.focal_px == found.told_px == pytest.approx(30 / 43.267 * 400)
+    assert sequence.camera.K[0, 0] == found.focal_px
+    low, high = found.range_px
+    assert 0.1 < (high - low) / found.focal_px < 0.2
+
+
+@pytest.mark.parametrize("off", [1.0, pytest.param(1.6, marks=pytest.mark.slow)])
+def test_the_frames_are_asked_all_the_same(tmp_path: Path, off: float) -> None:
+    """What is told may be of another lens, or of an image that was cropped: the frames have the last word."""
+    world = make_sequence("room", 70, 3, 320, 240)
+    true = world.camera.K[0, 0]
+    folder = write(tmp_path / "images", [world.frame(i).image for i in range(70)], told(off * true / 400 * 43.267))
+    config = Config.model_validate({"frontend": {"n_features": 800}})
+    opened = open_without_calibration(str(folder), start=0, stride=1, max_frames=None)
+    _, found = with_camera_found(config, opened)
+    assert found.told_px == pytest.approx(off * true, rel=0.02)
+    assert found.focal_px == pytest.approx(true, rel=0.05 if off == 1.0 else 0.12)
 
 
 def test_on_a_saved_map_an_unknown_camera_is_the_one_that_made_it(tmp_path: Path) -> None:

@@ -29,6 +29,8 @@ class FocalSearch:
         Of the image, pixels.
     n_pairs : int
         Of frames, that had an answer.
+    told_px : float or None
+        Focal length by the EXIF data of the first image.
     """
 
     focal_px: float
@@ -37,6 +39,7 @@ class FocalSearch:
     width: int
     height: int
     n_pairs: int
+    told_px: float | None = None
 
     @property
     def range_px(self) -> tuple[float, float]:
@@ -75,4 +78,5 @@ class FocalSearch:
             "fov_range_deg": list(self.fov_range_deg),
             "lens": self.lens,
             "pairs": self.n_pairs,
+            "told_px": self.told_px,
         }
