@@ -32,8 +32,8 @@ FRAMES = {"circuit": 400, "eight": 800, "terrace": 300, "corridors": 470, "poste
 SIZE = (320, 240, 600)
 """Width, height, features."""
 FIRST_SEED = {"development": 0, "reporting": 10_000}
-APART = 60
-"""Frames between two visits."""
+APART, AWAY_M = 60, 20.0
+"""Frames between two visits, and the way: who stands before a wall for two seconds has not come back to it."""
 SHARED, SHARED_FALSE = 0.4, 0.1
 """Share of a view that the other must show to be a loop that should be found; and below which it is none."""
 
@@ -59,9 +59,11 @@ def shared(world: Any, a: int, b: int) -> float:
 def revisits(world: Any) -> int:
     """Return how many frames (every fifth looked at) show what a frame long before showed."""
     T = world.ground_truth_T_world_cam
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1))])
     found = 0
     for j in range(APART, len(T), 5):
         earlier = np.linalg.norm(T[: j - APART, :3, 3] - T[j, :3, 3], axis=1)
+        earlier[way[: j - APART] > way[j] - AWAY_M] = np.inf
         ahead = T[: j - APART, :3, 2] @ T[j, :3, 2] > 0.7
         near = np.flatnonzero((earlier < 15) & ahead)
         if len(near):

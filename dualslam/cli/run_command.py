@@ -15,6 +15,7 @@ from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.errors import InputError, NoCalibrationError
 from dualslam.io.atomic import atomic_file
 from dualslam.io.reduced import MAX_SIDE_PX
+from dualslam.io.sequence import RecordedSequence
 from dualslam.run.focal import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
 from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import open_source
@@ -64,7 +65,12 @@ def execute(args: argparse.Namespace) -> int:
             focal=focal,
             watcher=live,
         )
-    return conclude(outcome, args)
+    status = conclude(outcome, args)
+    may_go_on = isinstance(sequence, RecordedSequence) and not args.reverse and not args.localise
+    if outcome.report.interrupted and outcome.has_map and may_go_on and not args.quiet:
+        following = outcome.system.numbers.index_of(max(outcome.system.rows)) + args.stride
+        print(f"to go on: the same with --start {following}, --map {outcome.out} and another --out", flush=True)
+    return status
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from dualslam.config.settings import LinkingConfig
 from dualslam.core.types import IntArray
@@ -68,7 +68,7 @@ class ScaleWatch:
     """
 
     def __init__(self, config: LinkingConfig) -> None:
-        self.max_sigma = config.wrong_scale / float(norm.ppf(1.0 - 0.5 * SURE))
+        self.max_sigma = config.wrong_scale / float(ndtri(1.0 - 0.5 * SURE))
         """From here on the scale is wrong with that probability."""
         self._asked: dict[int, int] = {}  # by submap: the newest keyframe that was in a group
 

@@ -130,7 +130,9 @@ def test_an_interrupted_run_keeps_what_it_has(
     before = signal.getsignal(number)
     assert main(["run", str(folder), "--out", str(tmp_path / "run")]) == 130
     assert signal.getsignal(number) is before
-    assert capsys.readouterr().out.startswith("interrupted: coverage 100.0 % (7 of 7 frames)")
+    told, how = capsys.readouterr().out.splitlines()
+    assert told.startswith("interrupted: coverage 100.0 % (7 of 7 frames)")
+    assert f"--start 7, --map {tmp_path / 'run'}" in how
     assert len(rows_of(tmp_path / "run")) == 7
     events = (tmp_path / "run" / "events.jsonl").read_text().splitlines()
     assert json.loads(events[-1])["event"] == "interrupted"
