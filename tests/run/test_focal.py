@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,12 +13,14 @@ from PIL import ExifTags, Image
 from dualslam.config.settings import Config
 from dualslam.core.camera.corrected import LensCorrection, correct
 from dualslam.core.camera.focal import FocalSearch
-from dualslam.core.camera.models import DivisionCamera
+from dualslam.core.camera.models import DivisionCamera, PinholeCamera
 from dualslam.core.errors import InputError
 from dualslam.io.map_store import save_atlas
 from dualslam.lab.synthetic import make_sequence
 from dualslam.map.atlas import Atlas
 from dualslam.run.focal import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
+from dualslam.run.session import SEARCHED_SIGMA, refined_camera
+from dualslam.system import System
 
 
 def write(folder: Path, images: list[np.ndarray], exif: Image.Exif | bytes = b"") -> Path:
@@ -45,6 +49,19 @@ def test_self_calibration_trusts_a_focal_length_as_far_as_it_was_found() -> None
         found = FocalSearch(500.0, log_sigma, 0.0, 640, 480, 20)
         sigma = with_prior(config, found).calibration.log_focal_sigma
         assert sigma == max(config.calibration.log_focal_sigma, log_sigma)
+
+
+def test_what_became_of_a_searched_camera_is_as_unsure_as_its_lens() -> None:
+    calibrated = cast(
+        System, SimpleNamespace(log_focal_sigma=0.01, camera=PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5))
+    )
+    given, searched = (refined_camera(calibrated, was_searched) for was_searched in (False, True))
+    assert given is not None
+    assert searched is not None
+    assert given["log_focal_sigma"] == 0.01
+    assert searched["log_focal_sigma"] == pytest.approx(np.hypot(0.01, SEARCHED_SIGMA))
+    untouched = cast(System, SimpleNamespace(log_focal_sigma=None))
+    assert refined_camera(untouched, True) is None
 
 
 def test_where_nothing_moves_the_person_is_asked(tmp_path: Path) -> None:
