@@ -113,9 +113,10 @@ def audit_again(links: list[Any], unbroken: Any, world: Any) -> list[dict[str, f
     """Return for each link what the same audit finds in a map that never broke, if that was one map."""
     from dualslam.lab.audits.link_audit import audit_unbroken
 
-    submaps = unbroken.atlas.submaps
-    T = {p.index: submaps[0].resolve_anchor(p.keyframe_id, p.T_kf_cam) for p in unbroken.poses.values()}
-    controls = [audit_unbroken(link, T, truth_of(world)) if len(submaps) == 1 else None for link in links]
+    submaps, poses = unbroken.atlas.submaps, unbroken.poses.values()
+    is_one = len(submaps) == 1
+    T = {p.index: submaps[0].resolve_anchor(p.keyframe_id, p.T_kf_cam) for p in poses} if is_one else {}
+    controls = [audit_unbroken(link, T, truth_of(world)) if is_one else None for link in links]
     return [
         {"unbroken_scale": getattr(c, "scale", None), "unbroken_live_scale": getattr(c, "live_scale", None)}
         for c in controls

@@ -110,9 +110,9 @@ class LinkAudit:
         return self.live_scale if surely else 0.0
 
     def _is_wrong(self, sigmas: float) -> bool:
-        if self._live_error:
-            return True
         scale = abs(self.scale) - sigmas * self.scale_sigma
+        if self.live_scale is not None and self.live_scale_sigma is not None:
+            scale = max(scale, abs(self.live_scale) - sigmas * self.live_scale_sigma)
         rotation_deg = self.rotation_deg - sigmas * self.rotation_sigma_deg
         return scale > WRONG_SCALE or rotation_deg > WRONG_ROTATION_DEG or self.position > WRONG_POSITION
 
