@@ -567,7 +567,7 @@ class System:
             view,
             old.id,
             reason=str(FailureReason.SCALE_LOST),
-            detail=f"the scale from here on is known to {loss.sigma:.0%} by what was mapped before",
+            detail=loss.detail,
             lost_since=loss.first,
             suspected_since=loss.since,
             sigma_scale=loss.sigma,

@@ -55,6 +55,12 @@ class ScaleLoss:
     first: int
     sigma: float
 
+    @property
+    def detail(self) -> str:
+        """For the event log."""
+        known = "not known" if np.isinf(self.sigma) else f"known to {self.sigma:.0%}"
+        return f"the scale from here on is {known} by what was mapped before"
+
 
 class ScaleWatch:
     """Asks about each group of a live map's keyframes, once, when `BEHIND` have come after it.

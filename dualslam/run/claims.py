@@ -23,7 +23,7 @@ TOGETHER = 2
 sink, by a quarter with 6 (a room), since more of the map holds the scale: the inflation below is not made for that."""
 MIN_LANDMARKS = 6
 POSITION_INFLATION = 1.1
-"""As `SCALE_INFLATION`, for positions."""
+"""As `SCALE_INFLATION` (`recovery/scale_watch.py`), for positions."""
 
 
 @dataclass(frozen=True, slots=True)

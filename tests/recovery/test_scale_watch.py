@@ -57,6 +57,8 @@ def test_a_map_that_hangs_by_next_to_nothing_is_parted_there(n_ties: int) -> Non
     assert loss.since == group[0]
     assert loss.first == PLACE
     assert loss.sigma > watch.max_sigma > LinkingConfig().wrong_scale
+    assert "not known" in loss.detail
+    assert "known to 45%" in ScaleLoss(1, 2, 0.45).detail
     assert watch.judge(submap, []) is None  # a group is asked about once
 
 
