@@ -244,7 +244,7 @@ class BesideGraphs:
                 return  # the desk has lost what it was given
             for ended in answers:
                 if isinstance(ended.result, Failure):
-                    log.warning("a graph was left behind at the end: %s", ended.result.detail)
+                    log.log(_level(ended.result), "a graph was left behind at the end: %s", ended.result.detail)
                     return
                 if (moved := self._take(ended.result, submaps)) is not None:
                     yield moved
@@ -270,7 +270,7 @@ class BesideGraphs:
         assert self._under_way is not None
         (submap_id, graph, K), self._under_way = self._under_way, None
         if isinstance(result, Failure):
-            log.warning("graph of submap %d: %s; it is made anew", submap_id, result.detail)
+            log.log(_level(result), "graph of submap %d: %s; it is made anew", submap_id, result.detail)
             graph.mirror, graph.rebuild_asked = SubmapMirror(), False
             # A solver that has failed on these arrays would fail again: it waits for the next keyframe.
             graph.is_behind = graph.is_behind or result.reason is not FailureReason.SOLVER
@@ -288,3 +288,8 @@ class BesideGraphs:
         submap.remove_outliers(rows)
         graph.holds_refused = len(rows) > 0
         return Moved(submap, before, estimate.rebuilt)
+
+
+def _level(failure: Failure) -> int:
+    """Return how loudly a failure is told: that the process has let an old map's graph go is no trouble."""
+    return logging.INFO if failure.reason is FailureReason.DISABLED else logging.WARNING
