@@ -50,11 +50,7 @@ def submap_of(submap: Submap, submap_id: int, keyframe_ids: list[int]) -> Submap
     for k in keyframe_ids:
         twin.add_keyframe(submap.keyframes[k], submap.T_submap_kf[k])
     old = submap.landmarks_of_keyframes(keyframe_ids)
-    n_seen = np.zeros(len(submap.landmarks), np.int64)
-    for k in keyframe_ids:
-        ids = submap.landmark_of[k]
-        n_seen[ids[ids >= 0]] += 1
-    old = old[n_seen[old] >= 2]
+    old = old[submap.n_views_among(keyframe_ids)[old] >= 2]
     twin.copy_landmarks(submap, old)
     new_id = np.full(len(submap.landmarks), NO_LANDMARK, np.int64)
     new_id[old] = np.arange(len(old))

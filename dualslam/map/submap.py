@@ -348,6 +348,14 @@ class Submap:
         order = np.lexsort((ids, -counts))
         return ids[order], counts[order]
 
+    def n_views_among(self, keyframe_ids: Iterable[int]) -> IntArray:
+        """Return by how many of some keyframes each landmark is seen, dead ones too."""
+        n_seen = np.zeros(len(self.landmarks), np.int64)
+        for k in keyframe_ids:
+            ids = self.landmark_of[k]
+            n_seen[ids[ids >= 0]] += 1
+        return n_seen
+
     def landmarks_of_keyframes(self, keyframe_ids: IntArray | list[int]) -> IntArray:
         """Return the ids of all live landmarks that any of the keyframes sees, ascending."""
         seen = np.zeros(len(self.landmarks), bool)

@@ -116,14 +116,9 @@ class ScaleWatch:
 
 def _n_ties(submap: Submap, ids: IntArray, end: int, begin: int, n_views: int = 1) -> int:
     """Return how many landmarks are seen by `n_views` or more of the keyframes before `end`, and from `begin` on."""
-    held = np.ones(len(submap.landmarks), bool)
-    for side in (ids[max(end - N_AROUND, 0) : end], ids[begin : begin + N_AROUND]):
-        n_seen = np.zeros(len(submap.landmarks), np.int64)
-        for k in side.tolist():
-            of_keyframe = submap.landmark_of[k]
-            n_seen[of_keyframe[of_keyframe >= 0]] += 1
-        held &= n_seen >= n_views
-    return int(held.sum())
+    sides = ids[max(end - N_AROUND, 0) : end], ids[begin : begin + N_AROUND]
+    before, after = (submap.n_views_among(side.tolist()) for side in sides)
+    return int(((before >= n_views) & (after >= n_views)).sum())
 
 
 def _is_linked(submap_id: int, first: int, links: Iterable[Link]) -> bool:
