@@ -1,12 +1,13 @@
-"""Measure what the README and docs/results.md claim, at one commit, and write the tables there.
+"""Measure what the README and docs/results.md claim, and write the tables there, each with its commit.
 
     python benchmarks/results.py --data DIR [--part sequences] [--part failures] [--part links]
                                  [--seeds 5] [--trials 4] [--worlds 8] [--jobs 2] [--out runs/results] [--write-only]
 
 `make results DATA=DIR` is the same. DIR holds `kitti_03`, `7scenes_1000`, `tum_fr1_rpy` and `hololens_000`, each with
-an `images` folder, as `dualslam run` reads them. A measurement that was stopped goes on where it was; one that was
-begun at another commit is refused: a table has one commit. All seeds are of the reporting half. Parts that were not
-measured keep their place in the page, and it says so.
+an `images` folder, as `dualslam run` reads them. Each part notes the commit that it is measured at: a part that was
+stopped goes on where it was, and one that was begun at another commit is refused, so that a table has one commit. Parts
+of one folder may have different ones, and `--write-only` writes those that are there; what was not measured stays in
+the pages as it was. All seeds are of the reporting half.
 """
 
 from __future__ import annotations
@@ -29,7 +30,6 @@ FIRST_SEED = 100
 CONDITIONS: dict[str, list[str]] = {"": [], "recovery off": ["--no-recovery"]}
 BLACK = ("kitti_03", "7scenes_1000")
 BLACK_FRAMES = 10
-NOT_MEASURED = "Not measured at this commit."
 
 
 def main() -> None:
@@ -44,24 +44,29 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "results")
     parser.add_argument("--write-only", action="store_true", help="from what was measured so far")
     args = parser.parse_args()
+    parts = [] if args.write_only else args.part or PARTS
+    if args.data is None and set(parts) - {"links"}:
+        parser.error("sequences and failures need --data")
     commit = _git("describe", "--always", "--dirty")
-    if not args.write_only:
-        _begin(args.out, commit)
-        for part in args.part or PARTS:
-            if part != "links" and args.data is None:
-                parser.error(f"{part} needs --data")
-            {"sequences": measure_sequences, "failures": measure_failures, "links": measure_links}[part](args)
-    known = args.out / "commit.txt"
-    at = f"Commit `{known.read_text().strip()}`" if known.exists() else NOT_MEASURED
-    write(args.out, at)
+    for part in parts:
+        begin(args.out, part, commit)
+    for part in parts:
+        {"sequences": measure_sequences, "failures": measure_failures, "links": measure_links}[part](args)
+    write(args.out)
 
 
-def _begin(out: Path, commit: str) -> None:
+def begin(out: Path, part: str, commit: str) -> None:
+    """Note the commit of a part; end the program where it was begun at another one."""
+    note = _note_of_commit(out, part)
+    if note.exists() and note.read_text().strip() != commit:
+        begun = note.read_text().strip()
+        sys.exit(f"{part} in {out} were measured at {begun}, this is {commit}: another --out, or --write-only")
     out.mkdir(parents=True, exist_ok=True)
-    marker = out / "commit.txt"
-    if marker.exists() and marker.read_text().strip() != commit:
-        sys.exit(f"{out} was measured at {marker.read_text().strip()}, this is {commit}: move it away, or --write-only")
-    marker.write_text(commit + "\n")
+    note.write_text(commit + "\n")
+
+
+def _note_of_commit(out: Path, part: str) -> Path:
+    return out / f"{part}.commit.txt"
 
 
 # --- measuring
@@ -118,21 +123,27 @@ def _git(*arguments: str) -> str:
 # --- writing
 
 
-def write(out: Path, at: str) -> None:
-    """Put the tables into README.md and docs/results.md, between their marks."""
-    sequences, failures, links = sequences_table(out), failures_tables(out), links_table(out)
-    _fill(ROOT / "README.md", {"sequences": sequences}, at)
-    _fill(ROOT / "docs" / "results.md", {"sequences": sequences, "failures": failures, "links": links}, at)
+def write(out: Path) -> None:
+    """Put the tables that were measured into README.md and docs/results.md, between their marks."""
+    tables = {"sequences": sequences_table(out), "failures": failures_tables(out), "links": links_table(out)}
+    for page, parts in ((ROOT / "README.md", PARTS[:1]), (ROOT / "docs" / "results.md", PARTS)):
+        text = page.read_text()
+        for part in parts:
+            if table := tables[part]:
+                note = _note_of_commit(out, part)
+                if not note.exists():
+                    sys.exit(f"{note} is missing: nothing says at which commit {part} were measured")
+                commit = note.read_text().strip()
+                text = _filled(text, part, f"Commit `{commit}`, `make results`.\n\n{table}\n")
+        page.write_text(text)
 
 
-def _fill(page: Path, tables: dict[str, str | None], at: str) -> None:
-    text = page.read_text()
-    for name, table in tables.items():
-        pattern = rf"(<!-- results: {name} -->\n).*?(<!-- end -->)"
-        assert re.search(pattern, text, re.DOTALL), f"{page} has no place for {name}"
-        filled = f"{at}, `make results`.\n\n{table}\n" if table else f"{NOT_MEASURED}\n"
-        text = re.sub(pattern, lambda m, filled=filled: m[1] + filled + m[2], text, flags=re.DOTALL)
-    page.write_text(text)
+def _filled(text: str, part: str, content: str) -> str:
+    """Return a page's text with one part's place filled anew."""
+    pattern = rf"(<!-- results: {part} -->\n).*?(<!-- end -->)"
+    text, n = re.subn(pattern, lambda m: m[1] + content + m[2], text, flags=re.DOTALL)
+    assert n == 1, f"{n} places for {part}"
+    return text
 
 
 def sequences_table(out: Path) -> str | None:
