@@ -71,11 +71,15 @@ def style_sheet() -> str:
     return files("dualslam.report").joinpath("page.css").read_text(encoding="utf-8")
 
 
+ROUNDING = 1e-9
+"""Below this a number is what rounding in a double's last digits leaves of nought: a first submap "moved by 1e-20"."""
+
+
 def number(value: float | None, digits: int = 3) -> str:
     """Return a number with so many significant digits, without exponents where a person would not want them."""
     if value is None or value != value:
         return "-"
-    if value == 0:
+    if abs(value) < ROUNDING:
         return "0"
     if 1e-4 <= abs(value) < 1e6:
         text = f"{value:.{digits}g}"
