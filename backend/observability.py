@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 
@@ -127,23 +129,13 @@ def compute_depth_sigmas(
 def find_components(kf: IntArray, landmark: IntArray) -> tuple[IntArray, IntArray]:
     """Return the keyframes that occur, ascending, and for each the number of the connected piece it belongs to.
 
-    Two keyframes are connected where they share a landmark. Labels spread along landmarks until they settle; each
-    round also follows the label's own label, so that a chain of n keyframes takes about log n rounds.
+    Two keyframes are connected where they share a landmark. Pieces count from 0, by their first keyframe.
     """
     ids, k = np.unique(kf, return_inverse=True)
-    _, j = np.unique(landmark, return_inverse=True)
-    label = np.arange(len(ids))
-    n_landmarks = int(j.max()) + 1 if len(j) else 0
-    while True:
-        of_landmark = np.full(n_landmarks, len(ids))
-        np.minimum.at(of_landmark, j, label[k])
-        new = label.copy()
-        np.minimum.at(new, k, of_landmark[j])
-        np.minimum.at(new, label, new)  # the old root learns what its members found
-        new = new[new]
-        if np.array_equal(new, label):
-            return ids, label
-        label = new
+    landmarks, j = np.unique(landmark, return_inverse=True)
+    nodes = len(ids) + len(landmarks)
+    seen = coo_matrix((np.ones(len(k), bool), (k, len(ids) + j)), shape=(nodes, nodes))
+    return ids, connected_components(seen, directed=False)[1][: len(ids)].astype(np.int64)
 
 
 def take_mask(ids: IntArray, size: int) -> BoolArray:
