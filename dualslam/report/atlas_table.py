@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from dualslam.report.markup import Markup, join, number, tag
+from dualslam.report.markup import Markup, cards, join, number, tag
 from dualslam.report.run_data import RunData
 
 _HEADS = ("frame", "submaps", "factors", "cost before", "cost after", "rejected", "bent by", "moved by")
@@ -19,15 +19,13 @@ def atlas_section(run: RunData) -> Markup | None:
         "Each connection between submaps is a factor of one graph, solved when it comes. What is rejected stays in the "
         "map, without a say. A submap is bent by the part of a move that is not a change of its place; in its own unit."
     )
-    head = tag("tr", [tag("th", name, scope="col") for name in _HEADS])
-    table = tag("table", tag("thead", head), tag("tbody", rows), cls="cards")
-    return join([tag("p", words), tag("div", table, cls="scroll")])
+    return join([tag("p", words), cards(_HEADS, rows)])
 
 
-def _row(event: dict[str, Any]) -> Markup:
+def _row(event: dict[str, Any]) -> tuple[str, ...]:
     factors = ", ".join(f"{n} {kind}" for kind, n in event.get("factors", {}).items())
     rejected = ", ".join(f"{link['connection']} {link['other_submap']}-{link['submap']}" for link in event["rejected"])
-    values = (
+    return (
         str(event["frame"]),
         ", ".join(map(str, event["submaps"])),
         factors,
@@ -37,4 +35,3 @@ def _row(event: dict[str, Any]) -> Markup:
         number(event["largest_bend"], 3),
         number(event["largest_move"], 3),
     )
-    return tag("tr", [tag("td", value, data_label=name) for name, value in zip(_HEADS, values, strict=True)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from dualslam.report.markup import Markup, join, number, tag
+from dualslam.report.markup import Markup, cards, join, number, tag
 from dualslam.report.statuses import count
 
 SHOWN_TRIES = 8
@@ -44,12 +44,8 @@ def _titled(title: str, table: Markup, note: str | None) -> Markup:
 
 def _table(columns: Sequence[str], cells: Sequence[dict[str, str]]) -> Markup:
     used = [c for c in columns if any(row.get(c) for row in cells)]
-    head = tag("tr", [tag("th", name, scope="col") for name in used])
-    body = [
-        tag("tr", [tag("td", row.get(c) or "-", data_label=c, cls="words" if c == "verdict" else "num") for c in used])
-        for row in cells
-    ]
-    return tag("div", tag("table", tag("thead", head), tag("tbody", body), cls="cards"), cls="scroll")
+    classes = {c: "words" if c == "verdict" else "num" for c in used}
+    return cards(used, [[row.get(c) or "-" for c in used] for row in cells], classes)
 
 
 def _attempt_cells(event: Event) -> dict[str, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.core.types import FrameStatus
-from dualslam.report.markup import Markup, duration, join, number, tag
+from dualslam.report.markup import Markup, duration, join, number, number_row, stretched, table, tag
 from dualslam.report.run_data import RunData
 
 BINS_PER_DECADE = 8
@@ -45,15 +45,7 @@ def latency_histogram(run: RunData) -> Markup:
         left = 100 * (np.log10(value) - low) / (high - low)
         title = f"{name}: {duration(value)}"
         marks.append(tag("span", cls="at rule", style=f"left:{left:.2f}%", title=title))
-    svg = tag(
-        "svg",
-        tag("title", "Histogram of the frames' latency"),
-        bars,
-        viewBox=f"0 0 {n_bins} 100",
-        preserveAspectRatio="none",
-        role="img",
-        aria_label="Histogram of the frames' latency",
-    )
+    svg = stretched(n_bins, 100, bars, "Histogram of the frames' latency")
     median, p95, most = (duration(float(np.percentile(latency, q))) for q in (50, 95, 100))
     caption = f"Median {median}, 95 % of the frames below {p95}, longest {most} (upright lines)."
     return tag("figure", tag("div", svg, marks, words, cls="histogram"), tag("figcaption", caption))
@@ -75,8 +67,7 @@ def stage_table(run: RunData) -> Markup:
         )
         for name, seconds in sorted(stages.items(), key=lambda item: -item[1])
     ]
-    note = "A stage named (in x) is part of x."
-    return tag("table", tag("caption", f"CPU time a frame, by stage. {note}"), tag("tbody", rows), cls="plain stages")
+    return table((), rows, "plain stages", "CPU time a frame, by stage. A stage named (in x) is part of x.")
 
 
 def beside_table(run: RunData) -> Markup:
@@ -84,23 +75,21 @@ def beside_table(run: RunData) -> Markup:
     beside = run.summary.get("beside") or {}
     if not beside:
         return join(None)
-    head = ("", "jobs", "failed", "waited at once", "longest", "CPU", "peak memory")
+    heads = ("", "jobs", "failed", "waited at once", "longest", "CPU", "peak memory")
     rows = [
-        tag(
-            "tr",
-            tag("th", kind, scope="row"),
-            tag("td", str(queue["n_done"]), cls="num"),
-            tag("td", str(queue["n_failed"]), cls="num"),
-            tag("td", str(queue["max_waiting"]), cls="num"),
-            tag("td", duration(1e3 * queue["longest_s"]), cls="num"),
-            tag("td", f"{number(queue['cpu_s'])} s", cls="num"),
-            tag("td", f"{number(queue['peak_rss_mb'], 4)} MB", cls="num"),
+        number_row(
+            kind,
+            (
+                *(str(queue[name]) for name in ("n_done", "n_failed", "max_waiting")),
+                duration(1e3 * queue["longest_s"]),
+                f"{number(queue['cpu_s'])} s",
+                f"{number(queue['peak_rss_mb'], 4)} MB",
+            ),
         )
         for kind, queue in beside.items()
     ]
     caption = "Work beside the tracking, in processes of its own: the longest counts from when a job was submitted."
-    table_head = tag("thead", tag("tr", [tag("th", word, scope="col") for word in head]))
-    return tag("table", tag("caption", caption), table_head, tag("tbody", rows), cls="plain stages")
+    return table(heads, rows, "plain stages", caption)
 
 
 def pace_words(run: RunData) -> Markup:

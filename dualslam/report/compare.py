@@ -11,7 +11,7 @@ import numpy as np
 from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure, FloatArray, FrameStatus
 from dualslam.report.canvas import Canvas
-from dualslam.report.markup import Markup, document, join, number, tag
+from dualslam.report.markup import Markup, document, join, number, number_row, stretched, table, tag
 from dualslam.report.page import headline
 from dualslam.report.placement import Placed, align, extent, plane_from_above
 from dualslam.report.run_data import PosedRows, RunData
@@ -219,15 +219,7 @@ def _strip(run: RunData, name: str, first: int, stop: int) -> Markup:
         place = {"x": ends[0] - first, "y": f"{1 - height:.2f}", "width": ends[1] - ends[0] + stride}
         blocks.append(tag("rect", title, **place, height=f"{height:.2f}", cls=f"st-{value}"))
     unposed = sum(run.count(s) for s in WITHOUT_POSE)
-    svg = tag(
-        "svg",
-        tag("title", f"Frames of {name}"),
-        blocks,
-        viewBox=f"0 0 {max(stop - first, 1)} 1",
-        preserveAspectRatio="none",
-        role="img",
-        aria_label=f"Frames of {name}",
-    )
+    svg = stretched(max(stop - first, 1), 1, blocks, f"Frames of {name}")
     head = tag("div", tag("b", name), " ", tag("small", f"{unposed} of {count(len(status), 'frame')} without a pose"))
     return tag("div", tag("div", head, cls="lane-name"), tag("div", svg, cls="lane-body"), cls="lane")
 
@@ -240,7 +232,7 @@ def _strip_sample(status: FrameStatus) -> Markup:
 
 def _number_table(runs: Sequence[RunData]) -> Markup:
     head, *rows = comparison_table(runs)
-    return _side_by_side([tag("th", cell, scope="col") for cell in head], rows)
+    return _side_by_side(head, rows)
 
 
 def _config_table(runs: Sequence[RunData], names: Sequence[str]) -> Markup:
@@ -253,13 +245,12 @@ def _config_table(runs: Sequence[RunData], names: Sequence[str]) -> Markup:
     ]
     if not rows:
         return tag("p", "All runs have the same configuration.", cls="empty")
-    return _side_by_side([tag("th", cell, scope="col") for cell in ("", *names)], rows)
+    return _side_by_side(("", *names), rows)
 
 
-def _side_by_side(head: list[Markup], rows: Sequence[Sequence[str]]) -> Markup:
-    body = [tag("tr", tag("th", row[0], scope="row"), [tag("td", cell, cls="num") for cell in row[1:]]) for row in rows]
-    table = tag("table", tag("thead", tag("tr", head)), tag("tbody", body), cls="plain beside")
-    return tag("div", table, cls="scroll", tabindex=0, role="region", aria_label="table, scrolls sideways")
+def _side_by_side(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Markup:
+    whole = table(heads, [number_row(row[0], row[1:]) for row in rows], "plain beside")
+    return tag("div", whole, cls="scroll", tabindex=0, role="region", aria_label="table, scrolls sideways")
 
 
 def _flat(config: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

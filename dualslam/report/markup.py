@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 
 # The browser itself refuses scripts and whatever is outside of the page.
@@ -49,6 +49,42 @@ def join(children: object) -> Markup:
     if isinstance(children, Iterable):
         return Markup("".join(join(child) for child in children))
     raise TypeError(f"{type(children).__name__} is no child of an element")
+
+
+def table(heads: Sequence[str], rows: Sequence[Markup], cls: str, caption: str | None = None) -> Markup:
+    """Return a table of ready rows; `heads` stand above its columns, none: there is no such line."""
+    head = tag("thead", tag("tr", [tag("th", words, scope="col") for words in heads])) if heads else None
+    return tag("table", None if caption is None else tag("caption", caption), head, tag("tbody", rows), cls=cls)
+
+
+def number_row(head: str, numbers: Sequence[str]) -> Markup:
+    """Return a row of a table: its own head, then numbers."""
+    return tag("tr", tag("th", head, scope="row"), [tag("td", text, cls="num") for text in numbers])
+
+
+def cards(
+    heads: Sequence[str], rows: Sequence[Sequence[str]], classes: Mapping[str, str | None] | None = None
+) -> Markup:
+    """Return a table of text whose rows become cards where the page is narrow; `classes` by the head of a column."""
+    of = classes or {}
+    body = [
+        tag("tr", [tag("td", text, data_label=head, cls=of.get(head)) for head, text in zip(heads, row, strict=True)])
+        for row in rows
+    ]
+    return tag("div", table(heads, body, "cards"), cls="scroll")
+
+
+def stretched(width: float, height: float, shapes: object, description: str) -> Markup:
+    """Return a drawing that fills whatever holds it, both ways."""
+    return tag(
+        "svg",
+        tag("title", description),
+        shapes,
+        viewBox=f"0 0 {width} {height}",
+        preserveAspectRatio="none",
+        role="img",
+        aria_label=description,
+    )
 
 
 def document(title: str, body: object) -> Markup:

@@ -12,7 +12,7 @@ from dualslam.report.atlas_table import atlas_section
 from dualslam.report.charts import beside_table, latency_histogram, pace_words, stage_table
 from dualslam.report.event_words import event_words
 from dualslam.report.failures import failures_section, stories
-from dualslam.report.markup import Markup, document, duration, join, number, tag
+from dualslam.report.markup import Markup, cards, document, duration, join, number, table, tag
 from dualslam.report.run_data import RunData
 from dualslam.report.statuses import WITHOUT_POSE, count
 from dualslam.report.timeline import timeline
@@ -21,6 +21,7 @@ from dualslam.report.trust import trust_section
 
 MAX_EVENTS = 500
 """A bound on the size of the page."""
+_EVENT_COLUMNS = {"frame": "num", "time": "num", "event": None, "submap": "num", "what belongs to it": "words"}
 
 
 def report_page(run: RunData) -> str:
@@ -138,11 +139,10 @@ def _configuration(run: RunData) -> Markup:
         tag("tr", tag("th", name, scope="row"), tag("td", str(value)), tag("td", str(was)))
         for name, value, was in changed
     ]
-    head = tag("tr", [tag("th", words, scope="col") for words in ("field", "here", "default")])
-    table = tag("div", tag("table", tag("thead", head), tag("tbody", rows), cls="plain"), cls="scroll")
+    changes = tag("div", table(("field", "here", "default"), rows, "plain"), cls="scroll")
     words = tag("p", "All fields have their default values.", cls="empty")
     whole = tag("details", tag("summary", "The whole configuration"), tag("pre", run.config_text))
-    return join([table if rows else words, whole])
+    return join([changes if rows else words, whole])
 
 
 def _differences(here: dict[str, Any], default: dict[str, Any], prefix: str = "") -> list[tuple[str, Any, Any]]:
@@ -160,22 +160,19 @@ def _events(run: RunData) -> Markup:
     if not run.events:
         return tag("p", "Nothing happened.", cls="empty")
     rows = [
-        tag(
-            "tr",
-            tag("td", str(event.get("frame", "")), data_label="frame", cls="num"),
-            tag("td", f"{event.get('timestamp_s', 0.0):.2f} s", data_label="time", cls="num"),
-            tag("td", str(event.get("event", "")).replace("_", " "), data_label="event"),
-            tag("td", "-" if event.get("submap") is None else str(event["submap"]), data_label="submap", cls="num"),
-            tag("td", event_words(event), data_label="what belongs to it", cls="words"),
+        (
+            str(event.get("frame", "")),
+            f"{event.get('timestamp_s', 0.0):.2f} s",
+            str(event.get("event", "")).replace("_", " "),
+            "-" if event.get("submap") is None else str(event["submap"]),
+            event_words(event),
         )
         for event in run.events[:MAX_EVENTS]
     ]
-    head = tag("tr", [tag("th", w, scope="col") for w in ("frame", "time", "event", "submap", "what belongs to it")])
-    table = tag("table", tag("thead", head), tag("tbody", rows), cls="cards")
     words = count(len(run.events), "event")
     if len(run.events) > MAX_EVENTS:
         words += f", of which the first {MAX_EVENTS} are here and all in {EVENTS}"
-    return tag("details", tag("summary", words), tag("div", table, cls="scroll"))
+    return tag("details", tag("summary", words), cards(tuple(_EVENT_COLUMNS), rows, _EVENT_COLUMNS))
 
 
 def _footer(run: RunData) -> Markup:

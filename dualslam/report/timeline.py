@@ -13,7 +13,7 @@ import numpy as np
 
 from dualslam.core.types import FloatArray, FrameStatus
 from dualslam.report.canvas import ticks
-from dualslam.report.markup import Markup, coordinate, duration, number, tag
+from dualslam.report.markup import Markup, coordinate, duration, number, stretched, tag
 from dualslam.report.placement import PlacedRun, place
 from dualslam.report.run_data import RunData
 from dualslam.report.statuses import MEANING, count, span, stretches
@@ -58,7 +58,7 @@ def _status_lanes(run: RunData) -> list[Markup]:
         block = _block(stretch.start, len(stretch), f"{frames}: {value}", f"st-{value}")
         by_status[value].append(block)
     return [
-        _lane(str(s), count(run.count(s), "frame"), _stretched(len(status), by_status[s], f"{s}: {MEANING[s]}"))
+        _lane(str(s), count(run.count(s), "frame"), stretched(len(status), 1, by_status[s], f"{s}: {MEANING[s]}"))
         for s in found
     ]
 
@@ -78,7 +78,7 @@ def _submap_lane(run: RunData) -> Markup:
             centre = stretch.start + len(stretch) / 2
             words.append(_at(100 * centre / n, str(submap) if in_main else f"({submap})", "on-block"))
     note = "in brackets: not linked"
-    return _lane("submap", note if run.unlinked else "", _stretched(n, shapes, "Submap of each frame"), words)
+    return _lane("submap", note if run.unlinked else "", stretched(n, 1, shapes, "Submap of each frame"), words)
 
 
 def _owner_class(in_main: bool) -> str:
@@ -112,7 +112,7 @@ def _inlier_lane(run: RunData) -> Markup:
         y = 100 * (1 - threshold / top)
         shapes.append(tag("path", cls="threshold", d=f"M0 {coordinate(y)}H{len(run.rows)}"))
         note += f"; dashed: {threshold} needed"
-    return _lane("landmarks", note, _stretched(len(run.rows), shapes, "Landmarks matched and agreeing", 100), words)
+    return _lane("landmarks", note, stretched(len(run.rows), 100, shapes, "Landmarks matched and agreeing"), words)
 
 
 def _error_lane(run: RunData, scene: PlacedRun) -> Markup | None:
@@ -126,7 +126,7 @@ def _error_lane(run: RunData, scene: PlacedRun) -> Markup | None:
     note = "distance from the truth after alignment, each map by itself"
     shape = _curve(error, max(top, 1e-12), "error")
     words = [tag("span", f"{number(top)} m", cls="y-max")]
-    return _lane("error", note, _stretched(len(run.rows), shape, "Position error", 100), words)
+    return _lane("error", note, stretched(len(run.rows), 100, shape, "Position error"), words)
 
 
 def _latency_lane(run: RunData) -> Markup:
@@ -135,7 +135,7 @@ def _latency_lane(run: RunData) -> Markup:
     low, top = 1.0, max(float(latency.max()), 10.0)
     height = np.log10(np.clip(latency, low, None) / low)
     words = [tag("span", duration(top), cls="y-max")]
-    svg = _stretched(len(latency), _area(height, float(np.log10(top / low)), "latency"), "Latency of each frame", 100)
+    svg = stretched(len(latency), 100, _area(height, float(np.log10(top / low)), "latency"), "Latency of each frame")
     return _lane("latency", "wall time of each frame, logarithmic from 1 ms", svg, words)
 
 
@@ -156,18 +156,6 @@ def _axis(run: RunData) -> Markup:
 def _lane(name: str, note: str, drawing: Markup, words: Sequence[Markup] = (), cls: str = "") -> Markup:
     head = tag("div", tag("b", name), " ", tag("small", note), cls="lane-name")
     return tag("div", head, tag("div", drawing, words, cls="lane-body"), cls=f"lane {cls or name}")
-
-
-def _stretched(n: int, shapes: object, description: str, height: int = 1) -> Markup:
-    return tag(
-        "svg",
-        tag("title", description),
-        shapes,
-        viewBox=f"0 0 {n} {height}",
-        preserveAspectRatio="none",
-        role="img",
-        aria_label=description,
-    )
 
 
 def _block(start: int, length: int, title: str, cls: str) -> Markup:

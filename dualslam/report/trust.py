@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from dualslam.core.types import FloatArray
-from dualslam.report.markup import Markup, join, number, tag
+from dualslam.report.markup import Markup, cards, join, number, stretched, tag
 from dualslam.report.run_data import RunData
 
 LOOSE_SCALE = 0.05
@@ -30,9 +30,7 @@ def trust_section(run: RunData) -> Markup:
         "Once a map has matured it walks back over its own start, on points of its own: what agrees is confirmed, what "
         "does not is cut off and posed again. Links, gaps and places that two answers explain alike are not believed."
     )
-    head = tag("tr", [tag("th", name, scope="col") for name in _HEADS])
-    table = tag("table", tag("thead", head), tag("tbody", rows), cls="cards")
-    verdicts = tag("div", table, cls="scroll") if rows else tag("p", "Nothing was audited or doubted.", cls="empty")
+    verdicts = cards(_HEADS, rows) if rows else tag("p", "Nothing was audited or doubted.", cls="empty")
     strips = (
         _strip(
             run,
@@ -69,10 +67,9 @@ def _told(event: dict[str, Any]) -> tuple[str, str] | None:
     return None
 
 
-def _row(event: dict[str, Any], what: str, outcome: str) -> Markup:
+def _row(event: dict[str, Any], what: str, outcome: str) -> tuple[str, ...]:
     submap = event.get("submap")
-    values = (str(event["frame"]), "-" if submap is None else str(submap), what, outcome)
-    return tag("tr", [tag("td", value, data_label=name) for name, value in zip(_HEADS, values, strict=True)])
+    return str(event["frame"]), "-" if submap is None else str(submap), what, outcome
 
 
 def _strip(run: RunData, sigmas: list[float | None], name: str, note: str) -> Markup:
@@ -94,16 +91,7 @@ def _strip(run: RunData, sigmas: list[float | None], name: str, note: str) -> Ma
             share = max(share, 0.01)
             bars.append(tag("rect", title, x=float(i), y=100 * (1 - share), width=0.9, height=100 * share, cls="bar"))
         first += len(part)
-    label = f"{name}, frame by frame"
-    svg = tag(
-        "svg",
-        tag("title", label),
-        bars,
-        viewBox=f"0 0 {len(parts)} 100",
-        preserveAspectRatio="none",
-        role="img",
-        aria_label=label,
-    )
+    svg = stretched(len(parts), 100, bars, f"{name}, frame by frame")
     median, p95 = (number(float(np.percentile(known, q)), 2) for q in (50, 95))
     caption = f"The {name}: median {median}, 95 % below {p95}; bars from {10.0**low:g} to {10.0**high:g}. {note}"
     return tag("figure", tag("div", svg, cls="histogram"), tag("figcaption", caption))
