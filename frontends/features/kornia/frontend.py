@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import RLock
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dualslam.core.errors import InputError
+from dualslam.core.errors import ConfigError
 from dualslam.core.types import Features, FloatArray, Matches
 from dualslam.frontends.features.corners import grades, select_spread
 from dualslam.frontends.features.groups import NO_MATCHES, best_per_group, consistent_rotation
@@ -17,8 +19,6 @@ from dualslam.frontends.features.kornia.levels import LevelFeatures
 from dualslam.frontends.features.kornia.matchers import MIN_FEATURES, build_matcher
 from dualslam.frontends.features.kornia.networks import Network
 from dualslam.frontends.features.kornia.options import LEVELS_ZOOM, NETWORK_TURN_DEG, NETWORK_ZOOM, KorniaOptions
-from dualslam.frontends.features.kornia.runtime import DeviceCopies, choose_device, inference
-from dualslam.frontends.features.kornia.weights import WeightSource
 from dualslam.frontends.features.optioned import OptionedFrontend
 
 MIN_SIDE_PX = 33
@@ -27,6 +27,7 @@ CANDIDATES = 2
 """Keypoints that a network is asked for, times those that are kept, so that there is something to spread."""
 UNREFINED = 1.5
 """Noise of a maximum that stays at its pixel, times that of the others."""
+_ONE_CALLER = RLock()
 
 
 class KorniaFrontend(OptionedFrontend):
@@ -52,33 +53,19 @@ class KorniaFrontend(OptionedFrontend):
 
     def __init__(self, n_features: int = 1500, options: KorniaOptions | None = None) -> None:
         super().__init__(n_features, options)
-        noise = self.options.noise
-        self.max_distance, self.max_distance_strict = noise.max_distance, noise.max_distance_strict
-        self._sigma_px = noise.sigma_px
-        self._device = choose_device(self.options.device)
-        self._copies = DeviceCopies(self._device)
+        options = self.options
+        self.max_distance, self.max_distance_strict = options.noise.max_distance, options.noise.max_distance_strict
+        self._device = choose_device(options.device)
         with torch.random.fork_rng(devices=[]):  # networks are made at random before their weights are read
-            self._build()
-
-    def _build(self) -> None:
-        """Make detector, descriptor and matcher on the device."""
-        options, checkpoints = self.options, self.options.checkpoints
-        source = WeightSource("frontend.options.weights", options.weights, is_single=len(checkpoints) == 1)
-        for checkpoint in checkpoints:  # all of them before any network is made, which takes seconds
-            source.find(checkpoint)
-        self._extract: Callable[[list[NDArray[np.uint8]]], list[Features]]
-        if options.is_network:
-            self.scale_factor, self.n_octaves = NETWORK_ZOOM, 1
-            self.max_turn_deg, self.max_zoom = NETWORK_TURN_DEG, NETWORK_ZOOM
-            n_candidates = CANDIDATES * self.n_features
-            self._network = Network(options.detector, n_candidates, self._device, options.half, source)
-            self._extract = self._by_network
-        else:
-            self.scale_factor, self.n_octaves = options.scale_factor, options.n_octaves
-            self.max_turn_deg, self.max_zoom = 180.0, LEVELS_ZOOM
-            self._levels = LevelFeatures(options, self.n_features, self._device, source)
-            self._extract = self._by_levels
-        self._match = build_matcher(options, self._device)
+            if options.is_network:
+                self.scale_factor, self.n_octaves = NETWORK_ZOOM, 1
+                self.max_turn_deg, self.max_zoom = NETWORK_TURN_DEG, NETWORK_ZOOM
+                self._network = Network(options.detector, CANDIDATES * n_features, self._device, options.weights)
+            else:
+                self.scale_factor, self.n_octaves = options.scale_factor, options.n_octaves
+                self.max_turn_deg, self.max_zoom = 180.0, LEVELS_ZOOM
+                self._levels = LevelFeatures(options, n_features, self._device)
+            self._match = build_matcher(options, self._device)
 
     def __reduce__(self) -> tuple[type[KorniaFrontend], tuple[int, KorniaOptions]]:
         """Go to another process as the options: it builds its own and reads the weights itself."""
@@ -97,28 +84,12 @@ class KorniaFrontend(OptionedFrontend):
         InputError
             The array is no such image.
         """
-        return self.extract_batch([image])[0]
-
-    def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Features]:
-        """Do the same for images of one size, all at once: on a GPU that is what keeps it busy.
-
-        Raises
-        ------
-        InputError
-            An array is no image, or they differ in size.
-        """
-        grey = [to_grey(image) for image in images]
-        if len({image.shape for image in grey}) > 1:
-            raise InputError(f"a batch must be of one size, not {sorted({image.shape for image in grey})}")
-        # Flat images, too, have a best keypoint, for a network that keeps the best ones whatever they are.
-        usable = [row for row, each in enumerate(grey) if min(each.shape) >= MIN_SIDE_PX and each.min() < each.max()]
-        result = [self._no_features() for _ in images]
-        if usable:
-            with inference(self._device, self.options.half):
-                chosen = [to_rgb(images[row]) if self.options.is_network else grey[row] for row in usable]
-                for row, features in zip(usable, self._extract(chosen), strict=True):
-                    result[row] = features
-        return result
+        grey = to_grey(image)
+        # A flat image, too, has a best keypoint, for a network that keeps the best ones whatever they are.
+        if min(grey.shape) < MIN_SIDE_PX or grey.min() == grey.max():
+            return self._no_features()
+        with inference(self._device):
+            return self._by_network(to_rgb(image)) if self.options.is_network else self._by_levels(grey)
 
     def distance(self, a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
         """Euclidean distance of paired unit vectors (N, D), (N, D) float32 -> (N,) float64, 0 to 2."""
@@ -129,8 +100,8 @@ class KorniaFrontend(OptionedFrontend):
         """Compare all with all: what the matcher finds, one to one, within `max_distance_strict`, turned alike."""
         if min(len(a), len(b)) < MIN_FEATURES:
             return NO_MATCHES
-        with inference(self._device, self.options.half):
-            of_a, of_b = self._copies.to_device(a.descriptors), self._copies.to_device(b.descriptors)
+        with inference(self._device):
+            of_a, of_b = (torch.tensor(each.descriptors, device=self._device) for each in (a, b))
             pairs = self._match(a, b, of_a, of_b)
         distance = self.distance(a.descriptors[pairs[:, 0]], b.descriptors[pairs[:, 1]])
         kept = np.flatnonzero(distance <= self.max_distance_strict)
@@ -140,45 +111,69 @@ class KorniaFrontend(OptionedFrontend):
         turned_alike = consistent_rotation(b.angle_rad[pairs[kept, 1]] - a.angle_rad[pairs[kept, 0]])
         return Matches(pairs[kept][turned_alike], distance[kept][turned_alike])
 
-    def _by_levels(self, images: list[NDArray[np.uint8]]) -> list[Features]:
+    def _by_levels(self, grey: NDArray[np.uint8]) -> Features:
         """Pyramid, maxima, frames, descriptors."""
-        batch = torch.from_numpy(np.stack(images)[:, None]).to(self._device).float() / 255.0
-        result = []
-        for image, found in zip(batch, self._levels.detect(batch), strict=True):
-            if len(found.uv_px) == 0:
-                result.append(self._no_features())
-                continue
-            angle, descriptors = self._levels.describe(image[None], found)
-            scale = self.scale_factor ** found.octave.astype(np.float64)
-            sigma = self._sigma_px * scale * np.where(found.refined, 1.0, UNREFINED)
-            result.append(self._features(found.uv_px, sigma, scale, found.octave, angle, descriptors))
-        return result
+        image = torch.tensor(grey[None, None], device=self._device).float() / 255.0
+        found = self._levels.detect(image)
+        if len(found.uv_px) == 0:
+            return self._no_features()
+        angle, descriptors = self._levels.describe(image, found)
+        scale = self.scale_factor ** found.octave.astype(np.float64)
+        sigma = self.options.noise.sigma_px * scale * np.where(found.refined, 1.0, UNREFINED)
+        return Features(found.uv_px, found.uv_px, sigma, scale, found.octave, angle, _unit(descriptors))
 
-    def _by_network(self, images: list[NDArray[np.uint8]]) -> list[Features]:
+    def _by_network(self, rgb: NDArray[np.uint8]) -> Features:
         """One pass of the network."""
-        batch = torch.from_numpy(np.stack(images)).to(self._device).permute(0, 3, 1, 2).float() / 255.0
-        result = []
-        for found in self._network(batch.contiguous()):
-            rows = select_spread(found.uv_px.astype(np.int64), grades(found.score), self.n_features)
-            n = len(rows)
-            descriptors = found.descriptors[torch.from_numpy(rows).to(self._device)]
-            sigma, one, zero = np.full(n, self._sigma_px), np.ones(n), np.zeros(n)
-            result.append(self._features(found.uv_px[rows], sigma, one, np.zeros(n, np.int64), zero, descriptors))
-        return result
-
-    def _features(
-        self,
-        uv_px: FloatArray,
-        sigma_px: FloatArray,
-        scale: FloatArray,
-        octave: NDArray[np.int64],
-        angle_rad: FloatArray,
-        descriptors: torch.Tensor,
-    ) -> Features:
-        unit = torch.nn.functional.normalize(descriptors.float(), dim=1)
-        return Features(uv_px, uv_px, sigma_px, scale, octave, angle_rad, self._copies.to_host(unit))
+        image = torch.tensor(rgb[None], device=self._device).permute(0, 3, 1, 2).float() / 255.0
+        uv, score, descriptors = self._network(image.contiguous())
+        rows = select_spread(uv.astype(np.int64), grades(score), self.n_features)
+        uv, sigma, one = uv[rows], np.full(len(rows), self.options.noise.sigma_px), np.ones(len(rows))
+        octave = np.zeros(len(rows), np.int64)
+        return Features(uv, uv, sigma, one, octave, np.zeros(len(rows)), _unit(descriptors)[rows])
 
     def _no_features(self) -> Features:
-        none, dim = np.empty(0), self.options.descriptor_length
-        uv = np.empty((0, 2))
-        return Features(uv, uv, none, none, np.empty(0, np.int64), none, np.empty((0, dim), np.float32))
+        none, uv = np.empty(0), np.empty((0, 2))
+        length = 64 if self.options.detector == "xfeat" else 128
+        return Features(uv, uv, none, none, np.empty(0, np.int64), none, np.empty((0, length), np.float32))
+
+
+def choose_device(name: str) -> torch.device:
+    """Return the device that the config names; `auto` is CUDA where torch sees it.
+
+    Raises
+    ------
+    ConfigError
+        CUDA is asked for and torch sees none.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(
+            f"frontend.options.device: torch {torch.__version__} sees no CUDA device: install a torch built for CUDA, "
+            "or choose cpu or auto"
+        )
+    return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
+
+
+@contextmanager
+def inference(device: torch.device) -> Iterator[None]:
+    """Run torch without gradients; on the CPU in one thread.
+
+    The number of threads belongs to the process: it is put back. One, because the order of a sum, and so its last bit,
+    would depend on it, and because our parallelism is processes (`dualslam.core.threads`). Callers in other threads
+    wait: they would put back each other's.
+    """
+    if device.type != "cpu":
+        with torch.inference_mode():
+            yield
+        return
+    with _ONE_CALLER, torch.inference_mode():
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(threads)
+
+
+def _unit(descriptors: torch.Tensor) -> NDArray[np.float32]:
+    unit: NDArray[np.float32] = torch.nn.functional.normalize(descriptors.float(), dim=1).cpu().numpy()
+    return unit

@@ -9,9 +9,8 @@ import numpy as np
 import torch
 
 from dualslam.core.types import Features, IntArray
-from dualslam.frontends.features.kornia.checkpoints import LIGHTGLUE
 from dualslam.frontends.features.kornia.options import KorniaOptions
-from dualslam.frontends.features.kornia.weights import WeightSource
+from dualslam.frontends.features.kornia.weights import LIGHTGLUE
 
 Matcher = Callable[[Features, Features, torch.Tensor, torch.Tensor], IntArray]
 """Features and descriptors (N, D) of two images to pairs (M, 2); one to one is not asked for."""
@@ -47,8 +46,8 @@ class LightGlueMatcher:
         for layer in range(self._model.conf.n_layers):
             for block in ("self_attn", "cross_attn"):
                 rename[f"{block}.{layer}."] = f"transformers.{layer}.{block}."
-        source = WeightSource("frontend.options.matcher_weights", options.matcher_weights, is_single=True)
-        source.load(LIGHTGLUE[options.detector], self._model, rename)
+        field = "frontend.options.matcher_weights"
+        LIGHTGLUE[options.detector].load(field, options.matcher_weights, self._model, rename)
         self._model.to(device)
 
     def __call__(self, a: Features, b: Features, of_a: torch.Tensor, of_b: torch.Tensor) -> IntArray:

@@ -1,34 +1,17 @@
-"""Networks that detect and describe at once: XFeat, ALIKED, DISK and DeDoDe, behind one face."""
+"""Networks that detect and describe at once: XFeat, ALIKED and DISK, behind one face."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import kornia.feature as kf
-import numpy as np
 import torch
 
 from dualslam.core.types import FloatArray
-from dualslam.frontends.features.kornia.checkpoints import ALIKED, DEDODE_DESCRIPTOR, DEDODE_DETECTOR, DISK, XFEAT
-from dualslam.frontends.features.kornia.weights import WeightSource
+from dualslam.frontends.features.kornia.weights import DETECTOR
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NetworkKeypoints:
-    """What a network finds in one image.
-
-    Attributes
-    ----------
-    uv_px : (N, 2) float64
-    score : (N,) float64
-    descriptors : (N, D)
-        On the device, of any length.
-    """
-
-    uv_px: FloatArray
-    score: FloatArray
-    descriptors: torch.Tensor
+FIELD = "frontend.options.weights"
 
 
 class Network:
@@ -36,58 +19,42 @@ class Network:
 
     Parameters
     ----------
-    name : {"xfeat", "aliked", "disk", "dedode"}
+    name : {"xfeat", "aliked", "disk"}
     n_candidates : int
         Keypoints per image, at most.
     device : torch.device
-    half : bool
-        Half precision, for the one network that does not leave it to the caller.
-    source : WeightSource
+    weights : Path or None
+        See `KorniaOptions`.
     """
 
-    def __init__(self, name: str, n_candidates: int, device: torch.device, half: bool, source: WeightSource) -> None:
+    def __init__(self, name: str, n_candidates: int, device: torch.device, weights: Path | None) -> None:
         self._name = name
         self._n = n_candidates
+        DETECTOR[name].find(FIELD, weights)  # before the network is made, which takes seconds
         self._model: Any
         if name == "xfeat":
             self._model = kf.XFeat(top_k=n_candidates)
-            source.load(XFEAT, self._model.net)
         elif name == "aliked":
             self._model = kf.ALIKED("aliked-n16", max_num_keypoints=n_candidates)
-            source.load(ALIKED, self._model)
-        elif name == "disk":
-            self._model = kf.DISK()
-            source.load(DISK, self._model)
         else:
-            self._model = kf.DeDoDe("L", "B", amp_dtype=torch.float16 if half else torch.float32)
-            source.load(DEDODE_DETECTOR, self._model.detector)
-            source.load(DEDODE_DESCRIPTOR, self._model.descriptor)
+            self._model = kf.DISK()
+        DETECTOR[name].load(FIELD, weights, self._model.net if name == "xfeat" else self._model)
         self._model.eval().to(device)
 
-    def __call__(self, images: torch.Tensor) -> list[NetworkKeypoints]:
-        """Detect and describe in RGB images (B, 3, H, W) of 0 to 1, all at once."""
+    def __call__(self, image: torch.Tensor) -> tuple[FloatArray, FloatArray, torch.Tensor]:
+        """Return positions (N, 2), scores (N,) and descriptors (N, D), on the device, of an image (1, 3, H, W)."""
         if self._name == "xfeat":
-            return self._xfeat(images)
-        if self._name == "dedode":
-            uv, score, descriptors = self._model(images, n=self._n)
-            # DeDoDe puts the centre of the first pixel at (0.5, 0.5).
-            return [_keypoints(*each) for each in zip(uv - 0.5, score, descriptors, strict=True)]
+            found = self._model.detectAndCompute(image)[0]
+            # XFeat shrinks to multiples of 32 and scales pixel indices back, as if centres and not edges kept place.
+            height, width = image.shape[2:]
+            ratio = image.new_tensor([width / max(32, width // 32 * 32), height / max(32, height // 32 * 32)])
+            return _on_host(found["keypoints"] + 0.5 * (ratio - 1.0), found["scores"], found["descriptors"])
         if self._name == "disk":
-            found = self._model(images, n=self._n, pad_if_not_divisible=True)
-            return [_keypoints(each.keypoints, each.detection_scores, each.descriptors) for each in found]
-        return [_keypoints(each.keypoints, each.keypoint_scores, each.descriptors) for each in self._model(images)]
-
-    def _xfeat(self, images: torch.Tensor) -> list[NetworkKeypoints]:
-        """XFeat shrinks to multiples of 32 and scales pixel indices back, as if centres and not edges kept place."""
-        height, width = images.shape[2:]
-        ratio = images.new_tensor([width / max(32, width // 32 * 32), height / max(32, height // 32 * 32)])
-        return [
-            _keypoints(each["keypoints"] + 0.5 * (ratio - 1.0), each["scores"], each["descriptors"])
-            for each in self._model.detectAndCompute(images)
-        ]
+            found = self._model(image, n=self._n, pad_if_not_divisible=True)[0]
+            return _on_host(found.keypoints, found.detection_scores, found.descriptors)
+        found = self._model(image)[0]
+        return _on_host(found.keypoints, found.keypoint_scores, found.descriptors)
 
 
-def _keypoints(uv_px: torch.Tensor, score: torch.Tensor, descriptors: torch.Tensor) -> NetworkKeypoints:
-    return NetworkKeypoints(
-        np.asarray(uv_px.double().cpu().numpy()), np.asarray(score.double().cpu().numpy()), descriptors.float()
-    )
+def _on_host(uv_px: torch.Tensor, score: torch.Tensor, descriptors: torch.Tensor) -> Any:
+    return uv_px.double().cpu().numpy(), score.double().cpu().numpy(), descriptors.float()

@@ -1,7 +1,7 @@
 """What can be chosen, and the numbers that go with each choice. Imports neither torch nor kornia.
 
-Numbers of `dog` and `harris` with `sift` were measured (docs/frontends.md); those of the learned ones could not be, for
-want of their weights: they are stated with their reason, and every one can be set in the config.
+Numbers of `dog` and `harris` were measured (docs/frontends.md), those of the networks are their authors', with the
+reason; every one can be set in the config.
 """
 
 from __future__ import annotations
@@ -13,15 +13,11 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from dualslam.config.settings import StrictModel
-from dualslam.frontends.features.kornia.checkpoints import DESCRIPTORS, DETECTORS, Checkpoint
 
-NETWORKS = ("xfeat", "aliked", "disk", "dedode")
-"""One network each that detects and describes, at one scale and without an orientation."""
-LIGHTGLUE_FOR = ("xfeat", "aliked", "disk")
-"""Those that LightGlue was trained for and whose input a `Features` holds. Missing on purpose: KeyNet-AffNet-HardNet,
-whose LightGlue wants affine frames, and DeDoDe, whose LightGlue wants descriptors that are not unit vectors."""
+NETWORKS = ("xfeat", "aliked", "disk")
+"""One network each that detects and describes, at one scale and without an orientation, and that LightGlue knows."""
 NETWORK_ZOOM = 1.7
-"""A network sees one scale. This change of size it bears, as the published evaluations have it; not measured here."""
+"""A network sees one scale. It bears this change of size, as the published evaluations have it; not measured here."""
 NETWORK_TURN_DEG = 30.0
 """Nor does it know of orientations: it bears about this much turning."""
 LEVELS_ZOOM = 1.7
@@ -39,43 +35,34 @@ class Noise:
 
 NOISE = {
     "sift": Noise(0.5, 0.5, 0.4),
-    # The paper's distances (fig. 5 of Mishchuk et al. 2017): same patch about 0.6, the hardest other one about 1.1.
-    "hardnet": Noise(0.6, 1.0, 0.85),
     # The authors ask for a cosine of 0.82 without a guide; with one 0.6. Maxima lie on whole pixels of a resized image.
     "xfeat": Noise(1.0, 0.9, 0.6),
     # No threshold is published. A cosine of 0.68 (0.5 with a guide) is 8 (6) standard deviations of that of two random
     # unit vectors of 128 numbers. Maxima lie on whole pixels, of ALIKED between them.
     "aliked": Noise(0.7, 1.0, 0.8),
     "disk": Noise(1.0, 1.0, 0.8),
-    "dedode": Noise(1.0, 1.0, 0.8),
 }
 
 
 class KorniaOptions(StrictModel):
     """`frontend.options` of the kornia front end."""
 
-    detector: Literal["dog", "harris", "keynet", "xfeat", "aliked", "disk", "dedode"] = "dog"
-    """`dog` (difference of Gaussians) and `harris` need no weights; `keynet` is KeyNet with AffNet and OriNet; the
-    others are networks that describe what they detect."""
-    descriptor: Literal["auto", "sift", "hardnet"] = "auto"
-    """Of `dog`, `harris` and `keynet`: RootSIFT, which needs no weights, or HardNet. `auto`: RootSIFT, for `keynet`
-    HardNet. A network describes by itself (`auto`)."""
+    detector: Literal["dog", "harris", "xfeat", "aliked", "disk"] = "dog"
+    """`dog` (difference of Gaussians) and `harris` are described by RootSIFT and need no weights; the others are
+    networks that describe what they detect."""
     matcher: Literal["smnn", "adalam", "lightglue"] = "adalam"
-    """Without a guide: mutual nearest neighbours with a ratio test both ways, AdaLAM, or LightGlue (for `xfeat`,
-    `aliked`, `disk`)."""
+    """Without a guide: mutual nearest neighbours with a ratio test both ways, AdaLAM, or LightGlue (for a network)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """`auto` takes a CUDA device where torch sees one."""
-    half: bool = True
-    """Networks in half precision; on a CUDA device only."""
     weights: Path | None = None
-    """Checkpoint of the detector and descriptor: the file where one is needed, else a folder that holds the files under
-    their published names. Without it they are sought in torch's cache. Nothing is ever downloaded."""
+    """The network's checkpoint, or a folder that holds it under its published name. Without it torch's cache is
+    searched. Nothing is ever downloaded."""
     matcher_weights: Path | None = None
     """The same for LightGlue."""
     scale_factor: float = Field(1.2, gt=1.0, le=2.0)
-    """Ratio of the sizes of neighbouring pyramid levels; of `dog`, `harris` and `keynet`."""
+    """Ratio of the sizes of neighbouring pyramid levels; of `dog` and `harris`."""
     n_octaves: int = Field(8, ge=1, le=16)
-    """Number of pyramid levels; of `dog`, `harris` and `keynet`."""
+    """Number of pyramid levels; of `dog` and `harris`."""
     ratio: float = Field(0.85, gt=0.0, le=1.0)
     """`smnn`: greatest distance of the best match over that of the second best."""
     sigma_px: float | None = Field(None, gt=0.0)
@@ -88,10 +75,8 @@ class KorniaOptions(StrictModel):
     @model_validator(mode="after")
     def _check_combination(self) -> KorniaOptions:
         """Refuse what does not go together."""
-        if self.is_network and self.descriptor != "auto":
-            raise ValueError(f"detector '{self.detector}' describes by itself: leave descriptor at auto")
-        if self.matcher == "lightglue" and self.detector not in LIGHTGLUE_FOR:
-            raise ValueError(f"matcher 'lightglue' goes with the detectors {', '.join(LIGHTGLUE_FOR)}")
+        if self.matcher == "lightglue" and not self.is_network:
+            raise ValueError(f"matcher 'lightglue' goes with the detectors {', '.join(NETWORKS)}")
         return self
 
     @property
@@ -100,28 +85,9 @@ class KorniaOptions(StrictModel):
         return self.detector in NETWORKS
 
     @property
-    def described_by(self) -> str:
-        """Name of the descriptor: a key of `NOISE`."""
-        if self.is_network:
-            return self.detector
-        if self.descriptor == "auto":
-            return "hardnet" if self.detector == "keynet" else "sift"
-        return self.descriptor
-
-    @property
-    def descriptor_length(self) -> int:
-        """Numbers in a descriptor."""
-        return {"xfeat": 64, "dedode": 256}.get(self.described_by, 128)
-
-    @property
-    def checkpoints(self) -> tuple[Checkpoint, ...]:
-        """Files that `weights` stands for."""
-        return DETECTORS[self.detector] + DESCRIPTORS.get(self.described_by, ())
-
-    @property
     def noise(self) -> Noise:
         """What the user set, and the descriptor's own numbers for the rest."""
-        default = NOISE[self.described_by]
+        default = NOISE[self.detector if self.is_network else "sift"]
         return Noise(
             self.sigma_px or default.sigma_px,
             self.max_distance or default.max_distance,

@@ -1,4 +1,4 @@
-"""Checkpoints of the learned parts: where they are sought, and whether they fit. Nothing is downloaded."""
+"""Published files of weights: under which names they are sought, and whether they fit. Nothing is downloaded."""
 
 from __future__ import annotations
 
@@ -11,60 +11,55 @@ from typing import Any
 import torch
 
 from dualslam.core.errors import ConfigError
-from dualslam.frontends.features.kornia.checkpoints import Checkpoint
 
 
 @dataclass(frozen=True, slots=True)
-class WeightSource:
-    """Where the user wants checkpoints to be sought.
+class Checkpoint:
+    """A published file of weights.
 
     Attributes
     ----------
-    field : str
-        The option that says so, for messages.
-    path : Path or None
-        A file, where `is_single`; a folder; or None: torch's cache.
-    is_single : bool
-        Whether only one checkpoint is needed, so that a file can be named.
+    part : str
+        What it is for, in words.
+    file : str
+        Its name in torch's cache, which is the one that kornia uses.
+    url : str
+        Where it is published.
+    key : str
+        Where the state stands in the file; empty: the file is the state.
     """
 
-    field: str
-    path: Path | None
-    is_single: bool
+    part: str
+    file: str
+    url: str
+    key: str = ""
 
-    def find(self, checkpoint: Checkpoint) -> Path:
-        """Return the file.
+    def find(self, field: str, path: Path | None) -> Path:
+        """Return the file: `path`, or the one of this name in that folder; None: in torch's cache.
 
         Raises
         ------
         ConfigError
-            It is not there: the message says where it was sought and where it is published.
+            It is not there: the message says where it was sought and where it is published. `field` is the option.
         """
-        published = f"{checkpoint.part} is published at {checkpoint.url}"
-        if self.path is None:
-            path = Path(torch.hub.get_dir()) / "checkpoints" / checkpoint.file
-            if not path.is_file():
-                raise ConfigError(
-                    f"{self.field}: {path} is not there. Nothing is downloaded: {published}; put it there, or name "
-                    "the file by this option"
-                )
-            return path
-        if self.path.is_file() and not self.is_single:
+        folder = Path(torch.hub.get_dir()) / "checkpoints" if path is None else path
+        file = folder / self.file if path is None or path.is_dir() else path
+        if not file.is_file():
             raise ConfigError(
-                f"{self.field}: more than one checkpoint is needed: name the folder that holds them, among them "
-                f"{checkpoint.file} ({published})"
+                f"{field}: {file} is not there. Nothing is downloaded: {self.part} is published at {self.url}; put "
+                "it there, or name the file by this option"
             )
-        path = self.path / checkpoint.file if self.path.is_dir() else self.path
-        if not path.is_file():
-            raise ConfigError(f"{self.field}: {path} is not there ({published})")
-        return path
+        return file
 
-    def load(self, checkpoint: Checkpoint, module: torch.nn.Module, rename: Mapping[str, str] | None = None) -> None:
-        """Find a checkpoint and put it into a module, which is then ready to be used.
+    def load(
+        self, field: str, path: Path | None, module: torch.nn.Module, rename: Mapping[str, str] | None = None
+    ) -> None:
+        """Find the file and put it into a module, which is then ready to be used.
 
         Parameters
         ----------
-        checkpoint : Checkpoint
+        field, path
+            See `find`.
         module : torch.nn.Module
         rename : mapping, optional
             Old starts of the names of the state to new ones, where the publisher called them otherwise.
@@ -74,11 +69,11 @@ class WeightSource:
         ConfigError
             It is not there, cannot be read, or does not fit.
         """
-        path = self.find(checkpoint)
-        state = _read(path, checkpoint, self.field)
+        file = self.find(field, path)
+        state = self._read(field, file)
         for old, new in (rename or {}).items():
             state = {new + name[len(old) :] if name.startswith(old) else name: each for name, each in state.items()}
-        misfit = f"{self.field}: {path} does not fit {checkpoint.part}"
+        misfit = f"{field}: {file} does not fit {self.part}"
         try:
             missing = module.load_state_dict(state, strict=False).missing_keys
         except RuntimeError as error:
@@ -91,16 +86,33 @@ class WeightSource:
             raise ConfigError(f"{misfit}: {len(absent)} of its {len(learned)} tensors are missing, first {absent[0]}")
         module.eval()
 
+    def _read(self, field: str, file: Path) -> dict[str, Any]:
+        """Read the state from a file, bare or as it is published."""
+        try:
+            content = torch.load(file, map_location="cpu", weights_only=True)
+        except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
+            reason = str(error).strip().splitlines() or [type(error).__name__]
+            raise ConfigError(f"{field}: {file} cannot be read as a checkpoint of torch: {reason[0]}") from error
+        if isinstance(content, dict) and isinstance(content.get(self.key), dict):
+            content = content[self.key]
+        if not isinstance(content, dict) or not all(isinstance(name, str) for name in content):
+            raise ConfigError(f"{field}: {file} holds no named tensors, so it is no checkpoint of {self.part}")
+        return content
 
-def _read(path: Path, checkpoint: Checkpoint, field: str) -> dict[str, Any]:
-    """Read the state from a file, bare or as it is published."""
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
-        reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise ConfigError(f"{field}: {path} cannot be read as a checkpoint of torch: {reason[0]}") from error
-    if isinstance(content, dict) and isinstance(content.get(checkpoint.key), dict):
-        content = content[checkpoint.key]
-    if not isinstance(content, dict) or not all(isinstance(name, str) for name in content):
-        raise ConfigError(f"{field}: {path} holds no named tensors, so it is no checkpoint of {checkpoint.part}")
-    return content
+
+_HUB = "https://huggingface.co/kornia"
+_LIGHTGLUE = "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv"
+_XFEAT = "https://github.com/verlab/accelerated_features/raw/main/weights"
+
+DETECTOR = {
+    "xfeat": Checkpoint("XFeat", "xfeat.pt", f"{_XFEAT}/xfeat.pt"),
+    "aliked": Checkpoint("ALIKED", "aliked-n16.pth", f"{_HUB}/aliked/resolve/main/aliked-n16.pth"),
+    "disk": Checkpoint("DISK", "depth-save.pth", f"{_HUB}/disk/resolve/main/depth-save.pth", "extractor"),
+}
+LIGHTGLUE = {
+    "xfeat": Checkpoint("LightGlue for XFeat", "xfeat-lighterglue.pt", f"{_XFEAT}/xfeat-lighterglue.pt"),
+    "aliked": Checkpoint(
+        "LightGlue for ALIKED", "aliked_lightglue_v0-1_arxiv-pth", f"{_LIGHTGLUE}/aliked_lightglue.pth"
+    ),
+    "disk": Checkpoint("LightGlue for DISK", "disk_lightglue_v0-1_arxiv-pth", f"{_LIGHTGLUE}/disk_lightglue.pth"),
+}
