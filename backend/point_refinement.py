@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.backend.observability import MIN_DEPTH_MU, reproject
+from dualslam.core.sums import sum_by
 from dualslam.core.types import FloatArray, IntArray
 
 STEPS = 2
@@ -33,15 +34,6 @@ def projection_jacobian(
     J[:, 0, 2] = -(K[0, 0] * x + K[0, 1] * y) * w / z
     J[:, 1, 1], J[:, 1, 2] = K[1, 1] * w, -K[1, 1] * y * w / z
     return np.asarray(J @ R_submap_kf.transpose(0, 2, 1), np.float64)
-
-
-def sum_by(index: IntArray, values: FloatArray, n: int) -> FloatArray:
-    """Return (n, ...): the sum of the rows of each index."""
-    flat = values.reshape(len(values), -1)
-    sums = np.empty((n, flat.shape[1]))
-    for column in range(flat.shape[1]):
-        sums[:, column] = np.bincount(index, flat[:, column], n)
-    return sums.reshape(n, *values.shape[1:])
 
 
 def huber(chi2: FloatArray, k: float) -> tuple[FloatArray, FloatArray]:

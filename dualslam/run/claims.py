@@ -12,6 +12,7 @@ import numpy as np
 
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians
+from dualslam.core.types import FloatArray
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking.gates import PIXEL_CHI2
@@ -45,15 +46,15 @@ class Claim:
 
 def claims_of(submap: Submap) -> dict[int, Claim]:
     """Return what a submap claims of its keyframes."""
-    scale = _scale_sigmas(submap)
-    return {k: Claim(_position_sigma(submap, k), scale[k]) for k in submap.keyframes}
+    scale, covariances = _scale_sigmas(submap), landmark_covariances(submap, np.arange(len(submap.landmarks)))
+    return {k: Claim(_position_sigma(submap, k, covariances), scale[k]) for k in submap.keyframes}
 
 
-def _position_sigma(submap: Submap, keyframe_id: int) -> float:
-    """Resect the keyframe from its landmarks, each as uncertain as its views leave it."""
+def _position_sigma(submap: Submap, keyframe_id: int, covariances: FloatArray) -> float:
+    """Resect the keyframe from its landmarks, each as uncertain as its views leave it: `covariances` of all."""
     feature = np.flatnonzero(submap.landmark_of[keyframe_id] >= 0)
     ids = submap.landmark_of[keyframe_id][feature]
-    covariance = landmark_covariances(submap, ids)
+    covariance = covariances[ids]
     T_cam_submap = se3.inverse(submap.T_submap_kf[keyframe_id])
     depth = submap.depths(ids, T_cam_submap)
     known = np.isfinite(covariance).all((1, 2)) & (depth > 0)

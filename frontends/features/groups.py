@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -80,7 +81,12 @@ def best_pairs(
     return best[best_per_group(second[best], cost[best], n_second)]
 
 
-def mutual_best(distances: NDArray[Any], ratio: float, max_distance: float) -> Matches:
+def mutual_best(
+    distances: NDArray[Any],
+    ratio: float,
+    max_distance: float,
+    of_columns: Callable[[IntArray], NDArray[Any]] | None = None,
+) -> Matches:
     """One-to-one matches of a dense distance matrix: nearest to each other, near enough, and clearly nearest.
 
     Parameters
@@ -89,6 +95,8 @@ def mutual_best(distances: NDArray[Any], ratio: float, max_distance: float) -> M
     ratio : float
         Greatest best distance over second best, row-wise.
     max_distance : float
+    of_columns : callable, optional
+        Returns some columns of the matrix as rows, where that takes less than to gather them from it.
     """
     n_rows, n_columns = distances.shape
     if n_rows == 0 or n_columns == 0:
@@ -103,7 +111,11 @@ def mutual_best(distances: NDArray[Any], ratio: float, max_distance: float) -> M
         others[np.arange(len(rows)), columns[rows]] = _highest(others.dtype)
         rows = rows[best[rows] <= ratio * others.min(axis=1)]
     if len(rows):
-        rows = rows[distances.take(columns[rows], axis=1).argmin(axis=0) == rows]
+        asked = columns[rows]
+        nearest = (
+            distances.take(asked, axis=1).argmin(axis=0) if of_columns is None else of_columns(asked).argmin(axis=1)
+        )
+        rows = rows[nearest == rows]
     return Matches(np.stack([rows, columns[rows]], axis=1), best[rows].astype(np.float64))
 
 

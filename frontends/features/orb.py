@@ -176,7 +176,12 @@ class OrbFrontend(OptionedFrontend):
 
     def match_wide(self, a: Features, b: Features) -> Matches:
         """Compare all with all: mutually nearest, clearly so, within `max_distance_strict`, turned alike."""
-        found = mutual_best(hamming_matrix(a.descriptors, b.descriptors), self.options.ratio, self.max_distance_strict)
+        found = mutual_best(
+            hamming_matrix(a.descriptors, b.descriptors),
+            self.options.ratio,
+            self.max_distance_strict,
+            lambda columns: hamming_matrix(b.descriptors[columns], a.descriptors),
+        )
         kept = consistent_rotation(b.angle_rad[found.index[:, 1]] - a.angle_rad[found.index[:, 0]])
         return Matches(found.index[kept], found.distance[kept])
 

@@ -178,9 +178,10 @@ class Mapper:
         submap.add_observations(k, feature[free], ids[free])
         # Merge towards the landmark that more keyframes see.
         ids, there = ids[~free], there[~free]
-        n_seen = submap.n_observations(np.stack([ids, there]))
-        swap = n_seen[0] > n_seen[1]
-        submap.merge_landmarks(np.where(swap, ids, there), np.where(swap, there, ids))
+        if len(ids):
+            n_seen = submap.n_observations(np.stack([ids, there]))
+            swap = n_seen[0] > n_seen[1]
+            submap.merge_landmarks(np.where(swap, ids, there), np.where(swap, there, ids))
         return int(free.sum()), len(ids)
 
     def _grid(self, k: int, features: Features) -> FeatureGrid:

@@ -18,6 +18,7 @@ from scipy import sparse
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.alignment import COVARIANCE_INFLATION
 from dualslam.core.geometry.projection import project_points, projection_jacobians
+from dualslam.core.sums import sum_by
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 
@@ -113,7 +114,7 @@ class _Problem:
     kf: IntArray
     point: IntArray
     inverse: FloatArray
-    H_cross: sparse.csr_array
+    H_cross: sparse.bsr_array
     reduced: FloatArray
 
 
@@ -137,21 +138,20 @@ def _linearise(submap: Submap, ids: IntArray, pixel_chi2: float) -> _Problem:
     kf, landmark, weight = kf[good], landmark[good], 1.0 / sigma[good] ** 2
     J_pose, J_point = J_pose[good], J_point[good]
     points, point = np.unique(landmark, return_inverse=True)
+    order = np.lexsort((point, kf))  # as the blocks of a sparse matrix are stored
+    kf, point, weight, J_pose, J_point = kf[order], point[order], weight[order], J_pose[order], J_point[order]
     n_f, n_p = len(ids), len(points)
-    H_point = np.zeros((n_p, 3, 3))
-    np.add.at(H_point, point, np.einsum("rai,r,raj->rij", J_point, weight, J_point))
+    weighted = (weight[:, None, None] * J_pose).transpose(0, 2, 1)
+    H_point = sum_by(point, (weight[:, None, None] * J_point).transpose(0, 2, 1) @ J_point, n_p)
     H_point += SLACK * np.trace(H_point, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     inverse = np.asarray(np.linalg.inv(H_point), np.float64)
-    H_pose = np.zeros((n_f, 6, 6))
-    np.add.at(H_pose, kf, np.einsum("rai,r,raj->rij", J_pose, weight, J_pose))
-    blocks = np.einsum("rai,r,raj->rij", J_pose, weight, J_point)
-    row = 6 * kf[:, None, None] + np.arange(6)[:, None]
-    column = 3 * point[:, None, None] + np.arange(3)
-    through = np.einsum("rij,rjk->rik", blocks, inverse[point])
-    shape = 6 * n_f, 3 * n_p
-    places = np.broadcast_to(row, blocks.shape).reshape(-1), np.broadcast_to(column, blocks.shape).reshape(-1)
-    H_cross = sparse.csr_array((blocks.reshape(-1), places), shape=shape)
-    reduced = -np.asarray((sparse.csr_array((through.reshape(-1), places), shape=shape) @ H_cross.T).toarray())
+    H_pose, blocks = sum_by(kf, weighted @ J_pose, n_f), weighted @ J_point
+    start = np.concatenate([[0], np.cumsum(np.bincount(kf, minlength=n_f))])
+    H_cross, through = (
+        sparse.bsr_array((values, point, start), shape=(6 * n_f, 3 * n_p))
+        for values in (blocks, blocks @ inverse[point])
+    )
+    reduced = -np.asarray((through @ H_cross.T).toarray())
     for f in range(n_f):
         reduced[6 * f : 6 * f + 6, 6 * f : 6 * f + 6] += H_pose[f]
     return _Problem(
@@ -174,7 +174,6 @@ def _scale_at(problem: _Problem, ids: IntArray) -> tuple[FloatArray, FloatArray]
     by_point = T[:, 2, :3] / p[:, 2:]
     share = 1.0 / np.maximum(np.einsum("ri,rij,rj->r", by_point, problem.inverse[point], by_point), 1e-12)
     share /= share.sum()
-    g_pose, g_point = np.zeros((len(problem.ids), 6)), np.zeros_like(problem.xyz)
-    np.add.at(g_pose, kf, share[:, None] * by_pose)
-    np.add.at(g_point, point, share[:, None] * by_point)
+    g_pose = sum_by(kf, share[:, None] * by_pose, len(problem.ids))
+    g_point = sum_by(point, share[:, None] * by_point, len(problem.xyz))
     return g_pose.reshape(-1), g_point

@@ -40,6 +40,8 @@ def test_mutual_best_agrees_with_a_loop_and_leaves_its_input() -> None:
         assert matches.index.tolist() == expected
         assert 0 < len(expected) < 40
         np.testing.assert_array_equal(distances, copy)
+        gathered = mutual_best(distances, 0.7, 300.0, lambda columns, of=copy: of.T[columns])
+        assert gathered.index.tolist() == expected
 
 
 def test_mutual_best_of_little() -> None:

@@ -1,0 +1,13 @@
+"""Sums of rows that belong together, against numpy's own."""
+
+import numpy as np
+
+from dualslam.core.sums import sum_by
+
+
+def test_sum_by_is_numpys_to_the_bit() -> None:
+    rng = np.random.default_rng(0)
+    index, values = rng.integers(0, 7, 200), rng.normal(size=(200, 3, 2))
+    expected = np.zeros((9, 3, 2))  # the last two have no rows
+    np.add.at(expected, index, values)
+    np.testing.assert_array_equal(sum_by(index, values, 9), expected)
