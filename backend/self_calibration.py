@@ -29,8 +29,8 @@ from dualslam.backend.observability import compute_depth_sigmas, compute_residua
 from dualslam.backend.solver import GTSAM_ERRORS, SolverFailure
 from dualslam.config.calibration_config import CalibrationConfig
 from dualslam.core.bundle import BundleProblem
+from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import LensCorrection, correction_of, given_camera
-from dualslam.core.camera.models import Camera
 from dualslam.core.chi_square import CHI2_999
 from dualslam.core.geometry import so3
 from dualslam.core.interfaces import CalibrationEstimate, PreferredCamera

@@ -18,9 +18,9 @@ from dualslam.backend.window import NumpyWindowSolver
 from dualslam.calibration.lens import Calibration, CalibrationAnswer, CalibrationJob, answer
 from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.bundle import BundleAdjuster
+from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import CorrectedCamera
 from dualslam.core.camera.focal import FocalSearch
-from dualslam.core.camera.models import Camera
 from dualslam.core.errors import ConfigError
 from dualslam.core.interfaces import Frontend, PreferredCamera, SelfCalibrator, SubmapGraph, WindowSolver
 from dualslam.core.threads import spare_cores

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from dualslam.core.camera.models import Camera
+from dualslam.core.camera.base import Camera
 from dualslam.core.camera.rectification import rectify
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend, Shutter

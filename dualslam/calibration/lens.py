@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.config.calibration_config import CalibrationConfig
+from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import correct
-from dualslam.core.camera.models import Camera
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Keyframe, View

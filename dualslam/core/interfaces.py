@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from dualslam.core.types import Failure, Features, FloatArray, Frame, IntArray, Matches, Start, Track, View
 
 if TYPE_CHECKING:
+    from dualslam.core.camera.base import Camera
     from dualslam.core.camera.corrected import LensCorrection
-    from dualslam.core.camera.models import Camera
     from dualslam.map.submap import Submap
 
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.camera.models import Camera
+from dualslam.core.camera.base import Camera
 from dualslam.core.types import FloatArray, Frame
 from dualslam.export.colmap import image_name
 from dualslam.export.exported_map import ExportedMap

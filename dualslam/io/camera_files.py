@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import (
-    Camera,
     FovCamera,
     KannalaBrandtCamera,
     PinholeCamera,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.core.camera.models import Camera
+from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.geometry.so3 import matrix_from_quat_xyzw
 from dualslam.core.types import FloatArray

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dualslam.core.camera.models import Camera
+from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray
 from dualslam.io.camera_files import radtan_camera

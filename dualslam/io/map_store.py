@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.camera.models import Camera, camera_from_dict
+from dualslam.core.camera.base import Camera
+from dualslam.core.camera.models import camera_from_dict
 from dualslam.core.errors import InputError
 from dualslam.io.map_files import (
     Arrays,

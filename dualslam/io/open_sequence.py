@@ -9,7 +9,8 @@ from typing import Protocol
 
 from numpy.typing import ArrayLike
 
-from dualslam.core.camera.models import Camera, camera_from_fov
+from dualslam.core.camera.base import Camera
+from dualslam.core.camera.models import camera_from_fov
 from dualslam.core.errors import InputError, NoCalibrationError
 from dualslam.io import dataset_folder, euroc, folder, kitti, tum_mono, tum_rgbd, video
 from dualslam.io.camera_files import make_camera, read_camera_file

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dualslam.core.camera.models import Camera
+from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, Frame, IntArray
 from dualslam.io.images import ImageReader, ImageStore, UnreadableImageError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from dualslam.core.camera.models import Camera
+from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.io.camera_files import radtan_camera
 from dualslam.io.images import ImageFiles

@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.camera.models import Camera, camera_from_fov
+from dualslam.core.camera.base import Camera
+from dualslam.core.camera.models import camera_from_fov
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, Frame
 from dualslam.io.camera_files import make_camera

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from dualslam.config.settings import FusionConfig, RecoveryConfig
-from dualslam.core.camera.models import Camera
+from dualslam.core.camera.base import Camera
 from dualslam.core.errors import SolverError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry

@@ -12,8 +12,8 @@ from typing import Any, Protocol
 from dualslam.build import build_system
 from dualslam.config.files import dump_config
 from dualslam.config.settings import Config
+from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import FocalSearch
-from dualslam.core.camera.models import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Sequence

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dualslam.config import strict_yaml
-from dualslam.core.camera.models import Camera
+from dualslam.core.camera.base import Camera
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.core.camera.models import Camera, camera_from_dict
+from dualslam.core.camera.base import Camera
+from dualslam.core.camera.models import camera_from_dict
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure, FloatArray, FrameStatus, IntArray

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Protocol
 
-from dualslam.core.camera.models import Camera
+from dualslam.core.camera.base import Camera
 from dualslam.core.camera.rectification import rectify
 from dualslam.core.types import Failure, FailureReason, Features, View
 from dualslam.frontends.features.image_features import ImageFeatures

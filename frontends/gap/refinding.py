@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dualslam.core.camera.models import Camera
+from dualslam.core.camera.base import Camera
 from dualslam.core.camera.rectification import rectified_sigma
 from dualslam.core.columns import concatenate
 from dualslam.core.geometry import se3

@@ -13,7 +13,7 @@ import numpy as np
 import poselib
 
 from dualslam.config.settings import CameraConfig
-from dualslam.core.camera.models import Camera
+from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import so3
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error

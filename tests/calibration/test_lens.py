@@ -12,8 +12,8 @@ from dualslam.build import adjust_submap, build_system
 from dualslam.calibration.lens import Calibration
 from dualslam.config.calibration_config import CalibrationConfig
 from dualslam.config.settings import Config, GraphConfig
+from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import LensCorrection, correction_of
-from dualslam.core.camera.models import Camera
 from dualslam.core.camera.rectification import rectify
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from dualslam.config.settings import Config
-from dualslam.core.camera.models import Camera
+from dualslam.core.camera.base import Camera
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.stage_timer import StageTimer
 from dualslam.core.types import Features, FloatArray, Frame, FrameStatus, Keyframe

@@ -12,7 +12,7 @@ import pytest
 from dualslam.cli import main
 from dualslam.config.files import load_config
 from dualslam.config.settings import Config
-from dualslam.core.camera.models import Camera
+from dualslam.core.camera.base import Camera
 from dualslam.core.types import FloatArray, Frame
 from dualslam.run.sources import make_world
 from tests.cli.fakes import FakeSystem

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import (
-    Camera,
     DivisionCamera,
     FovCamera,
     KannalaBrandtCamera,

@@ -5,8 +5,9 @@ import pickle
 import numpy as np
 import pytest
 
+from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import CorrectedCamera, LensCorrection, correct, correction_of, given_camera
-from dualslam.core.camera.models import Camera, PinholeCamera, RadTanCamera, camera_from_dict
+from dualslam.core.camera.models import PinholeCamera, RadTanCamera, camera_from_dict
 from dualslam.core.errors import InputError
 
 PINHOLE = PinholeCamera(640, 480, 500.0, 505.0, 320.0, 240.0)

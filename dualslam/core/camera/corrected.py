@@ -10,7 +10,8 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from dualslam.core.camera.models import Camera, camera_from_dict
+from dualslam.core.camera.base import Camera
+from dualslam.core.camera.models import camera_from_dict
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import distortion
 from dualslam.core.types import FloatArray

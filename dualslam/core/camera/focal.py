@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.core.camera.models import Camera, DivisionCamera, PinholeCamera
+from dualslam.core.camera.base import Camera
+from dualslam.core.camera.models import DivisionCamera, PinholeCamera
 
 SIGMAS_90 = 1.645
 """Of the normal distribution: 90 % lie between."""

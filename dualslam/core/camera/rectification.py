@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dualslam.core.camera.models import Camera
+from dualslam.core.camera.base import Camera
 from dualslam.core.types import Features, FloatArray
 
 
