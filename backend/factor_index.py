@@ -259,7 +259,7 @@ class FactorIndex:
         names, index = np.unique(point[asked], return_inverse=True)
         sigmas = compute_depth_sigmas(submap.K, T, pose[asked], res.xyz_cam[asked], sigma[asked], index, len(names))
         limit = MAX_DEPTH_SIGMA / caution * np.where(known[names], LEAVE_RATIO, 1.0)
-        # Two views of a point fit whatever the poses are along their epipolar lines: it is the third that has a say.
+        # Two views of a point fit whatever the poses are along their epipolar lines: only the third tests them.
         n_views = np.bincount(index, minlength=len(names))
         young = len(submap.keyframes) <= YOUNG_KEYFRAMES
         enough = n_views >= np.where(known[names] | young, 2, MIN_VIEWS)

@@ -18,7 +18,7 @@ from dualslam.core.types import BoolArray, FloatArray, IntArray
 CELLS_ACROSS = 16
 """Cells of an image's width by which observations are spread, as in the choice of what a keyframe observes."""
 FIRST_VIEWS = 3
-"""Views that a landmark which lost some is given back: a third one has a say where two fit almost any pair of poses."""
+"""Views that a landmark gets back when it has lost some: two fit almost any pair of poses, a third one does not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -86,7 +86,7 @@ class NumpyWindowSolver:
     def __call__(self, submap: Submap, free_keyframes: list[int]) -> GraphEstimate | Failure:
         """Adjust a few keyframes, the newest first, and the points that the newest sees; the submap is not changed.
 
-        Keyframes of the submap's gauge stay, whoever names them.
+        Keyframes of the submap's gauge stay fixed even if they are named.
         """
         start = time.thread_time()
         newest = free_keyframes[0]

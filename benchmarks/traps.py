@@ -23,7 +23,7 @@ TOLD = (EventKind.FAILED, EventKind.LINKED, EventKind.GAP_RELOCALISED, EventKind
 
 
 def run(world: str, seed: int) -> str:
-    """Run a world once, and tell what came of it in one line."""
+    """Run a world once, and return its outcome in one line."""
     gap = 10 + 7 * (seed % 4) if world in ("parked", "board") else 0
     sequence = make_sequence(world, n_frames=FRAMES[world], seed=seed, width=480, height=360, supersampling=1.0)
     system = dualslam.build_system(dualslam.load_config(overrides=[f"seed={seed}"]), sequence.camera)

@@ -54,10 +54,10 @@ SETTLED_A_FRAME = 20
 class Components:
     """The parts that the composition root puts in: the system itself knows neither front end nor solver.
 
-    `new_relocaliser`: a front end that finds its submap again wherever it is seen, and goes on from there. `desk`:
-    where work beside the tracking is done; walks back have an executor of their own, which may stand at the same desk.
-    `graphs`: where submaps' graphs are solved in another process, what brings changes there and back. `open_features`:
-    starts a process more, and returns what has the features of a frame found there.
+    `new_relocaliser`: a front end that finds its submap again wherever it is seen, and tracks from there. `desk`: does
+    the work beside the tracking; reverse tracking has an executor of its own, which may use the same desk. `graphs`:
+    carries changes to submaps' graphs in another process and back, if they are solved there. `open_features`: starts
+    one more process, and returns a function that has the features of a frame found there.
     """
 
     view_of: Callable[[Frame], View | Failure]
@@ -94,10 +94,10 @@ class System:
     timer : StageTimer
     buffer : FrameBuffer
     pace : Pace
-        Told by who feeds the system in real time how late its frames are; otherwise without effect.
+        Whoever feeds the system in real time reports here how late its frames are; otherwise without effect.
     on_pose : callable or None
-        Called with each frame's track as soon as it is posed, before the map grows from it: who steers by the poses
-        need not wait for a keyframe.
+        Called with each frame's track as soon as it is posed, before the map grows from it, so that a controller need
+        not wait for a keyframe.
     numbers : FrameNumbers
         The frames' own count, by which all here goes but the frames that `step` is given and its results.
     saved : StoredMap or None
@@ -107,7 +107,7 @@ class System:
     def __init__(
         self, components: Components, config: Config, saved: StoredMap | None = None, localise: bool = False
     ) -> None:
-        """`saved`: a map to go on with, which becomes this system's; `localise`: only to find poses in it."""
+        """`saved`: a map to continue, which becomes this system's own; `localise`: only find poses in it."""
         record = Record() if saved is None else Record(saved.atlas, poses=dict(saved.poses))
         self.saved, self.numbers = saved, FrameNumbers(0 if saved is None else saved.next_id)
         self._world = saved.main[0] if saved is not None and saved.main else None
@@ -204,7 +204,7 @@ class System:
         return self._recoveries.is_under_way(self.atlas.submaps[submap_id])
 
     def _front_ends(self) -> list[VisualOdometry]:
-        """Those that go on in a submap, or may: what moves under them they must hear of."""
+        """Return the front ends that track in a submap, or may soon: they must follow when it moves."""
         return [front_end for front_end in (self._live, self._relocaliser.relocaliser) if front_end is not None]
 
     def step(self, frame: Frame) -> FrameResult:
@@ -241,12 +241,12 @@ class System:
         return self._result(frame, outcome, started)
 
     def finish(self, interrupted: bool = False) -> None:
-        """End the run: wait for walks back that are under way, for so long and no longer; archive what is live.
+        """End the run: wait, for a limited time, for reverse tracking that is under way; archive the live submap.
 
         Parameters
         ----------
         interrupted : bool
-            Someone waits: leave out the last walk back, for which the live map has grown since the one before.
+            Someone is waiting: leave out the last reverse tracking, which the growth of the live map would earn.
         """
         last = next(reversed(self.rows.values()), None)
         if self._parts.graphs is not None and last is not None:
@@ -294,7 +294,7 @@ class System:
         return outcome
 
     def _relocalise(self, view: View) -> Track | None:
-        """Go on in the map that was lost last, where two frames in a row show it."""
+        """Continue in the map that was lost last, once two frames in a row show it."""
         with self.timer.measure("relocalisation"):
             relocaliser = self._relocaliser.sighted(view)
         if relocaliser is None:
@@ -313,7 +313,7 @@ class System:
         return track
 
     def _relocalise_anywhere(self, view: View) -> Track | None:
-        """Go on in whichever submap shows a few frames in a row: at once in a saved map, else where none can start."""
+        """Continue in any submap that a few frames in a row show: at once in a saved map, else where no map starts."""
         self._n_without_map += len(view.features) >= self._config.tracking.min_inliers
         recovery = self._config.recovery
         after = 0 if self.saved is not None else recovery.relocalise_after if recovery.enabled else None
@@ -359,7 +359,7 @@ class System:
         return newest
 
     def _begin_submap(self, start: Start, view: View) -> Track | Failure:
-        """Make a submap of a start, and pose the frames before and between by walking back in time over the buffer."""
+        """Make a submap of a start, and pose the frames before and between by reverse tracking over the buffer."""
         submap = Submap.from_start(start, len(self.atlas.submaps), self._parts.K)
         graph = self._parts.new_graph()
         try:
@@ -429,7 +429,7 @@ class System:
         return track
 
     def _revisit(self, live: VisualOdometry, view: View) -> None:
-        """Link the live map where its newest keyframe shows a place of old; not while a walk back is under way."""
+        """Link the live map where its newest keyframe shows a place again; not while reverse tracking is under way."""
         if self._recoveries.is_under_way(live.submap):
             return
         with self.timer.measure("places"):
@@ -437,7 +437,7 @@ class System:
         self._collect_places(view)
 
     def _collect_places(self, now: FrameStamp) -> None:
-        """Take in the places that were found; while a walk back is under way, they wait for its end."""
+        """Link the places that were found; while reverse tracking is under way, they wait for its end."""
         live = self._live
         if live is not None and self._recoveries.is_under_way(live.submap):
             return
@@ -482,7 +482,7 @@ class System:
     # --- graphs beside the tracking
 
     def _collect_graphs(self, now: FrameStamp) -> None:
-        """Let submaps move to where their graphs have put them meanwhile, and tell the graphs what is new."""
+        """Move submaps to what their graphs have solved meanwhile, and send the graphs what is new."""
         graphs = self._parts.graphs
         if graphs is None:
             return
@@ -535,7 +535,7 @@ class System:
         self._lost = []
 
     def _break_at(self, live: VisualOdometry, view: View, first: int, failure: Failure) -> None:
-        """End a map that was found to be broken since frame `first`: what it has posed since is for a walk to pose."""
+        """End a map that is broken since frame `first`; reverse tracking will pose the frames since then."""
         self._lost = [buffered for buffered in self.buffer if buffered.index >= first] or [view]
         self.buffer.freeze()
         drop_corrupted(self._record, live.submap.id, first)
@@ -550,9 +550,9 @@ class System:
             return self._scale_watch.judge(submap, self.atlas.believed)
 
     def _part_at(self, live: VisualOdometry, view: View, loss: ScaleLoss) -> bool:
-        """End a map where it has lost its scale, and go on in another that begins there; return whether it was done.
+        """End a map where it has lost its scale, and continue in a new one from there; return whether it was done.
 
-        A walk back from the new one may join the two.
+        Reverse tracking from the new one may link the two.
         """
         old, graph = live.submap, self._parts.new_graph()
         rest = [k for k in old.keyframes if k >= loss.first]
@@ -616,7 +616,7 @@ class System:
         )
 
     def _unusable(self, frame: Frame, failure: Failure) -> Failure:
-        """A frame without an image of the right size: it has its row, and tracking goes on with the next."""
+        """Record a frame without an image of the right size; tracking continues with the next frame."""
         self.rows[frame.index].status = FrameStatus.UNREADABLE
         self.events.add(EventKind.UNREADABLE, frame.index, frame.timestamp_s, None, detail=failure.detail)
         return failure
@@ -624,7 +624,7 @@ class System:
     # --- a submap that is full
 
     def _roll_over(self, live: VisualOdometry, view: View) -> None:
-        """Go on in a new submap that shares its first keyframes with the full one: no failure, and a stiff link."""
+        """Continue in a new submap that shares its first keyframes with the full one: no failure, and a stiff link."""
         submap = next_submap(live.submap, len(self.atlas.submaps), self._config.graph.rollover_keyframes, view.index)
         graph = self._parts.new_graph()
         try:

@@ -1,4 +1,4 @@
-"""The camera as it is known now: when a submap is asked about it, what changes with the answer, and what must wait.
+"""The camera as it is known now: when a submap estimates it, what a new estimate changes, and what must wait.
 
 Asking takes up to seconds, so it is a job on a snapshot (`CalibrationJob`), which `answer` does, wherever that is; the
 submap that was asked has gone on when the answer comes (`dualslam/calibration/background.py`).
@@ -183,7 +183,7 @@ class Calibration:
         submap : Submap
             Keeps its ids. Only where the whole change succeeds, it gets other intrinsics, pixels, poses and points.
         graph : SubmapGraph, optional
-            A new one, for the changed submap; without it, whoever asked solves.
+            Makes a new graph for the changed submap; without it, the caller solves.
         """
         n = len(submap.keyframes)
         self._asked(submap.id, n)

@@ -8,7 +8,7 @@ from dualslam.config.strict_model import StrictModel
 
 
 class CalibrationConfig(StrictModel):
-    """Self-calibration: when a submap is asked about its camera, and when the answer counts."""
+    """Self-calibration: when a submap estimates its camera, and when the estimate is used."""
 
     refine: bool = True
     """Whether to do it at all."""

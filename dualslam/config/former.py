@@ -1,4 +1,4 @@
-"""Settings that older versions had, and what has become of each: told to whoever still has one in a file."""
+"""Settings that older versions had, and what replaced each: the error message for a file that still has one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading on a thread of its own, a bounded number of items ahead of whoever consumes them."""
+"""Reading in a thread of its own, a bounded number of items ahead of the consumer."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class ReducedImages:
         return _ReducedReader(self._images.reader(grey), self._factor)
 
     def told_focal(self) -> float | None:
-        """Return what is told of the large images: a share of their side."""
+        """Return by how much the images were reduced: a share of their side."""
         return self._images.told_focal()
 
 

@@ -61,7 +61,7 @@ class PlaceRecogniser(Protocol):
         submaps : mapping of int to Submap
             Those that were taken in, as they are now: culled and merged landmarks are followed there.
         may_be : callable
-            Whether a keyframe (submap id, keyframe id) is asked for; it is asked about those with votes only.
+            Whether a keyframe (submap id, keyframe id) may be returned; called for keyframes with votes only.
         at_most : int
         """
         ...

@@ -1,4 +1,4 @@
-"""Loops, merges by revisit, and relocalisation in any submap: when a place is asked for and believed, what follows.
+"""Loops, merges by revisit, and relocalisation in any submap: when places are searched and believed, and what follows.
 
 One verified pair is provisional. It is believed once keyframes (or, without a map, frames) that follow it say the same;
 it is dropped where they do not. What is believed becomes a link, and the atlas does the rest.
@@ -94,7 +94,7 @@ class _Seeker:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Relocalised:
-    """A map that frames without one were found in.
+    """The map in which frames without a map were found.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class Relocalised:
 
 
 class Revisits:
-    """Asks for places, keyframe by keyframe, and links what is seen again.
+    """Searches for places, keyframe by keyframe, and links those that are seen again.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ class Revisits:
     # --- keyframes of the live map
 
     def note_keyframe(self, live: VisualOdometry) -> None:
-        """Ask whether the live map's newest keyframe shows a place of old; `collect` has the answer."""
+        """Search for a place that the live map's newest keyframe shows again; `collect` returns the answer."""
         if not (self._config.places.enabled and self._config.loops.enabled):
             return
         self._frontend = None
@@ -178,7 +178,7 @@ class Revisits:
         self._desk.submit(JobKind.LOOP, search)
 
     def collect(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
-        """Take in what was found meanwhile, and link it where it is sure.
+        """Take in the places found meanwhile, and link those that are sure.
 
         Returns
         -------
@@ -252,7 +252,7 @@ class Revisits:
         return may_be
 
     def _weigh(self, match: PlaceMatch | None, submap: Submap, now: FrameStamp) -> None:
-        """Second what is provisional, or begin anew; believe it once enough keyframes say the same."""
+        """Confirm the provisional place or replace it; believe it once enough keyframes agree."""
         waiting = self._provisional
         if waiting is not None and waiting.match.query[0] != submap.id:
             waiting = self._provisional = None
@@ -297,7 +297,7 @@ class Revisits:
         return Link(a, b, match.S_place_query, match.covariance, kind, (), keyframe_a, keyframe_b, doubtful=False)
 
     def _link(self, match: PlaceMatch, seconds: int, live: VisualOdometry, now: FrameStamp) -> AtlasReport | None:
-        """Hand a link to the atlas, and record whether it was taken."""
+        """Give a link to the atlas, and record whether it was accepted."""
         atlas = self._record.atlas
         (a, keyframe_a), (b, keyframe_b) = match.place, match.query
         link = self._link_of(match)
@@ -328,7 +328,7 @@ class Revisits:
         return report
 
     def _merge_duplicates(self, submap: Submap, match: PlaceMatch) -> None:
-        """Let landmarks of the loop be one: then the loop is in the observations, too."""
+        """Merge duplicate landmarks of the loop, so that the observations hold it too."""
         current = submap.current_ids(match.landmark_pairs.ravel()).reshape(-1, 2)
         current = current[(current >= 0).all(axis=1)]
         submap.merge_landmarks(current[:, 0], current[:, 1])
@@ -361,7 +361,7 @@ class Revisits:
         return bool(np.linalg.norm(centres[0] - centres[1]) > float(sim3.scale(S_world[one.place[0]])) * depth)
 
     def _plausible(self, match: PlaceMatch) -> PlaceMatch | Failure:
-        """Refuse what no drift explains: a map that goes on from one place to the other has not lost that much.
+        """Refuse a place that no drift explains: the map that leads to it cannot have lost that much.
 
         These are the bounds of what drift can be at all, and not of what the chain says of its own: pixels that prove
         the place are believed over any chi-square. A street of identical houses is refused here, as each house is a
@@ -403,7 +403,7 @@ class Revisits:
         return next(c for c in self._record.atlas.components() if submap_id in c)
 
     def _way(self, component: list[int], S_world: dict[int, FloatArray], first: int, last: int) -> float:
-        """Return how far the camera went between two keyframes, in the unit of the world."""
+        """Return the length of the path between two keyframes, in the unit of the world."""
         first, last = min(first, last), max(first, last)
         centres: dict[int, FloatArray] = {}
         for m in component:
@@ -432,11 +432,11 @@ class Revisits:
     # --- frames without a map
 
     def avoid(self, submap_id: int) -> None:
-        """Find no frame in a submap any more: it was lost where two poses stood, and a third may pass by chance."""
+        """Relocalise no more frames in a submap that was lost as a look-alike: a wrong pose may pass by chance."""
         self._avoided.add(submap_id)
 
     def sighted(self, view: View, K: FloatArray) -> Relocalised | None:
-        """Show a frame without a map to all submaps; return where it goes on once others have said the same.
+        """Search all submaps for a frame without a map; return where it is once later frames confirm it.
 
         `K`: (3, 3) intrinsics of the frame; submaps of other ones are not looked at.
         """

@@ -1,4 +1,4 @@
-"""The search for a place of old as a job beside the tracking: a snapshot goes out, and what was verified comes back.
+"""The search for a place seen before, as a job beside the tracking: a snapshot goes out, verified places come back.
 
 Asking the index is cheap and stays where the map grows. Verification matches images against each other, and takes as
 long as several frames.

@@ -5,7 +5,7 @@ matching between the two groups pairs landmarks; (2) a similarity of these 3D-3D
 (3) a search, guided by it, for everything that either side should show in the other's images, which scores the
 similarity by what is *not* found as well; (4) the similarity again, of all pairs, with its covariance, and the gates:
 keyframes on either side, spread over the image, sigmas; (5) the test whether a second similarity fits as well.
-How the maps have drifted has no say: it cannot refute what the pixels prove, nor prove what they do not.
+Drift is not considered: it can neither refute what the pixels prove, nor prove what they do not.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from dualslam.recovery.linking.gates import (
 )
 
 GROUP = 5
-"""Keyframes on a side: the one that is asked about and the four that see most of the same landmarks."""
+"""Keyframes on a side: the one in question and the four that see most of the same landmarks."""
 N_MATCHED = 3
 """Of a side's keyframes, how many are matched with all of the other side's: matching is quadratic."""
 MIN_FIRST_MATCHES = 12
@@ -87,7 +87,7 @@ class PlaceMatch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Side:
-    """One side: a submap, the keyframes about the one that is asked about, and all that these see."""
+    """One side: a submap, the keyframe in question with those around it, and all that these see."""
 
     submap: Submap
     keyframes: list[int]

@@ -26,7 +26,7 @@ from dualslam.recovery.linking.scale_observability import scale_sigma_between
 from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryResult
 
 AUDIT_KEYFRAMES = 30
-"""Of a map that is asked about its start: the half that asks has then come a second and more from it, and has landmarks
+"""Of a map whose start is audited: the half that audits has then come a second and more from it, and has landmarks
 that the start never saw."""
 MIN_KEYFRAMES = 10
 """The same where the buffer is about to let go of the start."""

@@ -1,4 +1,4 @@
-"""When a map is asked about its start, and what becomes of a start that was found to be wrong."""
+"""When a map's start is audited, and how a start that was found to be wrong is cut off."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TakeIn = Callable[[RecoveryJob, RecoveryResult], bool]
 
 
 class Audits:
-    """Knows which maps were asked about their start, and cuts it off where it is the start that is wrong.
+    """Knows which maps were audited, and cuts off the start of one where it is the start that is wrong.
 
     Parameters
     ----------

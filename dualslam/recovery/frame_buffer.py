@@ -82,7 +82,7 @@ class FrameBuffer:
         self.peak_bytes = max(self.peak_bytes, self.nbytes)
 
     def freeze(self) -> None:
-        """Stop letting go of old views: the newest one was lost, or there has been no map yet. K = k + k_r."""
+        """Stop dropping old views: the newest one was lost, or there has been no map yet. K = k + k_r."""
         if not self._frozen:
             self._frozen = True
             self._before_loss = self._views[-2].index if len(self._views) > 1 else None

@@ -70,7 +70,7 @@ class Recoveries:
     connections : Connections
     config : RecoveryConfig
     audits : bool
-        Whether maps are asked about their start (`recovery/audit.py`).
+        Whether the starts of maps are audited (`recovery/audit.py`).
     """
 
     def __init__(

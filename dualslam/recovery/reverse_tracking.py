@@ -99,7 +99,7 @@ class FoundLink:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecoveryResult:
-    """What a recovery found out: the attempt that led to a link, or else the first one that walked at all.
+    """The result of a recovery: of the attempt that led to a link, or else of the first one that posed a frame.
 
     Attributes
     ----------
@@ -138,7 +138,7 @@ class Attempt:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecoveryParts:
-    """What a recovery is made of; put together by the composition root of the process in which it runs.
+    """The parts of a recovery, built by the composition root of the process in which it runs.
 
     `posing`: the way back where there is no lost map, but frames without a pose.
     `max_scale_sigma`: of a link, at the live end.
@@ -159,7 +159,7 @@ class RecoveryParts:
 
 
 def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Failure:
-    """Walk back from the job's submap until a link to a lost one passes its gates, or nothing is left to walk on.
+    """Walk back from the job's submap until a link to a lost one passes its gates, or no frames are left.
 
     The job is left as it was. Where there is no map to link with, the live features pose the frames before the start.
     """
@@ -191,7 +191,7 @@ def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Fai
 
 @dataclass(slots=True, eq=False)
 class _Progress:
-    """What one attempt has come to so far."""
+    """The state of one attempt."""
 
     submap: Submap
     frames: dict[int, RecoveredFrame] = field(default_factory=dict)  # in the order in which they were posed first
@@ -288,7 +288,7 @@ def _make_attempt(
 def _there_and_back(views: tuple[View, ...], progress: _Progress) -> Iterator[View]:
     """Yield the views, and then, the other way round, those that the walk has found no pose for.
 
-    A camera that turns away slowly and back at once is lost on the way back in time, and followed on the way there.
+    A camera that turns away slowly and comes back at once is lost in reverse, and followed forwards.
     """
     yield from views
     yield from way_to_gaps(views[::-1], progress.frames, progress.submap.keyframes)

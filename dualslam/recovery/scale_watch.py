@@ -28,7 +28,7 @@ SCALE_INFLATION = 1.8
 """Errors of neighbouring pixels and views are alike, and do not average out as the sigmas suppose. Chosen so that what
 is true comes to what is claimed on plain stretches (`benchmarks/covariances.py`, seeds 1 to 3)."""
 BEHIND = 2 * GROUP
-"""Keyframes after a group before it is asked about."""
+"""Keyframes after a group before it is tested."""
 SURE = 0.9
 """Probability of a wrong scale at which a map is parted. At even odds half of the maps that are parted would have been
 whole: six runs of `hololens_000` lose 2 % of their frames by that, and the error of the rest falls by a fifth."""
@@ -65,7 +65,7 @@ class ScaleLoss:
 class ScaleWatch:
     """Asks about each group of a live map's keyframes, once, when `BEHIND` have come after it.
 
-    What the map held when it was first shown is not asked about: a start is audited, a link has gates of its own.
+    What the map held when it was first seen is not tested: a start is audited, a link has gates of its own.
 
     Parameters
     ----------

@@ -108,7 +108,7 @@ def style_sheet() -> str:
 
 
 ROUNDING = 1e-9
-"""Below this a number is what rounding in a double's last digits leaves of nought: a first submap "moved by 1e-20"."""
+"""Below this a number is what rounding in a double's last digits leaves of zero: a first submap "moved by 1e-20"."""
 
 
 def number(value: float | None, digits: int = 3) -> str:

@@ -37,7 +37,7 @@ class SampleKeeper:
         self._gap_frames = 0
 
     def take(self, frame: Frame, status: FrameStatus) -> None:
-        """Look at one frame and what became of it."""
+        """Look at one frame and its result."""
         if status not in POSED:
             self._gap = [frame] if self._gap is None else [self._gap[0], frame]
             self._gap_frames += 1

@@ -49,7 +49,7 @@ def trust_section(run: RunData) -> Markup:
 
 
 def _told(event: dict[str, Any]) -> tuple[str, str] | None:
-    """Return what was asked and what came of it, where an event is about trust."""
+    """Return the question and its outcome, where an event is about trust."""
     kind, detail = event.get("event"), str(event.get("detail") or "")
     if kind == "audited":
         return "its start, walked back over", " ".join(filter(None, [str(event["verdict"]), detail and f"({detail})"]))

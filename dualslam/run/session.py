@@ -46,7 +46,7 @@ class Watcher(Protocol):
         ...
 
     def after(self, frame: Frame, result: FrameResult) -> None:
-        """Look at a frame and what became of it."""
+        """Look at a frame and its result."""
         ...
 
     def is_paused(self) -> bool:

@@ -1,4 +1,4 @@
-"""What a live view is told of a run: arrays and words, and of the map only what has changed since the last message.
+"""The messages to a live view: arrays and words, and of the map only what has changed since the last message.
 
 Made in the tracking thread: a message costs a millisecond or two, five times a second.
 """

@@ -107,7 +107,7 @@ class Worker:
 
     @property
     def was_ready(self) -> bool:
-        """Whether the process has ever come as far as to take a job."""
+        """Whether the process was ever ready to take a job."""
         return self._ready.is_set()
 
     def wait_until_ready(self, limit_s: float) -> bool:
@@ -304,7 +304,7 @@ class WorkerDesk:
         return [w.pid for queue in self._queues for w in [*(task.worker for task in queue.busy), *queue.idle]]
 
     def wait_until_ready(self) -> bool:
-        """Wait, so long and no longer, until all workers are warm: a clock that has begun does not wait for imports."""
+        """Wait, for a limited time, until all workers are warm: once the clock runs, it does not wait for imports."""
         return all(worker.wait_until_ready(START_S) for queue in self._queues for worker in queue.idle)
 
     def open(self, lane: Lane) -> None:
@@ -348,7 +348,7 @@ class WorkerDesk:
         return sum(job.kind is kind for job in [*queue.waiting, *(task.job for task in queue.busy)])
 
     def drain(self, kind: JobKind) -> list[Ended]:
-        """Wait for what is under way, for so long and no longer; what has not ended by then ends as a `Failure`."""
+        """Wait, for a limited time, for what is under way; what has not ended by then ends as a `Failure`."""
         queue, ended, began_s = self._by_kind[kind], self.poll(kind), time.monotonic()
         while self.n_open(kind) and time.monotonic() - began_s < self._finish_wait_s:
             time.sleep(PAUSE_S)

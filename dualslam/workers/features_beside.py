@@ -16,7 +16,7 @@ class FeaturesBeside:
     """Has the features of one frame after the other found in another process.
 
     Called on one thread that is not the tracking's. A process that has died or hangs costs nothing but time: the frame
-    comes back without features, and whoever tracks it finds them.
+    comes back without features, and the tracking process finds them.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """Work beside the tracking: one mechanism for all that the next frame does not need.
 
 A job is a snapshot of arrays that nobody else changes, and its kind says what is made of it. What comes back is a
-change, and whoever asked for it merges it, between two frames, into a map that has gone on meanwhile. Where the work is
-done is the desk's affair: `InlineDesk` does it at once, in the process that tracks, so that the same seed gives the
-same run to the bit; `dualslam/workers/desk.py` has the one with processes. A job may come to nothing: then its outcome
-is a `Failure`, and nothing else has changed.
+change, which the part that asked for it merges, between two frames, into a map that has grown meanwhile. The desk
+decides where the work is done: `InlineDesk` does it at once, in the process that tracks, so that the same seed gives
+the same run to the bit; `dualslam/workers/desk.py` has the one with processes. A job may fail: then its outcome is a
+`Failure`, and nothing else has changed.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Desk(Protocol):
         ...
 
     def drain(self, kind: JobKind) -> list[Ended]:
-        """Wait for what is under way of a kind, for so long and no longer, and return all that came of it."""
+        """Wait, for a limited time, for the jobs of a kind that are under way, and return their outcomes."""
         ...
 
     def close(self) -> None:

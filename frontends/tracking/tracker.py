@@ -58,7 +58,7 @@ class GivenPose:
         Mean squared whitened residual per degree of freedom of the inliers.
     covariance : (6, 6)
     wide : bool
-        Whether it is not the next frame's after the last one.
+        Whether frames were skipped between the last one and this.
     """
 
     T_cam_submap: FloatArray
@@ -110,7 +110,7 @@ class Tracker:
         self.refresh()
 
     def refresh(self) -> None:
-        """Take the map's changes in (after a keyframe): local landmarks, merged ids, the last frame's refined pose."""
+        """Take in the map's changes (after a keyframe): local landmarks, merged ids, the last frame's refined pose."""
         assert self._last is not None
         submap, last = self._submap, self._last
         ids = submap.current_ids(last.landmark_ids)
@@ -202,7 +202,7 @@ class Tracker:
     def track_near(self, view: View, T_cam_submap: FloatArray) -> Track | Failure:
         """Pose a frame by the landmarks of the keyframes nearest in time, from a pose that is near its own.
 
-        The tracker goes on from there only if it is told to `take` the track.
+        The tracker continues from there only after `take`.
         """
         keyframe_ids = self._submap.keyframes_near(view.index)[: self._config.local_keyframes]
         self._local = LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(keyframe_ids))
@@ -211,7 +211,7 @@ class Tracker:
         return self._pose_from_local_map(view, grid, T_cam_submap, nothing, T_cam_submap, wide=True)
 
     def relocalise(self, view: View, keyframe_id: int) -> Track | Failure:
-        """Pose a frame by a keyframe of the submap and those that see the same; go on from there, at rest."""
+        """Pose a frame by a keyframe of the submap and those that see the same; continue from there, at rest."""
         features = view.features
         if len(features) < self._config.min_inliers:
             return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features in the image")
@@ -233,7 +233,7 @@ class Tracker:
         return track
 
     def take(self, track: Track) -> None:
-        """Go on from a track."""
+        """Continue from a track."""
         self._accept(track)
 
     # --- steps
@@ -249,7 +249,7 @@ class Tracker:
 
     @property
     def _max_extrapolation(self) -> float:
-        """Intervals over which the velocity says something."""
+        """Return over how many intervals the velocity is used."""
         assert self._velocity is not None
         dt = abs(self._velocity[1])
         return max(MAX_EXTRAPOLATION, STEADY_S / dt) if dt > 0 else MAX_EXTRAPOLATION
@@ -315,7 +315,7 @@ class Tracker:
         return [*near, *(k for k in covering if k not in near)]
 
     def _judge_relocalised(self, track: Track) -> Track | Failure:
-        """Return a track across a gap if it holds the scale: all that is mapped beyond the gap will inherit it.
+        """Return a track across a gap if it holds the scale, which all that is mapped beyond the gap will inherit.
 
         A step that is small against the depth of what is seen leaves the scale where it is.
         """
@@ -333,7 +333,7 @@ class Tracker:
         return Failure(FailureReason.SCALE, detail, {"gap_scale_sigma": scale_sigma})
 
     def _refuse_look_alike(self, track: Track) -> Failure | None:
-        """Return why a pose across a gap is not believed, if another explains nearly as much of what was seen before.
+        """Refuse a pose across a gap if another one explains nearly as much of what was seen before it.
 
         That is asked of the last keyframes, in the descriptors that they saw. A gap beyond which two poses stood once
         is not crossed any more: frames further on show ever less of what was seen, and one would pass by chance.
@@ -428,7 +428,7 @@ class Tracker:
         )
 
     def _with_a_say(self, ids: IntArray, T_cam_submap: FloatArray) -> BoolArray:
-        """Return which of the landmarks found a pose goes by: not those right before the camera that nothing proves.
+        """Return which of the landmarks found a pose is estimated from: not unproven ones right before the camera.
 
         What two views show is on the epipolar line of either, and may be anything. Of the wrong ones those with the
         longest lever weigh most, which are nearer than all that three keyframes see: they hold the camera where it

@@ -230,7 +230,7 @@ def refine_pose(
         Decrease of the summed chi-square promised by a step, under which a round has converged. Unit-free: its root is
         the length of the step in standard deviations of the pose.
     counted : (N,) bool, optional
-        Points that the pose goes by; the others are judged by it, and have no say.
+        Points that the pose is estimated from; the others are only judged by it.
 
     Returns
     -------

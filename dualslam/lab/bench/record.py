@@ -1,4 +1,4 @@
-"""The one line that a trial leaves: what was measured, whatever came of it; and the verdict on it."""
+"""The one line that a trial leaves, even where it failed: what was measured, and the verdict on it."""
 
 from __future__ import annotations
 

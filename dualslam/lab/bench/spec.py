@@ -142,7 +142,7 @@ class BenchSpec(StrictModel):
     conditions: tuple[ConditionSpec, ...] = Field((ConditionSpec(name="natural"),), min_length=1)
     """What is done to the sequences."""
     trials: int = Field(10, ge=1)
-    """Of each sequence and condition. They differ in start frame, in the place of corruptions, and in seeds."""
+    """Of each sequence and condition. They differ in start frame, in where corruptions strike, and in seeds."""
     seed: int = Field(0, ge=0)
     """Of where trials start, where corruptions lie, and of each trial's own seeds."""
     half: Half = Half.REPORTING

@@ -55,7 +55,7 @@ class Reduction:
     interval : Interval or None
         None with fewer than `MIN_CLUSTERS` clusters in which the reference failed.
     undefined : float
-        Share of the bootstrap's resamples in which the reference never failed; they have no say.
+        Share of the bootstrap's resamples in which the reference never failed; they are left out.
     """
 
     value: float | None

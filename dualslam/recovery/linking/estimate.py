@@ -144,7 +144,7 @@ def estimate_link(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Overlap:
-    """What both maps hold of the same frames. `onset`: keyframes from there on are not trusted."""
+    """What both maps know of the frames that they share. `onset`: keyframes from there on are not trusted."""
 
     old: Submap
     new: Submap
@@ -356,7 +356,7 @@ def _link(
     limit: int | None,
     config: LinkingConfig,
 ) -> LinkEstimate:
-    """Pack a verified consensus. `later`: what all keyframes say to it, asked of all pairs as the maps hold them."""
+    """Pack a verified consensus. `later`: how all keyframes agree with it, on all pairs as the maps hold them."""
     c, estimate, votes = model.pairs, consensus.estimate, consensus.votes
     S = estimate.S_dst_src
     every = whole.pairs
