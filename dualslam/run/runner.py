@@ -16,22 +16,14 @@ from typing import Any, Protocol
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame
-from dualslam.io.read_ahead import read_ahead
 from dualslam.map.frame_records import FrameResult
 from dualslam.pace import Pace
+from dualslam.run.schedule import Schedule, prepared
 
-MAX_LATE_S = 1 / 15
-"""So late a frame may be while the next one waits: two frames of a camera at 30 Hz, which most often are what a
-keyframe takes more than other frames, and are caught up on after it. At 10 Hz a frame that the next one has overtaken
-is later."""
-CATCH_UP_S = 1.0
-"""Who has not been in time for so long does not catch up: the newest frame is then the one to look at."""
 PAUSE_S = 0.05
 """Between two looks at whether a run is to go on."""
 SWITCH_S = 5e-4
 """How long a thread computes while another waits for its turn, in real time: features would wait 5 ms at each step."""
-LATE_S = 2e-3
-"""What a sleeping process wakes up too late by is no lateness of ours."""
 
 
 class Steppable(Protocol):
@@ -141,133 +133,106 @@ def run_sequence(
         If the source gives no frame at all.
     """
     dropped: list[tuple[int, float]] = []
-    latencies_ms: list[float] = []
-    steps_ms: list[float] = []
-    error: InputError | None = None
-    bug: Exception | None = None
     began, cpu_began = clock(), _cpu_s()
     source = iter(sequence)
-    schedule = _Schedule(clock, sleep)
+    schedule = Schedule(clock, sleep)
     frames: Iterator[tuple[Frame, float]] = ((frame, 0.0) for frame in source)
     if realtime:
-        frames = _prepared(schedule.hand_out(source, dropped), prepare, schedule, clock)
+        frames = prepared(schedule.hand_out(source, dropped), prepare, schedule, clock)
+    steps = _Steps(system, schedule if realtime else None, pace, on_frame, clock)
     with _stop_on_signal() as stop, _switching_quickly(realtime):
+
+        def may_go_on() -> bool:
+            while is_paused is not None and is_paused() and not stop.is_set():
+                sleep(PAUSE_S)
+            return not stop.is_set()
+
         with _closing(source), _closing(frames):
-            while not stop.is_set():
-                while is_paused is not None and is_paused() and not stop.is_set():
-                    sleep(PAUSE_S)
-                if stop.is_set():
-                    break
-                try:
-                    frame, spent_s = next(frames)
-                except StopIteration:
-                    break
-                except InputError as problem:
-                    if not latencies_ms:
-                        raise
-                    error = problem
-                    break
-                before = clock()
-                late_s = schedule.late_s(frame, before) if realtime else 0.0
-                if pace is not None and realtime:
-                    pace.note(late_s - spent_s)
-                pose_ms = None
-                try:
-                    result = system.step(frame)
-                    pose_ms = result.pose_ms if realtime else None
-                except Exception as problem:
-                    bug = problem
-                    break
-                finally:
-                    steps_ms.append(1e3 * (clock() - before))
-                    latencies_ms.append(1e3 * max(late_s, 0.0) + (steps_ms[-1] if pose_ms is None else pose_ms))
-                if on_frame is not None:
-                    on_frame(replace(result, latency_ms=latencies_ms[-1]))
+            while may_go_on() and steps.take_next(frames):
+                pass
         interrupted = stop.is_set()
-        if not latencies_ms and not interrupted:
+        if not steps.latencies_ms and not interrupted:
             raise InputError(f"{sequence.name} gave no frame; check the source and which frames were asked for.")
         try:
             system.finish(interrupted=interrupted)
         except Exception as problem:
-            bug = bug or problem  # a system that broke may well break again here: the first one tells why
+            steps.bug = steps.bug or problem  # a system that broke may well break again here: the first one tells why
     return RunReport(
-        n_frames=len(latencies_ms) + len(dropped),
+        n_frames=len(steps.latencies_ms) + len(dropped),
         dropped=tuple(dropped),
-        latencies_ms=tuple(latencies_ms),
-        steps_ms=tuple(steps_ms),
+        latencies_ms=tuple(steps.latencies_ms),
+        steps_ms=tuple(steps.steps_ms),
         n_late=schedule.n_late,
         wall_s=clock() - began,
         cpu_s=_cpu_s() - cpu_began,
         peak_rss_mb=_peak_rss_mb(),
         interrupted=interrupted,
-        error=error,
-        bug=bug,
+        error=steps.error,
+        bug=steps.bug,
     )
 
 
-class _Schedule:
-    """When frames are due: as far after the first one as their timestamps are."""
+class _Steps:
+    """Gives a system one frame after the other, and notes how long each took and what ended them.
 
-    def __init__(self, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
-        self._clock = clock
-        self._sleep = sleep
-        self._first_s = 0.0
-        self._began = 0.0
-        self._in_time_at = 0.0
-        self.n_late = 0
-
-    def late_s(self, frame: Frame, now: float) -> float:
-        """Return how long ago a frame was due."""
-        # Absolute: a sequence that is read in reverse runs at the same rate.
-        return now - self._began - abs(frame.timestamp_s - self._first_s)
-
-    def hand_out(self, frames: Iterator[Frame], dropped: list[tuple[int, float]]) -> Iterator[Frame]:
-        """Yield each frame when its time has come, and note as dropped those that came too late."""
-        frame = next(frames, None)
-        if frame is None:
-            return
-        self._first_s, self._began = frame.timestamp_s, self._clock()
-        self._in_time_at = self._began
-        while frame is not None:
-            broken: InputError | None = None
-            try:
-                upcoming = next(frames, None)
-            except InputError as error:  # after the frame in hand
-                upcoming, broken = None, error
-            now = self._clock()
-            late_s = self.late_s(frame, now)
-            if late_s <= LATE_S:
-                self._in_time_at = now
-            may_be_late_s = MAX_LATE_S if now - self._in_time_at < CATCH_UP_S else 0.0
-            if upcoming is not None and late_s > may_be_late_s and self.late_s(upcoming, now) >= 0:
-                dropped.append((frame.index, frame.timestamp_s))
-            else:
-                if late_s < 0:
-                    self._sleep(-late_s)
-                self.n_late += late_s > LATE_S
-                yield frame
-            if broken is not None:
-                raise broken
-            frame = upcoming
-
-
-def _prepared(
-    frames: Iterator[Frame], prepare: Callable[[Frame], Frame] | None, schedule: _Schedule, clock: Callable[[], float]
-) -> Iterator[tuple[Frame, float]]:
-    """Yield frames, and how long each was prepared: the next one is begun when the last was taken.
-
-    One that comes in time finds nothing else to be done: it goes as it is, and leaves the other cores alone.
+    `schedule`: of a run in real time, else None.
     """
-    if prepare is None:
-        return ((frame, 0.0) for frame in frames)
 
-    def prepared() -> Iterator[tuple[Frame, float]]:
-        for frame in frames:
-            began = clock()
-            late = schedule.late_s(frame, began) > LATE_S
-            yield prepare(frame) if late else frame, clock() - began
+    def __init__(
+        self,
+        system: Steppable,
+        schedule: Schedule | None,
+        pace: Pace | None,
+        on_frame: Callable[[FrameResult], None] | None,
+        clock: Callable[[], float],
+    ) -> None:
+        self._system, self._schedule, self._pace = system, schedule, pace
+        self._on_frame, self._clock = on_frame, clock
+        self.latencies_ms: list[float] = []
+        self.steps_ms: list[float] = []
+        self.error: InputError | None = None
+        self.bug: Exception | None = None
 
-    return read_ahead(prepared(), depth=1)
+    def take_next(self, frames: Iterator[tuple[Frame, float]]) -> bool:
+        """Give the system the next frame; return whether another may follow.
+
+        Raises
+        ------
+        InputError
+            The source breaks before its first frame.
+        """
+        try:
+            frame, spent_s = next(frames)
+        except StopIteration:
+            return False
+        except InputError as problem:
+            if not self.latencies_ms:
+                raise
+            self.error = problem
+            return False
+        result = self._step(frame, spent_s)
+        if result is None:
+            return False
+        if self._on_frame is not None:
+            self._on_frame(replace(result, latency_ms=self.latencies_ms[-1]))
+        return True
+
+    def _step(self, frame: Frame, spent_s: float) -> FrameResult | None:
+        """Return the result of one step, None if it raised; `spent_s`: how long the frame was prepared."""
+        before, pose_ms = self._clock(), None
+        late_s = 0.0 if self._schedule is None else self._schedule.late_s(frame, before)
+        if self._pace is not None and self._schedule is not None:
+            self._pace.note(late_s - spent_s)
+        try:
+            result = self._system.step(frame)
+            pose_ms = None if self._schedule is None else result.pose_ms
+        except Exception as problem:
+            self.bug = problem
+            return None
+        finally:
+            self.steps_ms.append(1e3 * (self._clock() - before))
+            self.latencies_ms.append(1e3 * max(late_s, 0.0) + (self.steps_ms[-1] if pose_ms is None else pose_ms))
+        return result
 
 
 @contextmanager
