@@ -10,7 +10,6 @@ Drift is not considered: it can neither refute what the pixels prove, nor prove 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,6 +23,18 @@ from dualslam.core.types import Failure, FailureReason, Features, FloatArray, In
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 from dualslam.places.second_pose import SecondSimilarity, alike, find_second_pose
+from dualslam.places.sides import (
+    MIN_FIRST_MATCHES,
+    Looks,
+    Pairs,
+    Side,
+    image_spread,
+    keyframes_seeing,
+    one_to_one,
+    seen_as,
+    side_of,
+    sigmas_at_pairs,
+)
 from dualslam.recovery.linking.gates import (
     MAX_HYPOTHESES,
     MAX_SCALE,
@@ -33,12 +44,8 @@ from dualslam.recovery.linking.gates import (
     PAIR_CHI2,
 )
 
-GROUP = 5
-"""Keyframes on a side: the one in question and the four that see most of the same landmarks."""
 N_MATCHED = 3
 """Of a side's keyframes, how many are matched with all of the other side's: matching is quadratic."""
-MIN_FIRST_MATCHES = 12
-"""Matches between the two keyframes themselves, the best of the candidate's group: fewer, and no more is tried."""
 MIN_KEYFRAMES = 3
 """Keyframes on either side that must see the agreeing landmarks: two fix a shape of their own, evidence starts with
 the third."""
@@ -85,37 +92,6 @@ class PlaceMatch:
     numbers: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Side:
-    """One side: a submap, the keyframe in question with those around it, and all that these see."""
-
-    submap: Submap
-    keyframes: list[int]
-    landmarks: IntArray
-
-    @property
-    def id(self) -> tuple[int, int]:
-        return self.submap.id, self.keyframes[0]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pairs:
-    """Landmarks of the place and of the query, one to one, with their noise."""
-
-    place: IntArray
-    query: IntArray
-    xyz_place: FloatArray
-    xyz_query: FloatArray
-    cov_place: FloatArray
-    cov_query: FloatArray
-
-    def mahalanobis2(self, S: FloatArray) -> FloatArray:
-        A = S[:3, :3]
-        residual = self.xyz_place - sim3.act(S, self.xyz_query)
-        covariance = self.cov_place + A @ self.cov_query @ A.T
-        return np.asarray((residual * np.linalg.solve(covariance, residual[..., None])[..., 0]).sum(1))
-
-
 class PlaceVerifier:
     """Verifies candidates.
 
@@ -154,7 +130,7 @@ class PlaceVerifier:
             return first
         searched = self._search(place_side, query_side, first.S_dst_src)
         pairs = self._place_pairs(
-            place_side.submap, query_side.submap, *_one_to_one([*searched.pairs, *_as_votes(proposed)])
+            place_side.submap, query_side.submap, *one_to_one([*searched.pairs, (proposed.place, proposed.query)])
         )
         estimate = self._estimate(pairs, rng)
         if isinstance(estimate, Failure):
@@ -176,7 +152,7 @@ class PlaceVerifier:
         features : Features
             Of the frame.
         """
-        place = _side(submap, keyframe_id)
+        place = side_of(submap, keyframe_id)
         look = self._matcher.look(submap, place.landmarks, T_cam_submap, submap.K, features, SEARCH_RADIUS_PX)
         own = float(np.median([self._look(place, submap, k, np.eye(4)).share for k in place.keyframes]))
         numbers = {"found": look.share, "own_found": own, "n_visible": float(len(look.feature))}
@@ -187,8 +163,8 @@ class PlaceVerifier:
 
     # --- steps
 
-    def _sides(self, query: tuple[Submap, int], place: tuple[Submap, int]) -> tuple[_Side, _Side] | Failure:
-        query_side, place_side = _side(*query), _side(*place)
+    def _sides(self, query: tuple[Submap, int], place: tuple[Submap, int]) -> tuple[Side, Side] | Failure:
+        query_side, place_side = side_of(*query), side_of(*place)
         if query[0] is place[0] and set(query_side.keyframes) & set(place_side.keyframes):
             return Failure(FailureReason.DEGENERATE, "the two places see the same landmarks already")
         n = min(len(query_side.keyframes), len(place_side.keyframes))
@@ -197,7 +173,7 @@ class PlaceVerifier:
             return Failure(FailureReason.AGREEMENT, detail, {"n_keyframes": float(n)})
         return place_side, query_side
 
-    def _match(self, place: _Side, query: _Side) -> _Pairs | Failure:
+    def _match(self, place: Side, query: Side) -> Pairs | Failure:
         """Match keyframes of the one side with those of the other, without a guide."""
         votes: list[tuple[IntArray, IntArray]] = []
         most = 0
@@ -210,7 +186,7 @@ class PlaceVerifier:
             if n == 0 and most < MIN_FIRST_MATCHES:
                 detail = f"{most} matches with the place, {MIN_FIRST_MATCHES} needed"
                 return Failure(FailureReason.TOO_FEW_MATCHES, detail, {"n_matches": float(most)})
-        return self._place_pairs(place.submap, query.submap, *_one_to_one(votes))
+        return self._place_pairs(place.submap, query.submap, *one_to_one(votes))
 
     def _match_keyframes(self, place: Submap, k: int, query: Submap, q: int) -> tuple[IntArray, IntArray]:
         a, b = np.flatnonzero(place.landmark_of[k] >= 0), np.flatnonzero(query.landmark_of[q] >= 0)
@@ -219,7 +195,7 @@ class PlaceVerifier:
         found = self._matcher.match_wide(place.keyframes[k].features.take(a), query.keyframes[q].features.take(b))
         return place.landmark_of[k][a[found.index[:, 0]]], query.landmark_of[q][b[found.index[:, 1]]]
 
-    def _place_pairs(self, place: Submap, query: Submap, in_place: IntArray, in_query: IntArray) -> _Pairs:
+    def _place_pairs(self, place: Submap, query: Submap, in_place: IntArray, in_query: IntArray) -> Pairs:
         """Look up where the landmarks of pairs are; those that their views do not fix are left out."""
         half = 0.5 * self._config.deformation_sigma**2
         xyz, cov = [], []
@@ -229,9 +205,9 @@ class PlaceVerifier:
             xyz.append(points)
             cov.append(landmark_covariances(submap, ids) + half * spread2[:, None, None] * np.eye(3))
         fixed = np.isfinite(np.stack(cov)).all((0, 2, 3))
-        return _Pairs(in_place[fixed], in_query[fixed], *(part[fixed] for part in (*xyz, *cov)))
+        return Pairs(in_place[fixed], in_query[fixed], *(part[fixed] for part in (*xyz, *cov)))
 
-    def _estimate(self, pairs: _Pairs, rng: Generator) -> Sim3Estimate | Failure:
+    def _estimate(self, pairs: Pairs, rng: Generator) -> Sim3Estimate | Failure:
         config = self._config
         return estimate_sim3_robust(
             pairs.xyz_query,
@@ -245,19 +221,19 @@ class PlaceVerifier:
             scale_bounds=(1.0 / MAX_SCALE, MAX_SCALE),
         )
 
-    def _search(self, place: _Side, query: _Side, S_place_query: FloatArray) -> _Looks:
+    def _search(self, place: Side, query: Side, S_place_query: FloatArray) -> Looks:
         """Look for what each side should show in the images of the other."""
         S_query_place = sim3.inverse(S_place_query)
         in_query = [self._look(place, query.submap, q, S_place_query) for q in query.keyframes]
         in_place = [self._look(query, place.submap, k, S_query_place) for k in place.keyframes]
         own = [self._look(place, place.submap, k, np.eye(4)) for k in place.keyframes]
-        pairs = [_seen_as(look, query.submap.landmark_of[q]) for look, q in zip(in_query, query.keyframes, strict=True)]
+        pairs = [seen_as(look, query.submap.landmark_of[q]) for look, q in zip(in_query, query.keyframes, strict=True)]
         for look, k in zip(in_place, place.keyframes, strict=True):
-            theirs, ours = _seen_as(look, place.submap.landmark_of[k])
+            theirs, ours = seen_as(look, place.submap.landmark_of[k])
             pairs.append((ours, theirs))
-        return _Looks(in_query, own, pairs)
+        return Looks(in_query, own, pairs)
 
-    def _look(self, seen: _Side, looking: Submap, keyframe_id: int, S_seen_looking: FloatArray) -> Sighting:
+    def _look(self, seen: Side, looking: Submap, keyframe_id: int, S_seen_looking: FloatArray) -> Sighting:
         T_seen_cam = sim3.act_on_pose(S_seen_looking, looking.T_submap_kf[keyframe_id])
         features = looking.keyframes[keyframe_id].features
         return self._matcher.look(
@@ -265,18 +241,18 @@ class PlaceVerifier:
         )
 
     def _judge(
-        self, place: _Side, query: _Side, pairs: _Pairs, estimate: Sim3Estimate, looks: _Looks, rng: Generator
+        self, place: Side, query: Side, pairs: Pairs, estimate: Sim3Estimate, looks: Looks, rng: Generator
     ) -> PlaceMatch | Failure:
         config, S = self._config, estimate.S_dst_src
         inliers = estimate.inliers
         n = int(inliers.sum())
         found, own = looks.found, looks.own_found
-        sigmas = _sigmas(pairs.xyz_query[inliers], S, estimate.covariance, place)
-        keyframes_place = _seeing(place, pairs.place[inliers], MIN_PAIRS_PER_KEYFRAME)
-        keyframes_query = _seeing(query, pairs.query[inliers], MIN_PAIRS_PER_KEYFRAME)
+        sigmas = sigmas_at_pairs(pairs.xyz_query[inliers], S, estimate.covariance, place)
+        keyframes_place = keyframes_seeing(place, pairs.place[inliers], MIN_PAIRS_PER_KEYFRAME)
+        keyframes_query = keyframes_seeing(query, pairs.query[inliers], MIN_PAIRS_PER_KEYFRAME)
         spread = min(
-            _spread(place.submap, keyframes_place, pairs.place[inliers]),
-            _spread(query.submap, keyframes_query, pairs.query[inliers]),
+            image_spread(place.submap, keyframes_place, pairs.place[inliers]),
+            image_spread(query.submap, keyframes_query, pairs.query[inliers]),
         )
         numbers = {
             "n_matches": float(len(pairs.place)),
@@ -326,7 +302,7 @@ class PlaceVerifier:
             numbers,
         )
 
-    def _second_pose(self, place: _Side, query: _Side, S: FloatArray, rng: Generator) -> SecondSimilarity | None:
+    def _second_pose(self, place: Side, query: Side, S: FloatArray, rng: Generator) -> SecondSimilarity | None:
         """Look for another similarity among all that looks alike, in the place and in the keyframe that asks."""
         ids = query.submap.landmark_of[query.keyframes[0]]
         asked = np.unique(ids[ids >= 0])
@@ -341,7 +317,7 @@ class PlaceVerifier:
         half = 0.5 * self._config.deformation_sigma**2 * np.eye(3)
         spread_query = ((xyz_query - np.median(xyz_query, axis=0)) ** 2).sum(1)
         spread_place = ((xyz_place - np.median(xyz_place, axis=0)) ** 2).sum(1)
-        all_pairs = _Pairs(
+        all_pairs = Pairs(
             place.landmarks[j],
             asked[i],
             xyz_place[j],
@@ -362,96 +338,3 @@ class PlaceVerifier:
             chi2_gate=PAIR_CHI2,
             max_hypotheses=MAX_HYPOTHESES,
         )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Looks:
-    """What was looked for: the place's landmarks in the query's images and in its own; the resulting pairs."""
-
-    in_query: list[Sighting]
-    in_place: list[Sighting]
-    pairs: list[tuple[IntArray, IntArray]]
-
-    @property
-    def found(self) -> float:
-        """Share of what the place should show that the query's images show: of the middle one of them."""
-        return float(np.median([look.share for look in self.in_query]))
-
-    @property
-    def own_found(self) -> float:
-        """The same in the place's own images, where it is as much as can be had."""
-        return float(np.median([look.share for look in self.in_place]))
-
-
-def _side(submap: Submap, keyframe_id: int) -> _Side:
-    """Return a keyframe with those that see most of its landmarks."""
-    ids = submap.landmark_of[keyframe_id]
-    covisible, shared = submap.covisible(ids[ids >= 0])
-    others = [
-        k
-        for k, n in zip(covisible.tolist(), shared.tolist(), strict=True)
-        if k != keyframe_id and k not in submap.condemned and n >= MIN_FIRST_MATCHES
-    ]
-    keyframes = [keyframe_id, *others[: GROUP - 1]]
-    return _Side(submap, keyframes, submap.landmarks_of_keyframes(keyframes))
-
-
-def _seen_as(look: Sighting, landmark_of: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the landmarks that were looked for and found, and the landmarks that the image's own map has there."""
-    found = look.feature >= 0
-    own = landmark_of[look.feature[found]]
-    return look.landmark_ids[found][own >= 0], own[own >= 0]
-
-
-def _as_votes(pairs: _Pairs) -> list[tuple[IntArray, IntArray]]:
-    return [(pairs.place, pairs.query)]
-
-
-def _one_to_one(votes: list[tuple[IntArray, IntArray]]) -> tuple[IntArray, IntArray]:
-    """Return pairs of landmarks of which either is the other's most frequent partner, ascending."""
-    a, b = (np.concatenate([np.zeros(0, np.int64), *column]) for column in zip(*votes, strict=True))
-    pairs, n = np.unique(np.stack([a, b], 1), axis=0, return_counts=True)
-    order = np.lexsort((pairs[:, 1], pairs[:, 0], -n))
-    taken_a: set[int] = set()
-    taken_b: set[int] = set()
-    kept = []
-    for row in order.tolist():
-        i, j = pairs[row].tolist()
-        if i not in taken_a and j not in taken_b:
-            taken_a.add(i)
-            taken_b.add(j)
-            kept.append(row)
-    chosen = pairs[sorted(kept)]
-    return chosen[:, 0], chosen[:, 1]
-
-
-def _seeing(side: _Side, landmark_ids: IntArray, at_least: int) -> tuple[int, ...]:
-    """Return the keyframes of a side that see so many of the landmarks, ascending."""
-    counts = {k: int(np.isin(side.submap.landmark_of[k], landmark_ids).sum()) for k in side.keyframes}
-    return tuple(sorted(k for k, n in counts.items() if n >= at_least))
-
-
-def _spread(submap: Submap, keyframes: tuple[int, ...], landmark_ids: IntArray) -> float:
-    """Return the share of the image, along the axis where it is less, that landmarks cover in the best keyframe."""
-    best = 0.0
-    for k in keyframes:
-        uv = submap.keyframes[k].features.uv_rect_px
-        seen = uv[np.isin(submap.landmark_of[k], landmark_ids)]
-        covered, there = (np.ptp(np.percentile(pixels, [5, 95], axis=0), axis=0) for pixels in (seen, uv))
-        best = max(best, float((covered / np.maximum(there, 1e-9)).min()))
-    return best
-
-
-def _sigmas(xyz_query: FloatArray, S: FloatArray, covariance: FloatArray, place: _Side) -> dict[str, float]:
-    """Return the sigmas of scale (relative), rotation, and position at the pairs' centre relative to their depth."""
-    at_centre = sim3.adjoint(se3.from_parts(np.eye(3), -np.median(xyz_query, axis=0)))
-    C = at_centre @ covariance @ at_centre.T
-    depth = np.median(
-        np.linalg.norm(sim3.act(S, xyz_query) - place.submap.T_submap_kf[place.keyframes[0]][:3, 3], axis=1)
-    )
-    position = float(sim3.scale(S)) * math.sqrt(np.linalg.eigvalsh(C[3:6, 3:6])[-1])
-    return {
-        "sigma_scale": math.sqrt(C[6, 6]),
-        "sigma_rot_deg": math.degrees(math.sqrt(np.linalg.eigvalsh(C[:3, :3])[-1])),
-        "sigma_trans_rel": position / max(float(depth), 1e-12),
-    }

@@ -17,9 +17,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
-from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus, Keyframe, View
-from dualslam.map.atlas import Link, LinkKind
-from dualslam.map.atlas_report import AtlasReport
+from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe, View
 from dualslam.map.connections import Connections
 from dualslam.map.propagation import propagate_poses
 from dualslam.map.record import FrameStamp, Record
@@ -28,14 +26,15 @@ from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 from dualslam.map.trajectory import FramePose
 from dualslam.recovery.audits import Audits
-from dualslam.recovery.bypass import absorb, bypass, condemn_tail, drop_corrupted
+from dualslam.recovery.bypass import absorb
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
+from dualslam.recovery.fusion import fuse
 from dualslam.recovery.leaps import refuse_leaps
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.merge import Merged, merge_recovery
 from dualslam.recovery.overlap_refinement import gauge_at_overlap
-from dualslam.recovery.reverse_tracking import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult
+from dualslam.recovery.reverse_tracking import RecoveredFrame, RecoveryJob, RecoveryResult
 from dualslam.recovery.schedule import RetrySchedule, way_to_gaps
 
 
@@ -333,7 +332,7 @@ class Recoveries:
         if result.link is not None:
             estimate = result.link.estimate
             S_now_then = change_of_frame(unsolved, submap, estimate.agreeing_keyframes.tolist()) @ merged.S_live_grown
-            self._fuse(job, result.link, S_now_then, recovered_frames, now, seconds)
+            fuse(self._record, self._connections, job, result.link, S_now_then, recovered_frames, now, seconds)
             self._settle(result.link.old_id, live)
         for gone in absorb(self._record, recovered_frames, submap.id, self._lost.keys(), now):
             self._lost.pop(gone, None)
@@ -362,94 +361,12 @@ class Recoveries:
                 self._record.pose(recovered_frames[-1].pose, frame.n_matches, frame.n_inliers)
         return recovered_frames
 
-    def _fuse(
-        self,
-        job: RecoveryJob,
-        found: FoundLink,
-        S_now_then: FloatArray,
-        recovered_frames: list[RecoveredFrame],
-        now: FrameStamp,
-        seconds: float,
-    ) -> None:
-        """Join the two submaps by the link; frames of the old map's end take their pose from the new one.
-
-        The link was measured between a copy of the old submap and the new one at the end of the walk. Both may have
-        moved since, and the link with them.
-        """
-        record, link, new_id = self._record, found.estimate, job.submap.id
-        agreeing = link.agreeing_keyframes.tolist()
-        S_old_now_then = change_of_frame(job.lost[found.old_id], record.atlas.submaps[found.old_id], agreeing)
-        S_old_new = S_old_now_then @ link.S_old_new @ sim3.inverse(S_now_then)
-        Ad = sim3.adjoint(S_now_then)
-        covariance = Ad @ link.covariance @ Ad.T
-        joined = Link(found.old_id, new_id, S_old_new, covariance, LinkKind.RECOVERY, tuple(agreeing))
-        report = self._connections.connect([joined], now)
-        if not report or report.newly_rejected:
-            self._refused(found, new_id, report, now)
-            return
-        record.event(
-            EventKind.LINKED,
-            now,
-            new_id,
-            old_submap=found.old_id,
-            attempt=found.attempt,
-            matches=link.n_matches,
-            inliers=link.n_inliers,
-            agreeing_keyframes=agreeing,
-            change_point=link.change_point,
-            S_old_new=S_old_new.tolist(),
-            seconds=seconds,
-            **(link.numbers | {"scale": float(sim3.scale(S_old_new))}),
-        )
-        onset = job.onsets[found.old_id]
-        corrupted_since = onset if link.change_point is None else min(onset, link.change_point)
-        n_bypassed = bypass(record, recovered_frames, new_id, agreeing[-1])
-        n_dropped = drop_corrupted(record, found.old_id, corrupted_since)
-        n_condemned = condemn_tail(record, recovered_frames, found.old_id, agreeing[-1], corrupted_since)
-        for frame in recovered_frames:
-            if frame.pose.index >= onset and self._was_lost(frame.pose.index, found.old_id):
-                record.rows[frame.pose.index].status = FrameStatus.RECOVERED
-        refinement = found.refinement
-        numbers = (
-            {"overlap": str(refinement.reason)}
-            if isinstance(refinement, Failure)
-            else {"overlap": "refined", **refinement.numbers}
-        )
-        record.event(
-            EventKind.FUSED,
-            now,
-            new_id,
-            old_submap=found.old_id,
-            bypassed=n_bypassed,
-            dropped=n_dropped,
-            condemned_keyframes=n_condemned,
-            condemned_landmarks=int(record.atlas.submaps[found.old_id].landmarks["condemned"].sum()),
-            **numbers,
-        )
-
-    def _refused(self, found: FoundLink, new_id: int, report: AtlasReport, now: FrameStamp) -> None:
-        """Say that the atlas could not take a link in, or did not believe it."""
-        why = report.failure or Failure(FailureReason.CONTRADICTION, "the rest of the atlas contradicts the link")
-        self._record.event(
-            EventKind.LINK_REFUSED,
-            now,
-            new_id,
-            attempt=found.attempt,
-            old_submap=found.old_id,
-            verdict=why.detail,
-            reason=str(why.reason),
-        )
-
     def _settle(self, old_id: int, live: VisualOdometry | None) -> None:
         """Let no walk look any more for what is linked: the old submap, and all that is one map with the live one."""
         settled = {old_id}
         if live is not None:
             settled.update(next(c for c in self._record.atlas.components() if live.submap.id in c))
         self._lost = {m: loss for m, loss in self._lost.items() if m not in settled}
-
-    def _was_lost(self, index: int, old_id: int) -> bool:
-        tracked = self._record.rows[index].status is FrameStatus.TRACKED
-        return tracked and self._record.poses[index].submap_id != old_id
 
 
 def _path_of(poses: list[FramePose], submap: Submap) -> tuple[FloatArray, FloatArray]:

@@ -1,0 +1,109 @@
+"""Two submaps become one map by a link that a walk has found: the atlas takes it in, and frames change sides."""
+
+from __future__ import annotations
+
+from dualslam.core.events import EventKind
+from dualslam.core.geometry import sim3
+from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
+from dualslam.map.atlas import Link, LinkKind
+from dualslam.map.atlas_report import AtlasReport
+from dualslam.map.connections import Connections
+from dualslam.map.record import FrameStamp, Record
+from dualslam.map.submap_change import change_of_frame
+from dualslam.recovery.bypass import bypass, condemn_tail, drop_corrupted
+from dualslam.recovery.reverse_tracking import FoundLink, RecoveredFrame, RecoveryJob
+
+
+def fuse(
+    record: Record,
+    connections: Connections,
+    job: RecoveryJob,
+    found: FoundLink,
+    S_now_then: FloatArray,
+    recovered_frames: list[RecoveredFrame],
+    now: FrameStamp,
+    seconds: float,
+) -> None:
+    """Join the two submaps by the link; frames of the old map's end take their pose from the new one.
+
+    The link was measured between a copy of the old submap and the new one at the end of the walk. Both may have
+    moved since, and the link with them.
+    """
+    link, new_id = found.estimate, job.submap.id
+    agreeing = link.agreeing_keyframes.tolist()
+    S_old_now_then = change_of_frame(job.lost[found.old_id], record.atlas.submaps[found.old_id], agreeing)
+    S_old_new = S_old_now_then @ link.S_old_new @ sim3.inverse(S_now_then)
+    Ad = sim3.adjoint(S_now_then)
+    covariance = Ad @ link.covariance @ Ad.T
+    joined = Link(found.old_id, new_id, S_old_new, covariance, LinkKind.RECOVERY, tuple(agreeing))
+    report = connections.connect([joined], now)
+    if not report or report.newly_rejected:
+        _refused(record, found, new_id, report, now)
+        return
+    record.event(
+        EventKind.LINKED,
+        now,
+        new_id,
+        old_submap=found.old_id,
+        attempt=found.attempt,
+        matches=link.n_matches,
+        inliers=link.n_inliers,
+        agreeing_keyframes=agreeing,
+        change_point=link.change_point,
+        S_old_new=S_old_new.tolist(),
+        seconds=seconds,
+        **(link.numbers | {"scale": float(sim3.scale(S_old_new))}),
+    )
+    _hand_over(record, job, found, recovered_frames, now)
+
+
+def _hand_over(
+    record: Record, job: RecoveryJob, found: FoundLink, recovered_frames: list[RecoveredFrame], now: FrameStamp
+) -> None:
+    """Give the frames of the old map's end the poses of the new one, and condemn what is not to be relied on."""
+    link, new_id = found.estimate, job.submap.id
+    newest = int(link.agreeing_keyframes[-1])
+    onset = job.onsets[found.old_id]
+    corrupted_since = onset if link.change_point is None else min(onset, link.change_point)
+    n_bypassed = bypass(record, recovered_frames, new_id, newest)
+    n_dropped = drop_corrupted(record, found.old_id, corrupted_since)
+    n_condemned = condemn_tail(record, recovered_frames, found.old_id, newest, corrupted_since)
+    for frame in recovered_frames:
+        if frame.pose.index >= onset and _was_lost(record, frame.pose.index, found.old_id):
+            record.rows[frame.pose.index].status = FrameStatus.RECOVERED
+    refinement = found.refinement
+    numbers = (
+        {"overlap": str(refinement.reason)}
+        if isinstance(refinement, Failure)
+        else {"overlap": "refined", **refinement.numbers}
+    )
+    record.event(
+        EventKind.FUSED,
+        now,
+        new_id,
+        old_submap=found.old_id,
+        bypassed=n_bypassed,
+        dropped=n_dropped,
+        condemned_keyframes=n_condemned,
+        condemned_landmarks=int(record.atlas.submaps[found.old_id].landmarks["condemned"].sum()),
+        **numbers,
+    )
+
+
+def _refused(record: Record, found: FoundLink, new_id: int, report: AtlasReport, now: FrameStamp) -> None:
+    """Say that the atlas could not take a link in, or did not believe it."""
+    why = report.failure or Failure(FailureReason.CONTRADICTION, "the rest of the atlas contradicts the link")
+    record.event(
+        EventKind.LINK_REFUSED,
+        now,
+        new_id,
+        attempt=found.attempt,
+        old_submap=found.old_id,
+        verdict=why.detail,
+        reason=str(why.reason),
+    )
+
+
+def _was_lost(record: Record, index: int, old_id: int) -> bool:
+    tracked = record.rows[index].status is FrameStatus.TRACKED
+    return tracked and record.poses[index].submap_id != old_id
