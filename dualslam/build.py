@@ -50,6 +50,7 @@ from dualslam.recovery.executor import DeskExecutor, InlineExecutor, RecoveryExe
 from dualslam.recovery.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
 from dualslam.recovery.linking.gates import DESCRIPTOR_RADIUS_PX
 from dualslam.recovery.reverse_tracking import Attempt, RecoveryJob, RecoveryParts, run_recovery
+from dualslam.recovery.scale_watch import SCALE_HANDLERS
 from dualslam.system import Components, System
 from dualslam.workers.desk import Lane, WorkerDesk
 from dualslam.workers.features_beside import FeaturesBeside
@@ -295,7 +296,7 @@ def edge_handlers(config: Config) -> Handlers:
 
 def inline_handlers(config: Config, verifier: PlaceVerifier) -> Handlers:
     """Build what is done at once where there are no workers; walks back have an executor of their own."""
-    return {**edge_handlers(config), **calibration_handlers(config), **place_handlers(verifier)}
+    return {**edge_handlers(config), **SCALE_HANDLERS, **calibration_handlers(config), **place_handlers(verifier)}
 
 
 def graph_handlers(config: Config) -> Handlers:
@@ -321,6 +322,7 @@ def walk_handlers(config: Config, size_px: tuple[int, int], n_threads: int) -> H
     return {
         JobKind.WALK: lambda job: run_recovery(job, parts),
         **edge_handlers(config),
+        **SCALE_HANDLERS,
         **calibration_handlers(config),
         **place_handlers(verifier),
     }
@@ -338,7 +340,7 @@ def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript) -
     n_threads = min(FEATURE_THREADS, spare_cores(1 + recovery.workers))
     walks = Lane(
         "walks",
-        (JobKind.EDGES, JobKind.CALIBRATION, JobKind.LOOP, JobKind.WALK),
+        (JobKind.EDGES, JobKind.SCALE, JobKind.CALIBRATION, JobKind.LOOP, JobKind.WALK),
         partial(walk_handlers, config, size_px, n_threads),
         recovery.workers,
         recovery.time_limit_s,

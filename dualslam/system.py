@@ -19,7 +19,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
-from dualslam.core.interfaces import MapStarter, Seeker, Shutter, SubmapGraph, VisualOdometry
+from dualslam.core.interfaces import START_REACH, MapStarter, Seeker, Shutter, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, Start, Track, View
 from dualslam.health import HealthMonitor, count_signs
 from dualslam.io.map_store import StoredMap
@@ -124,9 +124,10 @@ class System:
         self._relocaliser = Relocaliser(components.new_relocaliser, config)
         self._starter = components.new_starter()
         self._lost: list[View] = []
+        self._to_revisit = False
         self._health = HealthMonitor(config.health)
         self._leaps = LeapWatch()
-        self._scale_watch = ScaleWatch(config.linking) if config.audit.enabled else None
+        self._scale_watch = ScaleWatch(config.linking, components.desk) if config.audit.enabled else None
         self._connections = Connections(
             record,
             components.atlas_solver,
@@ -350,12 +351,17 @@ class System:
         """Take the shutter that was found out of the frames so far; the starter begins anew. Returns the view's own."""
         shutter, camera = self._parts.shutter, self._parts.calibration.camera
         self._record.event(EventKind.SHUTTER_FOUND, view, None, readout_s=shutter.readout_s)
-        self.buffer.change_all(lambda views: shutter.all_corrected(views, camera))
+        correction = shutter.correction(self.buffer.indices, camera)
+        if correction is None:
+            self.buffer.change_all(lambda views: shutter.all_corrected(views, camera))
+        else:
+            self.buffer.map_later(correction, "shutter")
         self._starter = self._parts.new_starter()
         self._relocaliser.end()  # it is of the pixels of before
-        *waiting, newest = (v for v in self.buffer if self.rows[v.index].submap is None)
+        *waiting, newest = self.buffer.newest(START_REACH + 1)
         for earlier in waiting:
-            self._starter.collect(earlier)
+            if self.rows[earlier.index].submap is None:
+                self._starter.collect(earlier)
         return newest
 
     def _begin_submap(self, start: Start, view: View) -> Track | Failure:
@@ -404,6 +410,8 @@ class System:
                 self._break_at(live, view, first.index, contradicted)
                 return contradicted
             if live.reference_id != view.index:
+                if self._to_revisit and not self.pace.behind:
+                    self._revisit(live, view)
                 return track
             if (loss := self._scale_lost(live.submap)) is not None and self._part_at(live, view, loss):
                 return track
@@ -413,7 +421,10 @@ class System:
             else:
                 self._recoveries.retry(live.submap, view)
                 self._recoveries.audit_if_due(live.submap, view)
-                self._revisit(live, view)
+                if self.pace.in_real_time and not self._to_revisit:
+                    self._to_revisit = True  # a keyframe's frame has enough to do: with the next that comes in time
+                else:
+                    self._revisit(live, view)
             return track
         assert isinstance(track, Failure)
         if self._localises:
@@ -430,6 +441,7 @@ class System:
 
     def _revisit(self, live: VisualOdometry, view: View) -> None:
         """Link the live map where its newest keyframe shows a place again; not while reverse tracking is under way."""
+        self._to_revisit = False
         if self._recoveries.is_under_way(live.submap):
             return
         with self.timer.measure("places"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from dualslam.pace import BEHIND_S, MAX_LAG_KEYFRAMES, MAX_PUT_OFF, Pace
+from dualslam.places.revisits import Revisits
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
 
 MANY, WEAK = 300, 60
@@ -60,3 +61,29 @@ def test_a_system_that_is_behind_makes_fewer_keyframes_and_keeps_its_track() -> 
     counts = [len(system.atlas.submaps[0].keyframes) for system in systems]
     assert counts[1] < 0.5 * counts[0]
     assert all(len(system.poses) == len(systems[0].poses) for system in systems)
+
+
+@pytest.mark.parametrize("late_s", [None, 0.0, 2 * BEHIND_S], ids=["inline", "in time", "late"])
+def test_places_are_asked_for_with_the_frame_after_a_keyframe_that_comes_in_time(
+    late_s: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a clock with the keyframe's own; where the frames are late, with the next keyframe at the latest."""
+    world = PointWorld(cloud(), hand_held(40))
+    system = system_in(world, keyframes={"max_parallax_deg": 1.0})
+    now, asked = [-1], []
+    monkeypatch.setattr(Revisits, "note_keyframe", lambda _, live: asked.append((live.reference_id, now[0])))
+    for frame in world.frames():
+        now[0] = frame.index
+        if late_s is not None:
+            system.pace.note(late_s)
+        system.step(frame)
+    system.finish()
+    assert asked
+    waits = [at - keyframe for keyframe, at in asked]
+    if late_s is None:
+        assert set(waits) == {0}
+    elif late_s == 0.0:
+        assert 1 in waits
+        assert set(waits) <= {0, 1}  # two keyframes in a row: the second asks
+    else:
+        assert set(waits) == {0}

@@ -36,7 +36,7 @@ SAME_GAUGE = 1e-6
 class Views(Protocol):
     """Buffered views, which change to another camera with the maps."""
 
-    def map_later(self, change: Callable[[View], View]) -> None:
+    def map_later(self, change: Callable[[View], View], subject: str) -> None:
         """Change each view, at the latest when somebody looks at it."""
         ...
 
@@ -129,7 +129,7 @@ class Calibrations:
         before = live.submap.copy()
         live.submap.take_over(merged)
         live.adopt(graph, before)
-        self._buffer.map_later(self._calibration.rectified)
+        self._buffer.map_later(self._calibration.rectified, "camera")
         self._connections.follow(before, live.submap, now)
         return [m for m in sorted(lost) if self._change_lost(m, job, answer, now)]
 

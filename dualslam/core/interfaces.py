@@ -4,7 +4,7 @@ rest.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Set
+from collections.abc import Callable, Collection, Iterable, Iterator, Set
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -311,6 +311,10 @@ class KeyframeReport:
         return self.posed.seconds + (self.grown.seconds if self.grown is not None else 0.0)
 
 
+START_REACH = 64
+"""Frames back from the newest that a starter looks for its first view, at most."""
+
+
 class MapStarter(Protocol):
     """Collects views until some of them start a map."""
 
@@ -337,6 +341,13 @@ class Shutter(Protocol):
 
     def all_corrected(self, views: Iterable[View], camera: Camera) -> list[View]:
         """Do so for the frames that came before the readout time was known, given in their order."""
+        ...
+
+    def correction(self, indices: Collection[int], camera: Camera) -> Callable[[View], View] | None:
+        """Return what does so for these frames one by one, in any order; None where some turn is not known yet.
+
+        It makes the same of a view by whichever readout time it has been corrected before.
+        """
         ...
 
     def may_start(self, view: View, camera: Camera) -> bool:

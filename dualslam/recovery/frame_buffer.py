@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 
@@ -51,6 +52,7 @@ class FrameBuffer:
         self._before_loss: int | None = None  # the newest frame that came before it
         self._stale: set[int] = set()  # frames that are still to be changed
         self._change: Callable[[View], View] = _as_it_is
+        self._subject = ""  # of that change
 
     def __len__(self) -> int:
         return len(self._views)
@@ -59,6 +61,11 @@ class FrameBuffer:
         """From the oldest to the newest."""
         self.settle()
         return iter(self._views)
+
+    @property
+    def indices(self) -> list[int]:
+        """Of the frames, from the oldest to the newest."""
+        return [view.index for view in self._views]
 
     @property
     def duration_s(self) -> float:
@@ -97,13 +104,21 @@ class FrameBuffer:
         self._views = deque(change(self._views))
         self.nbytes = sum(view.nbytes for view in self._views)
 
-    def map_later(self, change: Callable[[View], View]) -> None:
+    def map_later(self, change: Callable[[View], View], subject: str) -> None:
         """Do the same in slices (`settle`), and what is left as soon as somebody looks.
 
-        `change` makes the same of a view whether or not it has changed it before; it takes the place of one that has
-        not come to its end yet.
+        `change` makes the same of a view whether or not it has changed it before; it takes the place of one of the same
+        `subject` that has not come to its end yet, and comes after one of another.
         """
-        self._change, self._stale = change, {view.index for view in self._views}
+        if subject != self._subject:
+            self.settle()
+        self._change, self._subject, self._stale = change, subject, set(self.indices)
+
+    def newest(self, n: int) -> list[View]:
+        """Return so many of the newest views, from the oldest to the newest, whatever is still to be done to others."""
+        first = max(len(self._views) - n, 0)
+        self.settle(sum(view.index in self._stale for view in islice(self._views, first, None)))
+        return list(islice(self._views, first, None))
 
     def settle(self, n_at_most: int | None = None) -> None:
         """Change so many views of those that are still to be changed, the newest first; by default all."""

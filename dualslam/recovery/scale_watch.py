@@ -3,7 +3,8 @@
 A camera that turns faster than it sees leaves few landmarks that both sides of the turn have seen, and where their
 depths are hardly known the scale behind the turn is another one; yet every frame finds its inliers, and nothing looks
 wrong. The map's own normal equations tell (`linking/scale_observability.py`), once some keyframes behind the turn have
-seen the same: a verdict at once would cut a map at each turn on the spot, from which the camera comes back.
+seen the same: a verdict at once would cut a map at each turn on the spot, from which the camera comes back. They are
+solved at the desk: beside the tracking where there are workers, and the verdict comes with a later keyframe.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ import numpy as np
 from scipy.special import ndtri
 
 from dualslam.config.settings import LinkingConfig
-from dualslam.core.types import IntArray
+from dualslam.core.types import Failure, IntArray
 from dualslam.map.atlas import Link
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking.gates import PIXEL_CHI2
-from dualslam.recovery.linking.scale_observability import N_AROUND, scale_sigmas_between
+from dualslam.recovery.linking.scale_observability import N_AROUND, ScaleQuestion, answer_scale, ask_scale
+from dualslam.workers.jobs import Desk, Handlers, InlineDesk, JobKind
 
 GROUP = 5
 """Keyframes over which the scale is handed on from those before to those after: about as long as a landmark lives on a
@@ -62,6 +64,23 @@ class ScaleLoss:
         return f"the scale from here on is {known} by what was mapped before"
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Asked:
+    """A question about a group of a submap's keyframes. It can be pickled."""
+
+    submap_id: int
+    group: IntArray
+    question: ScaleQuestion
+
+
+def answer_question(asked: _Asked) -> float:
+    """Return the standard deviation of the log of the scale after the group against that before it."""
+    return answer_scale(asked.question)[0]
+
+
+SCALE_HANDLERS: Handlers = {JobKind.SCALE: answer_question}
+
+
 class ScaleWatch:
     """Asks about each group of a live map's keyframes, once, when `BEHIND` have come after it.
 
@@ -71,9 +90,12 @@ class ScaleWatch:
     ----------
     config : LinkingConfig
         Says by how much a scale must be off to be wrong.
+    desk : Desk, optional
+        Where the normal equations are solved; by default here and now.
     """
 
-    def __init__(self, config: LinkingConfig) -> None:
+    def __init__(self, config: LinkingConfig, desk: Desk | None = None) -> None:
+        self._desk = desk or InlineDesk(SCALE_HANDLERS)
         self.max_sigma = config.wrong_scale / float(ndtri(1.0 - 0.5 * SURE))
         """From here on the scale is wrong with that probability."""
         self._asked: dict[int, int] = {}  # by submap: the newest keyframe that was in a group
@@ -88,30 +110,48 @@ class ScaleWatch:
         links : iterable of Link
             Those that are believed: what one of them holds is not lost.
         """
+        self._ask_if_due(submap)
+        for ended in self._desk.poll(JobKind.SCALE):
+            asked: _Asked = ended.work
+            if isinstance(ended.result, Failure) or asked.submap_id != submap.id:
+                continue  # it costs its question
+            sigma = SCALE_INFLATION * ended.result
+            if sigma > self.max_sigma and (loss := self._loss_at(submap, asked.group, sigma, links)) is not None:
+                return loss
+        return None
+
+    def _ask_if_due(self, submap: Submap) -> None:
+        """Ask about the next group, once what comes after it is there."""
         ids = np.array(sorted(submap.keyframes), np.int64)
         begin = int(np.searchsorted(ids, self._asked.setdefault(submap.id, int(ids[-1])), side="right"))
-        if len(ids) < begin + GROUP + BEHIND:
-            return None
+        if len(ids) < begin + GROUP + BEHIND or self._desk.n_open(JobKind.SCALE):
+            return
         before, group = ids[begin - GROUP : begin], ids[begin : begin + GROUP]
         after = ids[begin + GROUP : begin + 2 * GROUP]
         self._asked[submap.id] = int(group[-1])
         if len(before) < GROUP or _n_ties(submap, ids, begin, begin + GROUP, n_views=2) >= FIRM_TIES:
-            return None
-        sigma = self._claimed(submap, ids, before, after)
-        if sigma <= self.max_sigma:
-            return None
-        seam = min(range(begin, begin + GROUP + 1), key=lambda place: _n_ties(submap, ids, place, place))
+            return
+        self._desk.submit(JobKind.SCALE, _Asked(submap.id, group, _question(submap, ids, before, after)))
+
+    @staticmethod
+    def _loss_at(submap: Submap, group: IntArray, sigma: float, links: Iterable[Link]) -> ScaleLoss | None:
+        """Return the seam within a group across which the scale is lost, unless a link holds it."""
+        ids = np.array(sorted(submap.keyframes), np.int64)
+        begin, end = np.searchsorted(ids, [group[0], group[-1] + 1]).tolist()
+        if _n_ties(submap, ids, begin, end, n_views=2) >= FIRM_TIES:
+            return None  # a walk back, or a loop, has tied them meanwhile
+        seam = min(range(begin, end + 1), key=lambda place: _n_ties(submap, ids, place, place))
         first = int(ids[seam])
         return None if _is_linked(submap.id, first, links) else ScaleLoss(int(group[0]), first, sigma)
 
-    @staticmethod
-    def _claimed(submap: Submap, ids: IntArray, before: IntArray, after: IntArray) -> float:
-        """Return what the map claims of its scale after a group, against that before it."""
-        seen = submap.covisible(submap.landmarks_of_keyframes(ids[ids >= after[0]]))[0]
-        earliest = ids[max(int(np.searchsorted(ids, before[0])) - N_AROUND, 0)]
-        # Where others than those just before them have seen the same, they may hold the places together.
-        n_around = len(ids) if (seen < earliest).any() else N_AROUND
-        return SCALE_INFLATION * scale_sigmas_between(submap, [(before, after)], PIXEL_CHI2, n_around)[0]
+
+def _question(submap: Submap, ids: IntArray, before: IntArray, after: IntArray) -> ScaleQuestion:
+    """Ask what the map claims of its scale after a group, against that before it."""
+    seen = submap.covisible(submap.landmarks_of_keyframes(ids[ids >= after[0]]))[0]
+    earliest = ids[max(int(np.searchsorted(ids, before[0])) - N_AROUND, 0)]
+    # Where others than those just before them have seen the same, they may hold the places together.
+    n_around = len(ids) if (seen < earliest).any() else N_AROUND
+    return ask_scale(submap, [(before, after)], PIXEL_CHI2, n_around)
 
 
 def _n_ties(submap: Submap, ids: IntArray, end: int, begin: int, n_views: int = 1) -> int:

@@ -25,6 +25,7 @@ class JobKind(StrEnum):
     START = "start search"
     GRAPH = "graph"
     EDGES = "edge covariances"
+    SCALE = "scale watch"
     CALIBRATION = "calibration"
     LOOP = "loop search"
     WALK = "walk back"

@@ -18,7 +18,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians, refine_pose
 from dualslam.core.geometry.triangulation import triangulate_two_view
-from dualslam.core.interfaces import Frontend
+from dualslam.core.interfaces import START_REACH, Frontend
 from dualslam.core.types import (
     BoolArray,
     Failure,
@@ -41,7 +41,7 @@ MIN_SUPPORT = 0.6
 MAX_VIEWS = 120
 """How many recent frames are kept as possible first views."""
 
-LAGS = (2, 4, 8, 16, 32, 64)  # frames back that are tried as the first view
+LAGS = (2, 4, 8, 16, 32, START_REACH)  # frames back that are tried as the first view
 MAX_PAIRS = 2  # tried with each view, in turn: what two views farther apart lack, the next two lack most often as well
 N_WITNESSES = 3  # frames between the two views that must agree
 N_PROOF = 3  # views that prove a point

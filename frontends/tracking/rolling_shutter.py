@@ -6,7 +6,7 @@ to the frame before tell, and from the readout time, which is the camera's own.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -51,6 +51,8 @@ MIN_CHANGE_S = 0.002
 MIN_MATCHES = 60
 TURN_FEATURES = 400
 """Features of a frame that tell its turn: 100 matches of two pixels each fix it to 0.2 px."""
+KEPT_RATES = 3600
+"""Frames whose turn is kept while the readout time may still change: two minutes at 30 Hz."""
 MAX_GAP = 2.5
 """Of two times between frames, how much longer the later one may be for the turn to be carried on from one to the
 other."""
@@ -75,10 +77,21 @@ def correct_shutter(
     f, c = np.diag(K)[:2], K[:2, 2]
     rays = np.column_stack([(features.uv_rect_px - c) / f, np.ones(len(features))])
     late = (features.uv_px[:, 1] if read_v_px is None else read_v_px) / camera.height - 0.5
-    rays = np.einsum("nij,nj->ni", so3.exp(late[:, None] * turn_rad), rays)
+    rays = _turned(rays, late, turn_rad)
     uv_rect_px = f * rays[:, :2] / rays[:, 2:] + c
     # The found pixels move alike, so that the same features can be rectified again by a better camera.
     return replace(features, uv_px=features.uv_px + uv_rect_px - features.uv_rect_px, uv_rect_px=uv_rect_px)
+
+
+def _turned(rays: FloatArray, share: FloatArray, turn_rad: FloatArray) -> FloatArray:
+    """Turn each ray (N, 3) by its share (N,) of a turn (3,), by Rodrigues' formula: N matrices take thrice as long."""
+    angle_rad = float(np.linalg.norm(turn_rad))
+    axis = turn_rad / max(angle_rad, 1e-12)
+    across = rays @ so3.hat(axis).T
+    by = share * angle_rad
+    # 1 - cos as a square: small turns keep their digits.
+    inwards = across @ so3.hat(axis).T
+    return np.asarray(rays + np.sin(by)[:, None] * across + (2 * np.sin(0.5 * by) ** 2)[:, None] * inwards, np.float64)
 
 
 def _largest(features: Features) -> Features:
@@ -265,31 +278,50 @@ class RollingShutter:
         self._estimator = ReadoutEstimator(frontend, seed, READOUT_EVIDENCE) if asks else None
         self._meter = TurnMeter(frontend)
         self._was_s = 0.0  # by which the frames so far were corrected
-        self._rates_rad_s: dict[int, FloatArray] = {}  # of the frames that were asked while the shutter was unknown
+        self._rates_rad_s: dict[int, FloatArray] = {}  # of the frames by whose turns the shutter is being found
 
     def shutter_corrected(self, view: View, camera: Camera) -> View:
         """Take the frame's turn out of it. Frames come in the order of the sequence, each one once."""
         if not self.readout_s:
             return view
-        return self._corrected(view, camera, self._meter.rate_rad_s(view, camera.K))
+        rate_rad_s = self._meter.rate_rad_s(view, camera.K)
+        if self._estimator is not None:  # the readout time may still change
+            self._note_rate(view, rate_rad_s)
+        return self._corrected(view, camera, rate_rad_s)
 
     def all_corrected(self, views: Iterable[View], camera: Camera) -> list[View]:
         """Take the turns out of the frames that came before the shutter was found, or found anew, in their order.
 
         The turns that are known serve again; only the others are measured now.
         """
-        meter, known = TurnMeter(self._frontend), self._rates_rad_s
-        self._rates_rad_s = {}
+        meter = TurnMeter(self._frontend)
         corrected = []
         for view in views:
-            if view.turn_rad is not None and self._was_s:
-                rate_rad_s, raw = view.turn_rad / self._was_s, _as_read(view, camera)
-            elif view.index in known:
-                rate_rad_s, raw = known[view.index], view
+            if view.index in self._rates_rad_s:
+                rate_rad_s = self._rates_rad_s[view.index]
+            elif view.turn_rad is not None and self._was_s:
+                rate_rad_s = view.turn_rad / self._was_s
             else:
-                rate_rad_s, raw = meter.rate_rad_s(view, camera.K), view
-            corrected.append(self._corrected(raw, camera, rate_rad_s))
+                rate_rad_s = meter.rate_rad_s(view, camera.K)
+            corrected.append(self._corrected(_as_read(view, camera), camera, rate_rad_s))
         return corrected
+
+    def correction(self, indices: Collection[int], camera: Camera) -> Callable[[View], View] | None:
+        """Return what takes the turns out of these frames one by one; None where some turn is not known yet."""
+        rates = {i: self._rates_rad_s[i] for i in indices if i in self._rates_rad_s}
+        readout_s = self.readout_s
+
+        def corrected(view: View) -> View:
+            turn_rad = readout_s * rates[view.index]
+            raw = _as_read(view, camera)
+            return replace(raw, features=correct_shutter(raw.features, camera, turn_rad), turn_rad=turn_rad)
+
+        return corrected if all(i in rates for i in indices) else None
+
+    def _note_rate(self, view: View, rate_rad_s: FloatArray) -> None:
+        self._rates_rad_s[view.index] = rate_rad_s
+        if len(self._rates_rad_s) > KEPT_RATES:
+            del self._rates_rad_s[next(iter(self._rates_rad_s))]
 
     def _corrected(self, view: View, camera: Camera, rate_rad_s: FloatArray) -> View:
         turn_rad = self.readout_s * rate_rad_s
@@ -306,7 +338,7 @@ class RollingShutter:
         if self.readout_s:
             self._improve(self._estimator, view, camera)
             return True
-        self._rates_rad_s[view.index] = self._meter.rate_rad_s(view, camera.K)
+        self._note_rate(view, self._meter.rate_rad_s(view, camera.K))
         turn = self._meter.between_rad_s
         readout_s = self._estimator.add(view, turn, camera)
         if readout_s is None:

@@ -55,7 +55,7 @@ class TestFrameBuffer:
 
         for i in range(10):
             buffer.append(view(i))
-        buffer.map_later(change)
+        buffer.map_later(change, "turn")
         assert changed == []
         buffer.settle(3)
         assert changed == [9, 8, 7]
@@ -66,11 +66,33 @@ class TestFrameBuffer:
         assert len(changed) == 10
         assert buffer.nbytes == sum(v.nbytes for v in buffer)
 
+    def test_the_newest_are_changed_first_where_somebody_looks_at_them_alone(self) -> None:
+        buffer = FrameBuffer(100.0, 10.0)
+        for i in range(10):
+            buffer.append(view(i))
+        buffer.map_later(lambda v: replace(v, turn_rad=np.ones(3)), "turn")
+        buffer.append(view(10))
+        newest = buffer.newest(4)
+        assert [v.index for v in newest] == [7, 8, 9, 10]
+        assert [v.index for v in newest if v.turn_rad is None] == [10]
+        changed: list[int] = []
+        buffer.map_later(lambda v: changed.append(v.index) or v, "turn")  # type: ignore[func-returns-value]
+        assert buffer.newest(99)[0].turn_rad is None  # the second change has taken the place of the first
+        assert sorted(changed) == list(range(11))
+
+    def test_a_change_of_another_subject_comes_after_the_first(self) -> None:
+        buffer = FrameBuffer(100.0, 10.0)
+        for i in range(10):
+            buffer.append(view(i))
+        buffer.map_later(lambda v: replace(v, turn_rad=np.ones(3)), "turn")
+        buffer.map_later(lambda v: replace(v, image=None), "image")
+        assert all(v.turn_rad is not None and v.image is None for v in buffer)
+
     def test_what_is_let_go_of_meanwhile_is_not_changed(self) -> None:
         buffer, changed = FrameBuffer(1.0, 10.0), []
         for i in range(9):
             buffer.append(view(i))
-        buffer.map_later(lambda v: changed.append(v.index) or v)  # type: ignore[func-returns-value]
+        buffer.map_later(lambda v: changed.append(v.index) or v, "turn")  # type: ignore[func-returns-value]
         for i in range(9, 14):
             buffer.append(view(i))
         assert indices(buffer) == list(range(5, 14))

@@ -13,11 +13,12 @@ from dualslam.map.solving import solve
 from dualslam.map.split import submap_of
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking.scale_observability import N_AROUND
-from dualslam.recovery.scale_watch import BEHIND, GROUP, ScaleLoss, ScaleWatch
+from dualslam.recovery.scale_watch import BEHIND, GROUP, SCALE_HANDLERS, ScaleLoss, ScaleWatch
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
 from dualslam.testing.link_worlds import FRAME_STEP, Recipe, build, make_world, thinned
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
+from dualslam.workers.jobs import Ended, InlineDesk, JobKind
 
 N = 24
 PLACE = 11 * FRAME_STEP
@@ -152,3 +153,45 @@ def test_without_recovery_both_are_kept_and_told_apart(monkeypatch: pytest.Monke
         translation, rotation = pose_errors(part.T_world_cam, world.T_world_cam[part.index])
         assert translation.max() < 0.08
         assert rotation.max() < 0.01
+
+
+class _LateDesk(InlineDesk):
+    """Gives answers out when it is told to."""
+
+    held = True
+
+    def poll(self, kind: JobKind) -> list[Ended]:
+        return [] if self.held else super().poll(kind)
+
+    def n_open(self, kind: JobKind) -> int:
+        return len(self._done[kind]) if self.held else 0
+
+
+def late_watch(submap: Submap) -> tuple[ScaleWatch, _LateDesk]:
+    desk, ids = _LateDesk(SCALE_HANDLERS), sorted(submap.keyframes)
+    watch = ScaleWatch(LinkingConfig(), desk)
+    assert watch.judge(submap_of(submap, submap.id, ids[: -BEHIND - GROUP]), []) is None
+    assert watch.judge(submap, []) is None  # asked, and not answered yet
+    desk.held = False
+    return watch, desk
+
+
+def test_a_verdict_that_comes_late_is_the_same() -> None:
+    submap = thinned(solved("street"), PLACE, 0)
+    at_once = watch_since(submap).judge(submap, [])
+    assert isinstance(at_once, ScaleLoss)
+    watch, _ = late_watch(submap)
+    assert watch.judge(submap, []) == at_once
+    assert watch.judge(submap, []) is None
+
+
+def test_a_late_verdict_on_what_was_tied_meanwhile_or_on_another_map_is_none() -> None:
+    whole = solved("street")
+    submap = thinned(whole, PLACE, 0)
+    watch, _ = late_watch(submap)
+    assert watch.judge(whole, []) is None
+    watch, _ = late_watch(submap)
+    other = submap.copy()
+    other.id += 1
+    assert watch.judge(other, []) is None
+    assert watch.judge(submap, []) is None

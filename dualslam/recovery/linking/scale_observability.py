@@ -59,15 +59,66 @@ def scale_sigmas_between(
 
     `n_around`: keyframes before and after them that count as well.
     """
-    held = np.array(sorted(submap.keyframes))
-    pairs = [[ids[np.isin(ids, held)] for ids in pair] for pair in places]
+    return answer_scale(ask_scale(submap, places, pixel_chi2, n_around))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScaleQuestion:
+    """All that `scale_sigmas_between` needs of a submap: arrays of its own. It can be pickled.
+
+    Attributes
+    ----------
+    places : sequence of (IntArray, IntArray)
+        Keyframe ids of the pairs of places.
+    pixel_chi2 : float
+    K : (3, 3)
+    ids : (F,) int64
+        Keyframes that count; none where there is no place.
+    T_submap_kf : (F, 4, 4)
+    xyz : (N, 3)
+    kf, point : (R,) int64
+        Rows of `ids` and `xyz` of each observation.
+    uv_px : (R, 2), sigma_px : (R,)
+    """
+
+    places: Sequence[tuple[IntArray, IntArray]]
+    pixel_chi2: float
+    K: FloatArray
+    ids: IntArray
+    T_submap_kf: FloatArray
+    xyz: FloatArray
+    kf: IntArray
+    point: IntArray
+    uv_px: FloatArray
+    sigma_px: FloatArray
+
+
+def ask_scale(
+    submap: Submap, places: Sequence[tuple[IntArray, IntArray]], pixel_chi2: float, n_around: int = N_AROUND
+) -> ScaleQuestion:
+    """Collect what `answer_scale` needs for an answer, which takes longer and may be given elsewhere."""
+    held = np.array(sorted(submap.keyframes), np.int64)
+    pairs = [(here[np.isin(here, held)], there[np.isin(there, held)]) for here, there in places]
     asked = np.concatenate([ids for pair in pairs for ids in pair])
-    if not len(asked):
-        return [np.inf] * len(pairs)
-    first, last = np.searchsorted(held, [asked.min(), asked.max()])
-    problem = _linearise(submap, held[max(first - n_around, 0) : last + n_around + 1], pixel_chi2)
+    ids = held[:0]
+    if len(asked):
+        first, last = np.searchsorted(held, [asked.min(), asked.max()])
+        ids = held[max(first - n_around, 0) : last + n_around + 1]
+    obs = submap.observations
+    rows = np.flatnonzero(obs["alive"] & np.isin(obs["kf"], ids))
+    uv, sigma = submap.observed_pixels(rows)
+    landmarks, point = np.unique(obs["landmark"][rows], return_inverse=True)
+    kf, xyz = np.searchsorted(ids, obs["kf"][rows]), submap.landmarks["xyz_mu"][landmarks]
+    return ScaleQuestion(pairs, pixel_chi2, submap.K, ids, submap.keyframe_poses(ids), xyz, kf, point, uv, sigma)
+
+
+def answer_scale(question: ScaleQuestion) -> list[float]:
+    """Return what `scale_sigmas_between` does."""
+    problem = _linearise(question)
+    if problem is None:
+        return [np.inf] * len(question.places)
     values, vectors = np.linalg.eigh(problem.reduced)
-    return [_sigma(problem, values, vectors, here, there) for here, there in pairs]
+    return [_sigma(problem, values, vectors, here, there) for here, there in question.places]
 
 
 def _sigma(problem: _Problem, values: FloatArray, vectors: FloatArray, here: IntArray, there: IntArray) -> float:
@@ -118,26 +169,25 @@ class _Problem:
     reduced: FloatArray
 
 
-def _linearise(submap: Submap, ids: IntArray, pixel_chi2: float) -> _Problem:
-    obs = submap.observations
-    rows = np.flatnonzero(obs["alive"] & np.isin(obs["kf"], ids))
-    uv, sigma = submap.observed_pixels(rows)
-    kf = np.searchsorted(ids, obs["kf"][rows])
-    T = se3.inverse(submap.keyframe_poses(ids))
-    all_xyz = submap.landmarks["xyz_mu"][obs["landmark"][rows]]
-    J_pose, J_point, good = np.zeros((len(rows), 2, 6)), np.zeros((len(rows), 2, 3)), np.zeros(len(rows), bool)
+def _linearise(question: ScaleQuestion) -> _Problem | None:
+    """Return the normal equations; none where no point is seen twice."""
+    q = question
+    T, ids = se3.inverse(q.T_submap_kf), q.ids
+    all_xyz, n_rows = q.xyz[q.point], len(q.kf)
+    J_pose, J_point, good = np.zeros((n_rows, 2, 6)), np.zeros((n_rows, 2, 3)), np.zeros(n_rows, bool)
     for f in range(len(ids)):
-        seen = np.flatnonzero(kf == f)
-        seen = seen[submap.depths(obs["landmark"][rows[seen]], T[f]) > 0]
-        J_pose[seen], J_point[seen] = projection_jacobians(submap.K, T[f], all_xyz[seen])
-        predicted, _ = project_points(submap.K, T[f], all_xyz[seen])
-        good[seen] = ((predicted - uv[seen]) ** 2).sum(1) < pixel_chi2 * sigma[seen] ** 2
+        seen = np.flatnonzero(q.kf == f)
+        seen = seen[all_xyz[seen] @ T[f, 2, :3] + T[f, 2, 3] > 0]
+        J_pose[seen], J_point[seen] = projection_jacobians(q.K, T[f], all_xyz[seen])
+        predicted, _ = project_points(q.K, T[f], all_xyz[seen])
+        good[seen] = ((predicted - q.uv_px[seen]) ** 2).sum(1) < q.pixel_chi2 * q.sigma_px[seen] ** 2
     # A point seen once says nothing of the poses.
-    landmark = obs["landmark"][rows]
-    good &= np.bincount(landmark[good], minlength=len(submap.landmarks))[landmark] >= 2
-    kf, landmark, weight = kf[good], landmark[good], 1.0 / sigma[good] ** 2
+    good &= np.bincount(q.point[good], minlength=len(q.xyz))[q.point] >= 2
+    kf, weight = q.kf[good], 1.0 / q.sigma_px[good] ** 2
     J_pose, J_point = J_pose[good], J_point[good]
-    points, point = np.unique(landmark, return_inverse=True)
+    points, point = np.unique(q.point[good], return_inverse=True)
+    if len(points) == 0:
+        return None
     order = np.lexsort((point, kf))  # as the blocks of a sparse matrix are stored
     kf, point, weight, J_pose, J_point = kf[order], point[order], weight[order], J_pose[order], J_point[order]
     n_f, n_p = len(ids), len(points)
@@ -154,9 +204,7 @@ def _linearise(submap: Submap, ids: IntArray, pixel_chi2: float) -> _Problem:
     reduced = -np.asarray((through @ H_cross.T).toarray())
     for f in range(n_f):
         reduced[6 * f : 6 * f + 6, 6 * f : 6 * f + 6] += H_pose[f]
-    return _Problem(
-        ids, T, submap.landmarks["xyz_mu"][points], kf, point, inverse, H_cross, 0.5 * (reduced + reduced.T)
-    )
+    return _Problem(ids, T, q.xyz[points], kf, point, inverse, H_cross, 0.5 * (reduced + reduced.T))
 
 
 def _scale_at(problem: _Problem, ids: IntArray) -> tuple[FloatArray, FloatArray] | None:

@@ -111,6 +111,28 @@ def test_frames_that_were_corrected_are_corrected_anew() -> None:
         assert np.allclose(again.features.uv_px, expected.features.uv_px, atol=0.01)
 
 
+def test_frames_are_corrected_one_by_one_as_all_together() -> None:
+    """In any order, and by whichever time they were corrected before."""
+    world = PointWorld(cloud(seed=1), shaken(30), seed=1)
+    views = [read_row_by_row(world, i, READOUT_S) for i in range(9)]
+    shutter = RollingShutter(OrbFrontend(), CameraConfig(), 0)
+    for view in views[:-1]:
+        shutter.may_start(view, CAMERA)
+    assert shutter.readout_s == 0  # not known yet
+    shutter.readout_s = READOUT_S / 2
+    assert shutter.correction([view.index for view in views], CAMERA) is None  # of the last one no turn is known
+    by_half = shutter.correction([view.index for view in views[:-1]], CAMERA)
+    assert by_half is not None
+    half = [by_half(view) for view in views[:-1]]
+    shutter.readout_s = READOUT_S
+    correct = shutter.correction([view.index for view in views[:-1]], CAMERA)
+    assert correct is not None
+    together = shutter.all_corrected(views[:-1], CAMERA)
+    for mixed, expected in zip(reversed([*views[:4], *half[4:]]), reversed(together), strict=True):
+        assert np.allclose(correct(mixed).features.uv_px, expected.features.uv_px, atol=0.01)
+        assert np.allclose(correct(mixed).turn_rad, expected.turn_rad)
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_global_shutter_is_left_alone(seed: int) -> None:
     world = PointWorld(cloud(seed=seed), shaken(120), seed=seed)
