@@ -15,12 +15,12 @@ from dualslam.core.chi_square import CHI2_99
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
-from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray, Track, View
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from dualslam.frontends.features.matching import FeatureGrid, match_projected
-from dualslam.frontends.gap.second_pose import refuse_look_alike
-from dualslam.frontends.gap.uncertainty import SMALL_STEP, pose_uncertainty
 from dualslam.frontends.gates import MIN_CONSENSUS
-from dualslam.frontends.tracking.local_map import LocalMap, Prediction, covering_keyframes
+from dualslam.frontends.tracking.beyond_gap import refuse_lost_scale, refuse_second_pose
+from dualslam.frontends.tracking.local_map import LocalMap, Prediction, covering_keyframes, trusted
+from dualslam.frontends.tracking.motion import Motion
 from dualslam.frontends.tracking.resection import resect
 from dualslam.map.submap import NO_LANDMARK, Submap
 
@@ -28,20 +28,9 @@ LOCAL_RADIUS_PX = 4.0
 """The same for the landmarks of the local map, after a first pose is found."""
 
 WIDER = 2.5  # second guided search: this many times the first radius
-MAX_EXTRAPOLATION = 3.0  # intervals for which the motion between the last two frames says something
-STEADY_S = 1 / 6
-"""For so long it says something in any case: what carries a camera does not turn round in less. Up to four frames of
-30 Hz that came too late are no gap, whatever the interval before them was."""
 GUIDE_TOLERANCE, POSE_TOLERANCE = 0.1, 1e-3
 """Chi-square that a step may still promise when a pose counts as found (`refine_pose`): a third of its standard
 deviation where it only guides the search in the local map, a thirtieth where it is the frame's."""
-N_PROOF = 3
-"""Keyframes that prove a landmark: two show it on the epipolar line of each other, where anything may be."""
-SAFE, MOST = 2, 0.5
-"""With fewer proven landmarks than so many times the inliers that are asked for, or than this share, all have a say."""
-NEARER, NEAREST = 0.5, 0.05
-"""Of those that nothing proves, those have none that are nearer than so many times the depth of the nearest proven ones
-(this share): their lever is twice as long."""
 BEFORE_GAP = 3  # keyframes whose landmarks are asked for a second pose beyond a gap
 GIVEN_POSE_CHI2 = 4 * CHI2_99[2]  # 99 % with 2 degrees of freedom, and the pose off by as much as a pixel
 
@@ -95,7 +84,7 @@ class Tracker:
         self._seed = seed
         self._n_covering = n_covering
         self._last: Track | None = None
-        self._velocity: tuple[FloatArray, float] | None = None
+        self._motion = Motion()
         self._local: LocalMap | None = None
         self._doubt: Failure | None = None  # what was found to look alike beyond the gap at hand
 
@@ -106,7 +95,7 @@ class Tracker:
 
     def start(self, track: Track) -> None:
         """Begin at a frame whose pose is known, at rest."""
-        self._last, self._velocity, self._doubt = track, None, None
+        self._last, self._motion, self._doubt = track, Motion(), None
         self.refresh()
 
     def refresh(self) -> None:
@@ -127,9 +116,7 @@ class Tracker:
         assert self._last is not None
         T_submap_cam = sim3.act_on_pose(S_now_then, se3.inverse(self._last.T_cam_submap))
         self._last = replace(self._last, T_cam_submap=se3.inverse(T_submap_cam))
-        if self._velocity is not None:  # a motion in the camera's frame: a change of frame shows in its unit only
-            xi, dt = self._velocity
-            self._velocity = (np.concatenate([xi[:3], float(sim3.scale(S_now_then)) * xi[3:]]), dt)
+        self._motion = self._motion.scaled(float(sim3.scale(S_now_then)))
         self.refresh()
 
     def track(self, view: View, may_relocalise: bool = True) -> Track | Failure:
@@ -142,7 +129,7 @@ class Tracker:
         if len(features) < self._config.min_inliers:
             return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features in the image")
         grid = FeatureGrid.build(features.uv_rect_px)
-        T_predicted = self._predict(view.timestamp_s)
+        T_predicted = self._motion.predict(self._last, view.timestamp_s)
         found: tuple[FloatArray, IntArray] | Failure = Failure(FailureReason.TOO_FEW_MATCHES)
         for radius_px in (self._config.search_radius_px, self._config.search_radius_px * WIDER):
             found = self._pose_from_last(view, grid, T_predicted, radius_px)
@@ -157,17 +144,18 @@ class Tracker:
         track = self._pose_from_local_map(view, grid, *found, T_predicted, wide)
         if isinstance(track, Failure):
             return track
-        verdict = self._judge_relocalised(track) if wide else track
-        if not isinstance(verdict, Failure) and wide:
-            refused = self._refuse_look_alike(track)
-            verdict = track if refused is None else refused
-        if not isinstance(verdict, Failure):
-            self._accept(track)
-        return verdict
+        if wide:
+            refused = refuse_lost_scale(self._submap, track, self._last, self._max_gap_scale_sigma)
+            if refused is None:
+                refused = self._refuse_look_alike(track)
+            if refused is not None:
+                return refused
+        self._accept(track)
+        return track
 
     def lies_beyond_gap(self, view: View) -> bool:
         """Whether so much time has passed since the last posed frame that its motion does not lead to this one."""
-        return self._velocity is not None and self._n_intervals(view.timestamp_s) > self._max_extrapolation
+        return self._last is not None and self._motion.lies_beyond_gap(self._last, view)
 
     def track_at(self, view: View, pose: GivenPose) -> Track:
         """Take a pose as it is, and look for the landmarks of the keyframes nearest in time under it."""
@@ -226,7 +214,7 @@ class Tracker:
         track = self._pose_from_local_map(view, grid, *found, found[0], wide=True)
         if isinstance(track, Failure):
             return track
-        refused = self._second_pose(track, about[:BEFORE_GAP])
+        refused = self._refuse_second_pose(track, about[:BEFORE_GAP])
         if refused is not None:
             return refused
         self.start(track)
@@ -237,29 +225,6 @@ class Tracker:
         self._accept(track)
 
     # --- steps
-
-    def _predict(self, timestamp_s: float) -> FloatArray:
-        """Constant velocity: the last frame-to-frame motion, scaled to the time that has passed."""
-        assert self._last is not None
-        if self._velocity is None:
-            return self._last.T_cam_submap
-        # Far beyond the measured interval (frames were lost) the velocity says little.
-        n_intervals = np.clip(self._n_intervals(timestamp_s), 0.0, self._max_extrapolation)
-        return se3.exp(self._velocity[0] * n_intervals) @ self._last.T_cam_submap
-
-    @property
-    def _max_extrapolation(self) -> float:
-        """Return over how many intervals the velocity is used."""
-        assert self._velocity is not None
-        dt = abs(self._velocity[1])
-        return max(MAX_EXTRAPOLATION, STEADY_S / dt) if dt > 0 else MAX_EXTRAPOLATION
-
-    def _n_intervals(self, timestamp_s: float) -> float:
-        """Return the time since the last frame, over that in which its velocity was measured."""
-        assert self._last is not None
-        assert self._velocity is not None
-        dt = self._velocity[1]
-        return (timestamp_s - self._last.view.timestamp_s) / dt if dt != 0 else 1.0
 
     def _pose_from_last(
         self, view: View, grid: FeatureGrid, T_predicted: FloatArray, radius_px: float
@@ -314,24 +279,6 @@ class Tracker:
         covering = covering_keyframes(self._submap, self._n_covering, self._config.min_inliers)
         return [*near, *(k for k in covering if k not in near)]
 
-    def _judge_relocalised(self, track: Track) -> Track | Failure:
-        """Return a track across a gap if it holds the scale, which all that is mapped beyond the gap will inherit.
-
-        A step that is small against the depth of what is seen leaves the scale where it is.
-        """
-        assert self._last is not None
-        row = np.flatnonzero(track.landmark_ids >= 0)
-        ids = track.landmark_ids[row]
-        step = se3.inverse(track.T_cam_submap)[:3, 3] - se3.inverse(self._last.T_cam_submap)[:3, 3]
-        if np.linalg.norm(step) < SMALL_STEP * np.median(self._submap.depths(ids, track.T_cam_submap)):
-            return track
-        known = pose_uncertainty(self._submap, track.T_cam_submap, ids, track.view.features.sigma_px[row])
-        scale_sigma = np.inf if known is None else known[1]
-        if scale_sigma <= self._max_gap_scale_sigma:
-            return track
-        detail = f"the scale beyond the gap is known to {scale_sigma:.1%}"
-        return Failure(FailureReason.SCALE, detail, {"gap_scale_sigma": scale_sigma})
-
     def _refuse_look_alike(self, track: Track) -> Failure | None:
         """Refuse a pose across a gap if another one explains nearly as much of what was seen before it.
 
@@ -339,29 +286,11 @@ class Tracker:
         is not crossed any more: frames further on show ever less of what was seen, and one would pass by chance.
         """
         if self._doubt is None:
-            self._doubt = self._second_pose(track, self._submap.keyframes_near(track.view.index)[:BEFORE_GAP])
+            self._doubt = self._refuse_second_pose(track, self._submap.keyframes_near(track.view.index)[:BEFORE_GAP])
         return self._doubt
 
-    def _second_pose(self, track: Track, keyframe_ids: Sequence[int]) -> Failure | None:
-        """Return why a pose is not believed, if another explains nearly as much of what some keyframes see."""
-        submap = self._submap
-        features, ids, known = [], [], np.zeros(len(submap.landmarks), bool)
-        for k in keyframe_ids:
-            row = np.flatnonzero(submap.landmark_of[k] >= 0)
-            row = row[~known[submap.landmark_of[k][row]]]
-            ids.append(submap.landmark_of[k][row])
-            features.append(submap.keyframes[k].features.descriptors[row])
-            known[ids[-1]] = True
-        return refuse_look_alike(
-            self._frontend,
-            np.concatenate(features),
-            submap.landmarks["xyz_mu"][np.concatenate(ids)],
-            track.view.features,
-            track.T_cam_submap,
-            submap.K,
-            self._size_px,
-            self._seed,
-        )
+    def _refuse_second_pose(self, track: Track, keyframe_ids: Sequence[int]) -> Failure | None:
+        return refuse_second_pose(self._submap, track, keyframe_ids, self._frontend, self._size_px, self._seed)
 
     def _refine(
         self, view: View, T_start: FloatArray, ids: IntArray, xyz_mu: FloatArray, feature: IntArray
@@ -407,7 +336,7 @@ class Tracker:
             features.uv_rect_px[feature],
             features.sigma_px[feature],
             tolerance=POSE_TOLERANCE,
-            counted=self._with_a_say(ids, T_cam_submap),
+            counted=trusted(submap, ids, T_cam_submap, self._config.min_inliers),
         )
         if isinstance(estimate, Failure):
             return estimate
@@ -426,19 +355,6 @@ class Tracker:
             wide=wide,
             covariance=estimate.covariance,
         )
-
-    def _with_a_say(self, ids: IntArray, T_cam_submap: FloatArray) -> BoolArray:
-        """Return which of the landmarks found a pose is estimated from: not unproven ones right before the camera.
-
-        What two views show is on the epipolar line of either, and may be anything. Of the wrong ones those with the
-        longest lever weigh most, which are nearer than all that three keyframes see: they hold the camera where it
-        is, and a turn takes the place of its motion.
-        """
-        proven = np.asarray(self._submap.n_observations(ids) >= N_PROOF)
-        if np.count_nonzero(proven) < max(SAFE * self._config.min_inliers, MOST * len(ids)):
-            return np.ones(len(ids), np.bool_)
-        depth = self._submap.depths(ids, T_cam_submap)
-        return np.asarray(proven | (depth > NEARER * np.quantile(depth[proven], NEAREST)))
 
     def _search_local_map(
         self, view: View, grid: FeatureGrid, T_cam_submap: FloatArray, landmark_ids: IntArray
@@ -464,9 +380,7 @@ class Tracker:
 
     def _accept(self, track: Track) -> None:
         assert self._last is not None
-        last = self._last
-        dt = track.view.timestamp_s - last.view.timestamp_s
-        self._velocity = (se3.log(track.T_cam_submap @ se3.inverse(last.T_cam_submap)), dt)
+        self._motion = Motion.between(self._last, track)
         self._last, self._doubt = track, None
 
     # --- the local map

@@ -1,0 +1,60 @@
+"""What a pose across a gap must pass: it holds the scale, and no other pose explains nearly as much."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dualslam.core.geometry import se3
+from dualslam.core.interfaces import Frontend
+from dualslam.core.types import Failure, FailureReason, Track
+from dualslam.frontends.gap.second_pose import refuse_look_alike
+from dualslam.frontends.gap.uncertainty import SMALL_STEP, pose_uncertainty
+from dualslam.map.submap import Submap
+
+
+def refuse_lost_scale(submap: Submap, track: Track, last: Track, max_scale_sigma: float) -> Failure | None:
+    """Refuse a track across a gap that does not hold the scale, which all that is mapped beyond the gap will inherit.
+
+    A step from the last track that is small against the depth of what is seen leaves the scale where it is.
+    """
+    row = np.flatnonzero(track.landmark_ids >= 0)
+    ids = track.landmark_ids[row]
+    step = se3.inverse(track.T_cam_submap)[:3, 3] - se3.inverse(last.T_cam_submap)[:3, 3]
+    if np.linalg.norm(step) < SMALL_STEP * np.median(submap.depths(ids, track.T_cam_submap)):
+        return None
+    known = pose_uncertainty(submap, track.T_cam_submap, ids, track.view.features.sigma_px[row])
+    scale_sigma = np.inf if known is None else known[1]
+    if scale_sigma <= max_scale_sigma:
+        return None
+    detail = f"the scale beyond the gap is known to {scale_sigma:.1%}"
+    return Failure(FailureReason.SCALE, detail, {"gap_scale_sigma": scale_sigma})
+
+
+def refuse_second_pose(
+    submap: Submap,
+    track: Track,
+    keyframe_ids: Sequence[int],
+    frontend: Frontend,
+    size_px: tuple[int, int],
+    seed: int,
+) -> Failure | None:
+    """Refuse a track if another pose explains nearly as much of what some keyframes see, by their own descriptors."""
+    features, ids, known = [], [], np.zeros(len(submap.landmarks), bool)
+    for k in keyframe_ids:
+        row = np.flatnonzero(submap.landmark_of[k] >= 0)
+        row = row[~known[submap.landmark_of[k][row]]]
+        ids.append(submap.landmark_of[k][row])
+        features.append(submap.keyframes[k].features.descriptors[row])
+        known[ids[-1]] = True
+    return refuse_look_alike(
+        frontend,
+        np.concatenate(features),
+        submap.landmarks["xyz_mu"][np.concatenate(ids)],
+        track.view.features,
+        track.T_cam_submap,
+        submap.K,
+        size_px,
+        seed,
+    )

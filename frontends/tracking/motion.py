@@ -1,0 +1,65 @@
+"""The motion between the last two posed frames, and how far beyond them it says something."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.core.geometry import se3
+from dualslam.core.types import FloatArray, Track, View
+
+MAX_EXTRAPOLATION = 3.0
+"""Intervals for which the motion between the last two frames says something."""
+STEADY_S = 1 / 6
+"""For so long it says something in any case: what carries a camera does not turn round in less. Up to four frames of
+30 Hz that came too late are no gap, whatever the interval before them was."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Constant velocity in the camera's frame.
+
+    Attributes
+    ----------
+    xi : (6,) or None
+        The motion from one frame to the next; None: at rest.
+    interval_s : float
+        The time that it took; negative where frames come in reverse.
+    """
+
+    xi: FloatArray | None = None
+    interval_s: float = 0.0
+
+    @classmethod
+    def between(cls, before: Track, after: Track) -> Motion:
+        """Return the motion from one track to another."""
+        interval_s = after.view.timestamp_s - before.view.timestamp_s
+        return cls(se3.log(after.T_cam_submap @ se3.inverse(before.T_cam_submap)), interval_s)
+
+    def scaled(self, scale: float) -> Motion:
+        """Return the motion in another unit."""
+        if self.xi is None:
+            return self
+        return Motion(np.concatenate([self.xi[:3], scale * self.xi[3:]]), self.interval_s)
+
+    def predict(self, last: Track, timestamp_s: float) -> FloatArray:
+        """Return the pose `T_cam_submap` at a time: the motion scaled to the time that has passed since a track."""
+        if self.xi is None:
+            return last.T_cam_submap
+        # Far beyond the measured interval (frames were lost) the velocity says little.
+        n_intervals = np.clip(self._n_intervals(last, timestamp_s), 0.0, self._max_extrapolation)
+        return se3.exp(self.xi * n_intervals) @ last.T_cam_submap
+
+    def lies_beyond_gap(self, last: Track, view: View) -> bool:
+        """Whether so much time has passed since a track that the motion does not lead to a view."""
+        return self.xi is not None and self._n_intervals(last, view.timestamp_s) > self._max_extrapolation
+
+    @property
+    def _max_extrapolation(self) -> float:
+        dt = abs(self.interval_s)
+        return max(MAX_EXTRAPOLATION, STEADY_S / dt) if dt > 0 else MAX_EXTRAPOLATION
+
+    def _n_intervals(self, last: Track, timestamp_s: float) -> float:
+        dt = self.interval_s
+        return (timestamp_s - last.view.timestamp_s) / dt if dt != 0 else 1.0
