@@ -48,6 +48,9 @@ log = logging.getLogger(__name__)
 
 SETTLED_A_FRAME = 20
 """Buffered views that follow a change of the camera at each frame: 2 to 4 ms, where all of 10 s would take 30 to 60."""
+TAKEN_IN_A_FRAME = 200
+"""Landmarks that the index of places takes in at each frame in real time: 5 ms, where all that came during a walk back
+would take 200."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -410,8 +413,8 @@ class System:
                 self._break_at(live, view, first.index, contradicted)
                 return contradicted
             if live.reference_id != view.index:
-                if self._to_revisit and not self.pace.behind:
-                    self._revisit(live, view)
+                if self.pace.in_real_time and not self.pace.behind:
+                    self._catch_up_on_places(live, view)
                 return track
             if (loss := self._scale_lost(live.submap)) is not None and self._part_at(live, view, loss):
                 return track
@@ -439,13 +442,20 @@ class System:
             self._give_up(live, view, track)
         return track
 
+    def _catch_up_on_places(self, live: VisualOdometry, view: View) -> None:
+        """Do a part of what is left to do for places: first take in what the map has gained, then look for them."""
+        with self.timer.measure("places"):
+            n_taken = self._revisits.take_in(live.submap, TAKEN_IN_A_FRAME)
+        if self._to_revisit and not n_taken:
+            self._revisit(live, view)
+
     def _revisit(self, live: VisualOdometry, view: View) -> None:
         """Link the live map where its newest keyframe shows a place again; not while reverse tracking is under way."""
         self._to_revisit = False
         if self._recoveries.is_under_way(live.submap):
             return
         with self.timer.measure("places"):
-            self._revisits.note_keyframe(live)
+            self._revisits.note_keyframe(live, TAKEN_IN_A_FRAME if self.pace.in_real_time else None)
         self._collect_places(view)
 
     def _collect_places(self, now: FrameStamp) -> None:

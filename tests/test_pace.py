@@ -71,7 +71,7 @@ def test_places_are_asked_for_with_the_frame_after_a_keyframe_that_comes_in_time
     world = PointWorld(cloud(), hand_held(40))
     system = system_in(world, keyframes={"max_parallax_deg": 1.0})
     now, asked = [-1], []
-    monkeypatch.setattr(Revisits, "note_keyframe", lambda _, live: asked.append((live.reference_id, now[0])))
+    monkeypatch.setattr(Revisits, "note_keyframe", lambda _, live, n: asked.append((live.reference_id, now[0])))
     for frame in world.frames():
         now[0] = frame.index
         if late_s is not None:
@@ -87,3 +87,20 @@ def test_places_are_asked_for_with_the_frame_after_a_keyframe_that_comes_in_time
         assert set(waits) <= {0, 1}  # two keyframes in a row: the second asks
     else:
         assert set(waits) == {0}
+
+
+def test_in_real_time_no_frame_takes_more_than_its_share_of_landmarks_into_the_index(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = PointWorld(cloud(), hand_held(40))
+    system = system_in(world, keyframes={"max_parallax_deg": 1.0})
+    index = system._revisits._recogniser
+    monkeypatch.setattr("dualslam.system.TAKEN_IN_A_FRAME", 20)
+    grown = []
+    for frame in world.frames():
+        system.pace.note(0.0)
+        before = len(index)
+        system.step(frame)
+        grown.append(len(index) - before)
+    assert sum(grown) > 100
+    assert max(grown) <= 2 * 20  # a frame that takes its share in may be asked about, too

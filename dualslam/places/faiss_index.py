@@ -61,12 +61,14 @@ class FaissRecogniser:
     def __len__(self) -> int:
         return 0 if self._index is None else int(self._index.ntotal)
 
-    def take_in(self, submap: Submap, n_newest_left_out: int = 0) -> int:
-        """Add the landmarks that a submap has gained since the last call."""
+    def take_in(self, submap: Submap, n_newest_left_out: int = 0, at_most: int | None = None) -> int:
+        """Add the landmarks that a submap has gained since the last call, the oldest `at_most` of them."""
         start, stop = self._n_taken.get(submap.id, 0), len(submap.landmarks)
         if n_newest_left_out:
             young = np.isin(submap.landmarks["first_kf"][start:], list(submap.keyframes)[-n_newest_left_out:])
             stop = start + int(young.argmax()) if young.any() else stop
+        if at_most is not None:
+            stop = min(stop, start + at_most)
         if stop <= start:
             return 0
         self._n_taken[submap.id] = stop

@@ -38,10 +38,11 @@ class PlaceRecogniser(Protocol):
         """Memory of the index, about."""
         ...
 
-    def take_in(self, submap: Submap, n_newest_left_out: int = 0) -> int:
+    def take_in(self, submap: Submap, n_newest_left_out: int = 0, at_most: int | None = None) -> int:
         """Add the landmarks that a submap has gained since the last call; return how many.
 
-        `n_newest_left_out`: keyframes, by insertion, whose own new landmarks have yet to prove themselves.
+        `n_newest_left_out`: keyframes, by insertion, whose own new landmarks have yet to prove themselves. `at_most`:
+        the oldest so many of them; the others are left to later calls.
         """
         ...
 

@@ -160,8 +160,23 @@ class Revisits:
 
     # --- keyframes of the live map
 
-    def note_keyframe(self, live: VisualOdometry) -> None:
-        """Search for a place that the live map's newest keyframe shows again; `collect` returns the answer."""
+    def take_in(self, live: Submap | None, at_most: int | None = None) -> int:
+        """Let places be recognised by what maps have gained; return how many landmarks were taken in.
+
+        `live`: of which the newest keyframes wait. `at_most`: landmarks in one go, of which each costs some 25 us.
+        """
+        n = 0
+        if self._config.places.enabled and self._config.loops.enabled:
+            for submap in self._record.atlas.submaps.values():
+                left = None if at_most is None else at_most - n
+                n += self._recogniser.take_in(submap, YOUNG if submap is live else 0, left)
+        return n
+
+    def note_keyframe(self, live: VisualOdometry, at_most: int | None = None) -> None:
+        """Search for a place that the live map's newest keyframe shows again; `collect` returns the answer.
+
+        `at_most`: see `take_in`.
+        """
         if not (self._config.places.enabled and self._config.loops.enabled):
             return
         self._frontend = None
@@ -169,7 +184,7 @@ class Revisits:
         if (self._provisional is None and self._n_asked % ASK_EVERY) or self._desk.n_open(JobKind.LOOP):
             return
         submap, keyframe_id = live.submap, live.reference_id
-        self._take_in(submap)
+        self.take_in(submap, at_most)
         submaps = self._record.atlas.submaps
         features = submap.keyframes[keyframe_id].features
         candidates = tuple(self._recogniser.query(features, submaps, self._may_be(submap, keyframe_id)))
@@ -425,10 +440,6 @@ class Revisits:
             **why.numbers,
         )
 
-    def _take_in(self, live: Submap | None) -> None:
-        for submap in self._record.atlas.submaps.values():
-            self._recogniser.take_in(submap, YOUNG if submap is live else 0)
-
     # --- frames without a map
 
     def avoid(self, submap_id: int) -> None:
@@ -447,7 +458,7 @@ class Revisits:
                 return relocalised
             if self._frontend is not None:
                 return None
-        self._take_in(None)
+        self.take_in(None)
         self._frontend = self._relocalise(view, K)
         return None
 

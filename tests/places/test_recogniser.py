@@ -46,6 +46,18 @@ def test_the_same_calls_give_the_same_candidates() -> None:
     assert all(answers[0])
 
 
+def test_what_is_taken_in_by_parts_gives_the_same_candidates() -> None:
+    submap = driven_lap().atlas.submaps[0]
+    whole, parts = FaissRecogniser(MAX_BITS), FaissRecogniser(MAX_BITS)
+    whole.take_in(submap)
+    for _ in range(0, len(submap.landmarks), 200):
+        assert parts.take_in(submap, at_most=200) <= 200
+    assert len(parts) == len(whole)
+    assert parts.take_in(submap) == 0
+    for i in (5, 40, 80):
+        assert parts.query(lap().features(i), {0: submap}) == whole.query(lap().features(i), {0: submap})
+
+
 def test_candidates_are_of_different_places() -> None:
     submap = driven_lap().atlas.submaps[0]
     recogniser = FaissRecogniser(MAX_BITS)
