@@ -10,26 +10,26 @@ import logging
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from operator import itemgetter
+from functools import partial
 
 import gtsam
 import numpy as np
 
 from dualslam.backend import convert
 from dualslam.backend.bayes_tree import BayesTree, UpdateStatistics
-from dualslam.backend.factor_index import INSERT_SIGMAS, MIN_TIES, OUTSIDE, FactorIndex, Plan
-from dualslam.backend.factors import baseline_factor, insert_projections, pose_prior, relative_pose
-from dualslam.backend.gauge import Gauge, choose_gauge
+from dualslam.backend.factor_index import INSERT_SIGMAS, FactorIndex, Plan
+from dualslam.backend.factors import insert_projections
 from dualslam.backend.noise import LEAST_NOISE, OUTLIER_CHI2, PixelNoise, residual_variance
-from dualslam.backend.observability import compute_residuals, find_components, take_mask
-from dualslam.backend.point_refinement import refine_points, triangulation_covariances
+from dualslam.backend.observability import compute_residuals, take_mask
+from dualslam.backend.point_refinement import refine_points
+from dualslam.backend.points_beside import landmarks_beside, triangulated_covariances, views_of
 from dualslam.backend.solver import N_LAST, IncrementalSolver, SolverFailure, optimise_batch
+from dualslam.backend.ties import TieChanges, Ties
 from dualslam.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
-from dualslam.core.geometry import so3
 from dualslam.core.interfaces import GraphEstimate
-from dualslam.core.types import BoolArray, FloatArray, IntArray
-from dualslam.map.submap import RelativePose, Submap
+from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.submap import Submap
 
 READ_WINDOW = 20
 """Keyframes (the last inserted ones, and their landmarks) whose estimate is read after each update; 0 reads all."""
@@ -43,8 +43,6 @@ keyframes of KITTI 03) two reach the cost of eight to 0.4 %, in half the time.""
 
 logger = logging.getLogger(__name__)
 
-HOLD_ROTATION_RAD, HOLD_TRANSLATION_MU = 0.01, 0.02
-"""Sigmas of the loose prior that holds a keyframe with too few ties where it is."""
 REBUILD_ATTEMPTS = 8
 RELINEARISE_EVERY = 3
 MISFIT_CHI2 = 1.2
@@ -58,17 +56,13 @@ FAR_MU = 200.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Changes:
-    """A plan as the solver takes it. In `graph`: the gauge, the holds, the relative poses, the projections."""
+    """A plan as the solver takes it. In `graph`: the ties, then the projections, in this `order`."""
 
     graph: gtsam.NonlinearFactorGraph
     values: gtsam.Values
     remove: list[int]
-    gauge: Gauge
-    new_holds: list[int]  # keyframes
-    kept_holds: dict[int, int]
-    new_relative: list[tuple[int, RelativePose]]
-    kept_relative: dict[int, tuple[RelativePose, int]]
-    order: IntArray  # of the projections
+    ties: TieChanges
+    order: IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,16 +71,6 @@ class _Optimum:
 
     poses: Mapping[int, FloatArray]
     xyz_mu: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Views:
-    """Of points beside the graph: rows, the poses of their keyframes, and which of the poses and points each is of."""
-
-    row: IntArray
-    T_submap_kf: FloatArray
-    pose: IntArray
-    point: IntArray
 
 
 class ISam2SubmapGraph:
@@ -108,12 +92,8 @@ class ISam2SubmapGraph:
         self._robust_k, self._rebuild_iterations = config.robust_k, rebuild_iterations
         self._noise = PixelNoise(config.robust_k)
         self._factor_index = FactorIndex(config)
-        self._forced_holds: set[int] = set()
+        self._ties = Ties()
         self._solver: IncrementalSolver | None = None
-        self._gauge: Gauge | None = None
-        self._gauge_factors: list[int] = []
-        self._holds: dict[int, int] = {}
-        self._relative: dict[int, tuple[RelativePose, int]] = {}
         self._suspects: IntArray = np.zeros(0, np.int64)
         self._n_updates = 0
         self._misfit = False
@@ -135,7 +115,7 @@ class ISam2SubmapGraph:
         start = time.thread_time()
         if self._solver is None:
             return self._remake(submap, start, rebuilt=False)
-        if self._gauge is None or self._gauge.was_moved_in(submap):
+        if self._ties.gauge is None or self._ties.gauge.was_moved_in(submap):
             logger.info("submap %d changed its gauge: rebuilding its graph", submap.id)
             return self._remake(submap, start, rebuilt=True)
         try:
@@ -225,30 +205,7 @@ class ISam2SubmapGraph:
         SolverError
             If the solver cannot tell a pose's.
         """
-        ids = np.asarray(landmark_ids, np.int64)
-        covariances = np.full((len(ids), 3, 3), np.nan)
-        obs, inside = submap.observations, np.flatnonzero(self._factor_index.rows["admitted"])
-        in_graph = take_mask(
-            obs["landmark"][np.flatnonzero(self._factor_index.rows["factor"] >= 0)], len(submap.landmarks)
-        )
-        wanted = np.intersect1d(ids, self._beside(submap, inside, in_graph, None))
-        if len(wanted) == 0:
-            return covariances
-        views, xyz = self._views_of(submap, wanted, inside, {}), submap.landmarks["xyz_mu"][wanted]
-        sigma = self._factor_index.rows["sigma_px"][views.row]
-        found = triangulation_covariances(submap.K, views.T_submap_kf, views.pose, xyz, views.point, sigma)
-        newest = np.full(len(wanted), -1)
-        np.maximum.at(newest, views.point, obs["kf"][views.row])
-        for k in np.unique(newest).tolist():
-            T, P, of = submap.T_submap_kf[k], self.pose_covariance(k), np.flatnonzero(newest == k)
-            arm = (xyz[of] - T[:3, 3]) @ T[:3, :3]
-            J = np.concatenate((-so3.hat(arm), np.broadcast_to(np.eye(3), (len(of), 3, 3))), axis=2)
-            J = T[:3, :3] @ J
-            found[of] += J @ P @ J.transpose(0, 2, 1)
-        place = np.searchsorted(wanted, ids).clip(max=len(wanted) - 1)
-        mine = wanted[place] == ids
-        covariances[mine] = found[place[mine]]
-        return covariances
+        return triangulated_covariances(submap, landmark_ids, self._factor_index.rows, self.pose_covariance)
 
     # --- for those who want to look inside
 
@@ -283,29 +240,7 @@ class ISam2SubmapGraph:
             known = self._solver is not None and k in self._factor_index.keyframes
             return self._solver.pose(k) if self._solver is not None and known else poses[k]
 
-        gauge = choose_gauge(submap, self._gauge, pose_now)
-        if gauge is not self._gauge:
-            remove += self._gauge_factors
-            graph.push_back(pose_prior(gauge.first, gauge.T_submap_first))
-            if gauge.second is not None:
-                graph.push_back(baseline_factor(gauge.first, gauge.second, gauge.baseline_mu))
-
-        weak = set(plan.weak_keyframes.tolist())
-        known = {k: r for k, r in submap.relative_poses.items() if {k, r.keyframe_id} <= submap.keyframes.keys()}
-        wanted = ((weak | self._forced_holds) & submap.keyframes.keys()) - known.keys()
-        wanted.discard(gauge.first)
-        if gauge.second is not None and gauge.second in wanted and self._n_rows(submap, plan, gauge.second) >= MIN_TIES:
-            wanted.discard(gauge.second)  # the baseline gives it its scale, so that landmarks of two views tie it
-        remove += [factor for k, factor in self._holds.items() if k not in wanted]
-        new_holds = sorted(wanted - self._holds.keys())
-        for k in new_holds:
-            graph.push_back(pose_prior(k, pose_now(k), HOLD_ROTATION_RAD, HOLD_TRANSLATION_MU))
-        kept_relative = {k: (r, f) for k, (r, f) in self._relative.items() if known.get(k) is r}
-        remove += [factor for k, (_, factor) in self._relative.items() if k not in kept_relative]
-        new_relative = sorted(((k, r) for k, r in known.items() if k not in kept_relative), key=itemgetter(0))
-        for k, r in new_relative:
-            graph.push_back(relative_pose(k, r))
-
+        ties = self._ties.changes(graph, submap, plan, pose_now, partial(self._n_rows, submap, plan))
         obs, rows, e = submap.observations, self._factor_index.rows, plan.adding
         K = convert.to_cal3_s2(submap.K)
         order = insert_projections(
@@ -314,8 +249,7 @@ class ISam2SubmapGraph:
         new = plan.new_keyframes
         convert.insert_poses(values, new, np.array([poses[k] for k in new.tolist()]).reshape(-1, 4, 4))
         convert.insert_points(values, plan.new_landmarks, xyz_mu[plan.new_landmarks])
-        kept = {k: factor for k, factor in self._holds.items() if k in wanted}
-        return _Changes(graph, values, remove, gauge, new_holds, kept, new_relative, kept_relative, order)
+        return _Changes(graph, values, remove + ties.remove, ties, order)
 
     def _solve(self, solver: IncrementalSolver, submap: Submap, plan: Plan, changes: _Changes) -> None:
         """Let the solver take the changes in, and note the factor indices that it gives."""
@@ -323,13 +257,7 @@ class ISam2SubmapGraph:
         due = self._n_updates % RELINEARISE_EVERY == 0 or self._misfit
         indices = solver.update(changes.graph, changes.values, changes.remove, newest, due)
         projections = len(indices) - len(changes.order)
-        relative = projections - len(changes.new_relative)
-        holds = relative - len(changes.new_holds)
-        if changes.gauge is not self._gauge:
-            self._gauge, self._gauge_factors = changes.gauge, indices[:holds].tolist()
-        self._holds = changes.kept_holds | dict(zip(changes.new_holds, indices[holds:relative].tolist(), strict=True))
-        taken = zip(changes.new_relative, indices[relative:projections].tolist(), strict=True)
-        self._relative = changes.kept_relative | {k: (known, factor) for (k, known), factor in taken}
+        self._ties.note(changes.ties, indices[:projections])
         factors = np.empty(len(changes.order), np.int64)
         factors[changes.order] = indices[projections:]
         self._factor_index.commit(plan, factors)
@@ -382,7 +310,7 @@ class ISam2SubmapGraph:
             T, xyz_graph = np.array([optimum.poses[k] for k in keyframes.tolist()]), optimum.xyz_mu[landmarks]
         poses = dict(zip(keyframes.tolist(), T, strict=True))
         newest = None if everything else list(submap.keyframes)[-REFINED_KEYFRAMES:]
-        beside = self._beside(submap, inside, in_graph, newest)
+        beside = landmarks_beside(submap, inside, in_graph, newest)
         xyz = (submap.landmarks["xyz_mu"] if optimum is None else optimum.xyz_mu).copy()
         xyz[landmarks] = xyz_graph
         xyz[beside] = self._refined(submap, poses, xyz, beside, inside)
@@ -411,34 +339,20 @@ class ISam2SubmapGraph:
             seconds=time.thread_time() - start,
         )
 
-    def _beside(self, submap: Submap, inside: IntArray, in_graph: BoolArray, newest: list[int] | None) -> IntArray:
-        """Return the admitted landmarks that are no variables: those that keyframes see, or all."""
-        kf, lm = submap.observations["kf"][inside], submap.observations["landmark"][inside]
-        if newest is not None:
-            lm = lm[np.isin(kf, newest)]
-        return np.flatnonzero(take_mask(lm, len(in_graph)) & ~in_graph)
-
     def _refined(
         self, submap: Submap, poses: Mapping[int, FloatArray], xyz_mu: FloatArray, ids: IntArray, inside: IntArray
     ) -> FloatArray:
         """Return landmarks that are no variables as their views have them; `poses` are those that were read now."""
-        views = self._views_of(submap, ids, inside, poses)
+        views = views_of(submap, ids, inside, poses)
         rows, k = self._factor_index.rows, self._robust_k
         uv, sigma = rows["uv_px"][views.row], rows["sigma_px"][views.row]
         return refine_points(submap.K, views.T_submap_kf, views.pose, xyz_mu[ids], views.point, uv, sigma, k)
 
-    def _views_of(self, submap: Submap, ids: IntArray, inside: IntArray, poses: Mapping[int, FloatArray]) -> _Views:
-        obs = submap.observations
-        row = inside[take_mask(ids, len(submap.landmarks))[obs["landmark"][inside]]]
-        row = row[obs["alive"][row]]
-        keyframes, pose = np.unique(obs["kf"][row], return_inverse=True)
-        T = [poses[k] if k in poses else submap.T_submap_kf[k] for k in keyframes.tolist()]
-        return _Views(row, np.array(T).reshape(-1, 4, 4), pose, np.searchsorted(ids, obs["landmark"][row]))
-
     # --- starting again
 
     def _reset(self) -> None:
-        self._solver, self._gauge, self._gauge_factors, self._holds, self._relative = None, None, [], {}, {}
+        self._solver = None
+        self._ties.clear()
         self._suspects = np.zeros(0, np.int64)
         self._factor_index.clear()
 
@@ -449,7 +363,7 @@ class ISam2SubmapGraph:
         if not convert.is_pose_key(failure.key):
             self._factor_index.banned.add(failure.key)
         elif convert.keyframe_of(failure.key) in submap.keyframes:
-            self._forced_holds.add(convert.keyframe_of(failure.key))
+            self._ties.forced.add(convert.keyframe_of(failure.key))
 
     def _remake(
         self, submap: Submap, start: float, rebuilt: bool, iterations: int | None = None, with_all: bool = False
@@ -464,7 +378,7 @@ class ISam2SubmapGraph:
         for attempt in range(REBUILD_ATTEMPTS):
             self._reset()
             if attempt >= REBUILD_ATTEMPTS // 2:
-                self._forced_holds.update(submap.keyframes)
+                self._ties.forced.update(submap.keyframes)
             try:
                 caution = 1.0 + 0.5 * attempt
                 plan, optimum = self._seed(submap, iterations or self._rebuild_iterations, caution, with_all)
@@ -481,7 +395,7 @@ class ISam2SubmapGraph:
         poses: Mapping[int, FloatArray] = submap.T_submap_kf
         xyz = submap.landmarks["xyz_mu"]
         plan = self._factor_index.plan(submap, poses, xyz, caution, strict=False, choose=not with_all)
-        self._hold_loose_pieces(submap, plan)
+        self._ties.hold_loose_pieces(submap, plan)
         batch = self._changes(submap, plan, poses, xyz)
         optimum = optimise_batch(batch.graph, batch.values, plan.new_keyframes, plan.new_landmarks, iterations)
         poses = dict(zip(plan.new_keyframes.tolist(), optimum.T_submap_kf, strict=True))
@@ -489,18 +403,8 @@ class ISam2SubmapGraph:
         xyz[plan.new_landmarks] = optimum.xyz_mu
         # Seen from the optimum, some points are no longer certain, or no longer in front: plan again.
         plan = self._factor_index.plan(submap, poses, xyz, caution)
-        self._hold_loose_pieces(submap, plan)
+        self._ties.hold_loose_pieces(submap, plan)
         solver = IncrementalSolver()
         self._solve(solver, submap, plan, self._changes(submap, plan, poses, xyz))
         self._solver = solver
         return plan, _Optimum(poses, xyz)
-
-    def _hold_loose_pieces(self, submap: Submap, plan: Plan) -> None:
-        """Hold the keyframes of every piece of the graph that is not connected to the gauge."""
-        obs, e = submap.observations, plan.adding
-        ids, label = find_components(obs["kf"][e], obs["landmark"][e])
-        if len(ids) == 0 or label.max() == 0:
-            return
-        first = choose_gauge(submap, None, submap.T_submap_kf.__getitem__).first
-        home = label[ids == first]
-        self._forced_holds.update(ids[label != (home[0] if len(home) else OUTSIDE)].tolist())

@@ -98,12 +98,12 @@ def test_an_untied_keyframe_is_held_then_let_go():
     e = graph.update(submap)
     assert not e.rebuilt
     assert k in e.keyframe_ids
-    assert k in graph._holds
+    assert k in graph._ties.holds
     apply(submap, e)
     features, landmarks = submap.observations["feature"][rows[2:]], submap.observations["landmark"][rows[2:]]
     submap.add_observations(k, features, landmarks)
     assert not graph.update(submap).rebuilt
-    assert k not in graph._holds
+    assert k not in graph._ties.holds
 
 
 def test_an_island_of_keyframes_is_held():
@@ -189,7 +189,7 @@ def test_a_failure_that_names_nothing_or_a_pose(monkeypatch):
     feeder.add(rest[0])
     e = graph.update(feeder.submap)
     assert e.rebuilt
-    assert 2 in graph._holds
+    assert 2 in graph._ties.holds
 
 
 def test_what_cannot_be_rebuilt_is_said_in_our_words(monkeypatch):
