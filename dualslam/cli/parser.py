@@ -94,17 +94,17 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument_group("failure lab").add_argument(
         "--corrupt",
         metavar="FILE",
-        type=Path,
+        type=_path,
         help="YAML list of corruptions and faults for this run (corruptions), as - {kind: blur, start: 50, length: 9}",
     )
     images = parser.add_argument_group("camera")
     camera = images.add_mutually_exclusive_group()
-    camera.add_argument("--camera", metavar="FILE", type=Path, help="calibration, instead of the source's own")
+    camera.add_argument("--camera", metavar="FILE", type=_path, help="calibration, instead of the source's own")
     camera.add_argument("--fov", metavar="DEGREES", type=_angle, help="horizontal field of view, without a calibration")
     images.add_argument("--full-size", action="store_true", help="read images of more than 2048 pixels as they are")
     saved = parser.add_argument_group("saved map")
     saved.add_argument(
-        "--map", metavar="DIR", type=Path, help="run folder whose map this run finds its frames in, and extends"
+        "--map", metavar="DIR", type=_path, help="run folder whose map this run finds its frames in, and extends"
     )
     saved.add_argument("--localise", action="store_true", help="find poses in the map of --map, and add nothing to it")
     mode = parser.add_argument_group("mode")
@@ -133,34 +133,34 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
 
 def _add_eval(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser, _ = _command(commands, "eval", "Score a run against ground truth: coverage first, then ATE and RPE.")
-    parser.add_argument("run", metavar="RUN", type=Path, help="a run folder, or a trajectory in TUM format")
+    parser.add_argument("run", metavar="RUN", type=_path, help="a run folder, or a trajectory in TUM format")
     parser.add_argument("sequence", metavar="SEQUENCE", help="the sequence with its ground truth")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def _add_compare(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser, _ = _command(commands, "compare", "Put runs side by side: a table here, and a page with their pictures.")
-    parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help="run folders")
+    parser.add_argument("runs", metavar="RUN", type=_path, nargs="+", help="run folders")
     parser.add_argument(
-        "--out", metavar="FILE", type=Path, default=Path("compare.html"), help="page to write (default: compare.html)"
+        "--out", metavar="FILE", type=_path, default=Path("compare.html"), help="page to write (default: compare.html)"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace the page that is there")
 
 
 def _add_view(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser, _ = _command(commands, "view", "Play a run in the Rerun viewer: camera, map, statuses, numbers, events.")
-    parser.add_argument("run", metavar="RUN", type=Path, help="a run folder")
-    parser.add_argument("--save", metavar="FILE", type=Path, help="write the recording (.rrd) instead of opening it")
+    parser.add_argument("run", metavar="RUN", type=_path, help="a run folder")
+    parser.add_argument("--save", metavar="FILE", type=_path, help="write the recording (.rrd) instead of opening it")
     parser.add_argument("--overwrite", action="store_true", help="replace the recording that is there")
 
 
 def _add_export(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser, _ = _command(commands, "export", "Write the map of a run in the format of another program.")
-    parser.add_argument("run", metavar="RUN", type=Path, help="a run folder")
+    parser.add_argument("run", metavar="RUN", type=_path, help="a run folder")
     parser.add_argument(
         "--to", choices=EXPORTS, required=True, help="colmap and nerfstudio are folders, the others a file"
     )
-    parser.add_argument("--out", metavar="PATH", type=Path, required=True, help="folder or file to write")
+    parser.add_argument("--out", metavar="PATH", type=_path, required=True, help="folder or file to write")
     parser.add_argument("--overwrite", action="store_true", help="replace what is there")
     parser.add_argument(
         "--distance",
@@ -177,7 +177,7 @@ def _add_export(commands: argparse._SubParsersAction[_Parser]) -> None:
 
 def _add_scale(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser, _ = _command(commands, "scale", "Tell a map how long its unit is: its exports are in metres from then on.")
-    parser.add_argument("run", metavar="RUN", type=Path, help="a run folder")
+    parser.add_argument("run", metavar="RUN", type=_path, help="a run folder")
     known = parser.add_mutually_exclusive_group(required=True)
     known.add_argument(
         "--distance",
@@ -212,7 +212,7 @@ def _add_render(commands: argparse._SubParsersAction[_Parser]) -> None:
     _add_output(parser)
     parser.add_argument("--frames", metavar="N", type=_positive, default=300, help="how many (default: 300)")
     parser.add_argument("--seed", metavar="N", type=_count, default=0, help="which world and path (default: 0)")
-    parser.add_argument("--events", metavar="FILE", type=Path, help="YAML list of blur, black-out, ... to inject")
+    parser.add_argument("--events", metavar="FILE", type=_path, help="YAML list of blur, black-out, ... to inject")
 
 
 def _add_config(commands: argparse._SubParsersAction[_Parser]) -> None:
@@ -222,7 +222,7 @@ def _add_config(commands: argparse._SubParsersAction[_Parser]) -> None:
 
 def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser, talk = _command(commands, "demo", "Lose track in a synthetic street: recovery off against on.")
-    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/demo"), help="default: runs/demo")
+    parser.add_argument("--out", metavar="DIR", type=_path, default=Path("runs/demo"), help="default: runs/demo")
     parser.add_argument("--overwrite", action="store_true", help="replace the runs that are there")
     parser.add_argument("--frames", metavar="N", type=_positive, default=170, help="how long a drive (default: 170)")
     talk.add_argument("--profile", action="store_true", help="print where the time went, stage by stage")
@@ -231,9 +231,9 @@ def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> None:
 
 def _add_bench(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser, _ = _command(commands, "bench", "Run trials of sequences, variants and corruptions, and write the tables.")
-    parser.add_argument("spec", metavar="SPEC", type=Path, help="YAML file, such as benchmarks/kitti.yaml")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="folder; a bench goes on there (default: runs/NAME)")
-    parser.add_argument("--data", metavar="DIR", type=Path, help="folder in which the sequences of the bench are")
+    parser.add_argument("spec", metavar="SPEC", type=_path, help="YAML file, such as benchmarks/kitti.yaml")
+    parser.add_argument("--out", metavar="DIR", type=_path, help="folder; a bench goes on there (default: runs/NAME)")
+    parser.add_argument("--data", metavar="DIR", type=_path, help="folder in which the sequences of the bench are")
     parser.add_argument("--only", metavar="SEQUENCE", action="append", default=[], help="this sequence; repeatable")
     parser.add_argument("--trials", metavar="N", type=_positive, help="of each sequence and condition, over the spec's")
     parser.add_argument(
@@ -247,7 +247,7 @@ def _add_bench(commands: argparse._SubParsersAction[_Parser]) -> None:
 
 
 def _add_output(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
+    parser.add_argument("--out", metavar="DIR", type=_path, required=True, help="folder to write")
     parser.add_argument("--overwrite", action="store_true", help="replace what is there")
 
 
@@ -258,7 +258,9 @@ def _add_configuration(parser: argparse.ArgumentParser) -> None:
 
 def _add_fields(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     group = parser.add_argument_group("configuration")
-    group.add_argument("--config", metavar="FILE", type=Path, help="YAML file; what it does not name keeps its default")
+    group.add_argument(
+        "--config", metavar="FILE", type=_path, help="YAML file; what it does not name keeps its default"
+    )
     group.add_argument(
         "--set", metavar="KEY.PATH=VALUE", action="append", default=[], help="set one field, over the file; repeatable"
     )
@@ -273,6 +275,12 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--stride", metavar="N", type=_positive, default=1, help="take every N-th frame")
     group.add_argument("--max-frames", metavar="N", type=_positive, help="at most so many")
     group.add_argument("--reverse", action="store_true", help="read the same frames last to first")
+
+
+def _path(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("is empty; name a file or a folder")
+    return Path(text)
 
 
 def _integer(text: str, at_least: int) -> int:

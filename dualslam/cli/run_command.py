@@ -17,7 +17,7 @@ from dualslam.io.atomic import atomic_file
 from dualslam.io.reduced import MAX_SIDE_PX
 from dualslam.io.sequence import RecordedSequence
 from dualslam.run.focal import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
-from dualslam.run.session import Outcome, run_to_folder
+from dualslam.run.session import Outcome, check_out, run_to_folder
 from dualslam.run.sources import open_source
 from dualslam.viewer.live import LiveView
 
@@ -31,6 +31,7 @@ def execute(args: argparse.Namespace) -> int:
     if args.localise and args.map is None:
         raise InputError("--localise finds poses in a saved map: name its run folder with --map.")
     config = config_of(args)
+    check_out(args.out, overwrite=args.overwrite, saved_map=args.map)  # before a search for the camera
     selection = {
         "start": args.start,
         "stride": args.stride,

@@ -19,6 +19,7 @@ from dualslam.core.errors import InputError, OutputError
 from dualslam.core.events import Event
 from dualslam.core.types import FrameStatus
 from dualslam.io.atomic import atomic_file, write_text
+from dualslam.io.folder_lock import FolderLock
 from dualslam.io.map_files import to_plain
 from dualslam.io.trajectory_files import Trajectory, read_text, write_kitti, write_tum
 from dualslam.map.frame_records import FrameRow as FrameRow  # a row of frames.csv
@@ -97,25 +98,22 @@ class RunFolder:
     Raises
     ------
     OutputError
-        If there is an earlier run (or files of its names) and `overwrite` is not set, or the folder cannot be made.
+        As `check_vacant` says, or if another run is writing there, or the folder cannot be made.
     """
 
     def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
         self.path = Path(path)
         self._events: IO[str] | None = None
+        check_vacant(self.path, overwrite=overwrite)
         try:
-            present = _run_files(self.path)
-            if present and not overwrite:
-                raise OutputError(
-                    f"{self.path} holds {present[0].relative_to(self.path)} already; "
-                    "choose another folder, or say that it may be overwritten (--overwrite)."
-                )
             self.path.mkdir(parents=True, exist_ok=True)
-            for file in present:
-                file.unlink()
+            self._lock = FolderLock(self.path)
+            for file in _run_files(self.path):
+                if file.name != EVENTS:  # by which the next one knows that this is a run's folder
+                    file.unlink()
             self._events = (self.path / EVENTS).open("w", encoding="utf-8", newline="\n")
         except OSError as e:
-            raise OutputError(f"{self.path} cannot be written to: {e.strerror or e}; choose another folder.") from e
+            raise _not_writable(self.path, e) from e
 
     @property
     def map_path(self) -> Path:
@@ -193,16 +191,45 @@ class RunFolder:
                 file.unlink()
 
     def close(self) -> None:
-        """Close the event file; more than once does no harm."""
+        """Close the event file and let another run in; more than once does no harm."""
         if self._events is not None:
             self._events.close()
             self._events = None
+        self._lock.release()
 
     def __enter__(self) -> RunFolder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
+
+
+def check_vacant(path: Path, *, overwrite: bool) -> None:
+    """Refuse a folder that a run must not write to. It changes nothing: to be asked before long work, too.
+
+    Raises
+    ------
+    OutputError
+        If there is an earlier run (or files of its names) and `overwrite` is not set; if there are files of its names
+        and no run has written them, such as the ``groundtruth.txt`` of a sequence; or if it is a file.
+    """
+    try:
+        present = _run_files(path)
+        if path.exists() and not path.is_dir():
+            raise OutputError(f"{path} cannot be written to: it is a file; choose another folder.")
+    except OSError as e:
+        raise _not_writable(path, e) from e
+    if not present:
+        return
+    held = f"{path} holds {present[0].relative_to(path)} already"
+    if not (path / EVENTS).exists():
+        raise OutputError(f"{held}, and that is no run's (there is no {EVENTS}); choose another folder.")
+    if not overwrite:
+        raise OutputError(f"{held}; choose another folder, or say that it may be overwritten (--overwrite).")
+
+
+def _not_writable(path: Path, error: OSError) -> OutputError:
+    return OutputError(f"{path} cannot be written to: {error.strerror or error}; choose another folder.")
 
 
 # --- reading

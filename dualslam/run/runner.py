@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import resource
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from types import FrameType
 from typing import Any, Protocol
 
-from dualslam.core.errors import InputError
+from dualslam.core.errors import InputError, OutputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult
 from dualslam.pace import Pace
+from dualslam.run.interrupts import Interrupts
 from dualslam.run.schedule import Schedule, prepared
 
 PAUSE_S = 0.05
@@ -61,8 +59,8 @@ class RunReport:
         Highest resident memory of the process since it started, and of the largest of its children that have ended.
     interrupted : bool
         True where a signal ended the run early.
-    error : InputError or None
-        What ended the source early.
+    error : InputError, OutputError or None
+        What ended the source early, or kept its results from being written.
     bug : Exception or None
         What the system raised, which ended the run: its maker's mistake, no property of the input.
     """
@@ -76,7 +74,7 @@ class RunReport:
     cpu_s: float
     peak_rss_mb: float
     interrupted: bool
-    error: InputError | None
+    error: InputError | OutputError | None
     bug: Exception | None
 
     @property
@@ -94,14 +92,16 @@ def run_sequence(
     pace: Pace | None = None,
     on_frame: Callable[[FrameResult], None] | None = None,
     is_paused: Callable[[], bool] | None = None,
+    interrupts: Interrupts | None = None,
     clock: Callable[[], float] = time.perf_counter,
     sleep: Callable[[float], None] = time.sleep,
 ) -> RunReport:
     """Feed a system all frames of a sequence, then finish it.
 
-    The first SIGINT or SIGTERM ends the run after the frame in hand, so that what there is can be saved; the second one
-    acts as ever. A source that breaks after its first frame ends the run in the same way, and so does a system that
-    raises; what it raised is in the report, for the caller to raise again once the rest is saved.
+    The first SIGINT, SIGTERM or SIGHUP ends the run after the frame in hand, so that what there is can be saved; the
+    second one leaves this frame, or the end of the run, too; the third one acts as ever. A source that breaks after its
+    first frame ends the run in the same way, and so do a system that raises and a disk that is full; what was raised is
+    in the report, for the caller to raise again once the rest is saved.
 
     Parameters
     ----------
@@ -120,6 +120,8 @@ def run_sequence(
         Called with the result of each step.
     is_paused : callable, optional
         Asked before each frame; the run waits for as long as it says so, or until a signal ends it.
+    interrupts : Interrupts, optional
+        Entered already, where the caller has more to do that signals must not end.
     clock, sleep : callables
         For tests.
 
@@ -140,21 +142,24 @@ def run_sequence(
     if realtime:
         frames = prepared(schedule.hand_out(source, dropped), prepare, schedule, clock)
     steps = _Steps(system, schedule if realtime else None, pace, on_frame, clock)
-    with _stop_on_signal() as stop, _switching_quickly(realtime):
+    with Interrupts() if interrupts is None else nullcontext(interrupts) as stop, _switching_quickly(realtime):
 
         def may_go_on() -> bool:
-            while is_paused is not None and is_paused() and not stop.is_set():
+            while is_paused is not None and is_paused() and not stop.asked:
                 sleep(PAUSE_S)
-            return not stop.is_set()
+            return not stop.asked
 
-        with _closing(source), _closing(frames):
+        with stop.leave_at_second(), _closing(source), _closing(frames):
             while may_go_on() and steps.take_next(frames):
                 pass
-        interrupted = stop.is_set()
+        interrupted = stop.asked
         if not steps.latencies_ms and not interrupted:
             raise InputError(f"{sequence.name} gave no frame; check the source and which frames were asked for.")
         try:
-            system.finish(interrupted=interrupted)
+            with stop.leave_at_second():
+                system.finish(interrupted=interrupted)
+        except OutputError as problem:
+            steps.error = steps.error or problem
         except Exception as problem:
             steps.bug = steps.bug or problem  # a system that broke may well break again here: the first one tells why
     return RunReport(
@@ -190,7 +195,7 @@ class _Steps:
         self._on_frame, self._clock = on_frame, clock
         self.latencies_ms: list[float] = []
         self.steps_ms: list[float] = []
-        self.error: InputError | None = None
+        self.error: InputError | OutputError | None = None
         self.bug: Exception | None = None
 
     def take_next(self, frames: Iterator[tuple[Frame, float]]) -> bool:
@@ -213,9 +218,12 @@ class _Steps:
         result = self._step(frame, spent_s)
         if result is None:
             return False
-        if self._on_frame is not None:
-            self._on_frame(replace(result, latency_ms=self.latencies_ms[-1]))
-        return True
+        try:
+            if self._on_frame is not None:
+                self._on_frame(replace(result, latency_ms=self.latencies_ms[-1]))
+        except OutputError as problem:
+            self.error = problem
+        return self.error is None
 
     def _step(self, frame: Frame, spent_s: float) -> FrameResult | None:
         """Return the result of one step, None if it raised; `spent_s`: how long the frame was prepared."""
@@ -226,6 +234,9 @@ class _Steps:
         try:
             result = self._system.step(frame)
             pose_ms = None if self._schedule is None else result.pose_ms
+        except OutputError as problem:
+            self.error = problem
+            return None
         except Exception as problem:
             self.bug = problem
             return None
@@ -255,31 +266,6 @@ def _closing(frames: Iterator[Any]) -> Iterator[None]:
         close = getattr(frames, "close", None)
         if close is not None:
             close()
-
-
-@contextmanager
-def _stop_on_signal() -> Iterator[threading.Event]:
-    """Turn the first SIGINT or SIGTERM into an event; outside the main thread, where no signal comes, do nothing."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-    def handle(number: int, stack: FrameType | None) -> None:
-        stop.set()
-        restore()
-
-    for number in before:
-        signal.signal(number, handle)
-    try:
-        yield stop
-    finally:
-        restore()
 
 
 def _cpu_s() -> float:

@@ -20,12 +20,13 @@ from dualslam.core.interfaces import Sequence
 from dualslam.core.threads import spare_cores
 from dualslam.core.types import Frame
 from dualslam.io.map_store import load_atlas, save_atlas
-from dualslam.io.run_folder import RunFolder, RunRecord
+from dualslam.io.run_folder import RunFolder, RunRecord, check_vacant
 from dualslam.io.sequence import Selection
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.lab.disturbances import corrupted
 from dualslam.map.frame_records import FrameResult
 from dualslam.report import SampleKeeper, read_run, report_page
+from dualslam.run.interrupts import Interrupts
 from dualslam.run.results import frame_rows, summarise, trajectories_of, truth_of_frames
 from dualslam.run.runner import RunReport, run_sequence
 from dualslam.system import System
@@ -129,8 +130,7 @@ def run_to_folder(
     if focal is not None:
         given["focal_search"] = focal.as_dict()
     sequence = corrupted(sequence, config.corruptions)
-    if saved_map is not None and Path(out).resolve() == Path(saved_map).resolve():
-        raise InputError(f"{out} holds the map that this run is to continue; give another folder to write to.")
+    check_out(out, overwrite=overwrite, saved_map=saved_map)
     if saved_map is not None:
         saved = load_atlas(saved_map)
         system = build_system(config, sequence.camera, saved=saved, localise=localise)
@@ -150,31 +150,47 @@ def run_to_folder(
         if realtime and isinstance(system.desk, WorkerDesk):
             system.desk.wait_until_ready()
         watched = _Watched(system, SampleKeeper(folder.write_sample), watcher)
-        report = run_sequence(
-            watched,
-            sequence,
-            realtime=realtime,
-            prepare=prepare,
-            pace=system.pace,
-            on_frame=after_frame,
-            is_paused=None if watcher is None else watcher.is_paused,
-        )
-        if report.interrupted and system.rows:
-            last = next(reversed(system.rows.values()))
-            system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap)
-        _write_new_events(system, folder, n_events)
-        try:
-            summary = _write_results(system, report, config, sequence, folder, given)
-        except Exception as error:
-            if report.bug is None:
-                raise
-            raise report.bug from error  # the map of a system that broke may be in pieces
+        with Interrupts() as interrupts:
+            report = run_sequence(
+                watched,
+                sequence,
+                realtime=realtime,
+                prepare=prepare,
+                pace=system.pace,
+                on_frame=after_frame,
+                is_paused=None if watcher is None else watcher.is_paused,
+                interrupts=interrupts,
+            )
+            if report.interrupted and system.rows:
+                last = next(reversed(system.rows.values()))
+                system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap)
+            try:
+                _write_new_events(system, folder, n_events)
+                summary = _write_results(system, report, config, sequence, folder, given)
+            except Exception as error:
+                if report.bug is None:
+                    raise
+                raise report.bug from error  # the map of a system that broke may be in pieces
+    if not report.interrupted:
+        interrupts.act_late()
     if report.bug is not None:
         report.bug.add_note(f"What was found until then is in {out}.")
         raise report.bug
     if report.error is not None:
-        raise InputError(f"{report.error} What was found until then is in {out}.")
+        raise type(report.error)(f"{report.error} What was found until then is in {out}.")
     return Outcome(Path(out), summary, report, system)
+
+
+def check_out(out: str | Path, *, overwrite: bool = False, saved_map: str | Path | None = None) -> None:
+    """Refuse a folder that a run must not write to. `run_to_folder` asks too: this is for who computes before it.
+
+    Raises
+    ------
+    InputError, OutputError
+    """
+    if saved_map is not None and Path(out).resolve() == Path(saved_map).resolve():
+        raise InputError(f"{out} holds the map that this run is to continue; give another folder to write to.")
+    check_vacant(Path(out), overwrite=overwrite)
 
 
 def _given(sequence: Sequence, realtime: bool) -> dict[str, Any]:
@@ -237,10 +253,10 @@ class _Watched:
         return result
 
     def finish(self, interrupted: bool = False) -> None:
-        self._samples.finish()
         self._system.finish(interrupted)
         if self._watcher is not None:
             self._watcher.end()
+        self._samples.finish()
 
 
 def _write_new_events(system: System, folder: RunFolder, n_written: int) -> int:

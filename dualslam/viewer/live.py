@@ -15,6 +15,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 
 from dualslam.core.errors import InputError, OutputError
+from dualslam.core.processes import start_undisturbed
 from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult
 from dualslam.system import System
@@ -60,7 +61,7 @@ class LiveView:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, port), daemon=True, name="dualslam live view")
-        self._process.start()
+        start_undisturbed(self._process)
         theirs.close()
         self.url = self._await_start()
         self._teller: Teller | None = None

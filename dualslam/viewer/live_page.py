@@ -6,7 +6,6 @@ Handles are updated, never added again: a submap has one cloud and one set of li
 from __future__ import annotations
 
 import os
-import signal
 import socket
 from collections import deque
 from contextlib import redirect_stdout
@@ -54,7 +53,6 @@ def serve(pipe: Connection, port: int) -> None:
     port : int
         0: a free one.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run decides
     with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):  # of viser: the run says where the page is
         _serve(pipe, port)
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
-import signal
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -29,6 +28,7 @@ from typing import Any
 
 from dualslam.core.errors import ConfigError
 from dualslam.core.memory import keep_freed_memory, peak_rss_mb
+from dualslam.core.processes import start_undisturbed
 from dualslam.core.types import Failure, FailureReason
 from dualslam.workers.jobs import Ended, Handlers, JobKind
 from dualslam.workers.transport import Channel
@@ -75,7 +75,7 @@ class Worker:
         self._connection, theirs = context.Pipe()
         process = context.Process(target=serve, args=(theirs, make_handlers, niceness), name=name, daemon=True)
         self._process = process
-        self._process.start()
+        start_undisturbed(process)
         theirs.close()
         self._jobs: SimpleQueue[tuple[JobKind, Any] | None] = SimpleQueue()
         self._results: SimpleQueue[_Answer] = SimpleQueue()
@@ -144,8 +144,6 @@ class Worker:
 
 def serve(connection: Connection, make_handlers: MakeHandlers, niceness: int = 0) -> None:
     """Do jobs until the other end of the pipe is closed: what a worker process does."""
-    # An interrupt at the terminal reaches all processes; what becomes of the run is the first one's affair.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     if niceness:
         os.nice(niceness)
     keep_freed_memory()

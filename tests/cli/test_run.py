@@ -15,8 +15,11 @@ import pytest
 
 from dualslam.cli import main
 from dualslam.config.files import load_config
+from dualslam.core.errors import OutputError
+from dualslam.core.events import Event, EventKind
 from dualslam.core.types import Frame
-from dualslam.io.map_store import load_atlas
+from dualslam.io.map_store import load_atlas, save_atlas
+from dualslam.io.run_folder import RunFolder, read_events
 from dualslam.lab.synthetic import SyntheticSequence
 from dualslam.run.results import versions
 from dualslam.run.sources import open_source
@@ -95,6 +98,15 @@ def test_an_earlier_run_is_not_overwritten_without_being_told(
     assert captured.out == captured.err == ""
 
 
+def test_a_folder_that_is_taken_is_refused_before_the_camera_is_searched_for(
+    folder: Path, fake: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", str(folder), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    monkeypatch.setattr("dualslam.cli.run_command.with_camera_found", lambda *_: pytest.fail("long work for nothing"))
+    assert main(["run", str(folder / "images"), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+
 def test_the_frames_that_were_asked_for(folder: Path, fake: Install, tmp_path: Path) -> None:
     options = ["--start", "3", "--stride", "2", "--max-frames", "4", "--reverse", "--quiet"]
     assert main(["run", str(folder), "--out", str(tmp_path / "run"), *options]) == 0
@@ -137,6 +149,57 @@ def test_an_interrupted_run_keeps_what_it_has(
     events = (tmp_path / "run" / "events.jsonl").read_text().splitlines()
     assert json.loads(events[-1])["event"] == "interrupted"
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["interrupted"] is True
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_who_interrupts_twice_keeps_it_too(folder: Path, fake: Install, tmp_path: Path, number: int) -> None:
+    def interrupt(frame: Frame) -> None:
+        if frame.index == 6:
+            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), number)
+            pytest.fail("the second one leaves the frame in hand")
+
+    fake(before_step=interrupt)
+    assert main(["run", str(folder), "--out", str(tmp_path / "run"), "--quiet"]) == 130
+    assert len(rows_of(tmp_path / "run")) == 6
+    assert set(load_atlas(tmp_path / "run").poses) == set(range(6))
+
+
+def test_an_interrupt_while_results_are_written_waits_for_them(
+    folder: Path, fake: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*args: object) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        save_atlas(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("dualslam.run.session.save_atlas", interrupted)
+    assert main(["run", str(folder), "--out", str(tmp_path / "run")]) == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert len(load_atlas(tmp_path / "run").poses) == N_FRAMES
+    assert (tmp_path / "run" / "report.html").exists()
+
+
+def test_a_disk_that_is_full_for_a_while_ends_the_run_and_costs_nothing_else(
+    folder: Path, fake: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    append, full = RunFolder.append_event, [True]
+
+    def fill_up(written_to: RunFolder, event: Event) -> None:
+        if event.event is EventKind.FAILED and full.pop():
+            raise OutputError("events.jsonl cannot be written: No space left on device.")
+        append(written_to, event)
+
+    fake(lost=(6, 7))
+    full.insert(0, False)
+    monkeypatch.setattr(RunFolder, "append_event", fill_up)
+    out = tmp_path / "run"
+    assert main(["run", str(folder), "--out", str(out)]) == 2
+    said = (
+        f"dualslam: events.jsonl cannot be written: No space left on device. What was found until then is in {out}.\n"
+    )
+    assert capsys.readouterr().err == said
+    assert len(rows_of(out)) == 7
+    assert [event["event"] for event in read_events(out / "events.jsonl")] == ["initialised", "failed"]
 
 
 def test_a_bug_in_the_system_leaves_its_log_in_the_run_folder(

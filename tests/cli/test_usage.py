@@ -31,6 +31,7 @@ def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
         ("rum", "invalid choice: 'rum'"),
         ("run", "SOURCE, --out"),
         ("run here", "--out"),
+        ("run here --out=", "argument --out: is empty"),
         ("run here --out there --fov 200", "between 1 and 180 degrees, not '200'"),
         ("run here --out there --fov 70 --camera c.txt", "not allowed with"),
         ("run here --out there --inline --workers 2", "not allowed with"),

@@ -12,7 +12,7 @@ from dualslam.core.errors import InputError, OutputError
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.types import FrameStatus
 from dualslam.io import FrameRow, RunFolder, RunRecord, Trajectory, read_kitti, read_tum
-from dualslam.io.run_folder import read_events, read_frames, unlinked_submaps
+from dualslam.io.run_folder import check_vacant, read_events, read_frames, unlinked_submaps
 
 ROWS = [
     FrameRow(0, 0.1, FrameStatus.INITIALISING, None, False, 0, 0, 12.3456),
@@ -106,6 +106,32 @@ def test_nothing_is_overwritten_without_being_told(tmp_path: Path) -> None:
         pass
     left = sorted(str(p.relative_to(path)) for p in path.rglob("*") if p.is_file())
     assert left == ["console.log", "events.jsonl", "map/mine.doc"], "only what runs write was removed"
+
+
+def test_files_that_no_run_has_written_are_never_overwritten(tmp_path: Path) -> None:
+    """A TUM RGB-D sequence holds a ``groundtruth.txt``: a run that is sent there must not take it for its own."""
+    (tmp_path / "groundtruth.txt").write_text("precious")
+    with pytest.raises(OutputError, match=r"holds groundtruth.txt already, and that is no run's"):
+        RunFolder(tmp_path, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["groundtruth.txt"]
+
+
+def test_one_run_at_a_time_writes_to_a_folder(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "run") as first:
+        first.write_config("mine: 1\n")
+        with pytest.raises(OutputError, match="run is being written to by another run"):
+            RunFolder(tmp_path / "run", overwrite=True)
+        assert (first.path / "config.yaml").read_text() == "mine: 1\n"
+    RunFolder(tmp_path / "run", overwrite=True).close()
+
+
+def test_asking_changes_nothing(tmp_path: Path) -> None:
+    check_vacant(tmp_path / "run", overwrite=False)
+    assert list(tmp_path.iterdir()) == []
+    RunFolder(tmp_path / "run").close()
+    check_vacant(tmp_path / "run", overwrite=True)
+    with pytest.raises(OutputError, match="--overwrite"):
+        check_vacant(tmp_path / "run", overwrite=False)
 
 
 def test_places_that_cannot_be_used(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from threading import Thread
 
+from dualslam.core.processes import hear_interrupts, start_undisturbed
 from dualslam.core.threads import limit_threads
 from dualslam.lab.bench.plan import Trial
 from dualslam.lab.bench.record import TrialOutcome, TrialRecord, blank_record
@@ -78,7 +79,7 @@ def _start(run_trial: RunTrial, workers: list[_Worker]) -> _Worker:
     ours, theirs = context.Pipe()
     # Not a daemon: a trial may have a recovery process of its own.
     process = context.Process(target=_serve, args=(run_trial, theirs), name="dualslam-trial")
-    process.start()
+    start_undisturbed(process)
     theirs.close()
     workers.append(_Worker(process, ours))
     return workers[-1]
@@ -106,6 +107,7 @@ def _serve(run_trial: RunTrial, pipe: Connection) -> None:
     """Run trials until the other end of the pipe is closed, or someone interrupts."""
     Thread(target=_end_with_the_bench, daemon=True).start()
     with suppress(EOFError, BrokenPipeError, KeyboardInterrupt):
+        hear_interrupts()  # a trial ends by itself
         while True:
             pipe.send(run_trial(pipe.recv()))
 

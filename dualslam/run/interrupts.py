@@ -1,0 +1,71 @@
+"""Signals that end a run, so that what it has found is kept however impatient the user is."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Interrupts:
+    """Takes the signals that end a run, while it is entered; each asks for more than the one before.
+
+    The first one asks for no further frame (`asked`). The second one leaves what is in hand, too, where the code says
+    that this may be left (`leave_at_second`). The third one acts as it would without us. What a parent process has told
+    us to ignore stays ignored (nohup). Outside the main thread, where no signal comes, nothing is done.
+    """
+
+    def __init__(self) -> None:
+        self._n = 0
+        self._last = 0
+        self._may_leave = False
+        self._before: dict[int, Any] = {}
+
+    @property
+    def asked(self) -> bool:
+        """Whether the run is to end."""
+        return self._n > 0
+
+    @contextmanager
+    def leave_at_second(self) -> Iterator[None]:
+        """Let the second signal leave this block, by an exception that is not seen outside."""
+        self._may_leave = True
+        try:
+            yield
+        except KeyboardInterrupt:
+            if not self.asked:
+                raise
+        finally:
+            self._may_leave = False
+
+    def act_late(self) -> None:
+        """Have the last signal act after all, where it came too late to end the run; to be called when all is left."""
+        if self.asked:
+            signal.raise_signal(self._last)
+
+    def __enter__(self) -> Interrupts:
+        if threading.current_thread() is threading.main_thread():
+            known = {number: signal.getsignal(number) for number in ENDING}
+            self._before = {number: old for number, old in known.items() if old is not signal.SIG_IGN}
+            for number in self._before:
+                signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, old in self._before.items():
+            signal.signal(number, old)
+        self._before = {}
+
+    def _handle(self, number: int, stack: FrameType | None) -> None:
+        self._n, self._last = self._n + 1, number
+        if self._n > 2:
+            self.__exit__()
+            signal.raise_signal(number)
+        elif self._n == 2 and self._may_leave:
+            self._may_leave = False
+            raise KeyboardInterrupt

@@ -1,0 +1,53 @@
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from dualslam.run.interrupts import ENDING, Interrupts
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_the_first_asks_the_second_leaves_and_the_third_acts_as_ever(number: signal.Signals) -> None:
+    came: list[int] = []
+    before = signal.signal(number, lambda got, _: came.append(got))
+    try:
+        with Interrupts() as interrupts:
+            with interrupts.leave_at_second():
+                signal.raise_signal(number)
+                assert interrupts.asked
+                signal.raise_signal(number)
+                pytest.fail("the second one leaves")
+            assert came == []
+            signal.raise_signal(number)
+            assert came == [number]
+    finally:
+        signal.signal(number, before)
+
+
+def test_what_must_not_be_left_is_not() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with Interrupts() as interrupts:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        with interrupts.leave_at_second():
+            pass
+    assert signal.getsignal(signal.SIGINT) is before
+    with pytest.raises(KeyboardInterrupt):
+        interrupts.act_late()
+
+
+def test_an_interrupt_that_is_none_of_ours_goes_through() -> None:
+    with pytest.raises(KeyboardInterrupt), Interrupts() as interrupts, interrupts.leave_at_second():
+        raise KeyboardInterrupt
+    interrupts.act_late()
+
+
+def test_what_is_ignored_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with Interrupts() as interrupts:
+            signal.raise_signal(signal.SIGHUP)
+            assert not interrupts.asked
+    finally:
+        signal.signal(signal.SIGHUP, before)
