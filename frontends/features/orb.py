@@ -174,6 +174,10 @@ class OrbFrontend(OptionedFrontend):
         """Hamming distance of paired descriptors (N, 32), (N, 32) uint8 -> (N,) float64, 0 to 256."""
         return hamming_distance(a, b)
 
+    def distances(self, a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
+        """`distance` of all pairs (N, 32), (M, 32) -> (N, M)."""
+        return hamming_matrix(a, b).astype(np.float64)
+
     def match_wide(self, a: Features, b: Features) -> Matches:
         """Compare all with all: mutually nearest, clearly so, within `max_distance_strict`, turned alike."""
         found = mutual_best(

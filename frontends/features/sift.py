@@ -140,6 +140,10 @@ class SiftFrontend(OptionedFrontend):
             squared[rows] = np.einsum("ij,ij->i", step, step)
         return np.asarray(np.sqrt(squared) / UNIT, np.float64)
 
+    def distances(self, a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
+        """`distance` of all pairs (N, 128), (M, 128) -> (N, M)."""
+        return np.asarray(np.sqrt(_squared_matrix(a, b).astype(np.float64)) / UNIT, np.float64)
+
     def match_wide(self, a: Features, b: Features) -> Matches:
         """Compare all with all: mutually nearest, clearly so, within `max_distance_strict`, turned alike."""
         limit = (self.max_distance_strict * UNIT) ** 2

@@ -19,6 +19,7 @@ from dualslam.core.chi_square import CHI2_99
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray
+from dualslam.frontends.features.all_pairs import all_distances
 from dualslam.frontends.features.groups import rank_in_runs
 from dualslam.frontends.gates import MIN_CONSENSUS
 from dualslam.frontends.tracking.resection import resect
@@ -168,7 +169,7 @@ def _alike(frontend: Frontend, a: NDArray[np.generic], b: NDArray[np.generic]) -
     """Return all pairs of rows that look alike: for each of a the `N_ALIKE` nearest of b that are near enough."""
     if not len(a) or not len(b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    distance = np.stack([frontend.distance(np.broadcast_to(row, b.shape), b) for row in a])
+    distance = all_distances(frontend, a, b)
     i, j = np.nonzero(distance <= frontend.max_distance_strict)
     nearest_first = np.lexsort((distance[i, j], i))
     i, j = i[nearest_first], j[nearest_first]
