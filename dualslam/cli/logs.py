@@ -21,8 +21,9 @@ def set_up(verbose: int, quiet: bool) -> None:
     logging.basicConfig(level=level, handlers=[_held or stream], force=True)
     if verbose < 2:
         logging.getLogger("matplotlib").setLevel(logging.WARNING)
-        # OpenCV writes to stderr by itself; it reads this when it is imported.
+        # OpenCV writes to stderr by itself, and so does its decoder of videos; they read this when they begin.
         os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 def release() -> None:

@@ -28,6 +28,8 @@ _PLAIN_WORDS = {
     "a valid boolean": "true or false",
     "a valid array": "a list",
     "a valid list": "a list",
+    "tuple should have": "must have",
+    " after validation": "",
 }
 
 
@@ -159,9 +161,11 @@ def _sentence(problem: Any, path: tuple[str | int, ...], root: type[BaseModel]) 
     if problem["type"] == "missing":
         return f"{name} is missing"
     message = str(problem["msg"]).removeprefix("Value error, ").replace("Input should be", "must be")
+    message = message[:1].lower() + message[1:]
     for jargon, plain in _PLAIN_WORDS.items():
         message = message.replace(jargon, plain)
-    message = message[:1].lower() + message[1:]
+    if message.startswith("must have"):
+        return f"{name} {message}"
     if message.startswith("must be"):
         shown = json.dumps(problem["input"])
         return f"{name} {message}, not {shown if len(shown) < 60 else 'a ' + _kind(problem['input'])}"

@@ -90,6 +90,8 @@ def read(path: Path, what: str, source: str = "") -> Any:
         return loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{source}: {what} cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{source}: {what} is not a text file in UTF-8") from error
     except ValueError as error:
         raise ConfigError(f"{source}: {error}") from error
 

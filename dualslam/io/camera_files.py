@@ -43,6 +43,11 @@ CALIB_LINE = "fx fy cx cy [k1 k2 p1 p2 [k3]] width height"
 _MATRIX_KEYS = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "M1")
 _DISTORTION_KEYS = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D", "D1")
 _FISHEYE = ("equidistant", "fisheye", "kannala", "kannalabrandt8")
+_COMMON = (
+    *("", "none", "pinhole", "perspective", "rectified", "opencv"),
+    *("plumb_bob", "plumb bob", "radtan", "radial-tangential", "brown_conrady", "rational_polynomial"),
+)
+"""Names of cameras whose lens is k1 k2 p1 p2 [k3], or has none of it."""
 
 
 def read_camera_file(path: str | Path) -> Camera:
@@ -217,6 +222,7 @@ def distorted_camera(
     model: str, fxycxy: list[float], distortion: list[float], size: tuple[float, float], where: str
 ) -> Camera:
     """Make the camera of a named distortion model with its coefficients as OpenCV and ROS order them."""
+    check_model(model, (*_COMMON, *_FISHEYE), where)
     if model in _FISHEYE:
         pixels = whole_size(size, where)
         if len(distortion) != 4:
@@ -227,12 +233,21 @@ def distorted_camera(
     return radtan_camera(fxycxy, distortion[:5], size, where)
 
 
+def check_model(model: str, known: tuple[str, ...], where: str) -> None:
+    """Refuse a camera of another kind: its numbers would be taken for something else."""
+    if model not in known:
+        names = ", ".join(name for name in known if name)
+        raise InputError(f"{where}: the camera model {model!r} is not one of those that are read: {names}.")
+
+
 def _from_orb_slam(content: Mapping[str, Any], where: str) -> Camera:
     prefix = "Camera."
     fields = {str(k)[len(prefix) :]: v for k, v in content.items() if str(k).startswith(prefix)}
     fxycxy = [_number(fields, name, where) for name in ("fx", "fy", "cx", "cy")]
     size = _number(fields, "width", where), _number(fields, "height", where)
-    if str(fields.get("type", "")).lower() in _FISHEYE:
+    model = str(fields.get("type", "")).lower()
+    check_model(model, (*_COMMON, *_FISHEYE), where)
+    if model in _FISHEYE:
         names = ("k1", "k2", "k3", "k4")
         return distorted_camera("fisheye", fxycxy, [_number(fields, n, where) for n in names], size, where)
     distortion = [float(fields.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2", "k3")]

@@ -11,7 +11,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.geometry.so3 import matrix_from_quat_xyzw
 from dualslam.core.types import FloatArray
-from dualslam.io.camera_files import distorted_camera, parse_yaml
+from dualslam.io.camera_files import check_model, distorted_camera, parse_yaml
 from dualslam.io.images import ImageFiles
 from dualslam.io.sequence import Given, Recording
 from dualslam.io.times import checked_times, resolve_times
@@ -91,6 +91,7 @@ def _camera(sensor: dict[str, Any], where: Path) -> Camera:
         raise InputError(f"{where}: resolution, intrinsics or distortion_coefficients is no list of numbers.") from None
     if len(fxycxy) != 4:
         raise InputError(f"{where}: intrinsics has {len(fxycxy)} numbers; it should be fx fy cx cy.")
+    check_model(str(sensor.get("camera_model", "pinhole")).lower(), ("pinhole",), str(where))
     model = str(sensor.get("distortion_model", "radial-tangential")).lower()
     return distorted_camera(model, fxycxy, distortion, (width, height), str(where))
 

@@ -1,4 +1,4 @@
-"""A plain folder of images, in natural order, without a calibration of its own."""
+"""A plain folder of images, in natural order; a ``times.txt`` and a ``calib.txt`` among them are read."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from dualslam.core.types import FloatArray
-from dualslam.io.images import IMAGE_SUFFIXES, ImageFiles, list_images
+from dualslam.io.camera_files import read_calib_line
+from dualslam.io.images import IMAGE_SUFFIXES, ImageFiles, fill_gaps, list_images
 from dualslam.io.sequence import Given, Recording
-from dualslam.io.times import NOMINAL_RATE_HZ, resolve_times
+from dualslam.io.times import NOMINAL_RATE_HZ, check_count, read_times, resolve_times
 
 log = logging.getLogger(__name__)
 
@@ -22,18 +23,29 @@ def recognises(folder: Path) -> bool:
 
 def open_recording(folder: Path, given: Given) -> Recording:
     """Open a folder of images. Without times it is taken to run at the given rate, or at 30 Hz with a warning."""
+    times_path, calib_path = folder / "times.txt", folder / "calib.txt"
     where = folder / "images" if (folder / "images").is_dir() else folder
     paths = list_images(where)
     if given.times is not None:
         timestamps_s = resolve_times(given.times, len(paths), where)
+    elif times_path.exists():
+        timestamps_s = read_times(times_path)
+        paths = fill_gaps(paths, len(timestamps_s))
+        check_count(len(timestamps_s), times_path, len(paths), where)
     else:
-        timestamps_s = nominal_times(len(paths), given.rate_hz, where)
-    return Recording(folder.resolve().name, ImageFiles(paths), timestamps_s, camera=None)
+        timestamps_s = nominal_times(len(paths), given.rate_hz, times_path)
+    return Recording(
+        name=folder.resolve().name,
+        images=ImageFiles(paths),
+        timestamps_s=timestamps_s,
+        camera=None if given.camera or not calib_path.exists() else read_calib_line(calib_path),
+        calibration=str(calib_path),
+    )
 
 
-def nominal_times(n: int, rate_hz: float | None, where: Path) -> FloatArray:
-    """Return times of `n` frames at `rate_hz`, by default the nominal rate."""
+def nominal_times(n: int, rate_hz: float | None, times_path: Path) -> FloatArray:
+    """Return times of `n` frames at `rate_hz`, by default the nominal rate; `times_path`: where they could stand."""
     if rate_hz is None:
-        log.warning("%s has no times: taken to run at %g Hz; give the rate or a file of times.", where, NOMINAL_RATE_HZ)
+        log.warning("%s would tell the times: without it the images are taken at %g Hz", times_path, NOMINAL_RATE_HZ)
         rate_hz = NOMINAL_RATE_HZ
     return np.arange(n) / rate_hz

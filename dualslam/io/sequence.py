@@ -189,6 +189,7 @@ def image_size(images: ImageStore, name: str, wanted: tuple[int, int] | None = N
     n = len(images)
     few = list(dict.fromkeys(np.linspace(0, n - 1, min(n, 5)).astype(int).tolist()))
     sizes: list[tuple[int, int]] = []
+    why = ""
     reader = images.reader(grey=True)
     try:
         # Beyond the few, only until one image can be read at all.
@@ -199,6 +200,7 @@ def image_size(images: ImageStore, name: str, wanted: tuple[int, int] | None = N
                 height, width = reader.read(i).shape[:2]
             except UnreadableImageError as e:
                 log.info("looking for the image size: %s", e)
+                why = why or str(e)
                 continue
             if (width, height) == wanted:
                 return width, height
@@ -206,7 +208,7 @@ def image_size(images: ImageStore, name: str, wanted: tuple[int, int] | None = N
     finally:
         reader.close()
     if not sizes:
-        raise InputError(f"{name}: none of its {n} images can be read; check the files.")
+        raise InputError(f"{name}: none of its {n} images can be read, as {why} Check the files.")
     return Counter(sizes).most_common(1)[0][0]
 
 

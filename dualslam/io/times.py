@@ -12,6 +12,8 @@ from dualslam.core.types import FloatArray
 from dualslam.io.trajectory_files import read_number_table
 
 NOMINAL_RATE_HZ = 30.0
+LATEST_S = 1e11
+"""Beyond the year 5000: such numbers are epoch times in milliseconds or smaller units."""
 
 
 def read_times(path: Path) -> FloatArray:
@@ -31,6 +33,9 @@ def checked_times(times_s: ArrayLike, where: str) -> FloatArray:
     if not np.isfinite(times).all():
         bad = int(np.argmin(np.isfinite(times)))
         raise InputError(f"{where}: time {bad + 1} is {times[bad]}; every frame needs a finite time in seconds.")
+    if len(times) and np.abs(times).max() > LATEST_S:
+        bad = int(np.argmax(np.abs(times)))
+        raise InputError(f"{where}: time {bad + 1} is {times[bad]:.0f}, which are no seconds; times are in seconds.")
     step = np.diff(times)
     if (step <= 0).any():
         bad = int(np.argmax(step <= 0)) + 1

@@ -151,7 +151,9 @@ class _VideoReader:
 def _open(path: Path) -> Capture:
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
-        raise InputError(f"{path} is no video that OpenCV can open; give a video file, or convert it to another codec.")
+        raise InputError(
+            f"{path} is no video that OpenCV can open; fetch it again if its end may be missing, or convert it."
+        )
     return capture
 
 

@@ -166,6 +166,8 @@ def read_script(path: str | Path) -> list[Mapping[str, Any]]:
         parse_events(items)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not a text file in UTF-8.") from error
     except (ValueError, ConfigError) as error:
         raise InputError(f"{path}: {error}") from error
     return items

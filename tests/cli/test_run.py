@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -105,6 +106,16 @@ def test_a_folder_that_is_taken_is_refused_before_the_camera_is_searched_for(
     monkeypatch.setattr("dualslam.cli.run_command.with_camera_found", lambda *_: pytest.fail("long work for nothing"))
     assert main(["run", str(folder / "images"), "--out", str(tmp_path / "run"), "--quiet"]) == 2
     assert "--overwrite" in capsys.readouterr().err
+
+
+def test_a_torn_video_is_one_sentence_and_no_word_of_its_decoder(tmp_path: Path) -> None:
+    """A process of its own: the decoder writes to stderr past Python."""
+    (tmp_path / "torn.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(500))
+    command = [sys.executable, "-m", "dualslam.cli", "run", tmp_path / "torn.mp4", "--out", tmp_path / "run"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [done.stderr.rstrip()]
+    assert done.stderr.startswith(f"dualslam: {tmp_path / 'torn.mp4'} is no video that OpenCV can open")
 
 
 def test_the_frames_that_were_asked_for(folder: Path, fake: Install, tmp_path: Path) -> None:

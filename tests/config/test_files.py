@@ -92,6 +92,7 @@ def test_unknown_field_names_the_nearest() -> None:
         ("seed", "write key.path=value"),
         ("=3", "write key.path=value"),
         ("frontend.=3", "write key.path=value"),
+        ("recovery.attempts=[]", "recovery.attempts must have at least 1 item, not 0"),
         ("seed=[1", "the value is not valid YAML"),
     ],
 )
@@ -99,6 +100,12 @@ def test_wrong_values_are_named(override: str, expected: str) -> None:
     message = error_of(override)
     assert message.startswith(f"--set {override}: ")
     assert expected in message
+
+
+def test_a_file_that_is_no_text(tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match=r"c.yaml: the configuration is not a text file in UTF-8$"):
+        load_config(tmp_path / "c.yaml")
 
 
 def test_an_error_in_the_file_names_the_file_not_the_override(tmp_path: Path) -> None:

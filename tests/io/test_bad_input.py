@@ -99,7 +99,7 @@ def test_what_follows_the_image_in_its_file_does_no_harm(dataset: Path) -> None:
 def test_no_image_at_all_can_be_read(dataset: Path) -> None:
     for image in (dataset / "images").iterdir():
         image.write_bytes(b"junk")
-    raises_sentence(dataset, "none of its 6 images can be read")
+    raises_sentence(dataset, "none of its 6 images can be read, as", "000000.png cannot be decoded")
 
 
 # --- folders and files
@@ -146,6 +146,7 @@ def test_missing_parts_of_known_layouts(make, tmp_path: Path, layout: str) -> No
         ("100\n101\n99\n103\n104\n105\n", ["time 3 (99.000000) is not later"]),
         ("100\n101\n", ["has 2 times", "6 images"]),
         ("100\n101\nhello\n103\n104\n105\n", ["line 3", "'hello'"]),
+        ("1e18\n2e18\n3e18\n4e18\n5e18\n6e18\n", ["time 6", "which are no seconds"]),
         ("1 2\n3 4\n", ["line 1", "2 numbers where 1"]),
         ("", ["is empty"]),
     ],
@@ -223,6 +224,10 @@ def test_bad_euroc(make, tmp_path: Path) -> None:
     raises_sentence(folder, "sensor.yaml: T_BS is not a matrix of 4 x 4")
     sensor.write_text(content.replace("30.0", ".nan"))
     raises_sentence(folder, "sensor.yaml")
+    sensor.write_text(content.replace("radial-tangential", "unified"))
+    raises_sentence(folder, "sensor.yaml: the camera model 'unified' is not one of those", "radial-tangential")
+    sensor.write_text(content.replace("pinhole", "omni"))
+    raises_sentence(folder, "sensor.yaml: the camera model 'omni' is not one of those that are read: pinhole.")
     sensor.write_text("a: [1, 2\nb: {")
     raises_sentence(folder, "sensor.yaml, line", "not valid YAML")
     sensor.unlink()

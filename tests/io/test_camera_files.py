@@ -69,6 +69,20 @@ def test_ros_camera_info(tmp_path: Path, model: str, distortion: str, expected) 
         assert camera == expected
 
 
+def test_a_camera_of_another_kind_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    matrix = "image_width: 640\nimage_height: 480\ncamera_matrix: {data: [500, 0, 320, 0, 501, 240, 0, 0, 1]}\n"
+    path.write_text(f"{matrix}distortion_model: double_sphere\n")
+    with pytest.raises(InputError, match="'double_sphere' is not one of those that are read: none, pinhole"):
+        read_camera_file(path)
+    path.write_text(
+        "Camera.type: equirectangular\nCamera.fx: 5\nCamera.fy: 5\nCamera.cx: 9\nCamera.cy: 9\n"
+        "Camera.width: 20\nCamera.height: 20\n"
+    )
+    with pytest.raises(InputError, match="'equirectangular'"):
+        read_camera_file(path)
+
+
 def test_orb_slam_settings(tmp_path: Path) -> None:
     path = tmp_path / "TUM1.yaml"
     path.write_text(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 from pathlib import Path
 
 import cv2
@@ -131,6 +132,20 @@ def test_plain_folder_in_natural_order(tmp_path: Path, image_number, caplog: pyt
     assert open_sequence(tmp_path, fov_degrees=90, rate_hz=5).frame_timestamps[1] == 0.2
     own = [0.0, 0.5, *np.arange(1, 11)]
     assert open_sequence(tmp_path, fov_degrees=90, times=own).frame_timestamps.tolist() == own
+
+
+def test_plain_folder_whose_times_and_calibration_stand_among_the_images(dataset: Path, tmp_path: Path) -> None:
+    for file in (dataset / "calib.txt", dataset / "times.txt"):
+        shutil.copy(file, dataset / "images")
+    loose = open_sequence(dataset / "images")
+    whole = open_sequence(dataset)
+    assert loose.camera == whole.camera
+    assert loose.frame_timestamps.tolist() == whole.frame_timestamps.tolist()
+    assert open_sequence(dataset / "images", fov_degrees=90).camera.fx == pytest.approx(16.0)
+    assert open_sequence(dataset / "images", times=np.arange(6.0)).frame_timestamps[5] == 5.0
+    (dataset / "images" / "times.txt").write_text("1\n2\n")
+    with pytest.raises(InputError, match=r"times.txt has 2 times, but .* has 6 images"):
+        open_sequence(dataset / "images")
 
 
 def test_plain_folder_with_a_camera_file(dataset: Path, tmp_path: Path) -> None:
