@@ -20,7 +20,7 @@ from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import CorrectedCamera
-from dualslam.core.camera.focal import FocalSearch
+from dualslam.core.camera.focal import FocalSearch, ToldFocal
 from dualslam.core.errors import ConfigError
 from dualslam.core.interfaces import Frontend, PreferredCamera, SelfCalibrator, SubmapGraph, WindowSolver
 from dualslam.core.threads import spare_cores
@@ -367,11 +367,11 @@ def _features_beside(desk: WorkerDesk, config: FrontendConfig) -> FeaturesBeside
 
 
 def find_focal(
-    config: Config, frames: Iterable[Frame], size_px: tuple[int, int], told: float | None = None
+    config: Config, frames: Iterable[Frame], size_px: tuple[int, int], told: ToldFocal | None = None
 ) -> FocalSearch | Failure:
     """Search for the focal length of a camera that has no calibration, by frames from its beginning.
 
-    `told`: the focal length over the image's longer side that the source tells, if it does.
+    `told`: what the source's own data tell, if they do.
 
     Raises
     ------

@@ -15,6 +15,9 @@ MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
 """Of `FocalPlaneResolutionUnit`: inch, centimetre, millimetre."""
 LIKELY = (0.3, 20.0)
 """Focal lengths over the image's longer side that a lens may have; anything else is a mistake."""
+SIGMA = 0.05
+"""Of the logarithm of what they tell: whole millimetres of 26 leave 2 %, and what is meant, the image's diagonal or its
+width, 4 %."""
 SAME_SHAPE = 0.02
 """Relative difference of two aspect ratios up to which an image has only been scaled, not cropped."""
 
@@ -40,10 +43,20 @@ def focal_over_longer_side(path: Path) -> float | None:
     if focal_mm and pixels_per_unit and mm and taken[0] and taken[1]:
         ratio = focal_mm * pixels_per_unit / mm / max(taken[0], taken[1])
     elif equivalent_mm := _number(told, tag.FocalLengthIn35mmFilm):
-        ratio = equivalent_mm / DIAGONAL_35MM * math.hypot(width, height) / max(width, height)
+        ratio = over_longer_side(equivalent_mm, width, height)
     else:
         return None
-    return ratio if LIKELY[0] < ratio < LIKELY[1] else None
+    return ratio if is_likely(ratio) else None
+
+
+def over_longer_side(equivalent_mm: float, width: float, height: float) -> float:
+    """Return the focal length over an image's longer side that belongs to one of a 36 x 24 mm camera."""
+    return equivalent_mm / DIAGONAL_35MM * math.hypot(width, height) / max(width, height)
+
+
+def is_likely(ratio: float) -> bool:
+    """Whether a lens may have this focal length, over the image's longer side."""
+    return LIKELY[0] < ratio < LIKELY[1]
 
 
 def _number(told: Mapping[int, Any], tag: int) -> float | None:

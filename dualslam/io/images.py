@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.camera.focal import ToldFocal
 from dualslam.core.errors import InputError
-from dualslam.io.exif import focal_over_longer_side
+from dualslam.io import exif
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
 # How the files of a format end; a file without its ending was cut off, which decoders fill with grey and do not tell.
@@ -50,8 +51,8 @@ class ImageStore(Protocol):
         """Return a new reader; `grey` images are (H, W), others (H, W, 3) RGB."""
         ...
 
-    def told_focal(self) -> float | None:
-        """Return the focal length over the image's longer side that the images' own data tell, or None."""
+    def told_focal(self) -> ToldFocal | None:
+        """Return the focal length that the source's own data tell, or None."""
         ...
 
 
@@ -124,9 +125,10 @@ class ImageFiles:
         """Return a reader of these files."""
         return _FileReader(self.paths, grey)
 
-    def told_focal(self) -> float | None:
+    def told_focal(self) -> ToldFocal | None:
         """Return what the EXIF data of the first image tell."""
-        return focal_over_longer_side(self.paths[0])
+        ratio = exif.focal_over_longer_side(self.paths[0])
+        return None if ratio is None else ToldFocal(ratio, exif.SIGMA)
 
 
 class _FileReader:

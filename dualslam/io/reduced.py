@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera
+from dualslam.core.camera.focal import ToldFocal
 from dualslam.io.images import ImageReader, ImageStore
 
 MAX_SIDE_PX = 2048
@@ -58,8 +59,8 @@ class ReducedImages:
         """Return a reader of these images."""
         return _ReducedReader(self._images.reader(grey), self._factor)
 
-    def told_focal(self) -> float | None:
-        """Return by how much the images were reduced: a share of their side."""
+    def told_focal(self) -> ToldFocal | None:
+        """Return what is told of the large images: a share of their side."""
         return self._images.told_focal()
 
 

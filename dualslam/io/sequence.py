@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dualslam.core.camera.base import Camera
+from dualslam.core.camera.focal import ToldFocal
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, Frame, IntArray
 from dualslam.io.images import ImageReader, ImageStore, UnreadableImageError
@@ -140,8 +141,8 @@ class RecordedSequence:
         """Return the same frames as those of another camera, of images of the same size."""
         return RecordedSequence(self._recording, camera, self.selection, grey=self._grey)
 
-    def told_focal(self) -> float | None:
-        """Return the focal length over the image's longer side that the images' own data tell, or None."""
+    def told_focal(self) -> ToldFocal | None:
+        """Return the focal length that the source's own data tell, or None."""
         return self._recording.images.told_focal()
 
     def __len__(self) -> int:

@@ -41,7 +41,7 @@ def open_without_calibration(source: str, **selection: Any) -> RecordedSequence:
 
 
 def with_camera_found(config: Config, sequence: RecordedSequence) -> tuple[RecordedSequence, FocalSearch]:
-    """Return a sequence with the camera that its first frames tell, and the EXIF data of the first, and what they tell.
+    """Return a sequence with the camera that its first frames tell, and the source's own data, and what they tell.
 
     Raises
     ------

@@ -20,7 +20,7 @@ import numpy as np
 import poselib
 from scipy.optimize import minimize
 
-from dualslam.core.camera.focal import FocalSearch
+from dualslam.core.camera.focal import FocalSearch, ToldFocal
 from dualslam.core.chi_square import CHI2_999
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.distortion import division_area_ratio, undistort_division
@@ -50,9 +50,8 @@ FINE_CELLS = 10
 LOG_FOCAL_PRIOR, LENS_PRIOR = (np.log(0.75), 0.3), (0.0, 0.1)
 """Mean and sigma, of cameras that people film with: telephones 0.7 to 0.8 of that side, webcams 0.9 to 1, action
 cameras 0.45 to 0.6."""
-TOLD_SIGMA, TOLD_RIGHT = 0.05, 0.9
-"""Of the log focal length that EXIF data tell: whole millimetres of 26 leave 2 %, and what is meant, the image's
-diagonal or its width, 4 %. And how likely they tell of these images: one may have been cropped since."""
+TOLD_RIGHT = 0.9
+"""How likely a source's own data tell of these images: one may have been cropped since."""
 DEGREES_OF_FREEDOM, INFLATION = 3.0, 4.0
 """Of the Student distribution of a pair's cost, as some pairs are wrong altogether; and how much larger than their
 residuals errors are taken to be, as neighbouring points err alike (`CalibrationConfig.inflation`)."""
@@ -66,7 +65,7 @@ MAX_STEPS = 40
 
 
 def search_focal(
-    frontend: Frontend, features: Sequence[Features], size_px: tuple[int, int], seed: int, told: float | None = None
+    frontend: Frontend, features: Sequence[Features], size_px: tuple[int, int], seed: int, told: ToldFocal | None = None
 ) -> FocalSearch | Failure:
     """Search for the camera that pairs of frames agree about.
 
@@ -79,8 +78,8 @@ def search_focal(
     size_px : (int, int)
         Width and height.
     seed : int
-    told : float, optional
-        The focal length over the image's longer side, as the images' own data tell it.
+    told : ToldFocal, optional
+        What the source's own data tell.
 
     Returns
     -------
@@ -88,9 +87,9 @@ def search_focal(
         Fewer than `MIN_PAIRS` pairs moved enough, and nothing was told: `LOW_PARALLAX`.
     """
     pairs = list(_find_pairs(frontend, features, size_px, seed))
-    told_px = None if told is None else told * max(size_px)
-    if len(pairs) < MIN_PAIRS and told_px is not None:
-        return FocalSearch(told_px, TOLD_SIGMA, 0.0, *size_px, len(pairs), told_px)
+    told_px = None if told is None else told.over_side * max(size_px)
+    if len(pairs) < MIN_PAIRS and told is not None and told_px is not None:
+        return FocalSearch(told_px, told.log_sigma, 0.0, *size_px, len(pairs), told_px)
     if len(pairs) < MIN_PAIRS:
         return Failure(
             FailureReason.LOW_PARALLAX, f"{len(pairs)} pairs of frames tell the focal length, {MIN_PAIRS} needed"
@@ -242,14 +241,14 @@ def _K(focal: float) -> FloatArray:
 # --- what all pairs say together
 
 
-def _log_prior(log_focal: FloatArray, lens: FloatArray, told: float | None) -> FloatArray:
+def _log_prior(log_focal: FloatArray, lens: FloatArray, told: ToldFocal | None) -> FloatArray:
     """Return the logarithm of the prior of cameras, of the shape that both make together.
 
-    `told`: the focal length over the longer side that the images tell, which are right about it as a rule.
+    `told`: by the source's own data, which are right about it as a rule.
     """
     of_focal = _log_normal(log_focal, *LOG_FOCAL_PRIOR)
     if told is not None:
-        right, wrong = _log_normal(log_focal, math.log(told), TOLD_SIGMA), of_focal
+        right, wrong = _log_normal(log_focal, math.log(told.over_side), told.log_sigma), of_focal
         of_focal = np.logaddexp(right + math.log(TOLD_RIGHT), wrong + math.log(1.0 - TOLD_RIGHT))
     return of_focal + _log_normal(lens, *LENS_PRIOR)
 
@@ -273,7 +272,7 @@ def _between_nodes(
     side: int,
     log_focal: float,
     lens: float | None,
-    told: float | None,
+    told: ToldFocal | None,
 ) -> tuple[float, float]:
     """Return the best log focal length and lens near a node of the grid, which is coarser than many pairs are sure.
 

@@ -16,6 +16,22 @@ SIGMAS_90 = 1.645
 
 
 @dataclass(frozen=True, slots=True)
+class ToldFocal:
+    """The focal length that a source's own data tell.
+
+    Attributes
+    ----------
+    over_side : float
+        Over the image's longer side, however the camera was held.
+    log_sigma : float
+        Standard deviation of its logarithm.
+    """
+
+    over_side: float
+    log_sigma: float
+
+
+@dataclass(frozen=True, slots=True)
 class FocalSearch:
     """What was found.
 
@@ -31,7 +47,7 @@ class FocalSearch:
     n_pairs : int
         Of frames, that had an answer.
     told_px : float or None
-        Focal length by the EXIF data of the first image.
+        Focal length by the EXIF data of the first image, or by the container of the video.
     """
 
     focal_px: float

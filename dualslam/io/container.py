@@ -1,0 +1,120 @@
+"""What the container of a video (QuickTime, MP4) says of the camera that took it: its focal length.
+
+A QuickTime file is a tree of boxes: size, four letters, content. Apple's cameras, and programs that write as they do,
+keep names (`keys`) and values (`ilst`) in a box `meta` of the film or of a track. Others note no focal length.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
+PARENTS = (b"moov", b"trak", b"udta")
+"""Boxes in which there may be a `meta`, within each other."""
+MAX_BOXES, MAX_DEPTH = 10_000, 4
+"""In one file, and within each other: a broken one may hold any number."""
+MAX_BYTES = 2**20
+"""Of a list of names or values; real ones have a few hundred."""
+TEXT, FLOATS = 1, {23: ">f", 24: ">d"}
+SIGNED, UNSIGNED = (21, 65, 66, 67, 74), (22, 75, 76, 77, 78)
+"""Types of values."""
+
+
+def equivalent_focal_mm(path: Path) -> float | None:
+    """Return the focal length that a camera of 36 x 24 mm would need for the same view; None where none is told.
+
+    Whatever is no such container, or is broken before it tells, tells none.
+    """
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, 2)
+            for found in _in_parents(_Boxes(file), 0, size):
+                if math.isfinite(found) and found > 0:
+                    return found
+    except (OSError, ValueError, struct.error):
+        return None
+    return None
+
+
+class _Boxes:
+    """The boxes of a file, of which none reaches out of the one that it is in."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file = file
+        self._left = MAX_BOXES
+
+    def within(self, start: int, stop: int) -> Iterator[tuple[bytes, int, int]]:
+        """Yield each box's name, and where its content starts and stops."""
+        while start + 8 <= stop and self._left > 0:
+            self._left -= 1
+            size, name = struct.unpack(">I4s", self._read(start, 8))
+            content = start + 8
+            if size == 1 and content + 8 <= stop:
+                (size,) = struct.unpack(">Q", self._read(content, 8))
+                content += 8
+            end = stop if size == 0 else start + size
+            if end < content or end > stop:
+                return  # torn, or no box
+            yield name, content, end
+            start = end
+
+    def content(self, start: int, stop: int) -> bytes:
+        """Return what is in a box."""
+        if stop - start > MAX_BYTES:
+            raise ValueError("too long to be what it says")
+        return self._read(start, stop - start)
+
+    def _read(self, start: int, size: int) -> bytes:
+        self.file.seek(start)
+        return self.file.read(size)
+
+
+def _in_parents(boxes: _Boxes, start: int, stop: int, depth: int = 0) -> Iterator[float]:
+    for name, inner, end in boxes.within(start, stop):
+        if name in PARENTS and depth < MAX_DEPTH:
+            yield from _in_parents(boxes, inner, end, depth + 1)
+        elif name == b"meta":
+            yield from _in_meta(boxes, inner, end)
+
+
+def _in_meta(boxes: _Boxes, start: int, stop: int) -> Iterator[float]:
+    """Yield the focal lengths of one list of names and values."""
+    if boxes.content(start + 4, min(start + 8, stop)) != b"hdlr":  # as MP4 has it: four bytes of a version first
+        start += 4
+    numbers: set[int] = set()
+    for name, inner, end in boxes.within(start, stop):
+        if name == b"keys":
+            numbers = {n for n, key in enumerate(_keys(boxes.content(inner, end)), 1) if key == KEY.encode()}
+        elif name == b"ilst":
+            for number, item, item_end in boxes.within(inner, end):
+                if int.from_bytes(number, "big") in numbers:
+                    yield from _values(boxes, item, item_end)
+
+
+def _keys(content: bytes) -> Iterator[bytes]:
+    """Yield the names: each has its size and the four letters of its kind before it."""
+    at = 8  # a version, and how many there are
+    while at + 8 <= len(content):
+        (size,) = struct.unpack_from(">I", content, at)
+        if size < 8:
+            return
+        yield content[at + 8 : at + size]
+        at += size
+
+
+def _values(boxes: _Boxes, start: int, stop: int) -> Iterator[float]:
+    for name, inner, end in boxes.within(start, stop):
+        if name != b"data" or end - inner < 8:
+            continue
+        content = boxes.content(inner, end)
+        kind, value = int.from_bytes(content[1:4], "big"), content[8:]
+        if kind == TEXT:
+            yield float(value.decode("ascii").strip("\0 ").removesuffix("mm"))
+        elif kind in FLOATS:
+            yield float(struct.unpack(FLOATS[kind], value)[0])
+        elif kind in SIGNED or kind in UNSIGNED:
+            yield float(int.from_bytes(value, "big", signed=kind in SIGNED))
