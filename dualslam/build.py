@@ -49,8 +49,9 @@ from dualslam.places.search import search_places
 from dualslam.recovery.executor import DeskExecutor, InlineExecutor, RecoveryExecutor
 from dualslam.recovery.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
 from dualslam.recovery.linking.gates import DESCRIPTOR_RADIUS_PX
-from dualslam.recovery.reverse_tracking import Attempt, RecoveryJob, RecoveryParts, run_recovery
+from dualslam.recovery.reverse_tracking import Attempt, RecoveryJob, RecoveryParts, walk_back
 from dualslam.recovery.scale_watch import SCALE_HANDLERS
+from dualslam.recovery.walk_news import WalkWatch
 from dualslam.system import Components, System
 from dualslam.workers.desk import Lane, WorkerDesk
 from dualslam.workers.features_beside import FeaturesBeside
@@ -143,10 +144,13 @@ def build_system(
         # Built here in any case: a mistake in the config is told at once, not by a worker.
         parts = recovery_parts(config, size_px, frontend=frontend)
     places = place_parts(config, frontend, size_px)
-    desk = worker_desk(config, size_px, faults) if workers else InlineDesk(inline_handlers(config, places.verifier))
+    watch = WalkWatch()
+    desk = (
+        worker_desk(config, size_px, faults, watch) if workers else InlineDesk(inline_handlers(config, places.verifier))
+    )
     graphs = BesideGraphs(desk, window_solver(config)) if workers else None
     if recovery is None:
-        recovery = DeskExecutor(desk) if workers else faults.around_inline(InlineExecutor(parts))
+        recovery = DeskExecutor(desk) if workers else faults.around_inline(InlineExecutor(parts, watch))
 
     return System(
         Components(
@@ -158,6 +162,7 @@ def build_system(
             calibration=calibration,
             shutter=shutter,
             recovery=recovery,
+            walk_watch=watch,
             desk=desk,
             atlas_solver=atlas_solver(config),
             adjust_bundle=_adjuster(config),
@@ -320,7 +325,7 @@ def walk_handlers(config: Config, size_px: tuple[int, int], n_threads: int) -> H
     parts = recovery_parts(config, size_px, budget_s, frontend, n_threads)
     verifier = place_parts(config, frontend, size_px).verifier
     return {
-        JobKind.WALK: lambda job: run_recovery(job, parts),
+        JobKind.WALK: lambda job: walk_back(job, parts),
         **edge_handlers(config),
         **SCALE_HANDLERS,
         **calibration_handlers(config),
@@ -333,7 +338,7 @@ def feature_handlers(config: FrontendConfig) -> Handlers:
     return {JobKind.FEATURES: create_frontend(config).extract}
 
 
-def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript) -> WorkerDesk:
+def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript, watch: WalkWatch) -> WorkerDesk:
     """Build the desk whose work is done in processes, which are started at once."""
     recovery = config.recovery
     # Live frames come first: threads beside the walk only where a core is left beside the tracking and the workers.
@@ -354,7 +359,7 @@ def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript) -
         GRAPH_LIMIT_S,
         niceness=GRAPH_NICENESS,
     )
-    return WorkerDesk([live_map, walks], recovery.finish_wait_s, faults.kill_worker)
+    return WorkerDesk([live_map, walks], recovery.finish_wait_s, faults.kill_worker, watch)
 
 
 def _starter_beside(desk: WorkerDesk, live: LiveParts) -> StartBeside:

@@ -42,6 +42,7 @@ from dualslam.recovery.leaps import LeapWatch
 from dualslam.recovery.manager import Recoveries
 from dualslam.recovery.relocaliser import Relocaliser
 from dualslam.recovery.scale_watch import ScaleLoss, ScaleWatch
+from dualslam.recovery.walk_news import WalkNews, WalkWatch
 from dualslam.workers.jobs import Desk
 
 log = logging.getLogger(__name__)
@@ -57,10 +58,11 @@ would take 200."""
 class Components:
     """The parts that the composition root puts in: the system itself knows neither front end nor solver.
 
-    `new_relocaliser`: a front end that finds its submap again wherever it is seen, and tracks from there. `desk`: does
-    the work beside the tracking; reverse tracking has an executor of its own, which may use the same desk. `graphs`:
-    carries changes to submaps' graphs in another process and back, if they are solved there. `open_features`: starts
-    one more process, and returns a function that has the features of a frame found there.
+    `new_relocaliser`: a front end that finds its submap again wherever it is seen, and tracks from there.
+    `walk_watch`: hears of walks back that are under way. `desk`: does the work beside the tracking; reverse tracking
+    has an executor of its own, which may use the same desk. `graphs`: carries changes to submaps' graphs in another
+    process and back, if they are solved there. `open_features`: starts one more process, and returns a function that
+    has the features of a frame found there.
     """
 
     view_of: Callable[[Frame], View | Failure]
@@ -71,6 +73,7 @@ class Components:
     calibration: Calibration
     shutter: Shutter
     recovery: RecoveryExecutor
+    walk_watch: WalkWatch
     atlas_solver: AtlasSolver
     adjust_bundle: BundleAdjuster
     places: PlaceParts
@@ -206,6 +209,14 @@ class System:
     def is_walking_back(self, submap_id: int) -> bool:
         """Whether a walk back in time from a submap is under way."""
         return self._recoveries.is_under_way(self.atlas.submaps[submap_id])
+
+    def watch_walks(self, on_walk: Callable[[WalkNews], None]) -> None:
+        """Have a function called with how far walks back have come, while they are under way; some news may be lost.
+
+        It may look at the system, and change nothing. Frames are told by their index in the source.
+        """
+        numbers = self.numbers
+        self._parts.walk_watch.add(lambda news: on_walk(replace(news, frame=numbers.index_of(news.frame))))
 
     def _front_ends(self) -> list[VisualOdometry]:
         """Return the front ends that track in a submap, or may soon: they must follow when it moves."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 from dualslam.core.types import Failure
 from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryParts, RecoveryResult, run_recovery
+from dualslam.recovery.walk_news import WalkNews
 from dualslam.workers.jobs import Desk, JobKind
 
 Outcome = tuple[RecoveryJob, RecoveryResult | Failure]
@@ -28,15 +30,22 @@ class RecoveryExecutor(Protocol):
 
 
 class InlineExecutor:
-    """Runs each job when it is submitted: one process, deterministic."""
+    """Runs each job when it is submitted: one process, deterministic.
 
-    def __init__(self, parts: RecoveryParts) -> None:
-        self._parts = parts
+    Parameters
+    ----------
+    parts : RecoveryParts
+    tell : callable, optional
+        Called, during a walk, with how far it has come.
+    """
+
+    def __init__(self, parts: RecoveryParts, tell: Callable[[WalkNews], None] | None = None) -> None:
+        self._parts, self._tell = parts, tell
         self._done: list[Outcome] = []
 
     def submit(self, job: RecoveryJob) -> None:
         """Run the job."""
-        self._done.append((job, run_recovery(job, self._parts)))
+        self._done.append((job, run_recovery(job, self._parts, self._tell)))
 
     def poll(self) -> list[Outcome]:
         """Return what has run since the last call."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -31,6 +31,8 @@ from dualslam.recovery.linking import NO_BEND, Bend, LinkEstimate
 from dualslam.recovery.overlap_refinement import OverlapReport, refine_overlap
 from dualslam.recovery.relinker import Linker, LinkTry, Relinker
 from dualslam.recovery.schedule import way_to_gaps
+from dualslam.recovery.walk_news import WalkNews, WalkTrace
+from dualslam.workers.jobs import result_of
 
 log = logging.getLogger(__name__)
 
@@ -158,11 +160,19 @@ class RecoveryParts:
     budget_s: float | None = None
 
 
-def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Failure:
+def run_recovery(
+    job: RecoveryJob, parts: RecoveryParts, tell: Callable[[WalkNews], None] | None = None
+) -> RecoveryResult | Failure:
     """Walk back from the job's submap until a link to a lost one passes its gates, or no frames are left.
 
     The job is left as it was. Where there is no map to link with, the live features pose the frames before the start.
+    `tell` is called now and then with how far it has come.
     """
+    return result_of(walk_back(job, parts), tell)
+
+
+def walk_back(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNews, None, RecoveryResult | Failure]:
+    """Do what `run_recovery` does; yields how far it has come, and nothing depends on who takes notice."""
     started, cpu_started = time.perf_counter(), time.process_time()
     best: _Progress | None = None
     problem = Failure(FailureReason.SOLVER)
@@ -172,7 +182,7 @@ def run_recovery(job: RecoveryJob, parts: RecoveryParts) -> RecoveryResult | Fai
     for attempt in parts.attempts if job.lost else (parts.posing,):
         if best is not None and time.perf_counter() > until:
             break
-        progress = _make_attempt(job, parts, attempt, until, tries)
+        progress = yield from _make_attempt(job, parts, attempt, until, tries)
         if isinstance(progress, Failure):
             problem = progress
             continue
@@ -236,7 +246,7 @@ class _Progress:
 
 def _make_attempt(
     job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float, tries: LinkTries
-) -> _Progress | Failure:
+) -> Generator[WalkNews, None, _Progress | Failure]:
     """Make one attempt, from a copy of the job's submap; it stops at the time `until`."""
     started = time.perf_counter()
     submap, graph = job.submap.copy(), parts.new_graph()
@@ -253,16 +263,21 @@ def _make_attempt(
     # Frames before a start are worth a look each, however many show nothing; no map waits for the end of that walk.
     max_gap_frames = parts.config.max_gap_frames if job.lost else len(job.views)
     views = job.views if job.lost else _there_and_back(job.views, progress)
+    trace = WalkTrace(submap.id, attempt.name, job.newest_id, submap.T_submap_kf[job.newest_id][:3, 3])
     for step in track_in_reverse(reverse_tracker, views, parts.judge, relinker.keyframe_ids, max_gap_frames):
         progress.out_of_time = time.perf_counter() > until
         if progress.out_of_time:
             break
+        trace.note(step.view, step.track)
+        if (news := trace.news()) is not None:
+            yield news
         if isinstance(step.track, Failure):
             progress.note_unusable(step.track)
             continue
         progress.note_posed(_recovered_frame(reverse_tracker, step.view, step.track), step.report is not None)
         if (earlier := reverse_tracker.confirmed()) is not None:
             progress.note_confirmed(_recovered_frame(reverse_tracker, earlier.view, earlier))
+            trace.note_confirmed(earlier)
         if step.view.index not in submap.keyframes:
             continue
         for tried in relinker.attempts(step.view.index):

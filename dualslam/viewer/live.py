@@ -18,6 +18,7 @@ from dualslam.core.errors import InputError, OutputError
 from dualslam.core.processes import start_undisturbed
 from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult
+from dualslam.recovery.walk_news import WalkNews
 from dualslam.system import System
 from dualslam.viewer.messages import Message, Teller
 
@@ -97,12 +98,20 @@ class LiveView:
     def begin(self, system: System) -> None:
         """Watch a system."""
         self._teller = Teller(system)
+        system.watch_walks(self._on_walk)
 
     def after(self, frame: Frame, result: FrameResult) -> None:
         """Tell of a frame, where there is time."""
         self._last = frame, result
         self._tell_if_due()
         self._save()
+
+    def _on_walk(self, news: WalkNews) -> None:
+        """Tell of a walk back, for which the run itself waits where there are no workers."""
+        assert self._teller is not None
+        self._teller.note_walk(news)
+        if self._last is not None:
+            self._tell_if_due(within_step=True)
 
     def is_paused(self) -> bool:
         """Whether a person wants the run to wait; asked for as long as it does. Nobody does once the viewer is gone."""
@@ -138,16 +147,16 @@ class LiveView:
         self._thread.join()
         self._pipe.close()
 
-    def _tell_if_due(self) -> None:
+    def _tell_if_due(self, within_step: bool = False) -> None:
         now = time.monotonic()
         if now - self._told_s >= EVERY_S and self._idle.is_set() and self.alive:
             self._told_s = now
-            self._tell()
+            self._tell(within_step=within_step)
 
-    def _tell(self, over: bool = False) -> None:
+    def _tell(self, over: bool = False, within_step: bool = False) -> None:
         assert self._teller is not None
         assert self._last is not None
-        self._post(self._teller.tell(*self._last, over))
+        self._post(self._teller.tell(*self._last, over, within_step))
 
     def _post(self, message: Message | str) -> None:
         self._idle.clear()

@@ -19,7 +19,7 @@ import viser
 from numpy.typing import NDArray
 
 from dualslam.core.geometry import so3
-from dualslam.core.types import FloatArray
+from dualslam.core.types import FloatArray, FrameStatus
 from dualslam.report.statuses import MEANING, count
 from dualslam.viewer.colours import STATUS_COLOURS, rgb, submap_rgb
 from dualslam.viewer.live import PAUSE, SAVE
@@ -39,8 +39,14 @@ ABOVE, BEHIND = 0.55, 0.75
 """Of the extent of the map: from where it is looked at."""
 LEAST_EXTENT = 2.0
 """A map's first landmarks are about 1 away."""
-GROWN = 1.15
-"""So many times larger than it was when it was shown whole, a map is shown whole again."""
+WALK_RGB = (245, 245, 245)
+"""Of the way of a walk back that is under way: no submap's."""
+GROWN, SHRUNK = 1.15, 0.5
+"""So many times as large as it was when it was shown whole, a map is shown whole again."""
+LEAST_ASPECT = 0.8
+"""Of a window that shows the whole map from there: before a narrower one it stands further away."""
+NARROW_PX, COVERED = 640, 0.6
+"""Windows up to this width have the panel below, over this part of the scene."""
 
 
 def serve(pipe: Connection, port: int) -> None:
@@ -112,10 +118,17 @@ class Page:
         self._links = server.scene.add_line_segments(
             "/links", blank, np.zeros((1, 2, 3), np.uint8), thickness=4.0, thickness_units="screen"
         )
-        self._camera = server.scene.add_camera_frustum(
-            "/camera", fov=0.9, aspect=4 / 3, scale=0.1, thickness=3.0, thickness_units="screen", visible=False
+        self._ways = server.scene.add_line_segments(
+            "/walks", blank, WALK_RGB, thickness=3.0, thickness_units="screen", visible=False
         )
+        self._camera = self._add_camera("/camera")
+        self._walkers: dict[int, Any] = {}
         server.on_client_connect(lambda client: self._look(client))
+
+    def _add_camera(self, name: str) -> Any:
+        return self._server.scene.add_camera_frustum(
+            name, fov=0.9, aspect=4 / 3, scale=0.1, thickness=3.0, thickness_units="screen", visible=False
+        )
 
     def _add_panel(self) -> None:
         gui = self._server.gui
@@ -158,6 +171,7 @@ class Page:
             if len(points):
                 self._links.points, self._links.colors = points, _as_lines_are_lit(colours)
             self._move_camera(message)
+            self._move_walkers()
             self._tell(message)
         server.flush()
 
@@ -195,19 +209,40 @@ class Page:
         T = self._scene.T_world_cam
         if T is None:
             return
-        self._camera.visible = True
-        self._camera.position, self._camera.wxyz = T[:3, 3], so3.quat_xyzw_from_matrix(T[:3, :3])[[3, 0, 1, 2]]
-        self._camera.scale = 3.0 * self._scene.size
-        self._camera.color = rgb(STATUS_COLOURS[message.status])
+        self._show_camera(self._camera, T, STATUS_COLOURS[message.status])
         step = np.zeros(3) if self._was_at is None else T[:3, 3] - self._was_at
         self._was_at = T[:3, 3].copy()
-        outgrown = self._extent() > GROWN * self._shown
+        outgrown = not SHRUNK * self._shown <= self._extent() <= GROWN * self._shown
         for client in self._server.get_clients().values():
             if self._view.value == FOLLOW:
                 client.camera.position = client.camera.position + step
                 client.camera.look_at = client.camera.look_at + step
             elif self._view.value == WHOLE and outgrown:
                 self._look(client)
+
+    def _show_camera(self, camera: Any, T_world_cam: FloatArray, colour: int) -> None:
+        camera.visible = True
+        R = T_world_cam[:3, :3]
+        camera.position, camera.wxyz = T_world_cam[:3, 3], so3.quat_xyzw_from_matrix(R)[[3, 0, 1, 2]]
+        camera.scale = 3.0 * self._scene.size
+        camera.color = rgb(colour)
+
+    def _move_walkers(self) -> None:
+        """Show how far each walk back has come: its way, and a camera where it has posed a frame last."""
+        lines = self._scene.walk_lines()
+        self._ways.visible = bool(len(lines))
+        if len(lines):
+            self._ways.points = lines
+        walks = {walk.submap_id: walk for walk in self._scene.walks}
+        for m, walk in walks.items():
+            if walk.T_world_cam is None:
+                continue
+            if m not in self._walkers:
+                self._walkers[m] = self._add_camera(f"/walker of submap {m}")
+            status = FrameStatus.RECOVERED if walk.is_posed else FrameStatus.LOST
+            self._show_camera(self._walkers[m], walk.T_world_cam, STATUS_COLOURS[status])
+        for m in set(self._walkers) - set(walks):
+            self._walkers.pop(m).remove()
 
     def _extent(self) -> float:
         low, high = self._scene.bounds()
@@ -219,13 +254,17 @@ class Page:
             return
         self._shown = self._extent()
         client.camera.up_direction = UP
-        client.camera.look_at, client.camera.position = self._viewpoint()
+        window = client.camera
+        covered = COVERED if window.image_width <= NARROW_PX else 0.0
+        window.look_at, window.position = self._viewpoint(window.aspect, covered * np.tan(window.fov / 2))
 
-    def _viewpoint(self) -> tuple[FloatArray, FloatArray]:
-        """Return the middle of the map, and from where all of it is seen."""
+    def _viewpoint(self, aspect: float = 1.0, lift: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Return the middle of the map, and from where all of it is seen, raised by `lift` of the distance."""
         low, high = self._scene.bounds()
         middle = (low + high) / 2
-        return middle, middle + self._extent() * np.array([0.0, -ABOVE, -BEHIND])
+        away = self._extent() * max(1.0, LEAST_ASPECT / aspect) * np.array([0.0, -ABOVE, -BEHIND])
+        down = lift * np.array([0.0, -away[2], away[1]])
+        return middle + down, middle + down + away
 
     def _tell(self, message: Message) -> None:
         for event in message.events:
@@ -233,7 +272,8 @@ class Page:
                 where = "" if event.submap is None else f", submap {event.submap}"
                 self._events.append(f"- **{event.kind.replace('_', ' ')}** at frame {event.frame}{where}")
         submaps = [f"{count(len(message.components), 'map')} of {count(len(self._scene.drawn), 'submap')}"]
-        submaps += [f"walking back in time from submap {m}" for m in message.walking]
+        at = {walk.submap_id: f" ({walk.words})" for walk in self._scene.walks}
+        submaps += [f"walking back in time from submap {m}{at.get(m, '')}" for m in message.walking]
         if message.backlog:
             submaps.append(f"{count(message.backlog, 'job')} beside the tracking")
         lead = "the run is over" if message.over else f"frame {message.frame}, {message.timestamp_s:.2f} s"
@@ -241,7 +281,8 @@ class Page:
         self._state.content = f"**{lead}**\n\n{line}\n\n{'; '.join(submaps)}"
         if message.picture is not None:
             self._image.image = draw_features(message.picture)
-        self._timeline.image = draw_timeline(self._scene.statuses)
+        places = [walk.place for walk in self._scene.walks if walk.place is not None]
+        self._timeline.image = draw_timeline(self._scene.statuses, places)
         self._key.content = _key(self._scene.statuses)
         self._told.content = "\n".join(reversed(self._events))
 

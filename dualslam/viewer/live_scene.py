@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dualslam.core.geometry import sim3
 from dualslam.core.types import FloatArray, FrameStatus
 from dualslam.viewer.colours import CONDEMNED_COLOUR, STATUS_COLOURS, rgb, submap_rgb
-from dualslam.viewer.messages import LinkLine, Message, Picture, SubmapArrays
+from dualslam.viewer.messages import LinkLine, Message, Picture, SubmapArrays, Walk
 
 FRUSTUM = np.array([[-1, -0.75, 1], [1, -0.75, 1], [1, 0.75, 1], [-1, 0.75, 1]]) * (0.5, 0.5, 0.6)
 """Corners of the image of a drawn keyframe of size 1; x right, y down, z forward."""
@@ -26,6 +26,8 @@ GAP_SHARE = 0.35
 WITHIN = 0.97
 """Landmarks further out are far away, or wrong: the view need not hold them."""
 TIMELINE_PX = (480, 28)
+MARK_PX, MARK_RGB = 2, (255, 255, 255)
+"""Half the width of the mark at the frame where a walk back is."""
 FEATURE_RGB, MATCHED_RGB = (150, 150, 150), (60, 220, 90)
 
 
@@ -48,6 +50,32 @@ class Drawn:
     centres: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class DrawnWalk:
+    """A walk back that is under way.
+
+    Attributes
+    ----------
+    submap_id : int
+    way : (N, 3) float32
+        The earliest frame first.
+    T_world_cam : (4, 4) or None
+        Of the last frame that has a pose.
+    is_posed : bool
+        Whether that is the frame at which the walk is.
+    place : int or None
+        Of that frame among the statuses.
+    words : str
+    """
+
+    submap_id: int
+    way: NDArray[np.float32]
+    T_world_cam: FloatArray | None
+    is_posed: bool
+    place: int | None
+    words: str
+
+
 class LiveScene:
     """A run as its messages tell it.
 
@@ -60,6 +88,7 @@ class LiveScene:
     T_world_cam : (4, 4) or None
         The newest camera that has a pose.
     links : tuple of LinkLine
+    walks : tuple of DrawnWalk
     statuses : list of str
     """
 
@@ -69,6 +98,7 @@ class LiveScene:
         self.S_world: dict[int, FloatArray] = {}
         self.T_world_cam: FloatArray | None = None
         self.links: tuple[LinkLine, ...] = ()
+        self.walks: tuple[DrawnWalk, ...] = ()
         self.statuses: list[str] = []
         self._arrays: dict[int, SubmapArrays] = {}
         self._size = 0.0
@@ -89,6 +119,9 @@ class LiveScene:
         self.S_world = S_world
         if message.T_submap_cam is not None and message.submap_id in S_world:
             self.T_world_cam = sim3.act_on_pose(S_world[message.submap_id], message.T_submap_cam)
+        self.walks = tuple(
+            _drawn_walk(w, S_world[w.news.submap_id]) for w in message.walks if w.news.submap_id in S_world
+        )
 
     @property
     def size(self) -> float:
@@ -96,13 +129,23 @@ class LiveScene:
         return self._size
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Return the box around cameras and landmarks, but for the `1 - WITHIN` furthest out on each side."""
-        every = [part for d in self.drawn.values() for part in (d.centres, d.points) if len(part)]
-        if not every:
+        """Return the box around all cameras, and landmarks but for the `1 - WITHIN` furthest out on each side."""
+        centres = [d.centres for d in self.drawn.values()] + [walk.way for walk in self.walks]
+        centres = [each for each in centres if len(each)]
+        if not centres:
             return np.full(3, -1.0), np.full(3, 1.0)
-        points = np.concatenate(every).astype(np.float64)
-        low, high = np.quantile(points, [1 - WITHIN, WITHIN], axis=0)
+        cameras = np.concatenate(centres).astype(np.float64)
+        low, high = cameras.min(axis=0), cameras.max(axis=0)
+        landmarks = np.concatenate([d.points for d in self.drawn.values()]).astype(np.float64)
+        if len(landmarks):
+            inner = np.quantile(landmarks, [1 - WITHIN, WITHIN], axis=0)
+            low, high = np.minimum(low, inner[0]), np.maximum(high, inner[1])
         return np.asarray(low), np.asarray(high)
+
+    def walk_lines(self) -> NDArray[np.float32]:
+        """Return the ways of the walks back that are under way as lines, (N, 2, 3)."""
+        lines = [np.stack([walk.way[:-1], walk.way[1:]], axis=1) for walk in self.walks]
+        return np.concatenate(lines) if lines else np.zeros((0, 2, 3), np.float32)
 
     def link_lines(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Return the links as lines between keyframes, (N, 2, 3), and their colours, (N, 2, 3)."""
@@ -168,14 +211,28 @@ class LiveScene:
         return Drawn(lines, np.repeat(each[:, None], 2, axis=1), points, centres)
 
 
-def draw_timeline(statuses: Sequence[str]) -> NDArray[np.uint8]:
-    """Return the statuses of all frames, first to newest, as a strip (H, W, 3) in their colours."""
+def _drawn_walk(walk: Walk, S_world: FloatArray) -> DrawnWalk:
+    news = walk.news
+    T = None if news.T_submap_cam is None else sim3.act_on_pose(S_world, news.T_submap_cam.astype(np.float64))
+    way = sim3.act(S_world, news.way.astype(np.float64)).astype(np.float32)
+    found = f"{news.n_posed} posed" if news.is_posed else f"{news.n_posed} posed, looking for a way across a gap"
+    return DrawnWalk(news.submap_id, way, T, news.is_posed, walk.place, f"at frame {news.frame}, {found}")
+
+
+def draw_timeline(statuses: Sequence[str], places: Sequence[int] = ()) -> NDArray[np.uint8]:
+    """Return the statuses of all frames, first to newest, as a strip (H, W, 3) in their colours.
+
+    `places`: of frames that are marked.
+    """
     width, height = TIMELINE_PX
     strip = np.full((height, width, 3), 235, np.uint8)
     if statuses:
         rgb_of = {str(status): rgb(colour) for status, colour in STATUS_COLOURS.items()}
         n = len(statuses)
         strip[:] = [rgb_of[statuses[column * n // width]] for column in range(width)]
+        for place in places:
+            at = (2 * place + 1) * width // (2 * n)
+            strip[:, max(at - MARK_PX, 0) : at + MARK_PX] = MARK_RGB
     return strip
 
 

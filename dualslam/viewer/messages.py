@@ -16,6 +16,7 @@ from dualslam.core.events import Event
 from dualslam.core.types import BoolArray, FloatArray, Frame, FrameStatus, IntArray, Track
 from dualslam.map.frame_records import FrameResult
 from dualslam.map.submap import Submap
+from dualslam.recovery.walk_news import WalkNews
 from dualslam.report.event_words import event_words
 from dualslam.system import System
 from dualslam.workers.jobs import JobKind
@@ -90,6 +91,14 @@ class EventWords:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Walk:
+    """A walk back that is under way. `place`: where its frame stands among all statuses; None where nowhere."""
+
+    news: WalkNews
+    place: int | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Message:
     """A run as it stands after a frame.
 
@@ -116,6 +125,8 @@ class Message:
         New ones.
     walking : tuple of int
         Submaps that are being walked back from.
+    walks : tuple of Walk
+        Those walks of which anything is known.
     backlog : int
         Jobs that wait or are done beside the tracking.
     over : bool
@@ -136,6 +147,7 @@ class Message:
     n_statuses_before: int
     events: tuple[EventWords, ...]
     walking: tuple[int, ...]
+    walks: tuple[Walk, ...]
     backlog: int
     over: bool = False
 
@@ -154,6 +166,8 @@ class Teller:
         self._track: Track | None = None
         self._n_events = 0
         self._n_statuses = 0
+        self._places: dict[int, int] = {}  # of frames, among the rows
+        self._walks: dict[int, WalkNews] = {}
         self._sent: dict[int, tuple[object, ...]] = {}
         earlier = system.on_pose
 
@@ -164,14 +178,20 @@ class Teller:
 
         system.on_pose = keep
 
-    def tell(self, frame: Frame, result: FrameResult, over: bool = False) -> Message:
-        """Return what is to be told after a frame."""
+    def note_walk(self, news: WalkNews) -> None:
+        """Keep what a walk back has told, for the next message."""
+        self._walks[news.submap_id] = news
+
+    def tell(self, frame: Frame, result: FrameResult, over: bool = False, within_step: bool = False) -> Message:
+        """Return what is to be told after a frame; `within_step`: while the next one is in its step."""
         system = self._system
         events = self._new_events()
         arrays = tuple(_arrays(s) for s in system.atlas.submaps.values() if self._has_changed(s))
         before = 0 if events or over else self._n_statuses
-        statuses = tuple(str(row.status) for row in islice(system.rows.values(), before, None))
-        self._n_statuses = len(system.rows)
+        n_statuses = len(system.rows) - within_step  # what becomes of the newest is not known yet
+        statuses = tuple(str(row.status) for row in islice(system.rows.values(), before, n_statuses))
+        self._n_statuses = n_statuses
+        walking = tuple(m for m in system.atlas.submaps if system.is_walking_back(m))
         return Message(
             result.index,
             frame.timestamp_s,
@@ -186,10 +206,18 @@ class Teller:
             statuses,
             before,
             events,
-            tuple(m for m in system.atlas.submaps if system.is_walking_back(m)),
+            walking,
+            self._walks_of(walking),
             sum(system.desk.n_open(kind) for kind in JobKind),
             over,
         )
+
+    def _walks_of(self, walking: tuple[int, ...]) -> tuple[Walk, ...]:
+        """Forget the walks that have ended, and return the others."""
+        self._walks = {m: news for m, news in self._walks.items() if m in walking}
+        rows, numbers = self._system.rows, self._system.numbers
+        self._places |= {number: n for n, number in enumerate(islice(rows, len(self._places), None), len(self._places))}
+        return tuple(Walk(news, self._places.get(numbers.number_of(news.frame))) for news in self._walks.values())
 
     def _new_events(self) -> tuple[EventWords, ...]:
         numbers = self._system.numbers

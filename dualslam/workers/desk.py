@@ -19,7 +19,8 @@ import multiprocessing
 import os
 import time
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from queue import Empty, SimpleQueue
@@ -30,7 +31,7 @@ from dualslam.core.errors import ConfigError
 from dualslam.core.memory import keep_freed_memory, peak_rss_mb
 from dualslam.core.processes import start_undisturbed
 from dualslam.core.types import Failure, FailureReason
-from dualslam.workers.jobs import Ended, Handlers, JobKind
+from dualslam.workers.jobs import Ended, Handlers, JobKind, result_of
 from dualslam.workers.transport import Channel
 
 log = logging.getLogger(__name__)
@@ -57,6 +58,13 @@ class _Answer:
     peak_rss_mb: float = 0.0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _News:
+    """How far a job has come: the newest counts, and one that is lost matters to nobody."""
+
+    told: Any
+
+
 class Worker:
     """A process that does one job after the other. It has imported all that it needs before the first comes.
 
@@ -79,6 +87,7 @@ class Worker:
         theirs.close()
         self._jobs: SimpleQueue[tuple[JobKind, Any] | None] = SimpleQueue()
         self._results: SimpleQueue[_Answer] = SimpleQueue()
+        self._news: Any = None  # of the job in hand: the newest
         self._ready = Event()
         # Pipes block, and a job is tens of megabytes: a thread of its own waits for them.
         self._carrier = Thread(target=self._carry, name=name, daemon=True)
@@ -92,6 +101,11 @@ class Worker:
     def give(self, kind: JobKind, work: Any) -> None:
         """Hand over a job; one at a time."""
         self._jobs.put((kind, work))
+
+    def news(self) -> Any:
+        """Return what the job in hand has told since the last call, the newest of it; None where nothing."""
+        news, self._news = self._news, None
+        return news
 
     def result(self, wait_s: float = 0.0) -> _Answer | None:
         """Return the outcome of the job, or None while it runs. A worker that has died says so by a `Failure`."""
@@ -132,7 +146,10 @@ class Worker:
                 self._ready.set()
                 while (job := self._jobs.get()) is not None:
                     channel.send(job)
-                    self._results.put(channel.receive())
+                    while isinstance(answer := channel.receive(), _News):
+                        self._news = answer.told
+                    self._news = None
+                    self._results.put(answer)
             except (EOFError, OSError, LookupError):
                 # LookupError: it names what is gone here, which is a mistake of ours, and costs no more than a job.
                 self._process.join(STOP_S)
@@ -148,6 +165,11 @@ def serve(connection: Connection, make_handlers: MakeHandlers, niceness: int = 0
         os.nice(niceness)
     keep_freed_memory()
     handlers, channel = make_handlers(), Channel(connection, gives=False)
+
+    def tell(news: Any) -> None:
+        with suppress(BrokenPipeError):  # the result will meet it too
+            channel.send_in_passing(_News(news))
+
     try:
         channel.send(None)
     except BrokenPipeError:
@@ -159,6 +181,8 @@ def serve(connection: Connection, make_handlers: MakeHandlers, niceness: int = 0
             return
         began_s = time.process_time()
         result = handlers[kind](work)
+        if isinstance(result, Generator):
+            result = result_of(result, tell)
         try:
             channel.send(_Answer(result, time.process_time() - began_s, peak_rss_mb()))
         except BrokenPipeError:  # nobody waits for it any more
@@ -279,6 +303,8 @@ class WorkerDesk:
     on_start : callable, optional
         Called with each job that a process begins (kind and work), and the process's id: where the failure lab takes
         hold.
+    on_news : callable, optional
+        Called, where a job's result is asked for, with what its process has told of it meanwhile.
     """
 
     def __init__(
@@ -286,8 +312,10 @@ class WorkerDesk:
         lanes: Sequence[Lane],
         finish_wait_s: float,
         on_start: Callable[[JobKind, Any, int | None], None] | None = None,
+        on_news: Callable[[Any], None] | None = None,
     ) -> None:
         self.on_start = on_start
+        self.on_news = on_news
         self.statistics: defaultdict[JobKind, QueueStatistics] = defaultdict(QueueStatistics)
         self._finish_wait_s = finish_wait_s
         self._queues: list[_Queue] = []
@@ -373,6 +401,8 @@ class WorkerDesk:
         """See what has ended in a lane, and give its idle workers what waits; `wait`: for as long as a job may take."""
         for task in list(queue.busy):
             limit_s = queue.lane.time_limit_s
+            if self.on_news is not None and (news := task.worker.news()) is not None:
+                self.on_news(news)
             answer = task.worker.result(limit_s if wait else 0.0)
             if answer is None and time.monotonic() - task.began_s > limit_s:
                 answer = _Answer(Failure(FailureReason.TIMEOUT, f"the {task.job.kind} took longer than {limit_s:g} s"))

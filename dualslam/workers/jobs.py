@@ -10,12 +10,14 @@ the same run to the bit; `dualslam/workers/desk.py` has the one with processes. 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from dualslam.core.types import Failure
+
+Result = TypeVar("Result")
 
 
 class JobKind(StrEnum):
@@ -32,8 +34,22 @@ class JobKind(StrEnum):
 
 
 Handler = Callable[[Any], Any]
-"""Makes a result, which can be pickled, or a `Failure` of the work. One that keeps a state is asked in order."""
+"""Makes a result, which can be pickled, or a `Failure` of the work. One that keeps a state is asked in order.
+
+One that is a generator function yields how far it has come, for those who look on, and returns its result."""
 Handlers = Mapping[JobKind, Handler]
+
+
+def result_of(work: Generator[Any, None, Result], tell: Callable[[Any], None] | None) -> Result:
+    """Do work that yields how far it has come, tell that, and return what comes of it."""
+    while True:
+        try:
+            news = next(work)
+        except StopIteration as end:
+            result: Result = end.value
+            return result
+        if tell is not None:
+            tell(news)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

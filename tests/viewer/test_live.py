@@ -20,6 +20,8 @@ from dualslam.core.errors import InputError, OutputError
 from dualslam.core.geometry import sim3
 from dualslam.core.types import Frame, FrameStatus
 from dualslam.map.frame_records import FrameResult
+from dualslam.recovery import walk_news
+from dualslam.recovery.walk_news import WalkNews
 from dualslam.system import System
 from dualslam.testing.point_world import PointWorld, system_in
 from dualslam.viewer import live
@@ -35,22 +37,35 @@ COVERED = frozenset(range(60, 80))
 
 
 class Run:
-    """A run that was told of after every frame, and all that was told."""
+    """A run that was told of after every frame, and all that was told; another teller tells of walks back besides."""
 
     def __init__(self) -> None:
         self.world: PointWorld = lap(N + 12, covered=COVERED)
         self.system: System = system_in(self.world, recovery={"enabled": True}, buffer={"duration_s": 0.3})
         teller, self.messages = Teller(self.system), []
+        self._steps, self.with_walks = Teller(self.system), []
+        self.system.watch_walks(self._on_walk)
+        self._done: list[tuple[Frame, FrameResult]] = []
         for frame in self.world.frames():
             result = self.system.step(frame)
+            self._done.append((frame, result))
             self.messages.append(teller.tell(frame, result))
+            self.with_walks.append((len(self._done), self._steps.tell(frame, result)))
         self.system.finish()
         self.messages.append(teller.tell(frame, result, over=True))
+        self.with_walks.append((len(self._done), self._steps.tell(frame, result, over=True)))
+
+    def _on_walk(self, news: WalkNews) -> None:
+        self._steps.note_walk(news)
+        if self._done:
+            self.with_walks.append((len(self._done), self._steps.tell(*self._done[-1], within_step=True)))
 
 
 @pytest.fixture(scope="module")
 def told() -> Run:
-    return Run()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(walk_news, "EVERY_S", 0.0)
+        return Run()
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +119,41 @@ def test_only_what_changed_is_told_again(told: Run) -> None:
     assert not any(message.changed for message in lost[1:5])
 
 
+# --- a walk back as it happens
+
+
+def test_a_walk_is_drawn_beside_the_lost_map_and_goes_when_it_ends(told: Run) -> None:
+    scene, frames, lengths = LiveScene(), [], []
+    for n_done, message in told.with_walks:
+        scene.take(message)
+        assert len(scene.statuses) == n_done, "what becomes of the frame in its step is not known yet"
+        over_the_gap = [walk for walk in message.walks if walk.news.submap_id == 1]
+        if not over_the_gap:
+            continue
+        (walk,), (drawn,) = over_the_gap, scene.walks
+        S = scene.S_world[1]
+        assert np.allclose(drawn.way, sim3.act(S, walk.news.way.astype(float)), atol=1e-4)
+        assert drawn.way[-1, 0] > scene.drawn[0].centres[:, 0].max(), "where the new map stands, not in the lost one"
+        assert walk.place == walk.news.frame, "no frame was left out"
+        assert str(walk.news.frame) in drawn.words
+        if frames and walk.news.frame > frames[-1]:
+            frames, lengths = [], []  # the next attempt
+        frames.append(walk.news.frame)
+        lengths.append(len(scene.walk_lines()))
+    assert len(frames) > len(COVERED)
+    assert lengths == sorted(lengths)
+    assert not scene.walks
+    assert scene.statuses == [str(row.status) for row in told.system.rows.values()]
+
+
+@pytest.mark.parametrize("place", [0, 7, 99])
+def test_the_timeline_marks_where_a_walk_is(place: int) -> None:
+    strip = draw_timeline([str(FrameStatus.TRACKED)] * 100, [place])
+    columns = np.flatnonzero((strip == 255).all(axis=(0, 2)))
+    assert 1 <= len(columns) <= 4
+    assert abs(columns.mean() - (place + 0.5) * TIMELINE_PX[0] / 100) < 2
+
+
 def test_features_on_the_picture() -> None:
     picture = Picture(
         np.zeros((20, 30, 3), np.uint8),
@@ -135,9 +185,12 @@ class Still:
         self.message = message
         self.n_told = 0
 
-    def tell(self, frame: Frame, result: FrameResult, over: bool = False) -> Message:
+    def tell(self, frame: Frame, result: FrameResult, over: bool = False, within_step: bool = False) -> Message:
         self.n_told += 1
         return self.message
+
+    def note_walk(self, news: WalkNews) -> None:
+        """Nothing is made of it."""
 
 
 @pytest.fixture
@@ -149,6 +202,19 @@ def view(told: Run, monkeypatch: pytest.MonkeyPatch) -> Iterator[LiveView]:
     view.begin(told.system)
     yield view
     view.close()
+
+
+def test_a_walk_is_told_to_the_viewer_at_once(view: LiveView, told: Run) -> None:
+    """Inline the run waits for it: no frame comes that would tell."""
+    assert isinstance(view._teller, Still)
+    step(view, told)
+    n_told, noted = view._teller.n_told, []
+    view._teller.note_walk = noted.append  # type: ignore[method-assign]
+    for _ in range(20):
+        view._on_walk(told)  # type: ignore[arg-type]
+        time.sleep(0.02)
+    assert len(noted) == 20
+    assert view._teller.n_told > n_told
 
 
 def step(view: LiveView, told: Run) -> float:
