@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from dualslam.run.session import run_to_folder
     from dualslam.run.sources import open_source
     from dualslam.system import System
+    from dualslam.viewer.progress import Progress
 
 _WHERE = {
     "Config": "config.settings",
@@ -49,6 +50,7 @@ _WHERE = {
     "FrameResult": "map.frame_records",
     "InputError": "core.errors",
     "OutputError": "core.errors",
+    "Progress": "viewer.progress",
     "SolverError": "core.errors",
     "System": "system",
     "build_system": "build",
@@ -83,6 +85,7 @@ __all__ = [
     "FrameResult",
     "InputError",
     "OutputError",
+    "Progress",
     "SolverError",
     "System",
     "__version__",

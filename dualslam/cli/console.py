@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bars
 
 from dualslam.core.interfaces import Sequence
-from dualslam.map.frame_records import FrameResult
-from dualslam.run.session import Outcome
-
-FINISHING = "all frames are in: ending the walks back, writing the results"
-"""Shown once no frame is left to count: a last walk back may take seconds."""
+from dualslam.run.session import Outcome, Watcher
+from dualslam.viewer.progress import RunState
 
 
 @contextmanager
-def progress(sequence: Sequence, quiet: bool) -> Iterator[Callable[[FrameResult], None] | None]:
+def progress(sequence: Sequence, quiet: bool) -> Iterator[Watcher | None]:
     """Show a bar on stderr while frames come in, if a person watches; otherwise nothing."""
     if quiet or not sys.stderr.isatty():
         yield None
@@ -34,16 +32,17 @@ def progress(sequence: Sequence, quiet: bool) -> Iterator[Callable[[FrameResult]
         TimeRemainingColumn(),
         TextColumn("{task.fields[state]}"),
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(sequence.name, total=total, state="")
+    with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
+        yield _Bar(bars, sequence.name, total)
 
-        def on_frame(result: FrameResult) -> None:
-            where = "" if result.submap_id is None else f", submap {result.submap_id}, {result.n_inliers} landmarks"
-            bar.update(task, advance=1, state=f"{result.status}{where}")
-            if bar.finished:
-                bar.update(task, state=FINISHING)
 
-        yield on_frame
+class _Bar(RunState):
+    def __init__(self, bars: Bars, name: str, n_frames: int | None) -> None:
+        super().__init__(n_frames)
+        self._bars, self._task = bars, bars.add_task(name, total=n_frames, state="")
+
+    def changed(self) -> None:
+        self._bars.update(self._task, completed=self.n_done, state=self.words)
 
 
 def final_line(outcome: Outcome) -> str:

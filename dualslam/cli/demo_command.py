@@ -45,9 +45,9 @@ def execute(args: argparse.Namespace) -> int:
     for name, enabled in (("off", False), ("on", True)):
         if not args.quiet:
             print(f"Recovery {name}:", flush=True)
-        with progress(sequence, args.quiet) as on_frame:
+        with progress(sequence, args.quiet) as shown:
             outcome = run_to_folder(
-                _with_recovery(config, enabled), sequence, args.out / name, overwrite=args.overwrite, on_frame=on_frame
+                _with_recovery(config, enabled), sequence, args.out / name, overwrite=args.overwrite, watcher=shown
             )
         status = conclude(outcome, args)
         if outcome.report.interrupted:

@@ -17,7 +17,7 @@ from dualslam.io.atomic import atomic_file
 from dualslam.io.reduced import MAX_SIDE_PX
 from dualslam.io.sequence import RecordedSequence
 from dualslam.run.focal import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
-from dualslam.run.session import Outcome, check_out, run_to_folder
+from dualslam.run.session import Outcome, Watchers, check_out, run_to_folder
 from dualslam.run.sources import open_source
 from dualslam.viewer.live import LiveView
 
@@ -53,18 +53,17 @@ def execute(args: argparse.Namespace) -> int:
             config = with_prior(config, focal)
         _tell(focal, args.quiet)
     logs.release()
-    with live_view(args) as live, progress(sequence, args.quiet) as on_frame:
+    with live_view(args) as live, progress(sequence, args.quiet) as shown:
         outcome = run_to_folder(
             config,
             sequence,
             args.out,
             overwrite=args.overwrite,
             realtime=args.realtime,
-            on_frame=on_frame,
             saved_map=args.map,
             localise=args.localise,
             focal=focal,
-            watcher=live,
+            watcher=Watchers([each for each in (live, shown) if each is not None]),
         )
     status = conclude(outcome, args)
     may_go_on = isinstance(sequence, RecordedSequence) and not args.reverse and not args.localise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -57,6 +57,37 @@ class Watcher(Protocol):
     def end(self) -> None:
         """Look at the whole map, once the run has ended."""
         ...
+
+
+class Watchers:
+    """Several who look on, as one: the run waits where any of them wants it to.
+
+    Parameters
+    ----------
+    watchers : sequence of Watcher
+    """
+
+    def __init__(self, watchers: Iterable[Watcher]) -> None:
+        self._all = tuple(watchers)
+
+    def begin(self, system: System) -> None:
+        """Let all learn of the system."""
+        for each in self._all:
+            each.begin(system)
+
+    def after(self, frame: Frame, result: FrameResult) -> None:
+        """Let all look at a frame."""
+        for each in self._all:
+            each.after(frame, result)
+
+    def is_paused(self) -> bool:
+        """Whether any of them wants the run to wait."""
+        return any(each.is_paused() for each in self._all)
+
+    def end(self) -> None:
+        """Let all look at the whole map."""
+        for each in self._all:
+            each.end()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

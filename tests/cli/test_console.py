@@ -9,10 +9,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from dualslam.cli.console import FINISHING, final_line, progress
-from dualslam.core.types import FrameStatus
+from dualslam.cli.console import final_line, progress
+from dualslam.core.types import Frame, FrameStatus
 from dualslam.map.frame_records import FrameResult
 from dualslam.run.sources import open_source
+from dualslam.viewer.progress import FINISHING
 
 SOURCE = "synthetic:street,frames=3,seed=1,width=160,height=120"
 
@@ -32,11 +33,11 @@ def test_the_bar_says_what_a_run_does_once_all_frames_are_in(monkeypatch: pytest
     monkeypatch.setenv("COLUMNS", "160")
     monkeypatch.setattr(sys, "stderr", screen := Screen())
     sequence = open_source(SOURCE)
-    with progress(sequence, quiet=False) as on_frame:
-        assert on_frame is not None
+    with progress(sequence, quiet=False) as shown:
+        assert shown is not None
         for i in range(len(sequence)):
             assert FINISHING not in screen.getvalue()
-            on_frame(tracked(i))
+            shown.after(Frame(i, 0.1 * i, None), tracked(i))
     assert "3/3" in screen.getvalue()
     assert FINISHING in screen.getvalue()
 
@@ -45,8 +46,8 @@ def test_the_bar_says_what_a_run_does_once_all_frames_are_in(monkeypatch: pytest
 def test_nobody_watches(monkeypatch: pytest.MonkeyPatch, watched: bool, quiet: bool) -> None:
     screen = Screen() if watched else io.StringIO()
     monkeypatch.setattr(sys, "stderr", screen)
-    with progress(open_source(SOURCE), quiet) as on_frame:
-        assert on_frame is None
+    with progress(open_source(SOURCE), quiet) as shown:
+        assert shown is None
     assert not screen.getvalue()
 
 
