@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dualslam.cli.outputs import check_free
+from dualslam.cli.view_command import save_recording
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.types import FloatArray
 from dualslam.export.exported_map import ExportedMap, flatten, read_stored
@@ -25,11 +26,15 @@ from dualslam.run.sources import open_images_of_run
 
 TRAJECTORIES = {"tum": TRAJECTORY, "kitti": TRAJECTORY_KITTI}
 """Formats of which a run folder has the file already."""
+RECORDING = "rerun"
+"""Of the run, not of its map alone: what `dualslam view` shows."""
 
 
 def execute(args: argparse.Namespace) -> int:
     """Write the map of a run in another format."""
     _check_out(args)
+    if args.to == RECORDING:
+        return _write_recording(args)
     if args.to in TRAJECTORIES:
         return _copy_trajectory(args)
     stored = read_stored(args.run)
@@ -86,6 +91,13 @@ def _copy_trajectory(args: argparse.Namespace) -> int:
         write_text(args.out, "".join(f"{row}\n" for row in rows))
     if not args.quiet:
         print(f"trajectory in {args.out}", flush=True)
+    return 0
+
+
+def _write_recording(args: argparse.Namespace) -> int:
+    if args.images is not None or args.distance is not None:
+        raise InputError(f"--images and --distance do not go with --to {args.to}, which records the run as it was.")
+    save_recording(args.run, args.out, args.quiet)
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from dualslam.cli.outputs import check_free
 from dualslam.core.errors import InputError
@@ -17,15 +18,19 @@ def execute(args: argparse.Namespace) -> int:
         raise InputError("there is no display to open a viewer on; write the recording with --save FILE.")
     if args.save is not None:
         check_free(args.save, args.overwrite, "another with --save")
-    recording = _record(read_run(args.run))
-    if args.save is None:
-        open_viewer(recording)
-        return 0
-    with atomic_file(args.save) as file:
-        file.write(recording)
-    if not args.quiet:
-        print(f"recording in {args.save}; open it with rerun {args.save}", flush=True)
+        save_recording(args.run, args.save, args.quiet)
+    else:
+        open_viewer(_record(read_run(args.run)))
     return 0
+
+
+def save_recording(run: Path, out: Path, quiet: bool) -> None:
+    """Write the recording of a run."""
+    recording = _record(read_run(run))
+    with atomic_file(out) as file:
+        file.write(recording)
+    if not quiet:
+        print(f"recording in {out}; open it with rerun {out}", flush=True)
 
 
 def _record(run: RunData) -> bytes:

@@ -55,9 +55,9 @@ def open_sequence(
 
     Parameters
     ----------
-    source : path, or number of a webcam
+    source : path, address, or number of a webcam
         A folder of a known layout (ours, KITTI odometry, TUM RGB-D, TUM-Mono, EuRoC), a plain folder of images, a
-        video file, or ``0``, ``1``, ... for a webcam.
+        video file, ``0``, ``1``, ... for a webcam, or the address of a stream (``rtsp://``, ``http://``).
     camera_file : path, optional
         Calibration to use instead of the source's own (see `dualslam.io.camera_files`).
     fov_degrees : float, optional
@@ -87,9 +87,11 @@ def open_sequence(
     selection = Selection(start, stride, max_frames, reverse)
     given_camera = None if camera_file is None else read_camera_file(camera_file)
     given = Given(camera_file is not None or fov_degrees is not None, times, rate_hz)
-    if isinstance(source, int) or (str(source).isdigit() and not Path(source).exists()):
-        return video.open_webcam(int(str(source)), given_camera, fov_degrees, selection, given, grey)
-    recording = _open_recording(Path(source), given)
+    if video.is_live(source):
+        name = str(source)
+        device = int(name) if name.isdigit() else name
+        return video.open_webcam(device, given_camera, fov_degrees, selection, given, grey)
+    recording = _open_recording(Path(str(source)), given)
     camera = given_camera or recording.camera
     if camera is None:
         camera = _camera_from_fov(recording, fov_degrees)
@@ -103,7 +105,10 @@ def open_sequence(
 
 def _open_recording(source: Path, given: Given) -> Recording:
     if not source.exists():
-        raise InputError(f"{source} does not exist; give a sequence folder, a video file or the number of a webcam.")
+        raise InputError(
+            f"{source} does not exist; give a sequence folder, a video file, the number of a webcam or the "
+            "address of a stream."
+        )
     if source.is_file():
         return video.open_recording(source, given)
     for known in FORMATS:

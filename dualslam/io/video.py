@@ -1,4 +1,4 @@
-"""Video files and webcams, through OpenCV."""
+"""Video files, webcams and streams, through OpenCV."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import time
 from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -213,14 +214,14 @@ class WebcamSequence:
 
     def __init__(
         self,
-        number: int,
+        name: str,
         camera: Camera,
         rate_hz: float,
         selection: Selection,
         grey: bool,
         connect: Callable[[], Capture],
     ) -> None:
-        self.name = f"webcam_{number}"
+        self.name = name
         self.camera = camera
         self.rate_hz = rate_hz / selection.stride
         self.selection = selection
@@ -244,7 +245,9 @@ class WebcamSequence:
         try:
             for index in count():
                 if not capture.grab():
-                    raise InputError(f"{self.name} stopped giving frames; check that it is plugged in.")
+                    raise InputError(
+                        f"{self.name} stopped giving frames; check that it is plugged in or can be reached."
+                    )
                 timestamp_s = epoch_s + time.monotonic()
                 if index < wanted.start or (index - wanted.start) % wanted.stride:
                     continue
@@ -260,27 +263,46 @@ class WebcamSequence:
             capture.release()
 
 
+def is_live(source: str | Path | int) -> bool:
+    """Whether a source is the number of a webcam, a device, or the address of a stream."""
+    name, path = str(source), Path(str(source))
+    return "://" in name or path.is_char_device() or (name.isdigit() and not path.exists())
+
+
 def open_webcam(
-    number: int,
+    source: int | str,
     camera: Camera | None,
     fov_degrees: float | None,
     selection: Selection,
     given: Given,
     grey: bool,
-    connect: Callable[[int], Capture] = cv2.VideoCapture,
+    connect: Callable[[Any], Capture] = cv2.VideoCapture,
 ) -> WebcamSequence:
-    """Open webcam `number`, once to learn its image size, then again whenever the sequence is read."""
+    """Open a webcam by its number or device, or a stream by its address.
+
+    It is opened once to learn the size of its images, then again whenever the sequence is read.
+    """
+    if isinstance(source, int):
+        name, called = f"webcam_{source}", f"Webcam {source}"
+    elif "://" in source:
+        host = urlsplit(source).hostname or "local"  # what else is in an address may be a password
+        name, called = f"stream_{host}", f"The stream at {host}"
+    else:
+        name, called = Path(source).name, source
     if selection.reverse:
-        raise InputError(f"Webcam {number} is live and cannot be read in reverse.")
+        raise InputError(f"{called} is live and cannot be read in reverse.")
     if given.times is not None:
-        raise InputError(f"Webcam {number} is live and has times of its own; leave out the file of times.")
+        raise InputError(f"{called} is live and has times of its own; leave out the file of times.")
     if camera is None and fov_degrees is None:
-        raise InputError(f"Webcam {number} has no calibration; give a camera file, or a field of view in degrees.")
+        raise InputError(f"{called} has no calibration; give a camera file, or a field of view in degrees.")
+
+    reach = "check the address and that it can be reached" if "://" in str(source) else ""
+    check = reach or "check that it is plugged in and that no one uses it"
 
     def connected() -> Capture:
-        capture = connect(number)
+        capture = connect(source)
         if not capture.isOpened():
-            raise InputError(f"Webcam {number} cannot be opened; check that it is plugged in and that no one uses it.")
+            raise InputError(f"{called} cannot be opened; {check}.")
         return capture
 
     capture = connected()
@@ -289,14 +311,14 @@ def open_webcam(
     fps = capture.get(cv2.CAP_PROP_FPS)
     capture.release()
     if image is None:
-        raise InputError(f"Webcam {number} gives no frames; check that it is plugged in and that no one uses it.")
+        raise InputError(f"{called} gives no frames; {check}.")
     height, width = image.shape[:2]
     if camera is None:
         degrees = float(fov_degrees or 0.0)
         camera = make_camera("the field of view", lambda: camera_from_fov(width, height, degrees))
     elif (camera.width, camera.height) != (width, height):
         raise InputError(
-            f"The camera file is for images of {camera.width} x {camera.height} pixels, but those of webcam {number} "
+            f"The camera file is for images of {camera.width} x {camera.height} pixels, but those of {name} "
             f"are {width} x {height}; give the calibration of these images."
         )
-    return WebcamSequence(number, camera, fps if fps > 0 else NOMINAL_RATE_HZ, selection, grey, connected)
+    return WebcamSequence(name, camera, fps if fps > 0 else NOMINAL_RATE_HZ, selection, grey, connected)

@@ -232,11 +232,17 @@ def _no_display(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name, raising=False)
 
 
+@pytest.mark.parametrize(("word", "options"), [("view", ["--save"]), ("export", ["--to", "rerun", "--out"])])
 def test_the_command_writes_a_recording(
-    broken_run: RunData, broken: Played, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    broken_run: RunData,
+    broken: Played,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    word: str,
+    options: list[str],
 ) -> None:
     file = tmp_path / "new" / "run.rrd"
-    command = ["view", str(broken_run.path), "--save", str(file)]
+    command = [word, str(broken_run.path), *options, str(file)]
     assert main(command) == 0
     assert str(file) in capsys.readouterr().out
     assert Played(file).rows == broken.rows
