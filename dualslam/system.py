@@ -49,9 +49,9 @@ log = logging.getLogger(__name__)
 
 SETTLED_A_FRAME = 20
 """Buffered views that follow a change of the camera at each frame: 2 to 4 ms, where all of 10 s would take 30 to 60."""
-TAKEN_IN_A_FRAME = 200
-"""Landmarks that the index of places takes in at each frame in real time: 5 ms, where all that came during a walk back
-would take 200."""
+TAKEN_IN_A_FRAME = 1000
+"""Landmarks that the index of places takes in at each frame in real time: 2 to 3 ms, where all that came during reverse
+tracking take 20."""
 
 
 @dataclass(frozen=True, slots=True)

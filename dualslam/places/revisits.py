@@ -163,7 +163,7 @@ class Revisits:
     def take_in(self, live: Submap | None, at_most: int | None = None) -> int:
         """Let places be recognised by what maps have gained; return how many landmarks were taken in.
 
-        `live`: of which the newest keyframes wait. `at_most`: landmarks in one go, of which each costs some 25 us.
+        `live`: of which the newest keyframes wait. `at_most`: landmarks in one go, of which 1,000 take 2.5 ms.
         """
         n = 0
         if self._config.places.enabled and self._config.loops.enabled:
