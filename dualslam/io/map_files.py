@@ -8,6 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -72,36 +73,72 @@ def save_map(folder: str | Path, arrays: Mapping[str, Arrays], metadata: Mapping
     """Write groups of arrays as ``<group>.npz`` and the metadata as ``map.json``.
 
     The metadata comes last and names the groups, so a map whose writing was interrupted is not taken for a whole one.
+    Where the folder has a map already the new files stand beside the old ones (``<group>.1.npz``) until the metadata
+    names them: interrupted, the old map is there as it was.
     """
     folder = Path(folder)
+    names = {group: _free_name(folder, group) for group in arrays}
     for group, content in arrays.items():
-        save_arrays(folder / f"{group}.npz", content)
+        save_arrays(folder / names[group], content)
+    files = {group: name for group, name in names.items() if name != f"{group}.npz"}
     document = {"format": MAP_FORMAT, "groups": sorted(arrays), "metadata": to_plain(metadata)}
+    document |= {"files": files} if files else {}
+    groups = {*arrays, *_groups_there(folder)}
     write_text(folder / METADATA, json.dumps(document, indent=2, allow_nan=False) + "\n")
+    for path in sorted(folder.glob("*.npz")):  # of the map before, and of saves that were interrupted
+        group, *number = path.stem.split(".", maxsplit=1)
+        if group in groups and path.name != names.get(group) and (not number or number[0].isdecimal()):
+            path.unlink()
+
+
+def _groups_there(folder: Path) -> list[str]:
+    """Return the groups of the map that is in a folder, if there is one that can be read."""
+    try:
+        return load_metadata(folder)[0]
+    except InputError:
+        return []
+
+
+def _free_name(folder: Path, group: str) -> str:
+    names = chain([f"{group}.npz"], (f"{group}.{n}.npz" for n in count(1)))
+    return next(name for name in names if not (folder / name).exists())
+
+
+def array_files(folder: str | Path) -> dict[str, Path]:
+    """Return where the groups of arrays of a map are, by its metadata."""
+    folder = Path(folder)
+    groups, _, files = _read_metadata(folder)
+    return {group: folder / files.get(group, f"{group}.npz") for group in groups}
 
 
 def load_map(folder: str | Path) -> tuple[dict[str, dict[str, NDArray[Any]]], dict[str, Any]]:
     """Read what `save_map` wrote: groups of arrays, and metadata."""
-    folder = Path(folder)
-    groups, metadata = load_metadata(folder)
-    return {group: load_arrays(folder / f"{group}.npz") for group in groups}, metadata
+    _, metadata = load_metadata(folder)
+    return {group: load_arrays(path) for group, path in array_files(folder).items()}, metadata
 
 
 def load_metadata(folder: str | Path) -> tuple[list[str], dict[str, Any]]:
     """Read the names of the groups that `save_map` wrote, and the metadata, but no arrays."""
-    path = Path(folder) / METADATA
+    groups, metadata, _ = _read_metadata(Path(folder))
+    return groups, metadata
+
+
+def _read_metadata(folder: Path) -> tuple[list[str], dict[str, Any], dict[str, str]]:
+    """Return groups, metadata, and the names of the files that are not named as their group."""
+    path = folder / METADATA
     text = read_text(path)
     try:
         document = json.loads(text)
         version = int(document.get("format", 1))
         groups, metadata = list(document["groups"]), dict(document["metadata"])
+        files = {str(group): Path(str(name)).name for group, name in document.get("files", {}).items()}
         if not all(isinstance(group, str) for group in groups):
             raise TypeError("a group is named by a word")
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, AttributeError):
         raise InputError(f"{path} is not the metadata of a map, or is damaged.") from None
     if version > MAP_FORMAT:
         raise InputError(f"{path} is of format {version}, newer than this version of dualslam reads ({MAP_FORMAT}).")
-    return groups, metadata
+    return groups, metadata, files
 
 
 def to_plain(value: Any) -> Any:

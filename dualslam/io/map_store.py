@@ -15,6 +15,7 @@ from dualslam.core.camera.models import camera_from_dict
 from dualslam.core.errors import InputError
 from dualslam.io.map_files import (
     Arrays,
+    array_files,
     load_arrays,
     load_map,
     load_metadata,
@@ -66,7 +67,7 @@ class StoredMap:
 
 def submap_path(folder: Path, submap_id: int) -> Path:
     """Where the arrays of a submap are in a ``map`` folder."""
-    return folder / f"{SUBMAP}{submap_id:02d}.npz"
+    return array_files(folder)[f"{SUBMAP}{submap_id:02d}"]
 
 
 class _Groups(Mapping[str, dict[str, NDArray[Any]]]):
@@ -173,9 +174,10 @@ def load_joints(folder: str | Path) -> tuple[list[int], Atlas]:
     groups, metadata = load_metadata(folder)
     try:
         ids = sorted(int(name.removeprefix(SUBMAP)) for name in groups if name not in _OTHER)
-        solution = load_arrays(folder / f"{SOLUTION}.npz") if SOLUTION in groups else None
+        files = array_files(folder)
+        solution = load_arrays(files[SOLUTION]) if SOLUTION in groups else None
         atlas = Atlas()
-        _join(atlas, load_arrays(folder / f"{LINKS}.npz"), solution, metadata)
+        _join(atlas, load_arrays(files[LINKS]), solution, metadata)
         return ids, atlas
     except _DAMAGE as error:
         raise InputError(f"{folder} is no map of this version, or is damaged: {error}.") from error

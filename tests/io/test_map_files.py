@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import pytest
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.geometry import se3
 from dualslam.core.types import Features, Keyframe
-from dualslam.io import load_map, load_submap, save_map, save_submap
+from dualslam.io import load_map, load_submap, map_files, save_map, save_submap
+from dualslam.io.map_files import Arrays, save_arrays
 from dualslam.map.submap import RelativePose, Submap
 
 
@@ -108,6 +110,37 @@ def test_map_round_trip(tmp_path: Path) -> None:
             np.testing.assert_array_equal(back[group][name], array)
     assert said == {"main": [0, 1], "scale": 0.5, "camera": {"model": "pinhole"}, "bad": None}
     assert sorted(p.name for p in (tmp_path / "map").iterdir()) == ["links.npz", "map.json", "submap_00.npz"]
+
+
+def test_an_interrupted_save_leaves_the_old_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At whichever file it ends, in whichever way; the next save takes the place of both."""
+
+    def value(folder: Path) -> list[int]:
+        groups, said = load_map(folder)
+        return [int(said["number"]), *(int(groups[name]["x"]) for name in sorted(groups))]
+
+    def save(number: int, n_groups: int) -> None:
+        groups = {f"submap_{m:02d}": {"x": np.array(number)} for m in range(n_groups)}
+        save_map(tmp_path, groups, {"number": number})
+
+    save(1, 3)
+    for n_whole in range(3):
+        with monkeypatch.context() as broken:
+            whole = iter(range(n_whole))
+
+            def save_some(path: Path, arrays: Arrays, whole: Iterator[int] = whole) -> None:
+                if next(whole, None) is None:
+                    raise KeyboardInterrupt
+                save_arrays(path, arrays)
+
+            broken.setattr(map_files, "save_arrays", save_some)
+            with pytest.raises(KeyboardInterrupt):
+                save(2, 3)
+        assert value(tmp_path) == [1, 1, 1, 1]
+    for number, n_groups in ((3, 3), (4, 2), (5, 3)):
+        save(number, n_groups)
+        assert value(tmp_path) == [number] * (n_groups + 1)
+        assert len(list(tmp_path.iterdir())) == n_groups + 1, "nothing of the maps before is left"
 
 
 def test_no_pickles(tmp_path: Path) -> None:
