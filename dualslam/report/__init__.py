@@ -1,13 +1,14 @@
 """What a person looks at after a run: one self-contained page for it, and one for several runs side by side.
 
 In reading order: `run_data` (a run folder, read), `page` (the page, section by section), `top_view`, `timeline`,
-`failures`, `charts` (its figures), `compare` (several runs), `markup` (how HTML is made so that text cannot break it).
+`failures`, `places`, `charts` (its figures), `compare` (several runs), `markup` (how HTML is made so that text cannot
+break it).
 The figures are SVG written by hand: crisp at any size, a few kilobytes, and no library is needed to make them.
 """
 
 from dualslam.report.compare import comparison_page, comparison_table
 from dualslam.report.page import report_page
 from dualslam.report.run_data import RunData, read_run
-from dualslam.report.samples import SampleKeeper
+from dualslam.report.samples import PlaceAlbum, SampleKeeper
 
-__all__ = ["RunData", "SampleKeeper", "comparison_page", "comparison_table", "read_run", "report_page"]
+__all__ = ["PlaceAlbum", "RunData", "SampleKeeper", "comparison_page", "comparison_table", "read_run", "report_page"]

@@ -13,6 +13,7 @@ from dualslam.report.charts import beside_table, latency_histogram, pace_words, 
 from dualslam.report.event_words import event_words
 from dualslam.report.failures import failures_section, stories
 from dualslam.report.markup import Markup, cards, document, duration, join, number, table, tag
+from dualslam.report.places import places_section
 from dualslam.report.run_data import RunData
 from dualslam.report.statuses import WITHOUT_POSE, count
 from dualslam.report.timeline import timeline
@@ -33,7 +34,8 @@ def report_page(run: RunData) -> str:
         _section("Every frame", timeline(run)),
         _section("Failures and recoveries", failures_section(run)),
         _section("Trust", trust_section(run)),
-        _atlas(run),
+        _where_told("Places seen again", places_section(run)),
+        _where_told("Connections between submaps", atlas_section(run)),
         _section("Time", [pace_words(run), latency_histogram(run), stage_table(run), beside_table(run)]),
         _section("Configuration", _configuration(run)),
         _section("All events", _events(run)),
@@ -48,9 +50,8 @@ def _map_link(run: RunData) -> Markup | None:
     return tag("p", tag("a", "Turn the map in three dimensions", href=MAP_PAGE), ", frame by frame.")
 
 
-def _atlas(run: RunData) -> Markup | None:
-    table = atlas_section(run)
-    return None if table is None else _section("Connections between submaps", table)
+def _where_told(title: str, content: Markup | None) -> Markup | None:
+    return None if content is None else _section(title, content)
 
 
 def headline(run: RunData) -> str:

@@ -1,8 +1,8 @@
-"""Sample frames: small pictures of the frames around each gap in the tracking, chosen while the run goes on."""
+"""Sample frames: small pictures around each gap in the tracking and of places seen again, chosen as the run goes on."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -14,6 +14,10 @@ MAX_GAPS = 12
 """Gaps of which frames are kept: what a person looks at, and a bound on the size of the report."""
 MIN_GAP_FRAMES = 3
 """Shorter gaps are a blink that tracking came back from."""
+MAX_PLACES = 12
+"""Places seen again of which pictures are kept, and that have a card: a bound on the size of the report."""
+ALBUM_EVERY_S, ALBUM_SIZE = 0.5, 600
+"""Time between two pictures that are remembered, and how many are: 5 to 10 MB."""
 WIDTH_PX = 320
 JPEG_QUALITY = 72
 POSED = frozenset({FrameStatus.TRACKED, FrameStatus.RECOVERED, FrameStatus.BYPASSED})
@@ -61,6 +65,41 @@ class SampleKeeper:
                 if frame is not None and frame.image is not None:
                     self._keep(frame.index, thumbnail(frame.image))
         self._gap, self._gap_frames = None, 0
+
+
+class PlaceAlbum:
+    """Remembers what the camera has seen, so that a place that is seen again can be shown as it was then, and is now.
+
+    Parameters
+    ----------
+    keep : callable
+        Given the frame's index and a JPEG, once a place is seen again.
+    """
+
+    def __init__(self, keep: Callable[[int, bytes], None]) -> None:
+        self._keep = keep
+        self._pictures: dict[int, bytes] = {}
+        self._next_s, self._every_s = -np.inf, ALBUM_EVERY_S
+        self._n_shown = 0
+
+    def take(self, frame: Frame, status: FrameStatus) -> None:
+        """Remember a frame with a pose, twice a second; fewer where there are very many."""
+        if status not in POSED or frame.image is None or frame.timestamp_s < self._next_s:
+            return
+        self._next_s = frame.timestamp_s + self._every_s
+        self._pictures[frame.index] = thumbnail(frame.image)
+        if len(self._pictures) > ALBUM_SIZE:
+            self._pictures = dict(list(self._pictures.items())[::2])
+            self._every_s *= 2
+
+    def show(self, indices: Sequence[int]) -> None:
+        """Keep for good the pictures nearest to some frames, of one place; of earlier runs' frames there are none."""
+        if self._n_shown == MAX_PLACES or not self._pictures:
+            return
+        self._n_shown += 1
+        for index in (i for i in indices if i >= 0):
+            nearest = min(self._pictures, key=lambda i: (abs(i - index), i))
+            self._keep(nearest, self._pictures[nearest])
 
 
 def thumbnail(image: NDArray[np.uint8]) -> bytes:

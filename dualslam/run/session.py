@@ -25,7 +25,7 @@ from dualslam.io.sequence import Selection
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.lab.disturbances import corrupted
 from dualslam.map.frame_records import FrameResult
-from dualslam.report import SampleKeeper, read_run, report_page
+from dualslam.report import PlaceAlbum, SampleKeeper, read_run, report_page
 from dualslam.run.interrupts import Interrupts
 from dualslam.run.results import frame_rows, summarise, trajectories_of, truth_of_frames
 from dualslam.run.runner import RunReport, run_sequence
@@ -37,6 +37,9 @@ SEARCHED_SIGMA = 0.031
 """Of the log focal length of a camera that was searched for, beside what self-calibration claims: what the lens leaves
 that it has no model for. With it the errors of eight pieces of recordings come to what is claimed (docs/notes, "A
 camera of which nothing is known")."""
+
+SEEN_AGAIN = (EventKind.LOOP_CLOSED, EventKind.MERGED, EventKind.RELOCALISED)
+"""Of these places pictures are kept."""
 
 
 class Watcher(Protocol):
@@ -180,7 +183,7 @@ def run_to_folder(
         prepare = system.features_beside() if realtime and spare_cores(1) else None
         if realtime and isinstance(system.desk, WorkerDesk):
             system.desk.wait_until_ready()
-        watched = _Watched(system, SampleKeeper(folder.write_sample), watcher)
+        watched = _Watched(system, SampleKeeper(folder.write_sample), PlaceAlbum(folder.write_sample), watcher)
         with Interrupts() as interrupts:
             report = run_sequence(
                 watched,
@@ -271,23 +274,35 @@ def _write_results(
 class _Watched:
     """A system whose frames are looked at: for sample pictures, and by who watches the run."""
 
-    def __init__(self, system: System, samples: SampleKeeper, watcher: Watcher | None) -> None:
-        self._system, self._samples, self._watcher = system, samples, watcher
+    def __init__(self, system: System, samples: SampleKeeper, album: PlaceAlbum, watcher: Watcher | None) -> None:
+        self._system, self._samples, self._album, self._watcher = system, samples, album, watcher
+        self._n_events = len(system.events)
         if watcher is not None:
             watcher.begin(system)
 
     def step(self, frame: Frame) -> FrameResult:
         result = self._system.step(frame)
         self._samples.take(frame, result.status)
+        self._album.take(frame, result.status)
+        self._show_places()
         if self._watcher is not None:
             self._watcher.after(frame, result)
         return result
 
     def finish(self, interrupted: bool = False) -> None:
         self._system.finish(interrupted)
+        self._show_places()
         if self._watcher is not None:
             self._watcher.end()
         self._samples.finish()
+
+    def _show_places(self) -> None:
+        numbers = self._system.numbers
+        for event in islice(self._system.events, self._n_events, None):
+            if event.event in SEEN_AGAIN:
+                frames = [event.data.get("keyframe", event.frame), event.data.get("other_frame")]
+                self._album.show([numbers.index_of(i) for i in frames if i is not None])
+        self._n_events = len(self._system.events)
 
 
 def _write_new_events(system: System, folder: RunFolder, n_written: int) -> int:
