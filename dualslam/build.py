@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -43,9 +43,10 @@ from dualslam.lab.disturbances import FaultScript
 from dualslam.map.graph_beside import BesideGraphs, GraphServer
 from dualslam.map.skeleton import answer_edges
 from dualslam.map.submap import Submap
+from dualslam.map.tidying import tidy
 from dualslam.places import FaissRecogniser, PlaceVerifier
-from dualslam.places.revisits import PlaceParts
 from dualslam.places.search import search_places
+from dualslam.places.sightings import PlaceParts
 from dualslam.recovery.executor import DeskExecutor, InlineExecutor, RecoveryExecutor
 from dualslam.recovery.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
 from dualslam.recovery.linking.gates import DESCRIPTOR_RADIUS_PX
@@ -136,7 +137,9 @@ def build_system(
     faults = FaultScript(config.corruptions)
     shutter = RollingShutter(frontend, config.camera, config.seed)
 
-    live = LiveParts(config, frontend, calibration, size_px)
+    if saved is not None and not localise:
+        saved = replace(saved, poses=tidy(saved.atlas, saved.poses))
+    live = LiveParts(config, frontend, calibration, size_px, 0 if saved is None else saved.next_id)
     reader = FrameReader(frontend, live.camera, config.camera.model_sigma_px, shutter)
 
     workers = config.recovery.workers
@@ -188,6 +191,8 @@ class LiveParts:
     frontend: Frontend
     calibration: Calibration
     size_px: tuple[int, int]
+    first_id: int = 0
+    """Number of the first frame: those before it are of the runs that have left the saved map."""
 
     def camera(self) -> Camera:
         """Return the camera as it is known now."""
@@ -213,7 +218,9 @@ class LiveParts:
         config, frontend = self.config, self.frontend
         refinder = Refinder(submap, frontend, self.camera, config.camera.model_sigma_px)
         window = window_solver(config)
-        return VisualFrontEnd(frontend, config, submap, graph, self.size_px, refinder, n_covering, window)
+        return VisualFrontEnd(
+            frontend, config, submap, graph, self.size_px, refinder, n_covering, window, self.first_id
+        )
 
 
 def new_initialiser(config: Config, frontend: Frontend, size_px: tuple[int, int], K: FloatArray) -> Initialiser:

@@ -34,7 +34,9 @@ from dualslam.map.split import next_submap, submap_of, take_out
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
 from dualslam.pace import Pace
-from dualslam.places.revisits import PlaceParts, Revisits
+from dualslam.places.handover import Handover
+from dualslam.places.revisits import Revisits
+from dualslam.places.sightings import PlaceParts, Relocalised
 from dualslam.recovery.bypass import drop_corrupted
 from dualslam.recovery.executor import RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
@@ -52,6 +54,10 @@ SETTLED_A_FRAME = 20
 TAKEN_IN_A_FRAME = 1000
 """Landmarks that the index of places takes in at each frame in real time: 2 to 3 ms, where all that came during reverse
 tracking take 20."""
+
+ROOM_TO_COME_BACK = 1.2
+"""A full submap of an earlier run takes so many times `graph.max_keyframes`: what later visits add to a place that is
+mapped (the first one about a tenth, hardly any the next) is no reason to map it once more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +124,7 @@ class System:
         self.saved, self.numbers = saved, FrameNumbers(0 if saved is None else saved.next_id)
         self._world = saved.main[0] if saved is not None and saved.main else None
         self._localises = localise
+        self._earlier = frozenset(record.atlas.submaps)
         self._n_without_map = 0
         self.atlas, self.rows, self.poses = record.atlas, record.rows, record.poses
         self.events, self.timer = record.events, record.timer
@@ -156,6 +163,8 @@ class System:
             config,
             merges=config.recovery.enabled or saved is not None,
         )
+        extends = saved is not None and not localise and config.places.enabled and config.loops.enabled
+        self._handover = Handover(record, self._revisits.sightings, self._earlier) if extends else None
         self._recoveries = Recoveries(
             record,
             self.buffer,
@@ -335,7 +344,7 @@ class System:
         if not self.atlas.submaps or after is None or self._n_without_map <= after:
             return None
         with self.timer.measure("places"):
-            found = self._revisits.sighted(view, self._parts.K)
+            found = self._revisits.sightings.sighted(view, self._parts.K)
         if found is None:
             return None
         self._live, submap = found.odometry, found.odometry.submap
@@ -423,6 +432,8 @@ class System:
             if contradicted is not None and first is not None:
                 self._break_at(live, view, first.index, contradicted)
                 return contradicted
+            if isinstance(track, Track) and (found := self._seen_from(live, track)) is not None:
+                return self._go_over(live, found, view)
             if live.reference_id != view.index:
                 if self.pace.in_real_time and not self.pace.behind:
                     self._catch_up_on_places(live, view)
@@ -430,7 +441,7 @@ class System:
             if (loss := self._scale_lost(live.submap)) is not None and self._part_at(live, view, loss):
                 return track
             self._calibrations.ask_if_due(live, view, self._recoveries.waiting)
-            if len(live.submap.keyframes) >= self._config.graph.max_keyframes:
+            if len(live.submap.keyframes) >= self._max_keyframes(live.submap):
                 self._roll_over(live, view)
             else:
                 self._recoveries.retry(live.submap, view)
@@ -494,7 +505,7 @@ class System:
             self._record.event(EventKind.GAP_RELOCALISED, view, odometry.submap.id, n_inliers=track.n_inliers)
         if self._localises:
             cast(Seeker, odometry).look_about()
-        elif odometry.keyframe_due(track) and not self.pace.puts_off(track.n_inliers, self._weak_landmarks):
+        elif self._keyframe_due(odometry, track):
             try:
                 with self.timer.measure("mapping"):
                     report = odometry.insert_keyframe(track)
@@ -511,6 +522,15 @@ class System:
         )
         self._record.pose(pose, track.n_matches, track.n_inliers)
         return track
+
+    def _keyframe_due(self, odometry: VisualOdometry, track: Track) -> bool:
+        """Whether a frame is to become a keyframe, now and in this submap."""
+        if not odometry.keyframe_due(track) or self.pace.puts_off(track.n_inliers, self._weak_landmarks):
+            return False
+        if self._handover is None or odometry is not self._live or self._recoveries.is_under_way(odometry.submap):
+            return True
+        with self.timer.measure("places"):
+            return not self._handover.waits(track, odometry, self._parts.K)
 
     # --- graphs beside the tracking
 
@@ -558,7 +578,7 @@ class System:
         # Not where its graph has failed, where two poses stood, or where a walk back is about to change it.
         doubtful = failure.reason in (FailureReason.LOOK_ALIKE, FailureReason.LEAP)
         if doubtful:
-            self._revisits.avoid(live.submap.id)
+            self._revisits.sightings.avoid(live.submap.id)
         hopeless = doubtful or failure.reason is FailureReason.SOLVER
         if not hopeless and not self._recoveries.is_under_way(live.submap):
             self._relocaliser.begin(live)
@@ -656,6 +676,11 @@ class System:
 
     # --- a submap that is full
 
+    def _max_keyframes(self, submap: Submap) -> int:
+        """Return with how many keyframes a submap is full; one that was full when an earlier run left it has room."""
+        share = ROOM_TO_COME_BACK if submap.id in self._earlier else 1.0
+        return int(share * self._config.graph.max_keyframes)
+
     def _roll_over(self, live: VisualOdometry, view: View) -> None:
         """Continue in a new submap that shares its first keyframes with the full one: no failure, and a stiff link."""
         submap = next_submap(live.submap, len(self.atlas.submaps), self._config.graph.rollover_keyframes, view.index)
@@ -672,6 +697,32 @@ class System:
         self._live = self._parts.new_odometry(submap, graph)
         self._live.start_at(list(submap.keyframes)[-1])
         self._connections.connect([link], view)
+
+    def _seen_from(self, live: VisualOdometry, track: Track) -> Relocalised | None:
+        """Return the submap of an earlier run that shows what the live one has come to, once that is sure."""
+        if self._handover is None:
+            return None
+        with self.timer.measure("places"):
+            return self._handover.follow(track, live)
+
+    def _go_over(self, live: VisualOdometry, found: Relocalised, view: View) -> Track:
+        """Go on in the submap of an earlier run that has this place already."""
+        self._archive(live, "an earlier map goes on")
+        self._live, submap, track = found.odometry, found.odometry.submap, found.track
+        reference = self._live.reference_id
+        pose = FramePose(view.index, view.timestamp_s, submap.id, reference, self._live.relative_pose(track))
+        self._record.pose(pose, track.n_matches, track.n_inliers)
+        self._record.event(
+            EventKind.RELOCALISED,
+            view,
+            submap.id,
+            n_inliers=track.n_inliers,
+            other_frame=reference,
+            frames=len(found.earlier) + 1,
+            from_submap=live.submap.id,
+        )
+        self._health = HealthMonitor(self._config.health)
+        return track
 
     # --- records
 

@@ -1,13 +1,13 @@
-"""Loops, merges by revisit, and relocalisation in any submap: when places are searched and believed, and what follows.
+"""Loops and merges by revisit: when places are searched and believed, and what follows.
 
-One verified pair is provisional. It is believed once keyframes (or, without a map, frames) that follow it say the same;
-it is dropped where they do not. What is believed becomes a link, and the atlas does the rest.
+One verified pair is provisional. It is believed once keyframes that follow it say the same; it is dropped where they
+do not. What is believed becomes a link, and the atlas does the rest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,17 +15,24 @@ from dualslam.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.interfaces import Seeker, SubmapGraph, VisualOdometry
-from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
-from dualslam.health import judge_track
+from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.atlas import Link, LinkKind
 from dualslam.map.atlas_report import AtlasReport
 from dualslam.map.connections import Connections
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import compose
-from dualslam.places.recogniser import PlaceRecogniser
 from dualslam.places.search import PlaceSearch, follow_maps, poses_of
-from dualslam.places.verification import PlaceMatch, PlaceVerifier
+from dualslam.places.sightings import (
+    N_SECONDS,
+    SAME_WITHIN,
+    PlaceParts,
+    Sightings,
+    record_refusal,
+    same_pose,
+    turn_between,
+)
+from dualslam.places.verification import PlaceMatch
 from dualslam.recovery.leaps import refuse_leaps
 from dualslam.workers.jobs import Desk, Ended, JobKind
 
@@ -33,33 +40,16 @@ ASK_EVERY = 2
 """Keyframes between two searches, where nothing is provisional: neighbours show the same."""
 RECENT = 20
 """Keyframes before and after that are no revisit: what is seen there is tracked, or was a moment ago."""
-N_SECONDS = 2
-"""Keyframes (or frames) that must say the same as the first: three with it, where evidence begins for a link too."""
 MAX_MISSES = 3
 """Keyframes that may not second before the provisional pair is dropped."""
 REST = 10
 """Keyframes after a link between two submaps before another is looked for between them."""
-YOUNG = 5
-"""Newest keyframes of the live submap whose own landmarks are not remembered yet: half of them will be culled."""
-SAME_WITHIN = 0.1
-"""Where two similarities put the camera, of the scene's depth, within which they say the same: twice the 5 % that makes
-a link a wrong one."""
-SAME_TURN_RAD = float(np.radians(6.0))
-"""The same for its rotation: twice 3 degrees."""
 MAX_DRIFT, MAX_DRIFT_DEG, MAX_DRIFT_LOG_SCALE = 0.5, 60.0, float(np.log(3.0))
 """What a map that was never lost between two places can have drifted at most: a share of the way, a turn, a scale. Half
 the way is what lies between two copies of a thing that stand next to each other; the largest drift that was seen on a
 real sequence is 47 % in scale."""
 _SILENT = (FailureReason.TOO_FEW_MATCHES, FailureReason.TOO_FEW_INLIERS)
 """Refusals of what only looked alike to the recogniser: they are no events."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PlaceParts:
-    """What places are recognised and verified by; made by the composition root."""
-
-    recogniser: PlaceRecogniser
-    verifier: PlaceVerifier
 
 
 @dataclass(slots=True)
@@ -81,36 +71,6 @@ class _Believed:
     match: PlaceMatch
     seconds: int
     then: tuple[FloatArray, FloatArray]
-
-
-@dataclass(slots=True)
-class _Seeker:
-    """A front end that has posed a frame in an archived submap, and those that it has posed since."""
-
-    odometry: Seeker
-    keyframe_id: int
-    tracks: list[tuple[Track, FloatArray]] = field(default_factory=list)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Relocalised:
-    """The map in which frames without a map were found.
-
-    Attributes
-    ----------
-    odometry : VisualOdometry
-        Goes on there.
-    earlier : list of (Track, (4, 4))
-        The frames before the newest that it has posed, with their poses relative to the keyframe `reference`.
-    track : Track
-        The newest frame's.
-    reference : int
-    """
-
-    odometry: Seeker
-    earlier: list[tuple[Track, FloatArray]]
-    track: Track
-    reference: int
 
 
 class Revisits:
@@ -145,18 +105,15 @@ class Revisits:
         self._record = record
         self._merges = merges
         self._recogniser = parts.recogniser
+        self.sightings = Sightings(record, parts, new_graph, new_relocaliser, config)
         self._verifier = parts.verifier
         self._connections = connections
         self._desk = desk
-        self._new_graph = new_graph
-        self._new_frontend = new_relocaliser
         self._config = config
         self._provisional: _Provisional | None = None
         self._believed: _Believed | None = None
         self._n_asked = 0
         self._linked_at: dict[tuple[int, int], int] = {}  # counted in `_n_asked`, by pairs of submaps
-        self._frontend: _Seeker | None = None
-        self._avoided: set[int] = set()
 
     # --- keyframes of the live map
 
@@ -165,12 +122,8 @@ class Revisits:
 
         `live`: of which the newest keyframes wait. `at_most`: landmarks in one go, of which 1,000 take 2.5 ms.
         """
-        n = 0
-        if self._config.places.enabled and self._config.loops.enabled:
-            for submap in self._record.atlas.submaps.values():
-                left = None if at_most is None else at_most - n
-                n += self._recogniser.take_in(submap, YOUNG if submap is live else 0, left)
-        return n
+        enabled = self._config.places.enabled and self._config.loops.enabled
+        return self.sightings.take_in(live, at_most) if enabled else 0
 
     def note_keyframe(self, live: VisualOdometry, at_most: int | None = None) -> None:
         """Search for a place that the live map's newest keyframe shows again; `collect` returns the answer.
@@ -179,7 +132,7 @@ class Revisits:
         """
         if not (self._config.places.enabled and self._config.loops.enabled):
             return
-        self._frontend = None
+        self.sightings.end()
         self._n_asked += 1
         if (self._provisional is None and self._n_asked % ASK_EVERY) or self._desk.n_open(JobKind.LOOP):
             return
@@ -234,14 +187,14 @@ class Revisits:
                 refused = candidate.submap_id, candidate.keyframe_id, match
         if not found:
             if refused is not None:  # the best of them: one event for a keyframe
-                self._refused(now, search.submap_id, *refused)
+                record_refusal(self._record, now, search.submap_id, *refused)
             return None
         best = max(found, key=lambda m: m.n_inliers)
         for other in found:
             if other is not best and self._contradict(best, other):
                 detail = f"keyframes {best.place[1]} and {other.place[1]} show the place as well, elsewhere"
                 why = Failure(FailureReason.AMBIGUOUS_MODEL, detail)
-                self._refused(now, search.submap_id, best.place[0], best.place[1], why)
+                record_refusal(self._record, now, search.submap_id, best.place[0], best.place[1], why)
                 self._provisional = None
                 return None
         return best
@@ -276,7 +229,7 @@ class Revisits:
                 waiting.misses += 1
                 if waiting.misses > MAX_MISSES:
                     why = Failure(FailureReason.UNCONFIRMED, f"seconded {waiting.seconds} times, {N_SECONDS} needed")
-                    self._refused(now, submap.id, *waiting.match.place, why)
+                    record_refusal(self._record, now, submap.id, *waiting.match.place, why)
                     self._provisional = None
             return
         if waiting is None or match.place[0] != waiting.match.place[0] or not self._agree(waiting.match, match):
@@ -320,7 +273,7 @@ class Revisits:
         report = self._connections.connect([link], now)
         if not report:
             assert report.failure is not None
-            self._refused(now, b, a, keyframe_a, report.failure)
+            record_refusal(self._record, now, b, a, keyframe_a, report.failure)
             return None
         if a == b:
             self._merge_duplicates(atlas.submaps[a], match)
@@ -357,7 +310,7 @@ class Revisits:
         T_place = place.T_submap_kf[second.place[1]]
         depth = float(np.median(place.depths(ids[ids >= 0], se3.inverse(T_place))))
         poses = [sim3.act_on_pose(match.S_place_query, T_q) for match in (first, second)]
-        return _same_pose(poses[0], poses[1], SAME_WITHIN * depth)
+        return same_pose(poses[0], poses[1], SAME_WITHIN * depth)
 
     def _contradict(self, one: PlaceMatch, other: PlaceMatch) -> bool:
         """Whether two matches of one keyframe put it at two places of one map."""
@@ -393,7 +346,7 @@ class Revisits:
         log_scale = float(np.log(sim3.scale(match.S_place_query) / sim3.scale(S_a_b)))
         way = self._way(component, S_world, k_a, k_b) / float(sim3.scale(S_world[a]))
         apart = float(np.linalg.norm(by_chain[:3, 3] - by_pixels[:3, 3]))
-        numbers = {"drift_rot_deg": float(np.degrees(_turn(by_chain, by_pixels))), "drift_log_scale": log_scale}
+        numbers = {"drift_rot_deg": float(np.degrees(turn_between(by_chain, by_pixels))), "drift_log_scale": log_scale}
         numbers |= {"drift": apart / max(way, 1e-12)}
         match.numbers.update(numbers)
         if numbers["drift_rot_deg"] > MAX_DRIFT_DEG or abs(log_scale) > MAX_DRIFT_LOG_SCALE or apart > MAX_DRIFT * way:
@@ -427,93 +380,3 @@ class Revisits:
                     centres[k] = sim3.act(S_world[m], T[None, :3, 3])[0]
         ordered = np.array([centres[k] for k in sorted(centres)])
         return float(np.linalg.norm(np.diff(ordered, axis=0), axis=1).sum())
-
-    def _refused(self, now: FrameStamp, submap_id: int, other_submap: int, other_frame: int, why: Failure) -> None:
-        self._record.event(
-            EventKind.LOOP_REFUSED,
-            now,
-            submap_id,
-            other_submap=other_submap,
-            other_frame=other_frame,
-            reason=str(why.reason),
-            detail=why.detail,
-            **why.numbers,
-        )
-
-    # --- frames without a map
-
-    def avoid(self, submap_id: int) -> None:
-        """Relocalise no more frames in a submap that was lost as a look-alike: a wrong pose may pass by chance."""
-        self._avoided.add(submap_id)
-
-    def sighted(self, view: View, K: FloatArray) -> Relocalised | None:
-        """Search all submaps for a frame without a map; return where it is once later frames confirm it.
-
-        `K`: (3, 3) intrinsics of the frame; submaps of other ones are not looked at.
-        """
-        if not self._config.places.enabled:
-            return None
-        if self._frontend is not None:
-            if relocalised := self._follow(self._frontend, view):
-                return relocalised
-            if self._frontend is not None:
-                return None
-        self.take_in(None)
-        self._frontend = self._relocalise(view, K)
-        return None
-
-    def _follow(self, relocaliser: _Seeker, view: View) -> Relocalised | None:
-        """Let the front end that has posed the last frame pose this one."""
-        track = judge_track(relocaliser.odometry.track(view), self._config.health)
-        if isinstance(track, Failure) or track.wide:
-            self._frontend = None
-            return None
-        if len(relocaliser.tracks) < N_SECONDS:
-            relocaliser.tracks.append((track, relocaliser.odometry.relative_pose(track)))
-            return None
-        self._frontend = None
-        return Relocalised(relocaliser.odometry, relocaliser.tracks, track, relocaliser.odometry.reference_id)
-
-    def _relocalise(self, view: View, K: FloatArray) -> _Seeker | None:
-        """Pose a frame in the submap that it shows, by pixels alone."""
-        all_submaps = self._record.atlas.submaps
-        submaps = {m: s for m, s in all_submaps.items() if (s.K == K).all() and m not in self._avoided}
-        found: list[tuple[_Seeker, Track]] = []
-        for candidate in self._recogniser.query(view.features, submaps):
-            submap = submaps[candidate.submap_id]
-            odometry = self._new_frontend(submap, self._new_graph())
-            track = judge_track(odometry.relocalise(view, candidate.keyframe_id), self._config.health)
-            if isinstance(track, Failure):
-                continue
-            why = self._verifier.check_pose(submap, candidate.keyframe_id, track.T_cam_submap, view.features)
-            if why is not None:
-                self._refused(view, candidate.submap_id, candidate.submap_id, candidate.keyframe_id, why)
-                continue
-            pose = odometry.relative_pose(track)
-            found.append((_Seeker(odometry, candidate.keyframe_id, [(track, pose)]), track))
-        if not found:
-            return None
-        best, track = max(found, key=lambda item: item[1].n_inliers)
-        for other, contender in found:
-            submap = best.odometry.submap
-            if other.odometry.submap is not submap:
-                continue
-            ids = track.landmark_ids[track.landmark_ids >= 0]
-            depth = float(np.median(submap.depths(ids, track.T_cam_submap)))
-            here, there = se3.inverse(track.T_cam_submap), se3.inverse(contender.T_cam_submap)
-            if not _same_pose(here, there, SAME_WITHIN * depth):
-                detail = f"keyframes {best.keyframe_id} and {other.keyframe_id} show the place as well, elsewhere"
-                why = Failure(FailureReason.AMBIGUOUS_MODEL, detail)
-                self._refused(view, submap.id, submap.id, best.keyframe_id, why)
-                return None
-        return best
-
-
-def _turn(T_a: FloatArray, T_b: FloatArray) -> float:
-    """Return the angle between two poses, radians."""
-    return float(np.arccos(np.clip((np.trace(T_a[:3, :3].T @ T_b[:3, :3]) - 1) / 2, -1, 1)))
-
-
-def _same_pose(T_a: FloatArray, T_b: FloatArray, within: float) -> bool:
-    """Whether two poses, camera to map, are one: within a distance and `SAME_TURN_RAD`."""
-    return bool(np.linalg.norm(T_a[:3, 3] - T_b[:3, 3]) < within and _turn(T_a, T_b) < SAME_TURN_RAD)

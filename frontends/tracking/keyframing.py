@@ -6,16 +6,19 @@ import numpy as np
 
 from dualslam.config.settings import KeyframeConfig
 from dualslam.core.geometry import se3
-from dualslam.core.types import Track
+from dualslam.core.types import IntArray, Track
 from dualslam.map.submap import Submap
 
 MIN_PARALLAX_DEG = 0.5
 """...and the camera has moved enough to see the scene's median depth under this angle (or tracking is weak)."""
 
+N_LIKE = 5
+"""Keyframes of earlier runs, those that see most of what a frame sees, that are asked whether one shows the same."""
+
 ESTABLISHED = 3  # views of a landmark from which on its loss says that the scene has changed
 
 
-def keyframe_due(track: Track, submap: Submap, reference_id: int, config: KeyframeConfig) -> bool:
+def keyframe_due(track: Track, submap: Submap, reference_id: int, config: KeyframeConfig, first_id: int = 0) -> bool:
     """Decide by what is still tracked of the last keyframe and by how far the camera has moved since.
 
     Parameters
@@ -25,28 +28,62 @@ def keyframe_due(track: Track, submap: Submap, reference_id: int, config: Keyfra
     reference_id : int
         The last keyframe, in the direction in which the frames come.
     config : KeyframeConfig
+    first_id : int
+        Number of this run's first frame: how long ago another run was says nothing.
     """
     if track.view.index in submap.keyframes:
         return False
     if track.n_inliers < config.weak_landmarks:
         return True
-    tracked_ratio = tracked_share(track, submap, reference_id)
-    parallax = parallax_deg(track, submap, reference_id)
+    n_frames = abs(track.view.index - reference_id) if reference_id >= first_id else 0
+    share = _share_in(track.landmark_ids, submap, reference_id)
+    return _shows_other(share, parallax_deg(track, submap, reference_id), n_frames, config)
+
+
+def keyframe_like(track: Track, submap: Submap, first_id: int, config: KeyframeConfig) -> int | None:
+    """Return the keyframe of an earlier run that makes one of this frame superfluous, if there is one.
+
+    What it sees is in view from much the same place; whether it is found there, or looks otherwise today, is no
+    question of where keyframes are, as long as enough of the map is.
+
+    Parameters
+    ----------
+    track : Track
+    submap : Submap
+    first_id : int
+        Number of this run's first frame.
+    config : KeyframeConfig
+    """
+    if track.n_inliers < config.weak_landmarks:
+        return None
+    in_view = np.union1d(track.visible_ids, track.landmark_ids)
+    covisible, _ = submap.covisible(track.landmark_ids[track.landmark_ids >= 0])
+    for k in covisible[covisible < first_id][:N_LIKE].tolist():
+        if not _shows_other(_share_in(in_view, submap, k), parallax_deg(track, submap, k), 0, config):
+            return int(k)
+    return None
+
+
+def _shows_other(share: float, parallax: float, n_frames: int, config: KeyframeConfig) -> bool:
+    """Whether a frame shows other things than a keyframe, or from elsewhere.
+
+    `share`: of the keyframe's landmarks, that the frame shows. `n_frames`: that lie between the two.
+    """
     if parallax > config.max_parallax_deg:
         return True
     if parallax < MIN_PARALLAX_DEG:
         # A turn in place reveals nothing that could be triangulated, until half of what was known is out of view.
-        return tracked_ratio < 0.5 * config.max_tracked_ratio
-    return tracked_ratio < config.max_tracked_ratio or abs(track.view.index - reference_id) >= config.max_frames
+        return share < 0.5 * config.max_tracked_ratio
+    return share < config.max_tracked_ratio or n_frames >= config.max_frames
 
 
-def tracked_share(track: Track, submap: Submap, reference_id: int) -> float:
-    """Share of a keyframe's established landmarks that the frame still sees."""
-    reference = submap.landmark_of[reference_id]
+def _share_in(landmark_ids: IntArray, submap: Submap, keyframe_id: int) -> float:
+    """Return the share of a keyframe's established landmarks that are among some."""
+    reference = submap.landmark_of[keyframe_id]
     reference = reference[reference >= 0]
     established = submap.n_observations(reference) >= min(ESTABLISHED, len(submap.keyframes))
     reference = reference[established]
-    return float(np.isin(reference, track.landmark_ids).mean()) if len(reference) else 0.0
+    return float(np.isin(reference, landmark_ids).mean()) if len(reference) else 0.0
 
 
 def parallax_deg(track: Track, submap: Submap, reference_id: int) -> float:

@@ -15,7 +15,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend, GraphEstimate, KeyframeReport, SubmapGraph, WindowSolver
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from dualslam.frontends.gap.refinding import Refinder
-from dualslam.frontends.tracking.keyframing import keyframe_due
+from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like
 from dualslam.frontends.tracking.mapper import Mapper
 from dualslam.frontends.tracking.tracker import GivenPose, Tracker
 from dualslam.map.submap import RelativePose, Submap
@@ -39,6 +39,7 @@ class VisualFrontEnd:
 
     `refinder`: finds landmarks across gaps in the images themselves; without it features alone tie the keyframes there.
     `n_covering`: see `Tracker`. `window`: poses new keyframes between the graph's updates; without it the graph does.
+    `first_id`: number of this run's first frame; keyframes before it are those of the saved map that it goes on in.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class VisualFrontEnd:
         refinder: Refinder | None = None,
         n_covering: int = 0,
         window: WindowSolver | None = None,
+        first_id: int = 0,
     ) -> None:
         self.submap = submap
         self.graph = graph
@@ -67,6 +69,7 @@ class VisualFrontEnd:
         self._mapper = Mapper(frontend, config.mapping, submap, size_px)
         self._refinder = refinder
         self._window = window
+        self._first_id = first_id
         self._since_graph = 0  # keyframes that the graph has not seen yet
         self._careful = True  # the next keyframe is the graph's to pose
         self._after_gap = False
@@ -169,8 +172,23 @@ class VisualFrontEnd:
         return se3.inverse(self.submap.T_submap_kf[self._reference_id]) @ se3.inverse(track.T_cam_submap)
 
     def keyframe_due(self, track: Track) -> bool:
-        """Whether the frame should become a keyframe."""
-        return keyframe_due(track, self.submap, self._reference_id, self._config.keyframes)
+        """Whether the frame should become a keyframe.
+
+        Where an earlier run has left one that shows the same, that one is gone by instead: a map that is used many
+        times has as many keyframes as its place needs.
+        """
+        config = self._config.keyframes
+        if not keyframe_due(track, self.submap, self._reference_id, config, self._first_id):
+            return False
+        known = keyframe_like(track, self.submap, self._first_id, config) if self._first_id else None
+        if known is None:
+            return True
+        if known != self._reference_id:
+            if known in self._path:  # it is passed again
+                self._path.remove(known)
+            self._meet(known)
+            self._tracker.refresh()
+        return False
 
     def insert_keyframe(self, track: Track, pose_is_given: bool = False) -> KeyframeReport | Failure:
         """Make the frame a keyframe: pose it by its matches, extend the map from there, solve.

@@ -41,8 +41,9 @@ def second_world() -> PointWorld:
     return PointWorld(wall(), T, seed=0)
 
 
-def go_on(folder: Path, world: PointWorld, localise: bool = False, n: int | None = None) -> System:
-    config = Config.model_validate({"camera": {"model_sigma_px": 0.0}, "calibration": {"refine": False}})
+def go_on(folder: Path, world: PointWorld, localise: bool = False, n: int | None = None, **settings: object) -> System:
+    fixed = {"camera": {"model_sigma_px": 0.0}, "calibration": {"refine": False}}
+    config = Config.model_validate(fixed | settings)
     system = build_system(config, CAMERA, saved=load_atlas(folder), localise=localise)
 
     def view_of(frame: Frame) -> View:
@@ -94,6 +95,52 @@ def test_a_map_is_extended_in_its_own_frame_and_numbers_go_on(first: Path) -> No
     assert new
     assert min(new) >= N_FIRST
     assert saved.poses.keys() <= system.poses.keys(), "where the first run's frames were is still known"
+
+
+@pytest.mark.slow
+def test_a_map_that_is_used_again_and_again_stays_as_large_as_its_place(first: Path, tmp_path: Path) -> None:
+    """The same way four times, a hand's breadth beside the first: what is there already is gone by, not made anew."""
+    T = ring(N_LAP)[10:60] @ se3.from_parts(np.eye(3), np.array([0.05, 0.02, 0.05]))
+    way, folder = PointWorld(wall(), T, seed=0), first
+    n_keyframes = [len(load_atlas(first).atlas.submaps[0].keyframes)]
+    n_rows, n_new = [], []
+    for use in range(4):
+        system = go_on(folder, way)
+        assert len(trajectories_of(system).main) == len(T)
+        (submap,) = system.atlas.submaps.values()
+        n_keyframes.append(len(submap.keyframes))
+        n_new.append(sum(k >= system.numbers.first_id for k in submap.keyframes))
+        n_rows.append(len(submap.observations) + len(submap.landmarks) + len(submap.anchors))
+        folder = tmp_path / str(use)
+        save_atlas(folder, system.atlas, system.poses, system.camera)
+    assert n_new[0] <= 8, "beside a map of 30 keyframes"
+    assert max(n_new[1:]) <= 2
+    assert n_keyframes[-1] <= n_keyframes[1] + 2
+    assert n_rows[-1] < 1.1 * n_rows[1]
+
+
+@pytest.mark.slow
+def test_a_run_goes_over_to_the_submap_that_has_the_place_already(tmp_path: Path) -> None:
+    """From one full submap into the next, as the first run did, and not into a new one."""
+    small = {"max_keyframes": 20, "rollover_keyframes": 6}
+    system, folder = run(lap(), n=100, graph=small), tmp_path / "0"
+    system.finish()
+    n_submaps = len(system.atlas.submaps)
+    assert n_submaps > 2
+    save_atlas(folder, system.atlas, system.poses, system.camera)
+    T = ring(N_LAP)[5:95] @ se3.from_parts(np.eye(3), np.array([0.05, 0.02, 0.05]))
+    sizes = [sum(len(submap.keyframes) for submap in system.atlas.submaps.values())]
+    for use in range(1, 4):
+        system = go_on(folder, PointWorld(wall(), T, seed=0), graph=small)
+        assert len(trajectories_of(system).main) == len(T)
+        assert len(system.atlas.components()) == 1
+        over = [e for e in system.events.of_kind(EventKind.RELOCALISED) if "from_submap" in e.data]
+        assert [(e.data["from_submap"], e.submap) for e in over] == [(0, 1), (1, 2)]
+        sizes.append(sum(len(submap.keyframes) for submap in system.atlas.submaps.values()))
+        folder = tmp_path / str(use)
+        save_atlas(folder, system.atlas, system.poses, system.camera)
+    assert len(system.atlas.submaps) == n_submaps
+    assert sizes[-1] <= sizes[1] + 3
 
 
 def test_the_folder_is_not_changed(first: Path) -> None:

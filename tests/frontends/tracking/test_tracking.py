@@ -14,7 +14,7 @@ from dualslam.core.geometry import se3, sim3
 from dualslam.core.interfaces import KeyframeReport
 from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe, Track, View
 from dualslam.frontends.features.orb import OrbFrontend
-from dualslam.frontends.tracking.keyframing import keyframe_due, parallax_deg
+from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like, parallax_deg
 from dualslam.frontends.tracking.local_map import LocalMap
 from dualslam.frontends.tracking.mapper import Mapper, spread_choice
 from dualslam.frontends.tracking.resection import resect
@@ -346,6 +346,36 @@ class TestKeyframing:
         track = tracked(live, world.view(9))
         assert keyframe_due(track, live.submap, 8, KeyframeConfig(weak_landmarks=5000))
         assert not keyframe_due(tracked(live, world.view(8)), live.submap, 8, KeyframeConfig(weak_landmarks=5000))
+
+    def test_where_an_earlier_run_has_the_same_in_view_it_is_gone_by(self, world: PointWorld) -> None:
+        """A second camera on the way of the first, with numbers of its own; then beyond what that one has seen."""
+        config, submap, first_id = Config(), true_map(world, list(range(0, 42, 3))), 100
+        graph = ISam2SubmapGraph(config.graph)
+        graph.update(submap)
+        live = VisualFrontEnd(OrbFrontend(), config, submap, graph, SIZE_PX, first_id=first_id)
+        live.start_at(0)
+        due, passed = [], []
+        for i in range(80):
+            track = tracked(live, replace(world.view(i), index=first_id + i, timestamp_s=world.view(i).timestamp_s))
+            if live.keyframe_due(track):
+                due.append(i)
+                live.insert_keyframe(track)
+            elif live.reference_id < first_id:
+                passed.append(live.reference_id)
+        assert min(due) > 42, "on the first camera's way there is nothing to add"
+        assert len(due) > 2, "beyond it there is"
+        assert len(set(passed)) > 4, "one after the other"
+        assert len(submap.keyframes) == 14 + len(due) - len(submap.anchors)
+
+    def test_another_run_that_shows_too_little_today_takes_no_keyframe_s_place(self, world: PointWorld) -> None:
+        submap = true_map(world, [0, 4, 8])
+        live = front_end(world, [0, 4, 8], start_at=8)
+        track = tracked(live, replace(world.view(9), index=109))
+        assert keyframe_like(track, submap, 100, KeyframeConfig()) in submap.keyframes
+        assert keyframe_like(track, submap, 100, KeyframeConfig(weak_landmarks=5000)) is None
+        assert keyframe_like(track, submap, 0, KeyframeConfig()) is None, "of this run"
+        elsewhere = se3.exp(np.array([0.0, 0.0, 0.0, 3.0, 0.0, 0.0])) @ track.T_cam_submap
+        assert keyframe_like(replace(track, T_cam_submap=elsewhere), submap, 100, KeyframeConfig()) is None
 
     @pytest.mark.filterwarnings("error")
     def test_a_pose_from_elsewhere_without_a_landmark_is_due(self, world: PointWorld) -> None:
