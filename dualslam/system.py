@@ -33,6 +33,7 @@ from dualslam.map.record import FrameStamp, Record
 from dualslam.map.split import next_submap, submap_of, take_out
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
+from dualslam.map.worlds import Worlds
 from dualslam.pace import Pace
 from dualslam.places.handover import Handover
 from dualslam.places.revisits import Revisits
@@ -125,6 +126,7 @@ class System:
         self._world = saved.main[0] if saved is not None and saved.main else None
         self._localises = localise
         self._earlier = frozenset(record.atlas.submaps)
+        self._worlds = Worlds(record.atlas, self._world)
         self._n_without_map = 0
         self.atlas, self.rows, self.poses = record.atlas, record.rows, record.poses
         self.events, self.timer = record.events, record.timer
@@ -735,6 +737,7 @@ class System:
         if pose is not None:
             T_submap_cam = self.atlas.submaps[pose.submap_id].resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
         failure = outcome if isinstance(outcome, Failure) else None
+        S_world_submap, world_id = (None, None) if pose is None else self._worlds.of(pose.submap_id)
         return FrameResult(
             self.numbers.index_of(frame.index),
             row.status,
@@ -745,4 +748,6 @@ class System:
             row.latency_ms,
             failure,
             pose_ms,
+            S_world_submap,
+            world_id,
         )

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure, FloatArray, FrameStatus
 
 
@@ -43,6 +46,12 @@ class FrameResult:
     ----------
     T_submap_cam : (4, 4) float64 or None
         In the unit and frame of submap `submap_id`, as known now; later frames refine it.
+    S_world_submap : (4, 4) float64 or None
+        Where that submap lies in its world, as known now: a similarity, ``p_world = S_world_submap @ p_submap``. It
+        changes with events alone (`linked`, `loop_closed`, `merged`, ...).
+    world_id : int or None
+        The submap in whose frame and unit the world is: the first of the linked set, or the saved map's. Frames with
+        the same one are in one world.
     failure : Failure or None
         Why the frame has no pose.
     pose_ms : float or None
@@ -58,3 +67,12 @@ class FrameResult:
     latency_ms: float
     failure: Failure | None
     pose_ms: float | None = None
+    S_world_submap: FloatArray | None = None
+    world_id: int | None = None
+
+    @property
+    def T_world_cam(self) -> FloatArray | None:
+        """(4, 4) pose, camera to world, in the world's unit; None without one."""
+        if self.T_submap_cam is None or self.S_world_submap is None:
+            return None
+        return np.asarray(sim3.act_on_pose(self.S_world_submap, self.T_submap_cam))
