@@ -21,7 +21,7 @@ from dualslam.io.trajectory_files import Trajectory
 from dualslam.lab.synthetic import SyntheticSequence, make_sequence, parse_events
 
 SYNTHETIC = "synthetic:"
-WORLD_NUMBERS = {"frames": 300, "seed": 0, "width": 640, "height": 480}
+WORLD_NUMBERS = {"frames": 300, "seed": 0, "width": 640, "height": 480, "visit": 0, "backwards": 0}
 """What a synthetic source states in numbers, and what it takes where it does not."""
 RENDER_AHEAD_FRAMES = 4
 ANY_FOV_DEG = 60.0
@@ -139,15 +139,18 @@ def make_world(
     events: Iterable[Any] = (),
     width: int = WORLD_NUMBERS["width"],
     height: int = WORLD_NUMBERS["height"],
+    **visit: int,
 ) -> SyntheticSequence:
     """Make a synthetic world; a wrong name or number is bad input here, as it comes from what a user names as source.
+
+    `visit`, `backwards`: see `make_sequence`.
 
     Raises
     ------
     InputError
     """
     try:
-        return make_sequence(name, n_frames, seed, width, height, events)
+        return make_sequence(name, n_frames, seed, width, height, events, **visit)
     except ConfigError as error:
         raise InputError(str(error)) from error
 
@@ -194,4 +197,5 @@ def parse_world(source: str) -> SyntheticSequence:
         else:
             numbers[key] = int(value)
     script = read_script(events) if events is not None else ()
-    return make_world(name, numbers["frames"], numbers["seed"], script, numbers["width"], numbers["height"])
+    n_frames, seed = numbers.pop("frames"), numbers.pop("seed")
+    return make_world(name, n_frames, seed, script, **numbers)

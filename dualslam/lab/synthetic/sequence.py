@@ -21,6 +21,7 @@ from dualslam.lab.synthetic.sensor import Sensor
 from dualslam.lab.synthetic.street import make_street
 from dualslam.lab.synthetic.traps import TRAPS
 from dualslam.lab.synthetic.twins import TWINS
+from dualslam.lab.synthetic.visits import OtherWay, at_another_hour
 
 if TYPE_CHECKING:
     from dualslam.core.camera.models import PinholeCamera
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 # A smear of motion blur is the average of images about three pixels apart, within these bounds on their number.
 _N_SUBFRAMES = (9, 33)
 SCENES = ("street", "room", "circuit", "eight", "terrace", *TWINS, *TRAPS)
+VISITED = ("street", "circuit", "eight")
+"""Of these there are later visits."""
 ON_WHEELS = ("street", "circuit", "eight", "terrace", "standstill")
 
 
@@ -158,6 +161,8 @@ def make_sequence(
     events: Iterable[Corruption | Mapping[str, Any]] = (),
     rate_hz: float | None = None,
     supersampling: float = 1.5,
+    visit: int = 0,
+    backwards: int = 0,
 ) -> SyntheticSequence:
     """Make a world, a way through it, and a camera.
 
@@ -179,6 +184,10 @@ def make_sequence(
         Frames a second: 10 on the street, 30 in the room and in the hand.
     supersampling : float
         Silhouettes are smoother and rendering slower with more.
+    visit : int
+        Of a place on wheels: 0, or a later one, with other light, other parked cars, and a drive of its own.
+    backwards : int
+        1: a closed road is driven the other way round, in the other lane.
 
     Raises
     ------
@@ -188,7 +197,14 @@ def make_sequence(
     if scene not in SCENES:
         raise ConfigError(f"synthetic scene {scene!r} is unknown; use one of {', '.join(SCENES)}")
     rate_hz = float(rate_hz) if rate_hz is not None else (10.0 if scene in ON_WHEELS else 30.0)
-    limits = {"n_frames": (1, 100_000), "seed": (0, 2**63), "width": (32, 4096), "height": (32, 4096)}
+    limits = {
+        "n_frames": (1, 100_000),
+        "seed": (0, 2**63),
+        "visit": (0, 1000),
+        "backwards": (0, 1),
+        "width": (32, 4096),
+        "height": (32, 4096),
+    }
     for name, (low, high) in limits.items():
         value = locals()[name]
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= high:
@@ -197,9 +213,13 @@ def make_sequence(
         raise ConfigError(f"synthetic sequence: rate_hz is {rate_hz:g}; it must lie between 0.5 and 1000")
     if not 1 <= supersampling <= 4:
         raise ConfigError(f"synthetic sequence: supersampling is {supersampling:g}; it must lie between 1 and 4")
+    if visit and (scene not in VISITED or visit < 0):
+        raise ConfigError(f"synthetic sequence: visit is {visit!r}; of {scene} there is the first, 0, alone")
+    if backwards and (scene not in ("circuit", "eight") or backwards != 1):
+        raise ConfigError(f"synthetic sequence: backwards is {backwards!r}; it may be 1 in a circuit or an eight")
     script = parse_events(events)
     duration_s = n_frames / rate_hz
-    rng = np.random.default_rng([seed, 0xCA4])
+    rng = np.random.default_rng([seed, 0xCA4, visit] if visit else [seed, 0xCA4])
     path: CameraPath
     in_hand = scene == "room" or scene in TWINS
     if scene in TWINS:
@@ -217,11 +237,12 @@ def make_sequence(
             world, road = make_terrace(seed, length_m)
         else:
             world, road = make_street(seed, length_m)
-        path = Drive(road, rng, duration_s, speed_m_s=10.0)
+        world = at_another_hour(world, visit)
+        path = Drive(OtherWay(road) if backwards else road, rng, duration_s, speed_m_s=10.0)
     else:
         world = make_room(seed)
         path = Walk(rng, duration_s, (HALF_SIZE_M[0] - 1.3, HALF_SIZE_M[1] - 1.3))
-    focal, sensor = 0.72, Sensor(seed, width, height, blur_px=0.45)
+    focal, sensor = 0.72, Sensor(seed + (visit << 40), width, height, blur_px=0.45)
     if in_hand:
         focal = 0.82
         # A cheap camera in the hand: softer than the one on the car.
@@ -237,6 +258,7 @@ def make_sequence(
         "rate_hz": rate_hz,
         "supersampling": float(supersampling),
     }
+    parameters |= {name: n for name, n in (("visit", visit), ("backwards", backwards)) if n}
     return SyntheticSequence(parameters, camera, path, renderer, sensor, script)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 
@@ -275,7 +276,8 @@ def _car(rng: np.random.Generator, middle: FloatArray, heading: float) -> list[S
     surfaces = box(middle, yaw, (length, 1.7, height), 0.12, body, 75)
     glass = [paint.car_glass] * 4 + [paint.plain]
     back = np.array([np.sin(heading), np.cos(heading)]) * 0.3
-    return surfaces + box(middle - back, yaw, (length * 0.52, 1.45, 0.55), 0.12 + height, glass, 75)
+    surfaces += box(middle - back, yaw, (length * 0.52, 1.45, 0.55), 0.12 + height, glass, 75)
+    return [replace(surface, parked=True) for surface in surfaces]
 
 
 def horizon() -> list[Surface]:

@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from dualslam.core.types import FloatArray
 from dualslam.lab.synthetic.painter import NoiseBank, Painter
 
+SUN = np.array([0.6, 0.8])
+"""(x, z) along which the light comes in."""
 Material = Callable[[Painter], None]
 U8Image = NDArray[np.uint8]
 
@@ -44,6 +46,8 @@ class Surface:
         True for the sky and what lies on the horizon: moves with the camera, has no depth.
     texture : int, optional
         Number of the picture, the same for surfaces that look alike; by default each has its own.
+    parked : bool
+        True where it is part of a car, which may have left by the next visit.
     """
 
     origin: FloatArray
@@ -56,6 +60,7 @@ class Surface:
     two_sided: bool = False
     infinite: bool = False
     texture: int | None = None
+    parked: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,6 +163,15 @@ class TextureStore:
         return Texture(RipMap(painter.finish(surface.shade)), alpha)
 
 
+def light_on(side: FloatArray, sun: FloatArray) -> float:
+    """Return how much light falls on an upright surface with this side: it depends on which way it looks.
+
+    `sun`: (2,) unit vector (x, z) along which the light comes in.
+    """
+    normal_in = np.array([-side[2], side[0]]) / max(float(np.hypot(side[0], side[2])), 1e-9)
+    return 0.78 + 0.36 * float(normal_in @ sun)
+
+
 def wall(
     left: ArrayLike,
     right: ArrayLike,
@@ -173,9 +187,7 @@ def wall(
     """
     left, right = np.asarray(left, np.float64), np.asarray(right, np.float64)
     side = np.array([right[0] - left[0], 0.0, right[1] - left[1]])
-    # The light comes from one side: the shade depends on which way the wall looks.
-    normal_in = np.array([-side[2], side[0]]) / max(float(np.hypot(side[0], side[2])), 1e-9)
-    shade = 0.78 + 0.36 * float(normal_in @ np.array([0.6, 0.8]))
+    shade = light_on(side, SUN)
     origin = np.array([left[0], -top_m, left[1]])
     return Surface(origin, side, np.array([0.0, top_m - bottom_m, 0.0]), material, texels_per_m, shade, **more)
 
