@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from dualslam.core.events import EventKind
-from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
 from dualslam.map.atlas import LinkKind
+from dualslam.places.search import PlaceSearch
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
 from dualslam.testing.late_desk import LateDesk
 from dualslam.testing.point_world import PointWorld, pose_errors, system_in
-from dualslam.workers.jobs import JobKind
+from dualslam.workers.jobs import Ended, InlineDesk, JobKind
 from tests.places.worlds import N_LAP, N, driven_lap, lap, ring, run, wall
 
 ROLLING = {"graph": {"max_keyframes": 25, "rollover_keyframes": 6}}
@@ -130,6 +131,33 @@ def test_a_loop_whose_covariances_come_late_is_closed_when_they_have_come(polls:
     assert closed_at > first.frame, "not before they were there"
     loop = system.events.of_kind(EventKind.LOOP_CLOSED)[0]
     assert (loop.data["keyframe"], loop.data["other_frame"]) == (first.data["keyframe"], first.data["other_frame"])
+    assert errors(system).max() < errors(driven_lap()).max()
+
+
+def test_a_worker_that_dies_over_a_search_costs_that_search_alone() -> None:
+    """The first two searches that would have found the loop come to nothing; those after them close it."""
+    world = lap()
+    system = system_in(world)
+    inner, lost = system._parts.desk, []
+
+    class Deadly(InlineDesk):
+        def submit(self, kind: JobKind, work: PlaceSearch) -> None:
+            if work.candidates and len(lost) < 2:
+                lost.append(work)
+                self._done[kind].append(Ended(work, Failure(FailureReason.WORKER, "it died")))
+            else:
+                inner.submit(kind, work)
+                self._done[kind] += inner.poll(kind)
+
+    system._revisits._desk = Deadly({})
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    (first,) = closed_lap().events.of_kind(EventKind.LOOP_CLOSED)[:1]
+    (loop,) = system.events.of_kind(EventKind.LOOP_CLOSED)[:1]
+    assert len(lost) == 2
+    assert loop.frame > first.frame
+    assert len(system.poses) == len(closed_lap().poses)
     assert errors(system).max() < errors(driven_lap()).max()
 
 
