@@ -48,9 +48,10 @@ from dualslam.places import FaissRecogniser, PlaceVerifier
 from dualslam.places.search import search_places
 from dualslam.places.sightings import PlaceParts
 from dualslam.recovery.executor import DeskExecutor, InlineExecutor, RecoveryExecutor
+from dualslam.recovery.job import RecoveryJob
 from dualslam.recovery.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
 from dualslam.recovery.linking.gates import DESCRIPTOR_RADIUS_PX
-from dualslam.recovery.reverse_tracking import Attempt, RecoveryJob, RecoveryParts, walk_back
+from dualslam.recovery.reverse_tracking import Attempt, RecoveryParts, walk_back
 from dualslam.recovery.scale_watch import SCALE_HANDLERS
 from dualslam.recovery.walk_news import WalkWatch
 from dualslam.system import Components, System

@@ -22,8 +22,8 @@ from dualslam.map.split import take_out
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 from dualslam.map.trajectory import FramePose
+from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.linking.scale_observability import scale_sigma_between
-from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryResult
 
 AUDIT_KEYFRAMES = 30
 """Of a map whose start is audited: the half that audits has then come a second and more from it, and has landmarks

@@ -23,7 +23,7 @@ from dualslam.recovery.audit import (
     without_start,
 )
 from dualslam.recovery.frame_buffer import FrameBuffer
-from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryResult
+from dualslam.recovery.job import RecoveryJob, RecoveryResult
 
 TakeIn = Callable[[RecoveryJob, RecoveryResult], bool]
 """Merges what a walk has found into its submap and solves it; False where it could not be solved."""

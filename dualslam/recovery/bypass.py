@@ -7,7 +7,7 @@ from collections.abc import Collection
 from dualslam.core.events import EventKind
 from dualslam.core.types import FrameStatus
 from dualslam.map.record import FrameStamp, Record
-from dualslam.recovery.reverse_tracking import RecoveredFrame
+from dualslam.recovery.job import RecoveredFrame
 
 
 def bypass(record: Record, recovered_frames: Collection[RecoveredFrame], new_id: int, handover: int) -> int:

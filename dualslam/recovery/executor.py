@@ -6,7 +6,8 @@ from collections.abc import Callable
 from typing import Protocol
 
 from dualslam.core.types import Failure
-from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryParts, RecoveryResult, run_recovery
+from dualslam.recovery.job import RecoveryJob, RecoveryResult
+from dualslam.recovery.reverse_tracking import RecoveryParts, run_recovery
 from dualslam.recovery.walk_news import WalkNews
 from dualslam.workers.jobs import Desk, JobKind
 

@@ -11,7 +11,7 @@ from dualslam.map.connections import Connections
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap_change import change_of_frame
 from dualslam.recovery.bypass import bypass, condemn_tail, drop_corrupted
-from dualslam.recovery.reverse_tracking import FoundLink, RecoveredFrame, RecoveryJob
+from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob
 
 
 def fuse(

@@ -30,11 +30,11 @@ from dualslam.recovery.bypass import absorb
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.fusion import fuse
+from dualslam.recovery.job import RecoveredFrame, RecoveryJob, RecoveryResult
 from dualslam.recovery.leaps import refuse_leaps
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.merge import Merged, merge_recovery
 from dualslam.recovery.overlap_refinement import gauge_at_overlap
-from dualslam.recovery.reverse_tracking import RecoveredFrame, RecoveryJob, RecoveryResult
 from dualslam.recovery.schedule import RetrySchedule, way_to_gaps
 
 

@@ -18,7 +18,8 @@ from dualslam.core.geometry import se3, sim3
 from dualslam.lab.audits.link_audit import LinkAudit, audit_links
 from dualslam.lab.synthetic import make_sequence
 from dualslam.recovery.executor import InlineExecutor, Outcome
-from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryResult, run_recovery
+from dualslam.recovery.job import RecoveryJob, RecoveryResult
+from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in

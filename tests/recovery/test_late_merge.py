@@ -14,7 +14,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, View
 from dualslam.map.trajectory import compose
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
-from dualslam.recovery.reverse_tracking import RecoveryJob
+from dualslam.recovery.job import RecoveryJob
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, random_features, system_in

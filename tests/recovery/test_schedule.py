@@ -15,7 +15,8 @@ from dualslam.core.types import FloatArray, FrameStatus, Keyframe, View
 from dualslam.frontends.tracking.local_map import covering_keyframes
 from dualslam.map.submap import Submap
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
-from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryResult, run_recovery
+from dualslam.recovery.job import RecoveryJob, RecoveryResult
+from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.recovery.schedule import RetrySchedule, way_to_gaps
 from dualslam.run.results import trajectories_of
 from dualslam.system import System

@@ -12,7 +12,8 @@ from dualslam.build import recovery_parts
 from dualslam.config.settings import Config
 from dualslam.core.types import Failure, FailureReason
 from dualslam.recovery import walk_news
-from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryResult, run_recovery
+from dualslam.recovery.job import RecoveryJob, RecoveryResult
+from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.recovery.walk_news import MAX_POINTS, WalkNews, WalkTrace
 from dualslam.testing.point_world import SIZE_PX, PointWorld, cloud, hand_held, pose_errors, system_in
 from dualslam.workers.desk import WorkerDesk

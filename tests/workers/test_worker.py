@@ -17,7 +17,8 @@ from dualslam.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.types import Failure, FailureReason
 from dualslam.recovery.executor import Outcome
-from dualslam.recovery.reverse_tracking import RecoveryJob, RecoveryResult, run_recovery
+from dualslam.recovery.job import RecoveryJob, RecoveryResult
+from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.run.results import trajectories_of
 from dualslam.testing.point_world import SIZE_PX, PointWorld, cloud, hand_held, pose_errors, system_in
 from dualslam.workers.desk import Lane, WorkerDesk

@@ -21,7 +21,7 @@ from dualslam.core.interfaces import KeyframeReport, Seeker, SubmapGraph, Visual
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, Track, View
 from dualslam.map.submap import Submap
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
-from dualslam.recovery.reverse_tracking import RecoveryJob
+from dualslam.recovery.job import RecoveryJob
 from dualslam.workers.jobs import JobKind
 
 _KINDS = INTERNAL_KINDS | {CorruptionKind.FEW_FEATURES}

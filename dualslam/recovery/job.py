@@ -1,0 +1,105 @@
+"""What a walk back in time is given, and what it returns: data that can be pickled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from dualslam.core.camera.base import Camera
+from dualslam.core.events import Event
+from dualslam.core.types import Failure, FloatArray, View
+from dualslam.map.submap import Submap
+from dualslam.map.trajectory import FramePose
+from dualslam.recovery.link_tries import LinkTries
+from dualslam.recovery.linking import LinkEstimate
+from dualslam.recovery.overlap_refinement import OverlapReport
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecoveryJob:
+    """Everything that a walk back needs, as it was when the new submap started. It can be pickled.
+
+    Attributes
+    ----------
+    submap : Submap
+        The new one, a copy.
+    newest_id : int
+        The keyframe of it to start from.
+    lost : dict of int to Submap
+        Copies of the lost submaps that it may link to. With none the walk only poses the frames before the start.
+    onsets : dict of int to int
+        For each of them the frame from which on it is suspected to be corrupted.
+    views : tuple of View
+        What is buffered, latest first, from the frame before `newest_id` on. Where a walk is made again for the sake of
+        frames without a pose: those, and what leads to them.
+    own : tuple of View
+        Buffered views of the new submap's keyframes, `newest_id` included: for attempts that need their images.
+    camera : Camera
+        The one that rectified them.
+    camera_covariance : (5, 5) or None
+        Of the correction that it has, if it was estimated.
+    is_audit : bool
+        Whether the submap is one without its start, which the walk is to be compared with (`recovery/audit.py`).
+    tries : LinkTries
+        What earlier walks have tried in vain.
+    """
+
+    submap: Submap
+    newest_id: int
+    lost: dict[int, Submap]
+    onsets: dict[int, int]
+    views: tuple[View, ...]
+    own: tuple[View, ...]
+    camera: Camera
+    camera_covariance: FloatArray | None
+    is_audit: bool = False
+    tries: LinkTries = field(default_factory=LinkTries)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecoveredFrame:
+    """A frame that the walk posed, relative to a keyframe of its submap."""
+
+    pose: FramePose
+    n_matches: int
+    n_inliers: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundLink:
+    """The link that an attempt ended with. `refinement`: of the overlap, or why there was none."""
+
+    old_id: int
+    estimate: LinkEstimate
+    refinement: OverlapReport | Failure
+    attempt: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecoveryResult:
+    """The result of a recovery: of the attempt that led to a link, or else of the first one that posed a frame.
+
+    Attributes
+    ----------
+    submap : Submap
+        The job's, grown at its early end.
+    frames : tuple of RecoveredFrame
+        In the order of the walk.
+    link : FoundLink or None
+    events : tuple of Event
+        Of all attempts, in order.
+    seconds, cpu_s : float
+        Wall time of all attempts, and CPU time of the process, whose threads find features beside the walk.
+    looks_alike : bool
+        Whether beyond a gap two poses explained as much: no later walk over it would tell them apart.
+    tries : LinkTries
+        The job's, with the tries of this walk.
+    """
+
+    submap: Submap
+    frames: tuple[RecoveredFrame, ...]
+    link: FoundLink | None
+    events: tuple[Event, ...]
+    seconds: float
+    cpu_s: float
+    looks_alike: bool = False
+    tries: LinkTries = field(default_factory=LinkTries)
