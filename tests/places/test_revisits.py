@@ -100,12 +100,14 @@ def test_without_recovery_a_lost_map_stays_apart() -> None:
     assert len(system.atlas.components()) == 2
 
 
-def test_frames_without_a_map_are_found_in_any_submap() -> None:
+@pytest.mark.parametrize("loops", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_frames_without_a_map_are_found_in_any_submap(loops: bool) -> None:
     """A walk; back along bare walls; then a place of long ago, where the camera stands, so that no map can start."""
     there = ring(N_LAP)
     T = np.concatenate([there[:70], there[69:10:-1], np.repeat(there[10:11], 25, axis=0)])
     world = PointWorld(wall(), T, covered=frozenset(range(70, 129)))
-    system = run(world, recovery={"enabled": True, "relocalise_after": 5}, graph=ROLLING["graph"])
+    recovery = {"enabled": True, "relocalise_after": 5}
+    system = run(world, recovery=recovery, loops={"enabled": loops}, graph=ROLLING["graph"])
     found = [e for e in system.events.of_kind(EventKind.GAP_RELOCALISED, EventKind.RELOCALISED) if e.frame >= 129]
     assert found
     assert system.rows[153].status is FrameStatus.TRACKED
