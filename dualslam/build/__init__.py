@@ -1,0 +1,27 @@
+"""The composition root: the one place that knows front ends, back end and system, and puts them together.
+
+In reading order: `system` (the system and the live front end), `parts` (solvers, calibration), `walks` (reverse
+tracking), `workers` (what is done beside the tracking), `checks` (mistakes in a config, told at once).
+"""
+
+from dualslam.build.checks import check_config
+from dualslam.build.parts import adjust_submap, find_focal, new_initialiser, window_solver
+from dualslam.build.system import LiveParts, build_system
+from dualslam.build.walks import recovery_parts
+from dualslam.build.workers import feature_handlers, graph_handlers, walk_handlers
+from dualslam.frontends.registry import create_frontend
+
+__all__ = [
+    "LiveParts",
+    "adjust_submap",
+    "build_system",
+    "check_config",
+    "create_frontend",
+    "feature_handlers",
+    "find_focal",
+    "graph_handlers",
+    "new_initialiser",
+    "recovery_parts",
+    "walk_handlers",
+    "window_solver",
+]

@@ -1,0 +1,43 @@
+"""What can be refused in a config before anything is built."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
+from dualslam.core.errors import ConfigError
+from dualslam.frontends.features.motion_statistics import nearest_search
+from dualslam.frontends.registry import check_frontend
+
+
+def check_config(config: Config) -> None:
+    """Refuse a config that no system can be built from, as far as it shows without extras and weights.
+
+    Raises
+    ------
+    ConfigError
+        If a front end, also one that an attempt at a recovery names, is not known or its options are wrong, or if the
+        initialiser cannot match with it.
+    """
+    frontend = check_frontend(config.frontend)
+    if frontend is not None and config.initialiser.matching == "gms":
+        nearest_search(frontend)
+    for number, attempt in enumerate(config.recovery.attempts):
+        if not attempt.is_live:
+            with naming_attempt(number):
+                check_frontend(auxiliary_config(attempt))
+
+
+def auxiliary_config(attempt: AttemptConfig) -> FrontendConfig:
+    """Return the front end that an attempt names."""
+    return FrontendConfig(name=attempt.frontend, n_features=attempt.n_features, options=attempt.options)
+
+
+@contextmanager
+def naming_attempt(number: int) -> Iterator[None]:
+    """Say of a mistake in the config that it is in this attempt."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"recovery.attempts[{number}]: {error}") from error

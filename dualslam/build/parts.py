@@ -1,0 +1,98 @@
+"""Solvers, calibration and the parts that look at features, each made from the config."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import partial
+
+from dualslam.backend.atlas_solver import GtsamAtlasSolver
+from dualslam.backend.local_ba import bundle_adjust, bundle_adjust_arrays
+from dualslam.backend.self_calibration import estimate_calibration
+from dualslam.backend.window import NumpyWindowSolver
+from dualslam.calibration.lens import Calibration
+from dualslam.config.settings import Config
+from dualslam.core.bundle import BundleAdjuster
+from dualslam.core.camera.base import Camera
+from dualslam.core.camera.focal import FocalSearch, ToldFocal
+from dualslam.core.interfaces import Frontend, SelfCalibrator, WindowSolver
+from dualslam.core.types import Failure, FloatArray, Frame
+from dualslam.frontends.place_matcher import FrontendPlaceMatcher
+from dualslam.frontends.registry import create_frontend
+from dualslam.frontends.tracking.initialiser import Initialiser
+from dualslam.map.submap import Submap
+from dualslam.places import FaissRecogniser, PlaceVerifier
+from dualslam.places.sightings import PlaceParts
+
+ADJUST_ITERATIONS = 20
+
+
+def new_initialiser(config: Config, frontend: Frontend, size_px: tuple[int, int], K: FloatArray) -> Initialiser:
+    """Build what starts a map from frames with these intrinsics."""
+    return Initialiser(frontend, bundle_adjuster(config), config.initialiser, K, size_px, config.seed)
+
+
+def place_parts(config: Config, frontend: Frontend, size_px: tuple[int, int]) -> PlaceParts:
+    """Build what recognises places and verifies them."""
+    matcher = FrontendPlaceMatcher(frontend, size_px)
+    return PlaceParts(
+        FaissRecogniser(frontend.max_distance_strict), PlaceVerifier(matcher, config.linking, config.seed)
+    )
+
+
+def atlas_solver(config: Config) -> GtsamAtlasSolver:
+    """Build what solves the graph over all submaps."""
+    return GtsamAtlasSolver(config.atlas.robust, config.graph.robust_k)
+
+
+def window_solver(config: Config) -> WindowSolver:
+    """Build what poses new keyframes between the updates of a submap's graph."""
+    return NumpyWindowSolver(config.graph.robust_k)
+
+
+def self_calibrator(config: Config) -> SelfCalibrator:
+    """Build what asks a submap about its camera."""
+    return lambda submap, camera, covariance: estimate_calibration(
+        submap, camera, config.calibration, config.graph.robust_k, config.seed, covariance
+    )
+
+
+def new_calibration(config: Config, camera: Camera, covariance: FloatArray | None = None) -> Calibration:
+    """Build what knows the camera; `covariance`: of the correction that it has, if it was estimated."""
+    return Calibration(
+        camera,
+        config.calibration,
+        estimate=self_calibrator(config),
+        adjust=lambda submap: adjust_submap(submap, config.graph.robust_k),
+        covariance=covariance,
+    )
+
+
+def find_focal(
+    config: Config, frames: Iterable[Frame], size_px: tuple[int, int], told: ToldFocal | None = None
+) -> FocalSearch | Failure:
+    """Search for the focal length of a camera that has no calibration, by frames from its beginning.
+
+    `told`: what the source's own data tell, if they do.
+
+    Raises
+    ------
+    ConfigError
+        If the front end is not known, or its options are wrong.
+    """
+    from dualslam.frontends.tracking.focal_search import search_focal  # an optimiser that no other run needs
+
+    frontend = create_frontend(config.frontend)
+    features = [frontend.extract(frame.image) for frame in frames if frame.image is not None]
+    return search_focal(frontend, features, size_px, config.seed, told)
+
+
+def bundle_adjuster(config: Config) -> BundleAdjuster:
+    """Batch bundle adjustment under the robust kernel of the graphs that its results go into."""
+    return partial(bundle_adjust_arrays, robust_k=config.graph.robust_k)
+
+
+def adjust_submap(submap: Submap, robust_k: float) -> None:
+    """Refine all of a submap in batch."""
+    keyframe_ids = list(submap.keyframes)
+    bundle = bundle_adjust(submap, keyframe_ids[1:], keyframe_ids[:1], robust_k, ADJUST_ITERATIONS)
+    submap.apply_estimate(*bundle.estimate)

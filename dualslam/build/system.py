@@ -1,0 +1,189 @@
+"""The system and the live front end, put together."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from functools import partial
+
+from dualslam.backend.submap_graph import ISam2SubmapGraph
+from dualslam.build.checks import check_config
+from dualslam.build.parts import (
+    atlas_solver,
+    bundle_adjuster,
+    new_calibration,
+    new_initialiser,
+    place_parts,
+    window_solver,
+)
+from dualslam.build.walks import recovery_parts
+from dualslam.build.workers import features_beside, inline_handlers, worker_desk
+from dualslam.calibration.lens import Calibration
+from dualslam.config.settings import Config
+from dualslam.core.camera.base import Camera
+from dualslam.core.camera.corrected import CorrectedCamera
+from dualslam.core.interfaces import Frontend, SubmapGraph
+from dualslam.frontends.frame_reader import FrameReader
+from dualslam.frontends.gap.refinding import Refinder
+from dualslam.frontends.registry import create_frontend
+from dualslam.frontends.tracking.initialiser import Initialiser
+from dualslam.frontends.tracking.rolling_shutter import RollingShutter
+from dualslam.frontends.tracking.visual import VisualFrontEnd
+from dualslam.io.map_store import StoredMap
+from dualslam.lab.disturbances import FaultScript
+from dualslam.map.graph_beside import BesideGraphs
+from dualslam.map.submap import Submap
+from dualslam.map.tidying import tidy
+from dualslam.recovery.executor import DeskExecutor, InlineExecutor, RecoveryExecutor
+from dualslam.recovery.walk_news import WalkWatch
+from dualslam.system import Components, System
+from dualslam.workers.desk import WorkerDesk
+from dualslam.workers.jobs import InlineDesk
+from dualslam.workers.start_beside import StartBeside
+
+log = logging.getLogger(__name__)
+
+
+def build_system(
+    config: Config,
+    camera: Camera,
+    recovery: RecoveryExecutor | None = None,
+    saved: StoredMap | None = None,
+    localise: bool = False,
+) -> System:
+    """Build a system from its config.
+
+    Parameters
+    ----------
+    config : Config
+    camera : Camera
+        Lens model and size of the images that `System.step` will be given.
+    recovery : RecoveryExecutor, optional
+        Takes the recovery jobs instead of what the config says: to look at them one by one.
+    saved : StoredMap, optional
+        A map to find frames in and to extend (`load_atlas`); it becomes the system's own. Its camera, as it was found
+        out, is taken as known.
+    localise : bool
+        Find poses in the saved map, and add nothing to it.
+
+    Returns
+    -------
+    System
+
+    Raises
+    ------
+    ConfigError
+        As `check_config`, and where an extra or weights that a front end needs are missing.
+    """
+    check_config(config)
+    frontend = create_frontend(config.frontend)
+    size_px = (camera.width, camera.height)
+    known = camera if saved is None else _camera_of(saved, camera)
+    is_known = saved is not None and known is saved.camera
+    if is_known:  # its camera is its own: to change it would part what is there from what comes
+        config = config.model_copy(update={"calibration": config.calibration.model_copy(update={"refine": False})})
+    calibration = new_calibration(config, known)
+    faults = FaultScript(config.corruptions)
+    shutter = RollingShutter(frontend, config.camera, config.seed)
+
+    if saved is not None and not localise:
+        saved = replace(saved, poses=tidy(saved.atlas, saved.poses))
+    live = LiveParts(config, frontend, calibration, size_px, 0 if saved is None else saved.next_id)
+    reader = FrameReader(frontend, live.camera, config.camera.model_sigma_px, shutter)
+
+    workers = config.recovery.workers
+    if recovery is None:
+        # Built here in any case: a mistake in the config is told at once, not by a worker.
+        parts = recovery_parts(config, size_px, frontend=frontend)
+    places = place_parts(config, frontend, size_px)
+    watch = WalkWatch()
+    desk = (
+        worker_desk(config, size_px, faults, watch) if workers else InlineDesk(inline_handlers(config, places.verifier))
+    )
+    graphs = BesideGraphs(desk, window_solver(config)) if workers else None
+    if recovery is None:
+        recovery = DeskExecutor(desk) if workers else faults.around_inline(InlineExecutor(parts, watch))
+
+    return System(
+        Components(
+            view_of=faults.around_views(reader),
+            new_starter=partial(_starter_beside, desk, live) if isinstance(desk, WorkerDesk) else live.new_starter,
+            new_graph=graphs.new_graph if graphs is not None else live.new_graph,
+            new_odometry=faults.around_odometry(live.new_odometry),
+            new_relocaliser=faults.around_odometry(live.new_relocaliser),
+            calibration=calibration,
+            shutter=shutter,
+            recovery=recovery,
+            walk_watch=watch,
+            desk=desk,
+            atlas_solver=atlas_solver(config),
+            adjust_bundle=bundle_adjuster(config),
+            graphs=graphs,
+            places=places,
+            open_features=partial(features_beside, desk, config.frontend) if isinstance(desk, WorkerDesk) else None,
+        ),
+        config,
+        saved,
+        localise,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class LiveParts:
+    """What the system makes anew with each start and each submap: the stations of a frame's walk after its features.
+
+    `FrameReader` finds a frame's features; `Initialiser` starts a map from them; `VisualFrontEnd` poses the frames that
+    follow, and extends the map by keyframes; `ISam2SubmapGraph` solves it.
+    """
+
+    config: Config
+    frontend: Frontend
+    calibration: Calibration
+    size_px: tuple[int, int]
+    first_id: int = 0
+    """Number of the first frame: those before it are of the runs that have left the saved map."""
+
+    def camera(self) -> Camera:
+        """Return the camera as it is known now."""
+        return self.calibration.camera
+
+    def new_starter(self) -> Initialiser:
+        """Make what collects views until two of them start a map."""
+        return new_initialiser(self.config, self.frontend, self.size_px, self.camera().K)
+
+    def new_graph(self) -> ISam2SubmapGraph:
+        """Make the factor graph of a submap, solved in this process."""
+        return ISam2SubmapGraph(self.config.graph)
+
+    def new_odometry(self, submap: Submap, graph: SubmapGraph) -> VisualFrontEnd:
+        """Make the front end that tracks frames against a submap and extends it."""
+        return self._front_end(submap, graph, 0)
+
+    def new_relocaliser(self, submap: Submap, graph: SubmapGraph) -> VisualFrontEnd:
+        """Make one that looks in the whole submap, and not only at what is near in time."""
+        return self._front_end(submap, graph, self.config.recovery.covering_keyframes)
+
+    def _front_end(self, submap: Submap, graph: SubmapGraph, n_covering: int) -> VisualFrontEnd:
+        config, frontend = self.config, self.frontend
+        refinder = Refinder(submap, frontend, self.camera, config.camera.model_sigma_px)
+        window = window_solver(config)
+        return VisualFrontEnd(
+            frontend, config, submap, graph, self.size_px, refinder, n_covering, window, self.first_id
+        )
+
+
+def _camera_of(saved: StoredMap, camera: Camera) -> Camera:
+    """Return the camera that made a saved map, where it is the one that is given, perhaps corrected since.
+
+    Where it is another one, the given: frames are not looked for in submaps of other intrinsics.
+    """
+    known = saved.camera or camera
+    given = known.base if isinstance(known, CorrectedCamera) else known
+    if given.to_dict() == camera.to_dict():
+        return known
+    log.warning("the saved map was made with another camera: single frames cannot be posed in it")
+    return camera
+
+
+def _starter_beside(desk: WorkerDesk, live: LiveParts) -> StartBeside:
+    return StartBeside(desk, live.new_starter(), live.camera().K)

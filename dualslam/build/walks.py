@@ -1,0 +1,131 @@
+"""What a walk back in time is made of: the live front end, and the attempts by others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from dualslam.backend.self_calibration import find_preferred_camera
+from dualslam.backend.submap_graph import ISam2SubmapGraph
+from dualslam.build.checks import auxiliary_config, naming_attempt
+from dualslam.build.parts import bundle_adjuster, window_solver
+from dualslam.config.settings import AttemptConfig, Config
+from dualslam.core.camera.base import Camera
+from dualslam.core.interfaces import Frontend, PreferredCamera, SubmapGraph
+from dualslam.core.types import IntArray
+from dualslam.frontends.features.image_features import ImageFeatures
+from dualslam.frontends.gap.auxiliary_features import AuxiliaryFeatures, BufferedFeatures, OwnFeatures
+from dualslam.frontends.gap.pnp_odometry import PnpOdometry, Route
+from dualslam.frontends.gap.refinding import Refinder
+from dualslam.frontends.registry import create_frontend
+from dualslam.frontends.tracking.visual import VisualFrontEnd
+from dualslam.health import judge_track
+from dualslam.map.submap import Submap
+from dualslam.recovery.job import RecoveryJob
+from dualslam.recovery.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
+from dualslam.recovery.linking.gates import DESCRIPTOR_RADIUS_PX
+from dualslam.recovery.reverse_tracking import Attempt, RecoveryParts
+
+FEATURE_THREADS = 2
+"""That find other front ends' features beside a walk back, where the tracking waits for it."""
+
+
+def _preferred_camera(
+    job: RecoveryJob, config: Config, submap: Submap, keyframe_ids: IntArray
+) -> PreferredCamera | None:
+    """Ask keyframes of a map that a walk has grown about the camera that it was walked with."""
+    settings = (config.calibration, config.graph.robust_k, config.seed)
+    return find_preferred_camera(submap, keyframe_ids, job.camera, *settings, job.camera_covariance)
+
+
+def recovery_parts(
+    config: Config,
+    size_px: tuple[int, int],
+    budget_s: float | None = None,
+    frontend: Frontend | None = None,
+    n_threads: int = FEATURE_THREADS,
+) -> RecoveryParts:
+    """Build what a walk back in time is made of, for images of this width and height; see `RecoveryParts.budget_s`.
+
+    `frontend`: the live one, where this process has it already: it may hold networks. `n_threads`: that find other
+    front ends' features beside the walk; the results do not depend on it.
+
+    Raises
+    ------
+    ConfigError
+        If a front end that an attempt names is not known, or its options are wrong.
+    """
+    frontend = frontend or create_frontend(config.frontend)
+
+    def live(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> VisualFrontEnd:
+        refinder = Refinder(submap, frontend, lambda: job.camera, config.camera.model_sigma_px)
+        for view in sorted(job.own, key=lambda view: view.index, reverse=True):  # those next to the walk stay
+            refinder.remember(view)
+        n_covering = 0 if job.lost else config.recovery.covering_keyframes
+        return VisualFrontEnd(frontend, config, submap, graph, size_px, refinder, n_covering, window_solver(config))
+
+    matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, DESCRIPTOR_RADIUS_PX)
+    return RecoveryParts(
+        attempts=_attempts(config, frontend, live, size_px, n_threads),
+        posing=Attempt("live", live),
+        new_graph=lambda: ISam2SubmapGraph(config.graph),
+        link=lambda old, new, onset: estimate_link(
+            old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
+        ),
+        max_scale_sigma=config.linking.max_live_scale_sigma,
+        propagate=lambda link, new, newest_id, bend: propagate_to_live_end(link, new, newest_id, config.linking, bend),
+        check_camera=lambda submap, link, job: check_camera(
+            submap, link, job.newest_id, partial(_preferred_camera, job, config), config.linking, config.calibration
+        ),
+        judge=lambda track: judge_track(track, config.health),
+        config=config.recovery,
+        fusion=config.fusion,
+        budget_s=budget_s,
+    )
+
+
+def _attempts(
+    config: Config,
+    frontend: Frontend,
+    live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
+    size_px: tuple[int, int],
+    n_threads: int,
+) -> tuple[Attempt, ...]:
+    """Build the attempts; those with the same auxiliary front end share what it finds in the images."""
+    auxiliaries: dict[str, ImageFeatures] = {}  # by their settings
+    attempts = []
+    for number, attempt in enumerate(config.recovery.attempts):
+        if attempt.is_live:
+            attempts.append(_attempt_by(frontend, lambda camera: OwnFeatures(), attempt, config, live, size_px))
+            continue
+        wanted = auxiliary_config(attempt)
+        key = wanted.model_dump_json()
+        if key not in auxiliaries:
+            with naming_attempt(number):
+                auxiliaries[key] = ImageFeatures(create_frontend(wanted), n_threads)
+        features_for = partial(BufferedFeatures, auxiliaries[key], config.camera.model_sigma_px)
+        attempts.append(_attempt_by(auxiliaries[key].frontend, features_for, attempt, config, live, size_px))
+    return tuple(attempts)
+
+
+def _attempt_by(
+    auxiliary: Frontend,
+    features_for: Callable[[Camera], AuxiliaryFeatures],
+    attempt: AttemptConfig,
+    config: Config,
+    live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
+    size_px: tuple[int, int],
+) -> Attempt:
+    """Build an attempt in which a front end, which may be the live one itself, gives the live one its poses."""
+    tracks_live = attempt.is_live or attempt.tracking == "live"
+
+    def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> PnpOdometry:
+        reverse_tracker, features = live(job, submap, graph), features_for(job.camera)
+        overlap_id = max((k for lost in job.lost.values() for k in lost.keyframes), default=job.newest_id)
+        route = Route(job.own, job.views, overlap_id)
+        adjuster = bundle_adjuster(config)
+        return PnpOdometry(reverse_tracker, auxiliary, features, route, adjuster, config, size_px, tracks_live)
+
+    return Attempt(attempt.name, new_odometry)

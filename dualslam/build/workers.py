@@ -1,0 +1,126 @@
+"""What is done beside the tracking, at once or in processes, and the lanes that it stands in."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from dualslam.backend.submap_graph import ISam2SubmapGraph
+from dualslam.build.parts import atlas_solver, new_calibration, new_initialiser, place_parts
+from dualslam.build.walks import FEATURE_THREADS, recovery_parts
+from dualslam.calibration.lens import CalibrationAnswer, CalibrationJob, answer
+from dualslam.config.settings import Config, FrontendConfig
+from dualslam.core.threads import spare_cores
+from dualslam.core.types import Failure
+from dualslam.frontends.registry import create_frontend
+from dualslam.lab.disturbances import FaultScript
+from dualslam.map.graph_beside import GraphServer
+from dualslam.map.skeleton import answer_edges
+from dualslam.places import PlaceVerifier
+from dualslam.places.search import search_places
+from dualslam.recovery.reverse_tracking import walk_back
+from dualslam.recovery.scale_watch import SCALE_HANDLERS
+from dualslam.recovery.walk_news import WalkWatch
+from dualslam.workers.desk import Lane, WorkerDesk
+from dualslam.workers.features_beside import FeaturesBeside
+from dualslam.workers.jobs import Handlers, JobKind
+from dualslam.workers.start_beside import StartServer
+
+WORKER_BUDGET = 0.75
+"""Share of the time after which a worker counts as hung that its walks may take: what they have by then is not lost."""
+GRAPH_LIMIT_S = 30.0
+"""After which the process that has the graphs counts as hung: a batch over a full submap takes a second."""
+FEATURES_LIMIT_S = 10.0
+"""After which the process that finds features counts as hung: networks take a second or two on a large image."""
+GRAPH_NICENESS, WALK_NICENESS = 3, 8
+"""Of the process that has the graphs, and of those for long work: half and a sixth of the share of what tracks,
+where cores are short."""
+
+
+def calibration_handlers(config: Config) -> Handlers:
+    """Build what answers questions about the camera."""
+
+    def answered(job: CalibrationJob) -> CalibrationAnswer | Failure:
+        calibration = new_calibration(config, job.camera, job.covariance)
+        return answer(job, calibration, lambda: ISam2SubmapGraph(config.graph))
+
+    return {JobKind.CALIBRATION: answered}
+
+
+def place_handlers(verifier: PlaceVerifier) -> Handlers:
+    """Build what verifies places."""
+    return {JobKind.LOOP: lambda search: search_places(search, verifier)}
+
+
+def edge_handlers(config: Config) -> Handlers:
+    """Build what gives covariances of edges within submaps."""
+    solver = atlas_solver(config)
+    return {JobKind.EDGES: lambda question: answer_edges(question, solver.edge_covariances)}
+
+
+def inline_handlers(config: Config, verifier: PlaceVerifier) -> Handlers:
+    """Build what is done at once where there are no workers; walks back have an executor of their own."""
+    return {**edge_handlers(config), **SCALE_HANDLERS, **calibration_handlers(config), **place_handlers(verifier)}
+
+
+def graph_handlers(config: Config) -> Handlers:
+    """Build what keeps and solves the graphs of submaps."""
+    return {JobKind.GRAPH: GraphServer(lambda: ISam2SubmapGraph(config.graph))}
+
+
+def map_handlers(config: Config, size_px: tuple[int, int]) -> Handlers:
+    """Build what the worker for the live map does: it looks for its start, and has its graph from then on."""
+    frontend = create_frontend(config.frontend)
+    return {
+        JobKind.START: StartServer(partial(new_initialiser, config, frontend, size_px)),
+        **graph_handlers(config),
+    }
+
+
+def walk_handlers(config: Config, size_px: tuple[int, int], n_threads: int) -> Handlers:
+    """Build what a worker for long work does: walks back, calibrations, the search for places, and for the atlas."""
+    budget_s = WORKER_BUDGET * config.recovery.time_limit_s
+    frontend = create_frontend(config.frontend)
+    parts = recovery_parts(config, size_px, budget_s, frontend, n_threads)
+    verifier = place_parts(config, frontend, size_px).verifier
+    return {
+        JobKind.WALK: lambda job: walk_back(job, parts),
+        **edge_handlers(config),
+        **SCALE_HANDLERS,
+        **calibration_handlers(config),
+        **place_handlers(verifier),
+    }
+
+
+def feature_handlers(config: FrontendConfig) -> Handlers:
+    """Build what the worker for features does: it finds those of one image after the other."""
+    return {JobKind.FEATURES: create_frontend(config).extract}
+
+
+def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript, watch: WalkWatch) -> WorkerDesk:
+    """Build the desk whose work is done in processes, which are started at once."""
+    recovery = config.recovery
+    # Live frames come first: threads beside the walk only where a core is left beside the tracking and the workers.
+    n_threads = min(FEATURE_THREADS, spare_cores(1 + recovery.workers))
+    walks = Lane(
+        "walks",
+        (JobKind.EDGES, JobKind.SCALE, JobKind.CALIBRATION, JobKind.LOOP, JobKind.WALK),
+        partial(walk_handlers, config, size_px, n_threads),
+        recovery.workers,
+        recovery.time_limit_s,
+        niceness=WALK_NICENESS,
+    )
+    live_map = Lane(
+        "map",
+        (JobKind.START, JobKind.GRAPH),
+        partial(map_handlers, config, size_px),
+        1,
+        GRAPH_LIMIT_S,
+        niceness=GRAPH_NICENESS,
+    )
+    return WorkerDesk([live_map, walks], recovery.finish_wait_s, faults.kill_worker, watch)
+
+
+def features_beside(desk: WorkerDesk, config: FrontendConfig) -> FeaturesBeside:
+    """Start the process that finds the features of the frame to come."""
+    desk.open(Lane("features", (JobKind.FEATURES,), partial(feature_handlers, config), 1, FEATURES_LIMIT_S))
+    return FeaturesBeside(desk)
