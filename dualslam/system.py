@@ -25,6 +25,7 @@ from dualslam.health import HealthMonitor, count_signs
 from dualslam.io.map_store import StoredMap
 from dualslam.map.atlas import Link
 from dualslam.map.connections import Connections
+from dualslam.map.endings import archive, hand_frames_over
 from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameResult, FrameRow
 from dualslam.map.graph_beside import N_FREE, N_FREE_BEHIND, BesideGraphs, Moved
@@ -628,14 +629,7 @@ class System:
             sigma_scale=loss.sigma,
         )
         self._archive(live, "scale lost")
-        anchored = {p.index: old.keyframe_for(p.keyframe_id) for p in self.poses.values() if p.submap_id == old.id}
-        for i, k in anchored.items():
-            if k in submap.keyframes:
-                pose = self.poses[i]
-                T_kf_cam = se3.inverse(old.T_submap_kf[k]) @ old.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
-                self.poses[i] = replace(pose, submap_id=submap.id, keyframe_id=k, T_kf_cam=T_kf_cam)
-                if i in self.rows:  # it may be another run's
-                    self.rows[i].submap = submap.id
+        hand_frames_over(self._record, old, submap)
         take_out(old, rest, max(old.keyframes.keys() - submap.keyframes.keys()))
         self.atlas.add(submap)
         n = int(submap.landmarks["alive"].sum())
@@ -651,24 +645,7 @@ class System:
         return True
 
     def _archive(self, live: VisualOdometry, why: str) -> None:
-        submap = live.submap
-        try:
-            final = live.graph.full_estimate(submap)
-            submap.apply_estimate(*final.values)
-        except SolverError:
-            log.warning("submap %d is archived as it stands: its graph gives no estimate", submap.id)
-        # A submap that rolled over and was lost at once has no frame of its own: its newest keyframe stands for it.
-        posed = [p.index for p in self.poses.values() if p.submap_id == submap.id and p.index in self.rows]
-        last = max(posed, default=max(submap.keyframes))
-        self.events.add(
-            EventKind.ARCHIVED,
-            last,
-            self.rows[last].timestamp_s,
-            submap.id,
-            why=why,
-            keyframes=len(submap.keyframes),
-            landmarks=int(submap.landmarks["alive"].sum()),
-        )
+        archive(self._record, live.submap, live.graph, why)
 
     def _unusable(self, frame: Frame, failure: Failure) -> Failure:
         """Record a frame without an image of the right size; tracking continues with the next frame."""

@@ -1,0 +1,47 @@
+"""What the end of a submap leaves: its last estimate, an event, and frames that go over to the submap after it."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+from dualslam.core.errors import SolverError
+from dualslam.core.events import EventKind
+from dualslam.core.geometry import se3
+from dualslam.core.interfaces import SubmapGraph
+from dualslam.map.record import Record
+from dualslam.map.submap import Submap
+
+log = logging.getLogger(__name__)
+
+
+def archive(record: Record, submap: Submap, graph: SubmapGraph, why: str) -> None:
+    """Take the last estimate of a submap's graph, and note that the submap is archived."""
+    try:
+        final = graph.full_estimate(submap)
+        submap.apply_estimate(*final.values)
+    except SolverError:
+        log.warning("submap %d is archived as it stands: its graph gives no estimate", submap.id)
+    # A submap that rolled over and was lost at once has no frame of its own: its newest keyframe stands for it.
+    posed = [p.index for p in record.poses.values() if p.submap_id == submap.id and p.index in record.rows]
+    last = max(posed, default=max(submap.keyframes))
+    record.event(
+        EventKind.ARCHIVED,
+        record.rows[last],
+        submap.id,
+        why=why,
+        keyframes=len(submap.keyframes),
+        landmarks=int(submap.landmarks["alive"].sum()),
+    )
+
+
+def hand_frames_over(record: Record, old: Submap, new: Submap) -> None:
+    """Let the frames that are posed relative to keyframes which both submaps hold take their pose from the new one."""
+    anchored = {p.index: old.keyframe_for(p.keyframe_id) for p in record.poses.values() if p.submap_id == old.id}
+    for i, k in anchored.items():
+        if k in new.keyframes:
+            pose = record.poses[i]
+            T_kf_cam = se3.inverse(old.T_submap_kf[k]) @ old.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
+            record.poses[i] = replace(pose, submap_id=new.id, keyframe_id=k, T_kf_cam=T_kf_cam)
+            if i in record.rows:  # it may be another run's
+                record.rows[i].submap = new.id
