@@ -35,7 +35,7 @@ def equivalent_focal_mm(path: Path) -> float | None:
             for found in _in_parents(_Boxes(file), 0, size):
                 if math.isfinite(found) and found > 0:
                     return found
-    except (OSError, ValueError, struct.error):
+    except (OSError, ValueError, OverflowError, struct.error):
         return None
     return None
 

@@ -85,7 +85,15 @@ def test_wherever_it_stands(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "value",
-    [data(1, b"wide"), data(1, b"\xff\xfe"), data(23, b"\0"), data(21, b"\0"), data(21, b""), data(13, b"\x1a")]
+    [
+        data(22, b"\xff" * 200),
+        data(1, b"wide"),
+        data(1, b"\xff\xfe"),
+        data(23, b"\0"),
+        data(21, b"\0"),
+        data(21, b""),
+        data(13, b"\x1a"),
+    ]
     + [data(23, struct.pack(">f", math.nan)), data(1, b"-26"), box(b"data", b"\0\0"), b"", box(b"name", b"26")],
 )
 def test_what_is_no_focal_length_is_none(tmp_path: Path, value: bytes) -> None:
