@@ -282,11 +282,13 @@ def open_webcam(
 
     It is opened once to learn the size of its images, then again whenever the sequence is read.
     """
+    check = "check that it is plugged in and that no one uses it"
     if isinstance(source, int):
         name, called = f"webcam_{source}", f"Webcam {source}"
     elif "://" in source:
-        host = urlsplit(source).hostname or "local"  # what else is in an address may be a password
+        host = _host(source)
         name, called = f"stream_{host}", f"The stream at {host}"
+        check = "check the address and that it can be reached"
     else:
         name, called = Path(source).name, source
     if selection.reverse:
@@ -295,9 +297,6 @@ def open_webcam(
         raise InputError(f"{called} is live and has times of its own; leave out the file of times.")
     if camera is None and fov_degrees is None:
         raise InputError(f"{called} has no calibration; give a camera file, or a field of view in degrees.")
-
-    reach = "check the address and that it can be reached" if "://" in str(source) else ""
-    check = reach or "check that it is plugged in and that no one uses it"
 
     def connected() -> Capture:
         capture = connect(source)
@@ -322,3 +321,11 @@ def open_webcam(
             f"are {width} x {height}; give the calibration of these images."
         )
     return WebcamSequence(name, camera, fps if fps > 0 else NOMINAL_RATE_HZ, selection, grey, connected)
+
+
+def _host(address: str) -> str:
+    """Return where a stream comes from: what else is in an address may be a password."""
+    try:
+        return urlsplit(address).hostname or "local"
+    except ValueError:
+        raise InputError("The address of the stream cannot be read; check its brackets.") from None

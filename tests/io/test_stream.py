@@ -83,3 +83,6 @@ def test_what_cannot_be_reached_is_one_sentence() -> None:
     assert "secret" not in str(error.value)
     with pytest.raises(InputError, match="no calibration"):
         open_sequence(address)
+    with pytest.raises(InputError, match="address of the stream cannot be read") as error:
+        open_sequence("rtsp://somebody:secret@[::1/video", fov_degrees=60)
+    assert "secret" not in str(error.value)
