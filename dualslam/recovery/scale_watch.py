@@ -138,6 +138,8 @@ class ScaleWatch:
         """Return the seam within a group across which the scale is lost, unless a link holds it."""
         ids = np.array(sorted(submap.keyframes), np.int64)
         begin, end = np.searchsorted(ids, [group[0], group[-1] + 1]).tolist()
+        if end == len(ids):
+            return None  # the map was parted meanwhile: nothing is left behind the group
         if _n_ties(submap, ids, begin, end, n_views=2) >= FIRM_TIES:
             return None  # a walk back, or a loop, has tied them meanwhile
         seam = min(range(begin, end + 1), key=lambda place: _n_ties(submap, ids, place, place))

@@ -195,3 +195,11 @@ def test_a_late_verdict_on_what_was_tied_meanwhile_or_on_another_map_is_none() -
     other.id += 1
     assert watch.judge(other, []) is None
     assert watch.judge(submap, []) is None
+
+
+def test_a_late_verdict_on_keyframes_that_were_taken_out_meanwhile_is_none() -> None:
+    submap = thinned(solved("street"), PLACE, 0)
+    watch, desk = late_watch(submap)
+    (asked,) = (ended.work for ended in desk._done[JobKind.SCALE])
+    earlier = submap_of(submap, submap.id, [k for k in sorted(submap.keyframes) if k < asked.group[0]])
+    assert watch.judge(earlier, []) is None
