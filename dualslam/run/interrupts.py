@@ -51,7 +51,8 @@ class Interrupts:
     def __enter__(self) -> Interrupts:
         if threading.current_thread() is threading.main_thread():
             known = {number: signal.getsignal(number) for number in ENDING}
-            self._before = {number: old for number, old in known.items() if old is not signal.SIG_IGN}
+            # None: by what is not Python, which could not be put back.
+            self._before = {number: old for number, old in known.items() if old not in (signal.SIG_IGN, None)}
             for number in self._before:
                 signal.signal(number, self._handle)
         return self

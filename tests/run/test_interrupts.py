@@ -43,6 +43,15 @@ def test_an_interrupt_that_is_none_of_ours_goes_through() -> None:
     interrupts.act_late()
 
 
+def test_a_handler_that_is_not_pythons_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = signal.getsignal(signal.SIGHUP)
+    monkeypatch.setattr(signal, "getsignal", lambda number: None)
+    with Interrupts():
+        pass
+    monkeypatch.undo()
+    assert signal.getsignal(signal.SIGHUP) is before
+
+
 def test_what_is_ignored_stays_ignored() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
