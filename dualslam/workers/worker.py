@@ -143,17 +143,17 @@ def serve(connection: Connection, make_handlers: MakeHandlers, niceness: int = 0
     handlers, channel = make_handlers(), Channel(connection, gives=False)
 
     def tell(news: Any) -> None:
-        with suppress(BrokenPipeError):  # the result will meet it too
+        with suppress(ConnectionError):  # the result will meet it too
             channel.send_in_passing(_News(news))
 
     try:
         channel.send(None)
-    except BrokenPipeError:
+    except ConnectionError:
         return
     while True:
         try:
             kind, work = channel.receive()
-        except EOFError:
+        except (EOFError, ConnectionError):
             return
         began_s = time.process_time()
         result = handlers[kind](work)
@@ -161,6 +161,6 @@ def serve(connection: Connection, make_handlers: MakeHandlers, niceness: int = 0
             result = result_of(result, tell)
         try:
             channel.send(Answer(result, time.process_time() - began_s, peak_rss_mb()))
-        except BrokenPipeError:  # nobody waits for it any more
+        except ConnectionError:  # nobody waits for it any more
             return
         del work, result  # as they go with the next job, what they held may go
