@@ -8,6 +8,7 @@ import json
 import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -95,6 +96,12 @@ class RunFolder:
     overwrite : bool
         Remove the files of an earlier run. Files that no run writes stay in any case.
 
+    Attributes
+    ----------
+    path : Path
+    n_events : int
+        How many events have been taken.
+
     Raises
     ------
     OutputError
@@ -104,16 +111,21 @@ class RunFolder:
     def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
         self.path = Path(path)
         self._events: IO[str] | None = None
+        self.n_events = 0
         check_vacant(self.path, overwrite=overwrite)
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            self._lock = FolderLock(self.path)
-            for file in _run_files(self.path):
-                if file.name != EVENTS:  # by which the next one knows that this is a run's folder
-                    file.unlink()
-            self._events = (self.path / EVENTS).open("w", encoding="utf-8", newline="\n")
-        except OSError as e:
-            raise _not_writable(self.path, e) from e
+        with ExitStack() as undo:
+            try:
+                self.path.mkdir(parents=True, exist_ok=True)
+                self._lock = FolderLock(self.path)
+                undo.callback(self._lock.release)
+                check_vacant(self.path, overwrite=overwrite)  # another run may have ended there meanwhile
+                for file in _run_files(self.path):
+                    if file.name != EVENTS:  # by which the next one knows that this is a run's folder
+                        file.unlink()
+                self._events = (self.path / EVENTS).open("w", encoding="utf-8", newline="\n")
+            except OSError as e:
+                raise _not_writable(self.path, e) from e
+            undo.pop_all()
 
     @property
     def map_path(self) -> Path:
@@ -131,6 +143,7 @@ class RunFolder:
             raise OutputError(f"{self.path / EVENTS} is closed; events come before the end of the run.")
         try:
             self._events.write(json.dumps(to_plain(event.as_dict()), allow_nan=False) + "\n")
+            self.n_events += 1  # from here on it is in the buffer, and goes with the next one where the disk is full
             self._events.flush()
         except OSError as e:
             raise OutputError(f"{self.path / EVENTS} cannot be written: {e.strerror or e}.") from e
@@ -192,10 +205,14 @@ class RunFolder:
 
     def close(self) -> None:
         """Close the event file and let another run in; more than once does no harm."""
-        if self._events is not None:
-            self._events.close()
-            self._events = None
-        self._lock.release()
+        events, self._events = self._events, None
+        try:
+            if events is not None:
+                events.close()
+        except OSError as e:
+            raise OutputError(f"{self.path / EVENTS} cannot be written: {e.strerror or e}.") from e
+        finally:
+            self._lock.release()
 
     def __enter__(self) -> RunFolder:
         return self

@@ -172,11 +172,9 @@ def run_to_folder(
         system = (build or build_system)(config, sequence.camera)
     with RunFolder(out, overwrite=overwrite) as folder:
         folder.write_config(dump_config(config))
-        n_events = 0
 
         def after_frame(result: FrameResult) -> None:
-            nonlocal n_events
-            n_events = _write_new_events(system, folder, n_events)
+            _write_new_events(system, folder)
             if on_frame is not None:
                 on_frame(result)
 
@@ -199,7 +197,7 @@ def run_to_folder(
                 last = next(reversed(system.rows.values()))
                 system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap)
             try:
-                _write_new_events(system, folder, n_events)
+                _write_new_events(system, folder)
                 summary = _write_results(system, report, config, sequence, folder, given)
             except Exception as error:
                 if report.bug is None:
@@ -305,10 +303,9 @@ class _Watched:
         self._n_events = len(self._system.events)
 
 
-def _write_new_events(system: System, folder: RunFolder, n_written: int) -> int:
-    if len(system.events) > n_written:
-        for event in islice(system.events, n_written, None):
+def _write_new_events(system: System, folder: RunFolder) -> None:
+    if len(system.events) > folder.n_events:
+        for event in islice(system.events, folder.n_events, None):
             numbers = system.numbers
             told = replace(event, frame=numbers.index_of(event.frame), data=numbers.in_source(event.data))
             folder.append_event(told)
-    return len(system.events)

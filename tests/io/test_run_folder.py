@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -140,6 +142,54 @@ def test_places_that_cannot_be_used(tmp_path: Path) -> None:
         RunFolder(tmp_path / "file")
     with pytest.raises(OutputError, match="cannot be written to"):
         RunFolder(tmp_path / "file" / "run")
+
+
+def test_a_folder_that_cannot_be_cleared_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "run"
+    with RunFolder(path) as run:
+        run.write_config("mine: 1\n")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+        with pytest.raises(OutputError, match="No space left"):
+            RunFolder(path, overwrite=True)
+    RunFolder(path, overwrite=True).close()
+
+
+class _Full(io.FileIO):
+    """The events of a run, on a disk that is full for a while."""
+
+    def __init__(self, run: RunFolder) -> None:
+        super().__init__(run.path / "events.jsonl", "w")
+        self.full = True
+        assert run._events is not None
+        run._events.close()
+        run._events = io.TextIOWrapper(io.BufferedWriter(self), encoding="utf-8")
+
+    def write(self, data: Any, /) -> int:
+        if self.full:
+            raise OSError(28, "No space left on device")
+        return super().write(data)
+
+
+def test_an_event_that_a_full_disk_refuses_is_written_once_when_it_has_room(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "run") as run:
+        file, events = _Full(run), EventLog()
+        with pytest.raises(OutputError, match="No space left"):
+            run.append_event(events.add(EventKind.FUSED, 1, 0.1, 0))
+        assert run.n_events == 1
+        file.full = False
+        run.append_event(events.add(EventKind.FUSED, 2, 0.2, 0))
+    assert [event["frame"] for event in read_events(run.path / "events.jsonl")] == [1, 2]
+
+
+def test_a_disk_that_stays_full_is_told_and_lets_the_folder_go(tmp_path: Path) -> None:
+    run = RunFolder(tmp_path / "run")
+    _Full(run)
+    for fill in (lambda: run.append_event(EventLog().add(EventKind.FUSED, 1, 0.1, 0)), run.close):
+        with pytest.raises(OutputError, match="No space left"):
+            fill()
+    run.close()
+    RunFolder(tmp_path / "run", overwrite=True).close()
 
 
 def test_no_event_after_the_end(tmp_path: Path) -> None:
