@@ -23,8 +23,8 @@ from dualslam.core.types import FloatArray, FrameStatus
 from dualslam.report.statuses import MEANING, count
 from dualslam.viewer.colours import STATUS_COLOURS, rgb, submap_rgb
 from dualslam.viewer.live import PAUSE, SAVE
-from dualslam.viewer.live_scene import LiveScene, draw_features, draw_timeline
-from dualslam.viewer.messages import Message
+from dualslam.viewer.live_scene import LEAST_EXTENT, LiveScene, draw_features, draw_timeline
+from dualslam.viewer.messages import EventWords, Message
 
 HOST = "127.0.0.1"
 N_EVENTS = 8
@@ -35,16 +35,10 @@ POINT_SHARE = 0.15
 """Size of a landmark, of a keyframe's."""
 WHOLE, FOLLOW, FREE = "the whole map", "follow the camera", "free"
 UP = (0.0, -1.0, 0.0)
-ABOVE, BEHIND = 0.55, 0.75
-"""Of the extent of the map: from where it is looked at."""
-LEAST_EXTENT = 2.0
-"""A map's first landmarks are about 1 away."""
 WALK_RGB = (245, 245, 245)
 """Of the way of a walk back that is under way: no submap's."""
-GROWN, SHRUNK = 1.15, 0.5
+GROWN, SHRUNK = 1.1, 0.8
 """So many times as large as it was when it was shown whole, a map is shown whole again."""
-LEAST_ASPECT = 0.8
-"""Of a window that shows the whole map from there: before a narrower one it stands further away."""
 NARROW_PX, COVERED = 640, 0.6
 """Windows up to this width have the panel below, over this part of the scene."""
 
@@ -104,7 +98,7 @@ class Page:
         self._scene = LiveScene()
         self._clouds: dict[int, Any] = {}
         self._lines: dict[int, Any] = {}
-        self._events: deque[str] = deque(maxlen=N_EVENTS)
+        self._events: deque[tuple[EventWords, int]] = deque(maxlen=N_EVENTS)
         self._pressed: list[tuple[str, object]] = []
         self._was_at: FloatArray | None = None
         self._shown = LEAST_EXTENT
@@ -155,7 +149,7 @@ class Page:
     def _as_page(self) -> str:
         """Return the scene as HTML that needs nothing else, and opens on the whole map."""
         first = self._server.initial_camera
-        first.up, first.look_at, first.position = UP, *self._viewpoint()
+        first.up, first.look_at, first.position = UP, *self._scene.viewpoint()
         return str(self._server.scene.as_html(dark_mode=True))
 
     def show(self, message: Message) -> None:
@@ -212,7 +206,7 @@ class Page:
         self._show_camera(self._camera, T, STATUS_COLOURS[message.status])
         step = np.zeros(3) if self._was_at is None else T[:3, 3] - self._was_at
         self._was_at = T[:3, 3].copy()
-        outgrown = not SHRUNK * self._shown <= self._extent() <= GROWN * self._shown
+        outgrown = not SHRUNK * self._shown <= self._scene.extent <= GROWN * self._shown
         for client in self._server.get_clients().values():
             if self._view.value == FOLLOW:
                 client.camera.position = client.camera.position + step
@@ -244,33 +238,20 @@ class Page:
         for m in set(self._walkers) - set(walks):
             self._walkers.pop(m).remove()
 
-    def _extent(self) -> float:
-        low, high = self._scene.bounds()
-        return max(float(np.linalg.norm(high - low)), LEAST_EXTENT)
-
     def _look(self, client: viser.ClientHandle | None) -> None:
         """Show all of the map from behind and above its first camera."""
         if client is None:
             return
-        self._shown = self._extent()
+        self._shown = self._scene.extent
         client.camera.up_direction = UP
         window = client.camera
         covered = COVERED if window.image_width <= NARROW_PX else 0.0
-        window.look_at, window.position = self._viewpoint(window.aspect, covered * np.tan(window.fov / 2))
-
-    def _viewpoint(self, aspect: float = 1.0, lift: float = 0.0) -> tuple[FloatArray, FloatArray]:
-        """Return the middle of the map, and from where all of it is seen, raised by `lift` of the distance."""
-        low, high = self._scene.bounds()
-        middle = (low + high) / 2
-        away = self._extent() * max(1.0, LEAST_ASPECT / aspect) * np.array([0.0, -ABOVE, -BEHIND])
-        down = lift * np.array([0.0, -away[2], away[1]])
-        return middle + down, middle + down + away
+        window.look_at, window.position = self._scene.viewpoint(window.fov, window.aspect, covered)
 
     def _tell(self, message: Message) -> None:
         for event in message.events:
             if event.kind not in NOT_TOLD:
-                where = "" if event.submap is None else f", submap {event.submap}"
-                self._events.append(f"- **{event.kind.replace('_', ' ')}** at frame {event.frame}{where}")
+                self._note_event(event)
         submaps = [f"{count(len(message.components), 'map')} of {count(len(self._scene.drawn), 'submap')}"]
         at = {walk.submap_id: f" ({walk.words})" for walk in self._scene.walks}
         submaps += [f"walking back in time from submap {m}{at.get(m, '')}" for m in message.walking]
@@ -284,7 +265,20 @@ class Page:
         places = [walk.place for walk in self._scene.walks if walk.place is not None]
         self._timeline.image = draw_timeline(self._scene.statuses, places)
         self._key.content = _key(self._scene.statuses)
-        self._told.content = "\n".join(reversed(self._events))
+        self._told.content = "\n".join(_as_line(*event) for event in reversed(self._events))
+
+    def _note_event(self, event: EventWords) -> None:
+        """Add an event to the list, or to the newest line if that is of its kind: links may be refused by the dozen."""
+        n = 1
+        if self._events and (self._events[-1][0].kind, self._events[-1][0].submap) == (event.kind, event.submap):
+            n += self._events.pop()[1]
+        self._events.append((event, n))
+
+
+def _as_line(event: EventWords, n: int) -> str:
+    where = "" if event.submap is None else f", submap {event.submap}"
+    times = "" if n == 1 else f" {n} times, last"
+    return f"- **{event.kind.replace('_', ' ')}**{times} at frame {event.frame}{where}"
 
 
 def _key(statuses: list[str]) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,15 @@ GAP_SHARE = 0.35
 """Between sets of submaps that are not linked, of the extent of the first."""
 WITHIN = 0.97
 """Landmarks further out are far away, or wrong: the view need not hold them."""
+RIGHT = np.array([1.0, 0.0, 0.0])
+DOWN, AHEAD = np.array([[0.0, 0.81, -0.59], [0.0, 0.59, 0.81]])
+"""The axes of a window onto the whole map, from behind and above its first camera."""
+FILLED = 0.85
+"""Of such a window, by the map."""
+FOV_RAD, ASPECT = np.radians(75.0), 1.5
+"""Of a window that is not known: a page that is saved."""
+LEAST_EXTENT = 2.0
+"""A map's first landmarks are about 1 away."""
 TIMELINE_PX = (480, 28)
 MARK_PX, MARK_RGB = 2, (255, 255, 255)
 """Half the width of the mark at the frame where a walk back is."""
@@ -141,6 +151,36 @@ class LiveScene:
             inner = np.quantile(landmarks, [1 - WITHIN, WITHIN], axis=0)
             low, high = np.minimum(low, inner[0]), np.maximum(high, inner[1])
         return np.asarray(low), np.asarray(high)
+
+    @property
+    def extent(self) -> float:
+        """How large the map is."""
+        low, high = self.bounds()
+        return max(float(np.linalg.norm(high - low)), LEAST_EXTENT)
+
+    def viewpoint(
+        self, fov_rad: float = FOV_RAD, aspect: float = ASPECT, covered: float = 0.0
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return what to look at, and from where, so that the box around the map fills what of a window is not covered.
+
+        Parameters
+        ----------
+        fov_rad : float
+            From the upper rim to the lower one.
+        aspect : float
+            Width over height.
+        covered : float
+            Share of the height, at the lower rim.
+        """
+        low, high = self.bounds()
+        middle, half = (low + high) / 2, np.maximum(high - low, LEAST_EXTENT / 2) / 2
+        corners = half * np.array(list(product((-1, 1), repeat=3)))
+        slope = np.tan(fov_rad / 2)
+        across = np.abs(corners @ RIGHT) / (FILLED * slope * aspect)
+        along = np.abs(corners @ DOWN) / (FILLED * slope * (1.0 - covered))
+        distance = float((np.maximum(across, along) - corners @ AHEAD).max())
+        look_at = middle + covered * slope * distance * DOWN
+        return look_at, look_at - distance * AHEAD
 
     def walk_lines(self) -> NDArray[np.float32]:
         """Return the ways of the walks back that are under way as lines, (N, 2, 3)."""

@@ -10,6 +10,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ from dualslam.testing.point_world import PointWorld, system_in
 from dualslam.viewer import live
 from dualslam.viewer.colours import STATUS_COLOURS, rgb
 from dualslam.viewer.live import PAUSE, SAVE, LiveView
-from dualslam.viewer.live_scene import TIMELINE_PX, LiveScene, draw_features, draw_timeline
+from dualslam.viewer.live_scene import FILLED, TIMELINE_PX, LiveScene, draw_features, draw_timeline
 from dualslam.viewer.messages import Message, Picture, Teller
 from tests.cli.test_usage import one_sentence
 from tests.places.worlds import N, lap
@@ -144,6 +145,25 @@ def test_a_walk_is_drawn_beside_the_lost_map_and_goes_when_it_ends(told: Run) ->
     assert lengths == sorted(lengths)
     assert not scene.walks
     assert scene.statuses == [str(row.status) for row in told.system.rows.values()]
+
+
+@pytest.mark.parametrize(("aspect", "covered"), [(1.17, 0.0), (2.4, 0.0), (0.46, 0.6)])
+def test_a_window_shows_the_whole_map_beside_what_covers_it(scene: LiveScene, aspect: float, covered: float) -> None:
+    """By a pinhole camera of our own, where every camera of the run appears."""
+    fov_rad = np.radians(75)
+    look_at, position = scene.viewpoint(fov_rad, aspect, covered)
+    z = (look_at - position) / np.linalg.norm(look_at - position)
+    x = np.cross([0.0, 1.0, 0.0], z) / np.linalg.norm(np.cross([0.0, 1.0, 0.0], z))
+    R_cam_world = np.stack([x, np.cross(z, x), z])
+    corners = np.array(list(product(*zip(*scene.bounds(), strict=True))))
+    seen = np.concatenate([drawn.centres for drawn in scene.drawn.values()] + [corners])
+    right, down, depth = R_cam_world @ (seen - position).T
+    assert (depth > 0).all()
+    half = np.tan(fov_rad / 2)
+    across, below = right / depth / (half * aspect), down / depth / half
+    middle = -covered  # of what is not covered, from the upper rim at -1
+    fullest = max(np.abs(across).max(), np.abs(below - middle).max() / (1 - covered))
+    assert fullest == pytest.approx(FILLED, rel=0.01), "all of it, and as large as it can be"
 
 
 @pytest.mark.parametrize("place", [0, 7, 99])
