@@ -58,9 +58,9 @@ class CalibratedOptimum:
 class _BehindCameraError(RuntimeError):
     """Points of the optimum lie behind a camera that saw them: the factor counts no error there, and fixes nothing."""
 
-    def __init__(self, points: IntArray) -> None:
+    def __init__(self, points: IntArray, reached: BundleProblem, correction: FloatArray) -> None:
         super().__init__(f"{len(points)} points went behind their cameras")
-        self.points = points
+        self.points, self.reached, self.correction = points, reached, correction
 
 
 def optimise_with_camera(
@@ -88,7 +88,8 @@ def optimise_with_camera(
         try:
             return _optimise(problem, start, prior, robust_k, mean)
         except _BehindCameraError as error:
-            problem = _without(problem, error.points)
+            # From where it has got to: the others have found their places.
+            problem, start = _without(error.reached, error.points), error.correction
     return _optimise(problem, start, prior, robust_k, mean)
 
 
@@ -134,11 +135,11 @@ def _optimise(
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
         result = optimizer.optimize()
     T, xyz = convert.poses_of(result), convert.points_of(result)
-    behind = np.unique(p.point[_depths(p, T, xyz) <= MIN_DEPTH_MU])
-    if len(behind):
-        raise _BehindCameraError(behind)
     found = np.asarray(result.atCal3DS2(CALIBRATION_KEY).vector())
     correction, J = _from_cal3_ds2(found, p.K)
+    behind = np.unique(p.point[_depths(p, T, xyz) <= MIN_DEPTH_MU])
+    if len(behind):
+        raise _BehindCameraError(behind, replace(p, T_submap_kf=T, xyz_mu=xyz), correction)
     marginal = np.asarray(gtsam.Marginals(graph, result).marginalCovariance(CALIBRATION_KEY))
     noise_ratio = _noise_ratio(p, T, xyz, correction)
     return CalibratedOptimum(T, correction, J @ marginal @ J.T, noise_ratio, before, float(optimizer.error()))

@@ -140,6 +140,8 @@ class TestEstimate:
         estimate = estimate_correction(replace(problem, uv_px=uv_px, xyz_mu=xyz), WIDTH, LensCorrection(), CONFIG)
         assert estimate
         assert abs(estimate.correction.log_focal + np.log(1.03)) < 0.004
+        # Without them it goes on from where it had got to, and not from the beginning.
+        assert estimate.cost_before < 1.5 * estimate.cost_after
         assert capfd.readouterr().out == ""
 
     def test_distortion_is_found(self) -> None:
