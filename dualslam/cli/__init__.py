@@ -5,6 +5,7 @@ Exit status: 0 done, 1 the run could not produce a map (or a bug of ours), 2 bad
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 import tempfile
@@ -23,6 +24,7 @@ EXIT_DONE, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Never raises."""
+    _never_stumble_over_letters()
     limit_threads()
     keep_freed_memory()
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -49,6 +51,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _say(_report_bug(error, arguments, getattr(args, "out", None)), EXIT_FAILED)
 
 
+def _never_stumble_over_letters() -> None:
+    """Have letters that the terminal's encoding lacks (LANG=C) shown by their number."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
 def _say(sentence: object, status: int) -> int:
     words = " ".join([str(sentence), *getattr(sentence, "__notes__", ())]).split()
     print(f"dualslam: {' '.join(words)}", file=sys.stderr)
@@ -61,7 +70,13 @@ def _report_bug(error: Exception, arguments: list[str], out: Path | None) -> str
     folder = out if out is not None and out.is_dir() else Path(tempfile.gettempdir())
     try:
         with tempfile.NamedTemporaryFile(
-            "w", prefix="dualslam-bug-", suffix=".log", dir=folder, delete=False, encoding="utf-8"
+            "w",
+            prefix="dualslam-bug-",
+            suffix=".log",
+            dir=folder,
+            delete=False,
+            encoding="utf-8",
+            errors="backslashreplace",
         ) as file:
             file.write(text)
         where = f"the traceback is in {file.name}"

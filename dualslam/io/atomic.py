@@ -51,7 +51,8 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically, UTF-8."""
     with atomic_file(path) as file:
-        file.write(text.encode())
+        # A file's name may hold bytes that the locale does not know: they go back as they came.
+        file.write(text.encode(errors="surrogateescape"))
 
 
 def _umask() -> int:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.types import Features, Keyframe
 from dualslam.io.atomic import atomic_file, write_text
+from dualslam.io.map_checks import check_submap
 from dualslam.io.trajectory_files import read_text
 from dualslam.map.submap import Anchor, RelativePose, Submap
 from dualslam.map.tables import Table
@@ -202,9 +203,10 @@ def submap_from_arrays(arrays: Arrays) -> Submap:
     version = int(arrays["format"])
     if version not in (SUBMAP_FORMAT - 1, SUBMAP_FORMAT):
         raise ValueError(f"format {version} where {SUBMAP_FORMAT} is due")
-    landmarks, observations = _group(arrays, "landmarks_"), _group(arrays, "observations_")
     if version < SUBMAP_FORMAT:
-        landmarks["condemned"] = np.zeros(len(landmarks["alive"]), bool)
+        arrays = {**arrays, "landmarks_condemned": np.zeros(len(arrays["landmarks_alive"]), bool)}
+    check_submap(arrays)
+    landmarks, observations = _group(arrays, "landmarks_"), _group(arrays, "observations_")
     descriptors = landmarks["descriptor"]
     submap = Submap(int(arrays["id"]), arrays["K"], np.zeros(descriptors.shape[1:], descriptors.dtype))
     submap.gauge = (int(arrays["gauge"][0]), int(arrays["gauge"][1]))

@@ -14,6 +14,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import camera_from_dict
 from dualslam.core.errors import InputError
 from dualslam.io.map_files import (
+    METADATA,
     Arrays,
     array_files,
     load_arrays,
@@ -134,6 +135,7 @@ def load_atlas(folder: str | Path) -> StoredMap:
         frames = groups[FRAMES]
         columns = (frames[name].tolist() for name in ("index", "timestamp_s", "submap", "keyframe"))
         rows = zip(*columns, frames["T_kf_cam"], strict=True)
+        _check_frames(frames, atlas)
         poses = {index: FramePose(index, t, m, k, T_kf_cam) for index, t, m, k, T_kf_cam in rows}
         camera = _camera(metadata)
     except _DAMAGE as error:
@@ -225,10 +227,24 @@ def _links(arrays: Arrays, metadata: Mapping[str, Any]) -> list[Link]:
     return links
 
 
+def _check_frames(frames: Arrays, atlas: Atlas) -> None:
+    if not (np.isfinite(frames["T_kf_cam"]).all() and np.isfinite(frames["timestamp_s"]).all()):
+        raise ValueError(f"{FRAMES} holds a number that is not finite")
+    for m, k in set(zip(frames["submap"].tolist(), frames["keyframe"].tolist(), strict=True)):
+        try:
+            atlas.submaps[m].keyframe_for(k)
+        except KeyError:
+            raise ValueError(f"a frame hangs on keyframe {k} of submap {m}, which is not there") from None
+
+
 def _map_folder(folder: str | Path) -> Path:
     """Return the map's own folder, given that or the run's."""
     folder = Path(folder)
-    return folder / MAP if (folder / MAP).is_dir() else folder
+    own = folder / MAP if (folder / MAP).is_dir() else folder
+    if not (own / METADATA).is_file():
+        what = "holds no map" if folder.is_dir() else "does not exist or is no folder"
+        raise InputError(f"{folder} {what}: there is no {METADATA}. Give the folder of a run that has ended.")
+    return own
 
 
 def _camera(metadata: Mapping[str, Any]) -> Camera | None:

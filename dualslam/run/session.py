@@ -14,7 +14,7 @@ from dualslam.config.files import dump_config
 from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import FocalSearch
-from dualslam.core.errors import InputError
+from dualslam.core.errors import InputError, OutputError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Sequence
 from dualslam.core.threads import spare_cores
@@ -199,6 +199,9 @@ def run_to_folder(
             try:
                 _write_new_events(system, folder)
                 summary = _write_results(system, report, config, sequence, folder, given)
+            except OutputError as error:
+                error.add_note(f"What could be written before is in {out}.")
+                raise
             except Exception as error:
                 if report.bug is None:
                     raise

@@ -18,7 +18,7 @@ N_FRAMES = 24
 @pytest.fixture(autouse=True)
 def _own_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The command sets up logging and the environment of its process; keep them out of the others' tests."""
-    for name in (*LIMITS, "OPENCV_LOG_LEVEL"):
+    for name in (*LIMITS, "OPENCV_LOG_LEVEL", "OPENCV_FFMPEG_LOGLEVEL"):
         monkeypatch.setenv(name, os.environ.get(name, "1"))
     root = logging.getLogger()
     before = (root.handlers[:], root.level)

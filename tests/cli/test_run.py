@@ -118,6 +118,17 @@ def test_a_torn_video_is_one_sentence_and_no_word_of_its_decoder(tmp_path: Path)
     assert done.stderr.startswith(f"dualslam: {tmp_path / 'torn.mp4'} is no video that OpenCV can open")
 
 
+def test_letters_that_the_locale_lacks_stop_nothing(tmp_path: Path) -> None:
+    """A process of its own, as the locale is the process's. A name that is no ASCII comes in as bytes."""
+    out = tmp_path / "мой сон"
+    command = [sys.executable, "-m", "dualslam.cli", "run", "synthetic:street,frames=2", "--out", out]
+    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii:strict"}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, **ascii_only})
+    assert (done.returncode, done.stderr) == (1, "")
+    assert done.stdout.startswith("no map: ")
+    assert (out / "report.html").exists()
+
+
 def test_the_frames_that_were_asked_for(folder: Path, fake: Install, tmp_path: Path) -> None:
     options = ["--start", "3", "--stride", "2", "--max-frames", "4", "--reverse", "--quiet"]
     assert main(["run", str(folder), "--out", str(tmp_path / "run"), *options]) == 0

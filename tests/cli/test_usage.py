@@ -60,6 +60,11 @@ def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
         ("config --set recovery.attempts=[live,sift9]", "recovery.attempts[1]: frontend.name: no front end is called"),
         ("config --frontend sift --set initialiser.matching=gms", "initialiser.matching: gms takes a front end with"),
         ("config --set seed", "write key.path=value"),
+        ("run synthetic:street,frames=5 --out there --map nowhere", "nowhere does not exist or is no folder"),
+        (
+            "run synthetic:street,frames=5 --out there --map .",
+            "holds no map: there is no map.json. Give the folder of a run",
+        ),
         ("eval nowhere nowhere", "nowhere does not exist"),
         ("view nowhere --save there", "nowhere is not the folder of a finished run"),
         ("render lake --out there", "invalid choice: 'lake'"),

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.geometry import se3
 from dualslam.core.types import Features, Keyframe
 from dualslam.io import load_map, load_submap, map_files, save_map, save_submap
-from dualslam.io.map_files import Arrays, save_arrays
+from dualslam.io.map_files import Arrays, save_arrays, submap_to_arrays
 from dualslam.map.submap import RelativePose, Submap
 
 
@@ -149,6 +151,35 @@ def test_no_pickles(tmp_path: Path) -> None:
     np.savez(tmp_path / "evil.npz", x=np.array([{"a": 1}], dtype=object))
     with pytest.raises(InputError, match="no map file"):
         load_submap(tmp_path / "evil.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("kf_timestamp_s", lambda a: a[:2], "kf_timestamp_s is of shape"),
+        ("kf_T_submap_kf", lambda a: a * np.nan, "kf_T_submap_kf holds a number that is not finite"),
+        ("kf_landmark_of", lambda a: a + 1000, "kf_landmark_of points at what is not there"),
+        ("kf_n_features", lambda a: -a, "kf_n_features is negative"),
+        ("features_uv_px", lambda a: a[:-1], "features_uv_px has"),
+        ("features_scale", lambda a: a * np.inf, "features_scale holds a number that is not finite"),
+        ("landmarks_xyz_mu", lambda a: a[:, :2], "landmarks_xyz_mu is of shape"),
+        ("landmarks_descriptor", lambda a: a[:-1], "landmarks_descriptor has"),
+        ("landmarks_alive", lambda a: a.astype(float), "landmarks_alive is of type float64"),
+        ("observations_landmark", lambda a: a + 1000, "observations_landmark points at what is not there"),
+        ("observations_kf", lambda a: a + 1000, "an observation is of no feature of a keyframe"),
+        ("landmarks_normal", None, "landmarks_normal"),
+    ],
+)
+def test_arrays_that_do_not_fit_together(
+    tmp_path: Path, submap: Submap, name: str, change: Callable[[NDArray[Any]], NDArray[Any]] | None, words: str
+) -> None:
+    arrays = submap_to_arrays(submap)
+    array = arrays.pop(name)
+    if change is not None:
+        arrays[name] = change(array)
+    np.savez(tmp_path / "s.npz", **arrays)
+    with pytest.raises(InputError, match=f"s.npz is no submap of this version, or is damaged: .*{words}"):
+        load_submap(tmp_path / "s.npz")
 
 
 def test_damaged_files(tmp_path: Path, submap: Submap) -> None:
