@@ -19,7 +19,7 @@ from dualslam.lab.synthetic.render import Renderer
 from dualslam.lab.synthetic.room import HALF_SIZE_M, make_room
 from dualslam.lab.synthetic.sensor import Sensor
 from dualslam.lab.synthetic.street import make_street
-from dualslam.lab.synthetic.traps import TRAPS
+from dualslam.lab.synthetic.traps import TRAPS, Place
 from dualslam.lab.synthetic.twins import TWINS
 from dualslam.lab.synthetic.visits import OtherWay, at_another_hour
 
@@ -32,6 +32,14 @@ SCENES = ("street", "room", "circuit", "eight", "terrace", *TWINS, *TRAPS)
 VISITED = ("street", "circuit", "eight")
 """Of these there are later visits."""
 ON_WHEELS = ("street", "circuit", "eight", "terrace", "standstill")
+LIMITS = {
+    "n_frames": (1, 100_000),
+    "seed": (0, 2**63),
+    "visit": (0, 1000),
+    "backwards": (0, 1),
+    "width": (32, 4096),
+    "height": (32, 4096),
+}
 
 
 class CameraPath(Protocol):
@@ -197,58 +205,17 @@ def make_sequence(
     if scene not in SCENES:
         raise ConfigError(f"synthetic scene {scene!r} is unknown; use one of {', '.join(SCENES)}")
     rate_hz = float(rate_hz) if rate_hz is not None else (10.0 if scene in ON_WHEELS else 30.0)
-    limits = {
-        "n_frames": (1, 100_000),
-        "seed": (0, 2**63),
-        "visit": (0, 1000),
-        "backwards": (0, 1),
-        "width": (32, 4096),
-        "height": (32, 4096),
-    }
-    for name, (low, high) in limits.items():
-        value = locals()[name]
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= high:
-            raise ConfigError(f"synthetic sequence: {name} is {value!r}; it must be a whole number, {low} to {high}")
-    if not 0.5 <= rate_hz <= 1000:
-        raise ConfigError(f"synthetic sequence: rate_hz is {rate_hz:g}; it must lie between 0.5 and 1000")
-    if not 1 <= supersampling <= 4:
-        raise ConfigError(f"synthetic sequence: supersampling is {supersampling:g}; it must lie between 1 and 4")
-    if visit and (scene not in VISITED or visit < 0):
-        raise ConfigError(f"synthetic sequence: visit is {visit!r}; of {scene} there is the first, 0, alone")
-    if backwards and (scene not in ("circuit", "eight") or backwards != 1):
-        raise ConfigError(f"synthetic sequence: backwards is {backwards!r}; it may be 1 in a circuit or an eight")
+    whole = {"n_frames": n_frames, "seed": seed, "visit": visit, "backwards": backwards, "width": width}
+    _check(scene, whole | {"height": height}, rate_hz, supersampling)
     script = parse_events(events)
-    duration_s = n_frames / rate_hz
-    rng = np.random.default_rng([seed, 0xCA4, visit] if visit else [seed, 0xCA4])
-    path: CameraPath
-    in_hand = scene == "room" or scene in TWINS
-    if scene in TWINS:
-        world, path = TWINS[scene](seed)
-    elif scene in TRAPS:
-        trap = TRAPS[scene](seed, duration_s)
-        world, path, in_hand = trap.scene, trap.path, trap.in_hand
-    elif not in_hand:
-        length_m = 10.0 * duration_s + 30
-        if scene == "circuit":
-            world, road = make_circuit(seed)
-        elif scene == "eight":
-            world, road = make_eight(seed)
-        elif scene == "terrace":
-            world, road = make_terrace(seed, length_m)
-        else:
-            world, road = make_street(seed, length_m)
-        world = at_another_hour(world, visit)
-        path = Drive(OtherWay(road) if backwards else road, rng, duration_s, speed_m_s=10.0)
-    else:
-        world = make_room(seed)
-        path = Walk(rng, duration_s, (HALF_SIZE_M[0] - 1.3, HALF_SIZE_M[1] - 1.3))
+    place = _place(scene, seed, n_frames / rate_hz, visit, backwards)
     focal, sensor = 0.72, Sensor(seed + (visit << 40), width, height, blur_px=0.45)
-    if in_hand:
+    if place.in_hand:
         focal = 0.82
         # A cheap camera in the hand: softer than the one on the car.
         sensor = Sensor(seed, width, height, blur_px=0.9, noise=1.2, stops=0.4)
     camera = _pinhole(focal * width, width, height)
-    renderer = Renderer(world, camera.K, width, height, detail=min(1.0, width / 640), supersampling=supersampling)
+    renderer = Renderer(place.scene, camera.K, width, height, detail=min(1.0, width / 640), supersampling=supersampling)
     parameters = {
         "scene": scene,
         "n_frames": int(n_frames),
@@ -259,7 +226,47 @@ def make_sequence(
         "supersampling": float(supersampling),
     }
     parameters |= {name: n for name, n in (("visit", visit), ("backwards", backwards)) if n}
-    return SyntheticSequence(parameters, camera, path, renderer, sensor, script)
+    return SyntheticSequence(parameters, camera, place.path, renderer, sensor, script)
+
+
+def _check(scene: str, whole: Mapping[str, Any], rate_hz: float, supersampling: float) -> None:
+    """Refuse parameters that make no sense; `whole`: those that are whole numbers."""
+    for name, value in whole.items():
+        low, high = LIMITS[name]
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= high:
+            raise ConfigError(f"synthetic sequence: {name} is {value!r}; it must be a whole number, {low} to {high}")
+    if not 0.5 <= rate_hz <= 1000:
+        raise ConfigError(f"synthetic sequence: rate_hz is {rate_hz:g}; it must lie between 0.5 and 1000")
+    if not 1 <= supersampling <= 4:
+        raise ConfigError(f"synthetic sequence: supersampling is {supersampling:g}; it must lie between 1 and 4")
+    if (visit := whole["visit"]) and scene not in VISITED:
+        raise ConfigError(f"synthetic sequence: visit is {visit!r}; of {scene} there is the first, 0, alone")
+    if (backwards := whole["backwards"]) and scene not in ("circuit", "eight"):
+        raise ConfigError(f"synthetic sequence: backwards is {backwards!r}; it may be 1 in a circuit or an eight")
+
+
+def _place(scene: str, seed: int, duration_s: float, visit: int, backwards: int) -> Place:
+    """Make a world and a way through it."""
+    rng = np.random.default_rng([seed, 0xCA4, visit] if visit else [seed, 0xCA4])
+    if scene in TWINS:
+        world, path = TWINS[scene](seed)
+        return Place(world, path, in_hand=True)
+    if scene in TRAPS:
+        return TRAPS[scene](seed, duration_s)
+    if scene == "room":
+        world = make_room(seed)
+        return Place(world, Walk(rng, duration_s, (HALF_SIZE_M[0] - 1.3, HALF_SIZE_M[1] - 1.3)), in_hand=True)
+    length_m = 10.0 * duration_s + 30
+    if scene == "circuit":
+        world, road = make_circuit(seed)
+    elif scene == "eight":
+        world, road = make_eight(seed)
+    elif scene == "terrace":
+        world, road = make_terrace(seed, length_m)
+    else:
+        world, road = make_street(seed, length_m)
+    drive = Drive(OtherWay(road) if backwards else road, rng, duration_s, speed_m_s=10.0)
+    return Place(at_another_hour(world, visit), drive, in_hand=False)
 
 
 def _pinhole(focal_px: float, width: int, height: int) -> PinholeCamera:

@@ -37,8 +37,8 @@ class _Path(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Trap:
-    """A world, the way through it, its frames a second, and whether its camera is one in the hand."""
+class Place:
+    """A world, the way through it, and whether its camera is one in the hand."""
 
     scene: Scene
     path: _Path
@@ -93,7 +93,7 @@ class _TakeOff:
         return up @ pose(dx[:3], *dx[3:])
 
 
-def make_board(seed: int, n_s: float) -> Trap:
+def make_board(seed: int, n_s: float) -> Place:
     """Build a board of prints that are all the same, `BOARD_PERIOD_M` apart, and slide along it for `n_s` seconds.
 
     On every second one stands a carton; so it is two periods after which all is as it was.
@@ -117,10 +117,10 @@ def make_board(seed: int, n_s: float) -> Trap:
                 carton = box((left + 0.12, 1.2), 0.0, size, 0.46 + row * BOARD_PERIOD_M, cartons, 400.0)
                 surfaces += [replace(face, texture=TEXTURES_FROM + 1 + i) for i, face in enumerate(carton)]
     path = _Slide(BOARD_SPEED_M_S, 1.5, Sway(rng, [0.01, 0.01, 0.03, 0.01, 0.01, 0.01], (0.15, 0.6)))
-    return Trap(Scene(tuple(surfaces), 150, seed), path, in_hand=True)
+    return Place(Scene(tuple(surfaces), 150, seed), path, in_hand=True)
 
 
-def make_parked(seed: int, n_s: float) -> Trap:
+def make_parked(seed: int, n_s: float) -> Place:
     """Build a row of like cars, `CAR_PERIOD_M` apart, before a plain wall, and drive past, looking at them."""
     rng = np.random.default_rng([seed, 0xCA2])
     length = CAR_SPEED_M_S * n_s + 40.0
@@ -142,10 +142,10 @@ def make_parked(seed: int, n_s: float) -> Trap:
         ahead = np.array([-20.0 + n * CAR_PERIOD_M, 0.0, 0.0])
         surfaces += [replace(surface, origin=surface.origin + ahead) for surface in car]
     path = _Slide(CAR_SPEED_M_S, 1.5, Sway(rng, [0.02, 0.01, 0.05, 0.004, 0.004, 0.003], (0.2, 0.9)))
-    return Trap(Scene(tuple(surfaces), 235, seed), path, in_hand=False)
+    return Place(Scene(tuple(surfaces), 235, seed), path, in_hand=False)
 
 
-def make_takeoff(seed: int, n_s: float) -> Trap:
+def make_takeoff(seed: int, n_s: float) -> Place:
     """Build a room and a textured bench in it, from which the camera takes off."""
     rng = np.random.default_rng([seed, 0x7A0])
     walk = Walk(rng, n_s, (HALF_SIZE_M[0] - 1.3, HALF_SIZE_M[1] - 1.3))
@@ -161,26 +161,26 @@ def make_takeoff(seed: int, n_s: float) -> Trap:
         900.0,
     )
     sway = Sway(rng, [0.004, 0.004, 0.004, 0.006, 0.006, 0.006], (0.3, 1.5))
-    return Trap(replace(room, surfaces=(*room.surfaces, bench)), _TakeOff(walk, sway), in_hand=True)
+    return Place(replace(room, surfaces=(*room.surfaces, bench)), _TakeOff(walk, sway), in_hand=True)
 
 
-def make_standstill(seed: int, n_s: float) -> Trap:
+def make_standstill(seed: int, n_s: float) -> Place:
     """Build a figure of eight, and set out on its bend from rest."""
     rng = np.random.default_rng([seed, 0x57A])
     world, road = make_eight(seed)
     tremor = Sway(rng, [0.001, 0.001, 0.001, 0.0005, 0.0005, 0.0005], (1.0, 4.0))
-    return Trap(world, _FromRest(Drive(road, rng, n_s, speed_m_s=10.0), 1.0, tremor), in_hand=False)
+    return Place(world, _FromRest(Drive(road, rng, n_s, speed_m_s=10.0), 1.0, tremor), in_hand=False)
 
 
-def make_hover(seed: int, n_s: float) -> Trap:
+def make_hover(seed: int, n_s: float) -> Place:
     """Build a room, and hover in it for `HOVER_S` seconds, by millimetres, before walking on."""
     rng = np.random.default_rng([seed, 0x40E])
     walk = Walk(rng, n_s, (HALF_SIZE_M[0] - 1.3, HALF_SIZE_M[1] - 1.3))
     tremor = Sway(rng, [0.004, 0.004, 0.004, 0.01, 0.01, 0.006], (0.3, 1.5))
-    return Trap(make_room(seed), _FromRest(walk, HOVER_S, tremor), in_hand=True)
+    return Place(make_room(seed), _FromRest(walk, HOVER_S, tremor), in_hand=True)
 
 
-TRAPS: dict[str, Callable[[int, float], Trap]] = {
+TRAPS: dict[str, Callable[[int, float], Place]] = {
     "board": make_board,
     "parked": make_parked,
     "takeoff": make_takeoff,
