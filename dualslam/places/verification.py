@@ -243,8 +243,7 @@ class PlaceVerifier:
     def _judge(
         self, place: Side, query: Side, pairs: Pairs, estimate: Sim3Estimate, looks: Looks, rng: Generator
     ) -> PlaceMatch | Failure:
-        config, S = self._config, estimate.S_dst_src
-        inliers = estimate.inliers
+        S, inliers = estimate.S_dst_src, estimate.inliers
         n = int(inliers.sum())
         found, own = looks.found, looks.own_found
         sigmas = sigmas_at_pairs(pairs.xyz_query[inliers], S, estimate.covariance, place)
@@ -266,22 +265,9 @@ class PlaceVerifier:
             "scale": float(sim3.scale(S)),
             **sigmas,
         }
-        if n <= MIN_MAJORITY * len(inliers):
-            return Failure(FailureReason.LOW_INLIER_RATIO, f"{n} of {len(inliers)} pairs agree", numbers)
-        if min(len(keyframes_place), len(keyframes_query)) < MIN_KEYFRAMES:
-            detail = f"{len(keyframes_place)} and {len(keyframes_query)} keyframes agree, {MIN_KEYFRAMES} needed"
-            return Failure(FailureReason.AGREEMENT, detail, numbers)
-        if found < MIN_FOUND * own:
-            detail = f"{found:.0%} of what the place should show is there, {own:.0%} in its own keyframes"
-            return Failure(FailureReason.REPROJECTION, detail, numbers)
-        if spread < MIN_IMAGE_SPREAD:
-            return Failure(FailureReason.SPREAD, f"{spread:.0%} of the image is covered", numbers)
-        if sigmas["sigma_scale"] > config.max_scale_sigma:
-            return Failure(FailureReason.SCALE, f"scale known to {sigmas['sigma_scale']:.1%}", numbers)
-        if sigmas["sigma_rot_deg"] > config.max_rotation_sigma_deg:
-            return Failure(FailureReason.DEGENERATE, f"rotation known to {sigmas['sigma_rot_deg']:.2f} deg", numbers)
-        if sigmas["sigma_trans_rel"] > config.max_position_sigma:
-            return Failure(FailureReason.DEGENERATE, f"position known to {sigmas['sigma_trans_rel']:.1%}", numbers)
+        refused = self._refuse(numbers)
+        if refused is not None:
+            return refused
         second = self._second_pose(place, query, S, rng)
         if second is not None:
             numbers |= {"second_support": float(second.support), "first_support": float(second.first_support)}
@@ -301,6 +287,29 @@ class PlaceVerifier:
             n,
             numbers,
         )
+
+    def _refuse(self, numbers: dict[str, float]) -> Failure | None:
+        """Hold what was measured against the gates."""
+        n, n_pairs = numbers["n_inliers"], numbers["n_matches"]
+        if n <= MIN_MAJORITY * n_pairs:
+            return Failure(FailureReason.LOW_INLIER_RATIO, f"{n:.0f} of {n_pairs:.0f} pairs agree", numbers)
+        n_place, n_query = numbers["n_keyframes_place"], numbers["n_keyframes_query"]
+        if min(n_place, n_query) < MIN_KEYFRAMES:
+            detail = f"{n_place:.0f} and {n_query:.0f} keyframes agree, {MIN_KEYFRAMES} needed"
+            return Failure(FailureReason.AGREEMENT, detail, numbers)
+        found, own = numbers["found"], numbers["own_found"]
+        if found < MIN_FOUND * own:
+            detail = f"{found:.0%} of what the place should show is there, {own:.0%} in its own keyframes"
+            return Failure(FailureReason.REPROJECTION, detail, numbers)
+        if numbers["spread"] < MIN_IMAGE_SPREAD:
+            return Failure(FailureReason.SPREAD, f"{numbers['spread']:.0%} of the image is covered", numbers)
+        if numbers["sigma_scale"] > self._config.max_scale_sigma:
+            return Failure(FailureReason.SCALE, f"scale known to {numbers['sigma_scale']:.1%}", numbers)
+        if numbers["sigma_rot_deg"] > self._config.max_rotation_sigma_deg:
+            return Failure(FailureReason.DEGENERATE, f"rotation known to {numbers['sigma_rot_deg']:.2f} deg", numbers)
+        if numbers["sigma_trans_rel"] > self._config.max_position_sigma:
+            return Failure(FailureReason.DEGENERATE, f"position known to {numbers['sigma_trans_rel']:.1%}", numbers)
+        return None
 
     def _second_pose(self, place: Side, query: Side, S: FloatArray, rng: Generator) -> SecondSimilarity | None:
         """Look for another similarity among all that looks alike, in the place and in the keyframe that asks."""
