@@ -79,14 +79,15 @@ class PlaceAlbum:
     def __init__(self, keep: Callable[[int, bytes], None]) -> None:
         self._keep = keep
         self._pictures: dict[int, bytes] = {}
-        self._next_s, self._every_s = -np.inf, ALBUM_EVERY_S
+        self._last_s, self._every_s = -np.inf, ALBUM_EVERY_S
         self._n_shown = 0
 
     def take(self, frame: Frame, status: FrameStatus) -> None:
         """Remember a frame with a pose, twice a second; fewer where there are very many."""
-        if status not in POSED or frame.image is None or frame.timestamp_s < self._next_s:
+        # Absolute: in a source that is read from its end times descend.
+        if status not in POSED or frame.image is None or abs(frame.timestamp_s - self._last_s) < self._every_s:
             return
-        self._next_s = frame.timestamp_s + self._every_s
+        self._last_s = frame.timestamp_s
         self._pictures[frame.index] = thumbnail(frame.image)
         if len(self._pictures) > ALBUM_SIZE:
             self._pictures = dict(list(self._pictures.items())[::2])

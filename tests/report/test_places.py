@@ -72,6 +72,14 @@ def test_without_a_place_there_is_no_section(broken_run: RunData) -> None:
     assert "Places seen again" not in report_page(replace(broken_run, events=[]))
 
 
+@pytest.mark.parametrize("step_s", [0.1, -0.1])
+def test_the_album_remembers_twice_a_second_in_either_direction(step_s: float) -> None:
+    album = PlaceAlbum(lambda *_: None)
+    for i in range(50):
+        album.take(Frame(i, 100 + step_s * i, np.zeros((30, 40), np.uint8)), FrameStatus.TRACKED)
+    assert 9 <= len(album._pictures) <= 10
+
+
 def test_the_album_shows_what_was_seen_nearest_to_a_frame_and_is_bounded() -> None:
     kept: dict[int, bytes] = {}
     album = PlaceAlbum(kept.__setitem__)
