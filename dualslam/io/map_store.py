@@ -67,8 +67,9 @@ class StoredMap:
 
 
 def submap_path(folder: Path, submap_id: int) -> Path:
-    """Where the arrays of a submap are in a ``map`` folder."""
-    return array_files(folder)[f"{SUBMAP}{submap_id:02d}"]
+    """Where the arrays of a submap are in a ``map`` folder, or would be: the metadata may lack it."""
+    name = f"{SUBMAP}{submap_id:02d}"
+    return array_files(folder).get(name, folder / f"{name}.npz")
 
 
 class _Groups(Mapping[str, dict[str, NDArray[Any]]]):

@@ -15,7 +15,8 @@ from dualslam.core.errors import InputError, OutputError
 from dualslam.core.geometry import se3
 from dualslam.core.types import Features, Keyframe
 from dualslam.io import load_map, load_submap, map_files, save_map, save_submap
-from dualslam.io.map_files import Arrays, save_arrays, submap_to_arrays
+from dualslam.io.map_files import Arrays, load_arrays, save_arrays, submap_to_arrays
+from dualslam.io.map_store import submap_path
 from dualslam.map.submap import RelativePose, Submap
 
 
@@ -143,6 +144,12 @@ def test_an_interrupted_save_leaves_the_old_map(tmp_path: Path, monkeypatch: pyt
         save(number, n_groups)
         assert value(tmp_path) == [number] * (n_groups + 1)
         assert len(list(tmp_path.iterdir())) == n_groups + 1, "nothing of the maps before is left"
+
+
+def test_a_submap_that_the_metadata_lacks_is_one_sentence(tmp_path: Path) -> None:
+    save_map(tmp_path, {}, {})
+    with pytest.raises(InputError, match=r"submap_07\.npz"):
+        load_arrays(submap_path(tmp_path, 7))
 
 
 def test_no_pickles(tmp_path: Path) -> None:
