@@ -234,6 +234,9 @@ class ISam2SubmapGraph:
     def _changes(self, submap: Submap, plan: Plan, poses: Mapping[int, FloatArray], xyz_mu: FloatArray) -> _Changes:
         """Translate a plan into factors and values; new variables start from `poses` and `xyz_mu`."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for k in plan.new_keyframes.tolist():
+            if not np.isfinite(poses[k]).all():
+                raise SolverError(f"submap {submap.id}: the pose of keyframe {k} is not finite; give it a guess")
         remove = self._factor_index.rows["factor"][plan.removing].tolist()
 
         def pose_now(k: int) -> FloatArray:

@@ -78,6 +78,16 @@ def test_missing_gauge_is_made_good(gauge):
     assert not any(e.rebuilt for e in estimates)
 
 
+def test_a_pose_that_is_not_finite_is_named():
+    feeder, _, _ = start(first=4)
+    feeder.submap.T_submap_kf[2] = np.full((4, 4), np.nan)
+    graph = ISam2SubmapGraph(GraphConfig())
+    with pytest.raises(SolverError, match=r"submap 0: the pose of keyframe 2 is not finite; give it a guess$"):
+        graph.update(feeder.submap)
+    feeder.submap.T_submap_kf[2] = feeder.submap.T_submap_kf[1].copy()
+    assert np.isfinite(graph.update(feeder.submap).T_submap_kf).all()
+
+
 def test_one_keyframe_and_none():
     feeder, _, _ = start(first=1)
     graph = ISam2SubmapGraph(GraphConfig())
