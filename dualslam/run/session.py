@@ -291,11 +291,13 @@ class _Watched:
         return result
 
     def finish(self, interrupted: bool = False) -> None:
-        self._system.finish(interrupted)
-        self._show_places()
-        if self._watcher is not None:
-            self._watcher.end()
-        self._samples.finish()
+        try:
+            self._system.finish(interrupted)
+            self._show_places()
+            if self._watcher is not None:
+                self._watcher.end()
+        finally:
+            self._samples.finish()
 
     def _show_places(self) -> None:
         numbers = self._system.numbers

@@ -25,6 +25,7 @@ from dualslam.lab.synthetic import SyntheticSequence
 from dualslam.run.results import versions
 from dualslam.run.sources import open_source
 from tests.cli.conftest import N_FRAMES
+from tests.cli.fakes import FakeSystem
 
 Install = Callable[..., None]
 
@@ -185,6 +186,21 @@ def test_who_interrupts_twice_keeps_it_too(folder: Path, fake: Install, tmp_path
     assert main(["run", str(folder), "--out", str(tmp_path / "run"), "--quiet"]) == 130
     assert len(rows_of(tmp_path / "run")) == 6
     assert set(load_atlas(tmp_path / "run").poses) == set(range(6))
+
+
+def test_who_leaves_the_end_of_a_run_keeps_the_pictures_of_its_last_gap(
+    folder: Path, fake: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("the second one leaves the end")
+
+    fake(lost=(N_FRAMES - 2, N_FRAMES - 1))
+    monkeypatch.setattr(FakeSystem, "finish", interrupted)
+    assert main(["run", str(folder), "--out", str(tmp_path / "run"), "--quiet"]) == 130
+    kept = sorted(int(path.stem) for path in (tmp_path / "run" / "samples").iterdir())
+    assert kept == [N_FRAMES - 3, N_FRAMES - 2, N_FRAMES - 1]
 
 
 def test_an_interrupt_while_results_are_written_waits_for_them(
