@@ -12,6 +12,7 @@ import numpy as np
 
 from dualslam.calibration.background import Calibrations
 from dualslam.calibration.lens import Calibration
+from dualslam.calibration.shutter_watch import ShutterWatch
 from dualslam.config.settings import Config
 from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.bundle import BundleAdjuster
@@ -47,7 +48,7 @@ from dualslam.recovery.manager import Recoveries
 from dualslam.recovery.relocaliser import Relocaliser
 from dualslam.recovery.scale_watch import ScaleLoss, ScaleWatch
 from dualslam.recovery.walk_news import WalkNews, WalkWatch
-from dualslam.workers.jobs import Desk
+from dualslam.workers.jobs import Desk, JobKind
 
 log = logging.getLogger(__name__)
 
@@ -180,6 +181,15 @@ class System:
         )
         self._calibrations = Calibrations(
             record, self.buffer, components.calibration, components.desk, components.new_graph, self._connections
+        )
+        self._shutter_watch = ShutterWatch(
+            record,
+            self.buffer,
+            components.calibration,
+            components.shutter,
+            components.desk,
+            components.new_graph,
+            self._connections,
         )
 
     @property
@@ -443,6 +453,7 @@ class System:
                 return track
             if (loss := self._scale_lost(live.submap)) is not None and self._part_at(live, view, loss):
                 return track
+            self._ask_shutter(live, view)
             self._calibrations.ask_if_due(live, view, self._recoveries.waiting)
             if len(live.submap.keyframes) >= self._max_keyframes(live.submap):
                 self._roll_over(live, view)
@@ -473,6 +484,12 @@ class System:
             n_taken = self._revisits.take_in(live.submap, TAKEN_IN_A_FRAME)
         if self._to_revisit and not n_taken:
             self._revisit(live, view)
+
+    def _ask_shutter(self, live: VisualOdometry, view: View) -> None:
+        """Ask the live map how long its images were read; not where what comes back meanwhile has the pixels of now."""
+        under_way = self._recoveries.is_under_way(live.submap) or self._parts.desk.n_open(JobKind.CALIBRATION)
+        if self.saved is None and not under_way:
+            self._shutter_watch.ask_if_due(live, view, self._recoveries.waiting)
 
     def _revisit(self, live: VisualOdometry, view: View) -> None:
         """Link the live map where its newest keyframe shows a place again; not while reverse tracking is under way."""

@@ -12,6 +12,7 @@ from dualslam.config.settings import Config, FrontendConfig
 from dualslam.core.threads import spare_cores
 from dualslam.core.types import Failure
 from dualslam.frontends.registry import create_frontend
+from dualslam.frontends.tracking.map_readout import answer_readout
 from dualslam.lab.disturbances import FaultScript
 from dualslam.map.graph_beside import GraphServer
 from dualslam.map.skeleton import answer_edges
@@ -57,9 +58,19 @@ def edge_handlers(config: Config) -> Handlers:
     return {JobKind.EDGES: lambda question: answer_edges(question, solver.edge_covariances)}
 
 
+READOUT_HANDLERS: Handlers = {JobKind.READOUT: answer_readout}
+"""What tells how long images were read."""
+
+
 def inline_handlers(config: Config, verifier: PlaceVerifier) -> Handlers:
     """Build what is done at once where there are no workers; walks back have an executor of their own."""
-    return {**edge_handlers(config), **SCALE_HANDLERS, **calibration_handlers(config), **place_handlers(verifier)}
+    return {
+        **edge_handlers(config),
+        **SCALE_HANDLERS,
+        **READOUT_HANDLERS,
+        **calibration_handlers(config),
+        **place_handlers(verifier),
+    }
 
 
 def graph_handlers(config: Config) -> Handlers:
@@ -86,6 +97,7 @@ def walk_handlers(config: Config, size_px: tuple[int, int], n_threads: int) -> H
         JobKind.WALK: lambda job: walk_back(job, parts),
         **edge_handlers(config),
         **SCALE_HANDLERS,
+        **READOUT_HANDLERS,
         **calibration_handlers(config),
         **place_handlers(verifier),
     }
@@ -103,7 +115,7 @@ def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript, w
     n_threads = min(FEATURE_THREADS, spare_cores(1 + recovery.workers))
     walks = Lane(
         "walks",
-        (JobKind.EDGES, JobKind.SCALE, JobKind.CALIBRATION, JobKind.LOOP, JobKind.WALK),
+        (JobKind.EDGES, JobKind.SCALE, JobKind.READOUT, JobKind.CALIBRATION, JobKind.LOOP, JobKind.WALK),
         partial(walk_handlers, config, size_px, n_threads),
         recovery.workers,
         recovery.time_limit_s,

@@ -4,7 +4,7 @@ rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Set
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -327,6 +327,26 @@ class MapStarter(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class ReadoutEstimate:
+    """By how much longer images are read, from the first row to the last, than their features were corrected for.
+
+    Attributes
+    ----------
+    more_s : float
+        Negative: they are read for less long.
+    sigma_s : float
+        Its standard deviation, by the residuals' own noise.
+    n_keyframes, n_observations : int
+        That told it.
+    """
+
+    more_s: float
+    sigma_s: float
+    n_keyframes: int
+    n_observations: int
+
+
 class Shutter(Protocol):
     """Knows or finds how an image is read row by row, and takes that out of the frames' features."""
 
@@ -352,6 +372,28 @@ class Shutter(Protocol):
 
     def may_start(self, view: View, camera: Camera) -> bool:
         """Whether a map may start from this view, found while there is none; `readout_s` may become known by it."""
+        ...
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether the readout time is not to be found, but as it was given."""
+        ...
+
+    def ask(self, submap: Submap, rates_rad_s: Mapping[int, FloatArray], camera: Camera) -> object | Failure:
+        """Ask a map for what of the readout is left in its keyframes, with how they turn (rad/s, in their own axes).
+
+        The question can be pickled; its answer is a `ReadoutEstimate`.
+        """
+        ...
+
+    def moved(self, features: Features, camera: Camera, turn_rad: FloatArray) -> Features:
+        """Return a keyframe's features without so much more of a turn while it was read."""
+        ...
+
+    def take(
+        self, readout_s: float, rates_rad_s: Mapping[int, FloatArray], latest: Iterable[View], K: FloatArray
+    ) -> None:
+        """Go on with the readout time that a map has told."""
         ...
 
 

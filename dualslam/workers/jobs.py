@@ -28,6 +28,7 @@ class JobKind(StrEnum):
     GRAPH = "graph"
     EDGES = "edge covariances"
     SCALE = "scale watch"
+    READOUT = "readout"
     CALIBRATION = "calibration"
     LOOP = "loop search"
     WALK = "walk back"

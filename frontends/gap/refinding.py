@@ -14,7 +14,7 @@ follows, and within the search.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +29,7 @@ from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Failure, Features, FloatArray, IntArray, Track, View
 from dualslam.frontends.gap.patches import HALF_PX, Pyramid, build_pyramid, match_patches
 from dualslam.frontends.gap.uncertainty import pose_uncertainty
+from dualslam.frontends.tracking.rolling_shutter import find_as_read, straighten
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 
@@ -104,17 +105,25 @@ class Refinder:
         self._camera = camera
         self._model_sigma_px = model_sigma_px
         self._images: dict[int, GreyImage] = {}
+        self._turns_rad: dict[int, FloatArray | None] = {}  # that were taken out of their features
         self._rim: list[int] = []
         self._levels: dict[int, Pyramid] = {}
         self._n_left = 0
 
     def remember(self, view: View) -> None:
-        """Keep the image of a keyframe; one that was straightened does not show its features where they are."""
-        if view.image is None or view.turn_rad is not None:
+        """Keep the image of a keyframe, and the turn by which its features are elsewhere than it shows them."""
+        if view.image is None:
             return
-        self._images[view.index] = view.image
+        self._images[view.index], self._turns_rad[view.index] = view.image, view.turn_rad
         for index in sorted(self._images, key=lambda i: abs(i - view.index))[KEPT_IMAGES:]:
-            del self._images[index]
+            del self._images[index], self._turns_rad[index]
+
+    def forget(self, keyframe_ids: Iterable[int]) -> None:
+        """Forget the images of keyframes whose features are not where they were when they were remembered."""
+        for k in keyframe_ids:
+            self._images.pop(k, None)
+            self._turns_rad.pop(k, None)
+            self._levels.pop(k, None)
 
     def begin(self, index: int) -> None:
         """Note that a gap lies between frame `index` and the keyframes so far."""
@@ -134,7 +143,7 @@ class Refinder:
             Its pose and covariance are not by the landmarks that it sees, and count beside these.
         """
         view = track.view
-        if self._n_left == 0 or view.image is None or view.turn_rad is not None:
+        if self._n_left == 0 or view.image is None:
             return track
         self._n_left -= 1
         levels = build_pyramid(view.image.pixels())
@@ -215,6 +224,9 @@ class Refinder:
         uv_kf = sought.features.uv_px
         depth = self._submap.depths(sought.landmark_ids, T_kf_submap)
         uv, J = _predict(camera, uv_kf, depth, T_cam_kf)
+        turn_rad, turn_kf_rad = track.view.turn_rad, self._turns_rad[sought.keyframe_id]
+        uv = uv if turn_rad is None else find_as_read(uv, camera, turn_rad)
+        uv_kf = uv_kf if turn_kf_rad is None else find_as_read(uv_kf, camera, turn_kf_rad)
         zoom = _zoom(J)
         margin = HALF_PX * np.maximum(zoom, 1.0)[:, None]
         inside = ((uv > margin) & (uv < np.array([camera.width, camera.height]) - 1 - margin)).all(axis=1)
@@ -228,9 +240,10 @@ class Refinder:
             SEARCH_RAD * camera.K[0, 0],
         )
         row = usable[matches.row]
-        uv_rect, magnification = camera.rectify(matches.uv_px)
+        found_px = matches.uv_px if turn_rad is None else straighten(matches.uv_px, camera, turn_rad)
+        uv_rect, magnification = camera.rectify(found_px)
         held = np.isfinite(uv_rect).all(axis=1) & np.isfinite(magnification)
-        row, uv_px, uv_rect = row[held], matches.uv_px[held], uv_rect[held]
+        row, uv_px, uv_rect = row[held], found_px[held], uv_rect[held]
         sigma = rectified_sigma(SIGMA_PX * matches.spacing_px[held], magnification[held], self._model_sigma_px)
         of = sought.features.take(row)
         scale = np.maximum(of.scale * zoom[row], 1.0)

@@ -6,7 +6,7 @@ to the frame before tell, and from the readout time, which is the camera's own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -18,9 +18,11 @@ from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import so3
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
-from dualslam.core.types import Features, FloatArray, View
+from dualslam.core.types import Failure, Features, FloatArray, View
+from dualslam.frontends.tracking.map_readout import ReadoutQuestion, ask_readout
 from dualslam.frontends.tracking.resection import poselib_camera
 from dualslam.frontends.tracking.turning import turn_between
+from dualslam.map.submap import Submap
 
 INFLATION = 4.0
 """How much larger errors are taken to be than they seem, as neighbouring pixels err alike."""
@@ -73,12 +75,8 @@ def correct_shutter(
     read_v_px : (N,), optional
         Rows in which the features were read, where `features` does not tell.
     """
-    K = camera.K
-    f, c = np.diag(K)[:2], K[:2, 2]
-    rays = np.column_stack([(features.uv_rect_px - c) / f, np.ones(len(features))])
-    late = (features.uv_px[:, 1] if read_v_px is None else read_v_px) / camera.height - 0.5
-    rays = _turned(rays, late, turn_rad)
-    uv_rect_px = f * rays[:, :2] / rays[:, 2:] + c
+    read_v_px = features.uv_px[:, 1] if read_v_px is None else read_v_px
+    uv_rect_px = _at_mid_row(features.uv_rect_px, read_v_px, camera, turn_rad)
     # The found pixels move alike, so that the same features can be rectified again by a better camera.
     return replace(features, uv_px=features.uv_px + uv_rect_px - features.uv_rect_px, uv_rect_px=uv_rect_px)
 
@@ -92,6 +90,31 @@ def _turned(rays: FloatArray, share: FloatArray, turn_rad: FloatArray) -> FloatA
     # 1 - cos as a square: small turns keep their digits.
     inwards = across @ so3.hat(axis).T
     return np.asarray(rays + np.sin(by)[:, None] * across + (2 * np.sin(0.5 * by) ** 2)[:, None] * inwards, np.float64)
+
+
+def _at_mid_row(uv_rect_px: FloatArray, read_v_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
+    """Return rectified pixels (N, 2), read in rows (N,), as they would be at the time of the middle row."""
+    K = camera.K
+    f, c = np.diag(K)[:2], K[:2, 2]
+    rays = np.column_stack([(uv_rect_px - c) / f, np.ones(len(uv_rect_px))])
+    rays = _turned(rays, read_v_px / camera.height - 0.5, turn_rad)
+    return np.asarray(f * rays[:, :2] / rays[:, 2:] + c, np.float64)
+
+
+def straighten(uv_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
+    """Return where things that an image shows at pixels (N, 2) are in the features: as `correct_shutter` moves them."""
+    uv_rect_px, _ = camera.rectify(uv_px)
+    return uv_px + _at_mid_row(uv_rect_px, uv_px[:, 1], camera, turn_rad) - uv_rect_px
+
+
+def find_as_read(uv_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
+    """Return where an image shows what features have at pixels (N, 2): the inverse of `straighten`."""
+    uv_rect_px, _ = camera.rectify(uv_px)
+    read_px = uv_px
+    # Each was read in a row that is known once it is put back: a second time, it is.
+    for _ in range(2):
+        read_px = uv_px + _at_mid_row(uv_rect_px, read_px[:, 1], camera, -turn_rad) - uv_rect_px
+    return read_px
 
 
 def _largest(features: Features) -> Features:
@@ -274,8 +297,8 @@ class RollingShutter:
     def __init__(self, frontend: Frontend, config: CameraConfig, seed: int) -> None:
         self._frontend = frontend
         self.readout_s = config.readout_s or 0.0
-        asks = config.readout_s is None
-        self._estimator = ReadoutEstimator(frontend, seed, READOUT_EVIDENCE) if asks else None
+        self.is_stated = config.readout_s is not None
+        self._estimator = None if self.is_stated else ReadoutEstimator(frontend, seed, READOUT_EVIDENCE)
         self._meter = TurnMeter(frontend)
         self._was_s = 0.0  # by which the frames so far were corrected
         self._rates_rad_s: dict[int, FloatArray] = {}  # of the frames by whose turns the shutter is being found
@@ -331,7 +354,7 @@ class RollingShutter:
         """Whether a map may start from this view, found while there is none; what it tells of the shutter is taken in.
 
         Of a camera that turns fast, with a shutter that is likely to roll, the rows' shifts would pass for parallax.
-        While a map lives nobody asks: it needs no other pixels than those that it is made of.
+        A map that lives is asked itself (`ask`).
         """
         if self._estimator is None:
             return True
@@ -347,6 +370,27 @@ class RollingShutter:
         if self._estimator.is_done or not readout_s:
             self._estimator = None
         return True
+
+    def ask(self, submap: Submap, rates_rad_s: Mapping[int, FloatArray], camera: Camera) -> ReadoutQuestion | Failure:
+        """Ask a map for what of the readout is left in its keyframes, with how they turn (rad/s, in their own axes)."""
+        return ask_readout(submap, rates_rad_s, camera.height)
+
+    def moved(self, features: Features, camera: Camera, turn_rad: FloatArray) -> Features:
+        """Return a keyframe's features without so much more of a turn while it was read."""
+        return correct_shutter(features, camera, turn_rad)
+
+    def take(
+        self, readout_s: float, rates_rad_s: Mapping[int, FloatArray], latest: Iterable[View], K: FloatArray
+    ) -> None:
+        """Go on with the readout time that a map has told.
+
+        `rates_rad_s`: how the camera turns at frames so far, for `all_corrected`; `latest`: the last ones, in order.
+        """
+        self._was_s, self.readout_s, self._estimator = self.readout_s, readout_s, None
+        self._rates_rad_s = dict(rates_rad_s)
+        if not self._was_s:  # else it has followed the frames
+            for view in latest:
+                self._meter.rate_rad_s(view, K)
 
     def _improve(self, estimator: ReadoutEstimator, view: View, camera: Camera) -> None:
         """Let a frame say more of a readout time that is known: by the first frames it may be off by half."""

@@ -106,6 +106,8 @@ class VisualFrontEnd:
         """Go on with another graph of the same submap, whose poses and points have moved since it was `before`."""
         self._careful |= graph is not self.graph
         self.graph = graph
+        if self._refinder is not None:
+            self._refinder.forget(_moved_features(before, self.submap))
         self._tracker.follow(change_of_frame(before, self.submap, [self._reference_id]))
 
     def track(self, view: View) -> Track | Failure:
@@ -314,3 +316,13 @@ class VisualFrontEnd:
                 self._path.remove(culled)
             submap.remove_keyframe(culled, self._reference_id)
         return culled
+
+
+def _moved_features(before: Submap, after: Submap) -> list[int]:
+    """Return the keyframes whose features are not at the pixels of the image where they were."""
+    pairs = (
+        (k, before.keyframes[k].features.uv_px, after.keyframes[k].features.uv_px)
+        for k in after.keyframes
+        if k in before.keyframes
+    )
+    return [k for k, was, now in pairs if was is not now and not np.array_equal(was, now)]

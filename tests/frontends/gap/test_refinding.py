@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from dualslam.core.types import FloatArray, Keyframe, Track, View
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.gap import refinding
 from dualslam.frontends.gap.refinding import FAR_KEYFRAMES, Refinder
+from dualslam.frontends.tracking.rolling_shutter import straighten
 from dualslam.lab.synthetic import SyntheticSequence, make_sequence
 from dualslam.map.submap import NO_LANDMARK, Submap
 
@@ -158,10 +160,46 @@ def test_a_few_keyframes_beyond_a_gap_are_searched_and_no_others() -> None:
     assert refinder.extend(track) is track
 
 
-def test_an_image_that_does_not_show_its_features_where_they_are_is_left_alone() -> None:
+def test_a_frame_without_an_image_is_left_alone() -> None:
     _, refinder = true_map()
-    view = replace(view_of(FAR), turn_rad=np.array([0.0, 0.05, 0.0]))
     refinder.begin(FAR)
-    track = track_of(view, se3.inverse(street().ground_truth_T_world_cam[FAR]))
+    track = track_of(view_of(FAR), se3.inverse(street().ground_truth_T_world_cam[FAR]))
+    without = replace(track, view=replace(track.view, image=None))
+    assert refinder.extend(without) is without
+
+
+def read_while_turning(view: View, turn_rad: FloatArray) -> View:
+    """Return a view whose image was read row by row meanwhile, and whose features do not show that any more."""
+    camera, image = street().camera, view.image
+    assert image is not None
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    shown = straighten(np.column_stack([u.ravel(), v.ravel()]).astype(float), camera, turn_rad)
+    at = [np.asarray(each.reshape(camera.height, camera.width), np.float32) for each in shown.T]
+    bent = cv2.remap(image.pixels(), at[0], at[1], cv2.INTER_LINEAR)
+    return replace(view, image=GreyImage.of(bent), turn_rad=turn_rad)
+
+
+@pytest.mark.parametrize("turned", ["frame", "keyframe", "both"])
+def test_what_a_rolling_shutter_shows_elsewhere_is_looked_for_there(turned: str) -> None:
+    turn_rad = np.array([0.01, 0.05, -0.03])
+    submap, refinder = true_map()
+    view, T_true = view_of(FAR), se3.inverse(street().ground_truth_T_world_cam[FAR])
+    if turned != "frame":
+        refinder.remember(read_while_turning(view_of(RIM), turn_rad))
+    if turned != "keyframe":
+        view = read_while_turning(view, turn_rad)
+    refinder.begin(FAR)
+    track = refinder.extend(track_of(view, nearly(T_true)), pose_is_given=True)
+    found = np.flatnonzero(track.landmark_ids >= 0)
+    assert len(found) > MANY
+    uv, _ = project_points(submap.K, T_true, submap.landmarks["xyz_mu"][track.landmark_ids[found]])
+    error = np.linalg.norm(uv - track.view.features.uv_rect_px[found], axis=1)
+    assert (error < TRUE_PLACE_PX).mean() > 0.9
+
+
+def test_keyframes_whose_features_have_moved_are_not_looked_at() -> None:
+    _, refinder = true_map()
+    refinder.forget([RIM])
+    refinder.begin(FAR)
+    track = track_of(view_of(FAR), se3.inverse(street().ground_truth_T_world_cam[FAR]))
     assert refinder.extend(track) is track
-    assert refinder.extend(replace(track, view=replace(view, image=None, turn_rad=None))).view.image is None

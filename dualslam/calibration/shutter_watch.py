@@ -1,0 +1,212 @@
+"""The shutter of a live map: how long its images were read is asked of the map itself, and taken out of all it is in.
+
+Before a map starts, pairs of frames tell a readout time to five or ten milliseconds, and where the camera does not turn
+fast just then they tell nothing. A map tells it to a fraction of one (`frontends/tracking/map_readout.py`). It matters:
+where a camera turns fast, few landmarks are seen from both sides of the turn, and each millisecond of readout on a fast
+walk moves the scale behind such a turn by 4 %, which nothing else shows.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import replace
+from operator import attrgetter
+from typing import Protocol
+
+import numpy as np
+
+from dualslam.calibration.lens import Calibration
+from dualslam.core.camera.base import Camera
+from dualslam.core.errors import SolverError
+from dualslam.core.events import EventKind
+from dualslam.core.geometry import so3
+from dualslam.core.interfaces import ReadoutEstimate, Shutter, SubmapGraph, VisualOdometry
+from dualslam.core.types import Failure, FloatArray, View
+from dualslam.map.connections import Connections
+from dualslam.map.record import FrameStamp, Record
+from dualslam.map.submap import Submap
+from dualslam.workers.jobs import Desk, JobKind
+
+log = logging.getLogger(__name__)
+
+FIRST_KEYFRAMES, GROWTH, SOON = 15, 2.0, 1.4
+"""Keyframes at which a map is asked first, and how many times as many it has at each next time; and where it was
+changed: what it had refused as outliers was by the shutter of before, and the first answer errs towards that."""
+INFLATION = 4.0
+"""How much larger errors are than the residuals say, as neighbouring pixels err alike: as self-calibration has it."""
+MIN_SIGMAS = 3.0
+"""Of these inflated errors, that a readout time must be off for the map to be changed. Global shutters come out at up
+to 1.2 (KITTI, EuRoC), rolling ones at 5 and more."""
+
+MAX_SIGMA_S = 0.004
+"""Inflated: where the camera turns too slowly to tell a readout time to that, other errors of the pixels pass for one
+(a rendered street, which hardly turns: -0.020 s with 0.008 claimed). There it does not matter either."""
+MAX_GAP_S = 0.2
+"""Between a frame and one beside it that tells how it turns."""
+
+
+class Views(Protocol):
+    """Buffered views, which change to another shutter with the maps."""
+
+    @property
+    def indices(self) -> list[int]:
+        """Return whose they are, the oldest first."""
+        ...
+
+    def newest(self, n: int) -> list[View]:
+        """Return so many of the newest views, from the oldest to the newest."""
+        ...
+
+    def change_all(self, change: Callable[[Iterable[View]], Iterable[View]]) -> None:
+        """Put what `change` makes of the views, oldest first, into their places."""
+        ...
+
+    def map_later(self, change: Callable[[View], View], subject: str) -> None:
+        """Change each view, at the latest when somebody looks at it."""
+        ...
+
+
+class ShutterWatch:
+    """Asks live submaps how long their images were read, and takes the answer in between two frames.
+
+    Parameters
+    ----------
+    record : Record
+    buffer : Views
+    calibration : Calibration
+    shutter : Shutter
+    desk : Desk
+        Where the questions are answered.
+    new_graph : callable
+    connections : Connections
+    """
+
+    def __init__(
+        self,
+        record: Record,
+        buffer: Views,
+        calibration: Calibration,
+        shutter: Shutter,
+        desk: Desk,
+        new_graph: Callable[[], SubmapGraph],
+        connections: Connections,
+    ) -> None:
+        self._record = record
+        self._buffer = buffer
+        self._calibration = calibration
+        self._shutter = shutter
+        self._desk = desk
+        self._new_graph = new_graph
+        self._connections = connections
+        self._due_at: dict[int, float] = {}  # by submap, keyframes
+        self._asked: tuple[int, float, Camera] | None = None  # which submap, of which pixels
+
+    def ask_if_due(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int]) -> None:
+        """Ask the live submap where it is time to, and take in what it has answered.
+
+        `lost`: the submaps that are to be linked with it, and must have the same pixels.
+        """
+        submap = live.submap
+        n = len(submap.keyframes)
+        if self._shutter.is_stated:
+            return
+        with self._record.timer.measure("shutter"):
+            if n >= self._due_at.get(submap.id, FIRST_KEYFRAMES) and not self._desk.n_open(JobKind.READOUT):
+                self._due_at[submap.id] = GROWTH * n
+                question = self._shutter.ask(submap, self._rates(submap), self._calibration.camera)
+                if not isinstance(question, Failure):
+                    self._desk.submit(JobKind.READOUT, question)
+                    self._asked = submap.id, self._shutter.readout_s, self._calibration.camera
+            for ended in self._desk.poll(JobKind.READOUT):
+                # What was asked of other pixels is no answer.
+                if self._asked == (submap.id, self._shutter.readout_s, self._calibration.camera):
+                    self._take_answer(ended.result, live, now, lost)
+
+    def _take_answer(
+        self, answer: ReadoutEstimate | Failure, live: VisualOdometry, now: FrameStamp, lost: Collection[int]
+    ) -> None:
+        submap = live.submap
+        if isinstance(answer, Failure) or not _is_sure(answer):
+            return
+        readout_s = self._shutter.readout_s + answer.more_s
+        if readout_s <= 0 or not self._change(live, answer.more_s, now):
+            return
+        self._due_at[submap.id] = SOON * len(submap.keyframes)
+        changed = [m for m in sorted(lost) if self._change_lost(m, answer.more_s, now)]
+        self._take(readout_s)
+        sigma_s = INFLATION * answer.sigma_s
+        self._record.event(EventKind.SHUTTER_FOUND, now, submap.id, readout_s=readout_s, sigma_s=sigma_s, lost=changed)
+
+    def _change(self, live: VisualOdometry, more_s: float, now: FrameStamp) -> bool:
+        """Change the live submap, and return whether it could be solved."""
+        changed, graph = live.submap.copy(), self._new_graph()
+        self._move(changed, more_s)
+        try:
+            changed.apply_estimate(*graph.rebuild(changed).values)
+        except SolverError as error:
+            log.warning("submap %d keeps its shutter: %s", changed.id, error)
+            return False
+        before = live.submap.copy()
+        live.submap.take_over(changed)
+        live.adopt(graph, before)
+        self._connections.follow(before, live.submap, now)
+        return True
+
+    def _change_lost(self, submap_id: int, more_s: float, now: FrameStamp) -> bool:
+        """Change a lost submap with the live one, if it could be."""
+        submap = self._record.atlas.submaps[submap_id]
+        changed = submap.copy()
+        self._move(changed, more_s)
+        try:
+            changed.apply_estimate(*self._new_graph().rebuild(changed).values)
+        except SolverError as error:
+            log.warning("submap %d keeps its shutter: %s", submap_id, error)
+            return False
+        before = submap.copy()
+        submap.take_over(changed)
+        self._connections.follow(before, submap, now)
+        return True
+
+    def _move(self, submap: Submap, more_s: float) -> None:
+        """Take so much more of the readout out of a submap's keyframes; poses and points stay."""
+        submap.relative_poses = {}  # they were measured with the pixels of before
+        rates = self._rates(submap)
+        for k in rates.keys() & submap.keyframes.keys():
+            keyframe = submap.keyframes[k]
+            features = self._shutter.moved(keyframe.features, self._calibration.camera, more_s * rates[k])
+            submap.keyframes[k] = replace(keyframe, features=features)
+
+    def _take(self, readout_s: float) -> None:
+        """Let the buffered frames and those to come be read in the time that was found."""
+        rates: dict[int, FloatArray] = {}
+        for submap in self._record.atlas.submaps.values():
+            rates.update(self._rates(submap))
+        camera, indices = self._calibration.camera, self._buffer.indices
+        known = {i: rates[i] for i in indices if i in rates}
+        self._shutter.take(readout_s, known, self._buffer.newest(2), camera.K)
+        correction = self._shutter.correction(indices, camera)
+        if correction is None:
+            self._buffer.change_all(lambda views: self._shutter.all_corrected(views, camera))
+        else:
+            self._buffer.map_later(correction, "shutter")
+
+    def _rates(self, submap: Submap) -> dict[int, FloatArray]:
+        """Return how the camera turns at the frames that a submap has posed (rad/s, in its own axes)."""
+        posed = sorted((p for p in self._record.poses.values() if p.submap_id == submap.id), key=attrgetter("index"))
+        if len(posed) < 2:
+            return {}
+        t = np.array([p.timestamp_s for p in posed])
+        R = np.array([submap.resolve_anchor(p.keyframe_id, p.T_kf_cam)[:3, :3] for p in posed])
+        n = np.arange(len(posed))
+        apart = np.abs(np.diff(t)) > MAX_GAP_S
+        first = n - ~np.concatenate([[True], apart])
+        last = n + ~np.concatenate([apart, [True]])
+        turn = so3.log(R[first].swapaxes(1, 2) @ R[last])
+        return {posed[i].index: turn[i] / (t[last[i]] - t[first[i]]) for i in n[first < last].tolist()}
+
+
+def _is_sure(answer: ReadoutEstimate) -> bool:
+    """Whether a map is to be changed by what it says."""
+    sigma_s = INFLATION * answer.sigma_s
+    return sigma_s < MAX_SIGMA_S and abs(answer.more_s) > MIN_SIGMAS * sigma_s
