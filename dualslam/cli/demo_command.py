@@ -22,7 +22,8 @@ from dualslam.run.session import run_to_folder
 from dualslam.run.sources import WorldSequence, make_world
 
 MIN_FRAMES = 60
-BLACKOUT_FRAMES = 12
+BLACKOUT_FRAMES = 10
+"""A second: enough to be lost, and little enough for the new map to know its scale as soon as it has started."""
 WORLD_SEED = 0
 
 
@@ -33,13 +34,12 @@ def execute(args: argparse.Namespace) -> int:
     config = config_of(args)
     page: Path = args.out / "compare.html"
     check_free(page, args.overwrite, "another folder with --out")
-    covered: dict[str, Any] = {"kind": "blackout", "start": args.frames // 2, "length": BLACKOUT_FRAMES}
     if not args.quiet:
-        last = covered["start"] + BLACKOUT_FRAMES - 1
-        where = f"the lens is covered in frames {covered['start']} to {last}"
+        first = args.frames // 2
+        where = f"the lens is covered in frames {first} to {first + BLACKOUT_FRAMES - 1}"
         print(f"A street of {args.frames} frames, rendered first; {where}.", flush=True)
     logs.release()
-    sequence = _Rendered(WorldSequence(make_world("street", args.frames, WORLD_SEED, [covered])))
+    sequence = _Rendered(drive(args.frames))
     runs = []
     # Both in this process: the second's peak memory is at least the first's.
     for name, enabled in (("off", False), ("on", True)):
@@ -57,6 +57,12 @@ def execute(args: argparse.Namespace) -> int:
     if not args.quiet:
         print(f"the joined map, to turn: {args.out / 'on' / MAP_PAGE}", flush=True)
     return status
+
+
+def drive(n_frames: int) -> WorldSequence:
+    """Return the drive through the street, the lens covered half-way."""
+    covered: dict[str, Any] = {"kind": "blackout", "start": n_frames // 2, "length": BLACKOUT_FRAMES}
+    return WorldSequence(make_world("street", n_frames, WORLD_SEED, [covered]))
 
 
 class _Rendered:

@@ -9,10 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dualslam.build import build_system
 from dualslam.cli import main
+from dualslam.cli.demo_command import drive
+from dualslam.cli.parser import parse
 from dualslam.config.files import load_config
 from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
+from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, Frame
 from dualslam.run.sources import make_world
 from tests.cli.fakes import FakeSystem
@@ -44,7 +48,7 @@ def test_demo_shows_recovery_off_against_on(out: Path, capsys: pytest.CaptureFix
     command = ["demo", "--frames", str(N), "--out", str(out)]
     assert main(command) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert "covered in frames 16 to 27" in lines[0]
+    assert "covered in frames 16 to 25" in lines[0]
     assert (lines[1], lines[3]) == ("Recovery off:", "Recovery on:")
     assert "2 submaps, 1 failure" in lines[2]
     assert lines[4].endswith(f"results in {out / 'on'}")
@@ -87,3 +91,19 @@ def test_an_interrupted_demo_ends_there(truth: Truth, out: Path, monkeypatch: py
     monkeypatch.setattr("dualslam.run.session.build_system", lambda *_: FakeSystem(truth, before_step=interrupt))
     assert main(["demo", "--frames", str(N), "--out", str(out), "--quiet"]) == 130
     assert [path.name for path in out.iterdir()] == ["off"]
+
+
+@pytest.mark.slow
+def test_the_two_maps_of_the_drive_are_joined_at_the_first_attempt() -> None:
+    """What the demo is to show, and to show within a minute."""
+    n_frames = parse(["demo"]).frames
+    sequence = drive(n_frames)
+    system = build_system(Config(), sequence.camera)
+    for frame in sequence:
+        system.step(frame)
+        if system.atlas.links:
+            break
+    assert len(system.events.of_kind(EventKind.FAILED)) == 1
+    assert not system.events.of_kind(EventKind.LINK_REFUSED)
+    (attempt,) = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)
+    assert attempt.data["verdict"] == "linked"
