@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.metadata import entry_points
 from typing import Any, Protocol, TypeVar
 
@@ -31,6 +31,10 @@ EXTRAS: Mapping[str, str] = {"kornia": "dualslam[kornia]"}
 EXTRA_OPTIONS: Mapping[str, str] = {"kornia": "dualslam.frontends.features.kornia.options:KorniaOptions"}
 """Options of the built-in front ends that need an extra, in modules that can be imported without it."""
 
+FOR_WALKS = ("extract", "match_wide")
+FOR_MAPS = (*FOR_WALKS, "distance", "scale_factor", "n_octaves", "max_distance", "max_distance_strict")
+"""What a front end must have: to pose the frames of a walk back as a further attempt, and to make maps."""
+
 OptionsT = TypeVar("OptionsT", bound=BaseModel)
 
 
@@ -47,7 +51,7 @@ def known_frontends() -> list[str]:
     return sorted({*BUILT_IN, *entry_points(group=ENTRY_POINT_GROUP).names})
 
 
-def create_frontend(config: FrontendConfig) -> Frontend:
+def create_frontend(config: FrontendConfig, needs: Iterable[str] = FOR_MAPS) -> Frontend:
     """Build the front end that the config names; a built-in name wins over an entry point of the same name.
 
     ``module:Class`` is a name as well: of what can be imported, whether it is installed or just being written.
@@ -55,9 +59,14 @@ def create_frontend(config: FrontendConfig) -> Frontend:
     Raises
     ------
     ConfigError
-        The name is unknown, what it points to cannot be imported, or an option is wrong.
+        The name is unknown, what it points to cannot be imported, or an option is wrong; or what is built lacks one of
+        `needs`.
     """
-    return _factory(config.name).from_options(config.n_features, config.options)
+    frontend = _factory(config.name).from_options(config.n_features, config.options)
+    lacking = [name for name in needs if not hasattr(frontend, name)]
+    if lacking:
+        raise ConfigError(f"frontend.name: '{config.name}' is no front end: it has no {', '.join(lacking)}")
+    return frontend
 
 
 def check_frontend(config: FrontendConfig) -> Frontend | None:

@@ -19,7 +19,7 @@ from dualslam.frontends.features.image_features import ImageFeatures
 from dualslam.frontends.gap.auxiliary_features import AuxiliaryFeatures, BufferedFeatures, OwnFeatures
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry, Route
 from dualslam.frontends.gap.refinding import Refinder
-from dualslam.frontends.registry import create_frontend
+from dualslam.frontends.registry import FOR_WALKS, create_frontend
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.health import judge_track
 from dualslam.map.submap import Submap
@@ -104,7 +104,7 @@ def _attempts(
         key = wanted.model_dump_json()
         if key not in auxiliaries:
             with naming_attempt(number):
-                auxiliaries[key] = ImageFeatures(create_frontend(wanted), n_threads)
+                auxiliaries[key] = ImageFeatures(create_frontend(wanted, FOR_WALKS), n_threads)
         features_for = partial(BufferedFeatures, auxiliaries[key], config.camera.model_sigma_px)
         attempts.append(_attempt_by(auxiliaries[key].frontend, features_for, attempt, config, live, size_px))
     return tuple(attempts)

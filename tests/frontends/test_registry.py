@@ -85,6 +85,27 @@ def test_what_is_no_front_end_is_a_config_error(name: str, said: str) -> None:
         registry.check_frontend(FrontendConfig(name=name))
 
 
+class Half:
+    """What poses the frames of a walk back, and no more."""
+
+    extract = match_wide = None
+
+    @classmethod
+    def from_options(cls, n_features: int, options: dict[str, Any]) -> Half:
+        return cls()
+
+
+def test_what_a_front_end_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_import", lambda name: Half)
+    said = (
+        "^frontend.name: 'half:Half' is no front end: it has no distance, scale_factor, n_octaves, max_distance, "
+        "max_distance_strict$"
+    )
+    with pytest.raises(ConfigError, match=said):
+        registry.create_frontend(FrontendConfig(name="half:Half"))
+    assert isinstance(registry.create_frontend(FrontendConfig(name="half:Half"), registry.FOR_WALKS), Half)
+
+
 def test_a_front_end_is_checked_without_its_extra() -> None:
     code = """
 import sys
