@@ -36,6 +36,16 @@ def progress(sequence: Sequence, quiet: bool) -> Iterator[Watcher | None]:
         yield _Bar(bars, sequence.name, total)
 
 
+@contextmanager
+def waiting(what: str, quiet: bool) -> Iterator[None]:
+    """Say on stderr, if a person watches, what goes on that nothing counts."""
+    if quiet or not sys.stderr.isatty():
+        yield
+        return
+    with Console(stderr=True).status(what):
+        yield
+
+
 class _Bar(RunState):
     def __init__(self, bars: Bars, name: str, n_frames: int | None) -> None:
         super().__init__(n_frames)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from dualslam.cli import logs
 from dualslam.cli.configuration import config_of
-from dualslam.cli.console import final_line, progress, stage_table
+from dualslam.cli.console import final_line, progress, stage_table, waiting
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.errors import InputError, NoCalibrationError
 from dualslam.io.atomic import atomic_file
@@ -40,17 +40,21 @@ def execute(args: argparse.Namespace) -> int:
         "max_side_px": None if args.full_size else MAX_SIDE_PX,
     }
     focal: FocalSearch | None = None
-    try:
-        sequence = open_source(args.source, camera_file=args.camera, fov_degrees=args.fov, **selection)
-    except NoCalibrationError:
-        logs.discard()  # it is opened again
-        recorded = open_without_calibration(args.source, **selection)
-        of_map = None if args.map is None else with_camera_of_map(args.map, recorded)
-        if of_map is not None:
-            sequence = of_map
-        else:
-            sequence, focal = with_camera_found(config, recorded)
-            config = with_prior(config, focal)
+    has_camera = True
+    with waiting("opening the source, and looking for its camera where it tells of none", args.quiet):
+        try:
+            sequence = open_source(args.source, camera_file=args.camera, fov_degrees=args.fov, **selection)
+        except NoCalibrationError:
+            has_camera = False
+            logs.discard()  # it is opened again
+            recorded = open_without_calibration(args.source, **selection)
+            of_map = None if args.map is None else with_camera_of_map(args.map, recorded)
+            if of_map is not None:
+                sequence = of_map
+            else:
+                sequence, focal = with_camera_found(config, recorded)
+                config = with_prior(config, focal)
+    if not has_camera:
         _tell(focal, args.quiet)
     logs.release()
     with live_view(args) as live, progress(sequence, args.quiet) as shown:

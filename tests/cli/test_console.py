@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from dualslam.cli.console import final_line, progress
+from dualslam.cli.console import final_line, progress, waiting
 from dualslam.core.types import Frame, FrameStatus
 from dualslam.map.frame_records import FrameResult
 from dualslam.run.sources import open_source
@@ -42,12 +42,21 @@ def test_the_bar_says_what_a_run_does_once_all_frames_are_in(monkeypatch: pytest
     assert FINISHING in screen.getvalue()
 
 
+def test_what_nothing_counts_is_told_while_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys, "stderr", screen := Screen())
+    with waiting("looking for the camera", quiet=False):
+        assert "looking for the camera" in screen.getvalue()
+
+
 @pytest.mark.parametrize(("watched", "quiet"), [(False, False), (True, True)])
 def test_nobody_watches(monkeypatch: pytest.MonkeyPatch, watched: bool, quiet: bool) -> None:
     screen = Screen() if watched else io.StringIO()
     monkeypatch.setattr(sys, "stderr", screen)
     with progress(open_source(SOURCE), quiet) as shown:
         assert shown is None
+    with waiting("looking for the camera", quiet):
+        pass
     assert not screen.getvalue()
 
 
