@@ -85,18 +85,20 @@ class FeatureGrid:
             Rows of `uv_px` (ascending) and of the features.
         """
         asked = np.flatnonzero(np.isfinite(uv_px).all(axis=1) & (radius_px >= 0))
-        low = _cells(uv_px[asked] - radius_px[asked, None], self.origin_px, self.cell_px, self.shape)
-        high = _cells(uv_px[asked] + radius_px[asked, None], self.origin_px, self.cell_px, self.shape)
+        at, reach = uv_px[asked], radius_px[asked]
+        low = _cells(at - reach[:, None], self.origin_px, self.cell_px, self.shape)
+        high = _cells(at + reach[:, None], self.origin_px, self.cell_px, self.shape)
         # A disc touches a run of cells in each of its cell rows: first one entry per (query, cell row), ...
         which, cell_row = _ranges(low[:, 1], high[:, 1] + 1)
-        begin = self.start[cell_row * self.shape[1] + low[which, 0]]
-        end = self.start[cell_row * self.shape[1] + high[which, 0] + 1]
+        first = cell_row * self.shape[1]
+        begin = self.start[first + low[which, 0]]
+        end = self.start[first + high[which, 0] + 1]
         # ... then one per feature of the run.
         run, place = _ranges(begin, end)
-        query, feature = asked[which[run]], self.order[place]
-        step = self.uv_px[feature] - uv_px[query]
-        inside = step[:, 0] ** 2 + step[:, 1] ** 2 <= radius_px[query] ** 2
-        return query[inside], feature[inside]
+        row, feature = which[run], self.order[place]
+        du, dv = (self.uv_px[:, axis][feature] - at[:, axis][row] for axis in (0, 1))
+        inside = np.flatnonzero(du * du + dv * dv <= (reach * reach)[row])
+        return asked[row[inside]], feature[inside]
 
 
 def match_projected(
