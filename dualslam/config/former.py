@@ -81,7 +81,9 @@ CONSTANTS = {
     "mapping.triangulate_against": "dualslam.frontends.tracking.mapper.TRIANGULATE_AGAINST",
     "recovery.max_shared_keyframes": "dualslam.recovery.relinker.MAX_SHARED_KEYFRAMES",
     "recovery.min_shared_keyframes": "dualslam.recovery.relinker.MIN_SHARED_KEYFRAMES",
+    "tracking.local_keyframes": "dualslam.frontends.tracking.tracker.LOCAL_KEYFRAMES",
     "tracking.local_radius_px": "dualslam.frontends.tracking.tracker.LOCAL_RADIUS_PX",
+    "tracking.wide_keyframes": "dualslam.frontends.tracking.tracker.WIDE_KEYFRAMES",
 }
 """Constants now, beside the algorithm that they belong to."""
 

@@ -62,10 +62,6 @@ class TrackingConfig(StrictModel):
     """Search radius about a landmark's predicted pixel, at the finest octave, when the motion model is trusted."""
     min_inliers: int = Field(20, ge=6)
     """Landmarks that must agree with a pose for it to be taken at all."""
-    local_keyframes: int = Field(20, ge=2)
-    """Covisible keyframes whose landmarks make the local map."""
-    wide_keyframes: int = Field(3, ge=1)
-    """Recent keyframes that are tried by wide matching and PnP when guided matching fails."""
     max_lost_frames: int = Field(8, ge=0)
     """Frames in a row that wide matching may fail on before the submap is given up."""
 
@@ -176,7 +172,7 @@ class RecoveryConfig(StrictModel):
     poses alone that finds none is the last."""
     covering_keyframes: int = Field(20, ge=0)
     """Keyframes that a walk which only poses frames, or a search for a lost map, matches widely at most, beyond those
-    nearest in time (`tracking.wide_keyframes`): the ones that together show the most of the map, since in a gap the
+    nearest in time: the ones that together show the most of the map, since in a gap the
     camera may have looked anywhere. Each costs about 2 ms of CPU for a frame that is not found."""
     workers: int = Field(0, ge=0, le=16)
     """Processes for long work beside the tracking, which never waits for it (`--workers`): walks back and

@@ -25,7 +25,11 @@ from dualslam.frontends.tracking.resection import resect
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 LOCAL_RADIUS_PX = 4.0
-"""The same for the landmarks of the local map, after a first pose is found."""
+"""Search radius about the pixels of the local map's landmarks, after a first pose is found."""
+LOCAL_KEYFRAMES = 20
+"""Covisible keyframes whose landmarks make the local map."""
+WIDE_KEYFRAMES = 3
+"""Recent keyframes that are tried by wide matching and PnP when guided matching fails."""
 
 WIDER = 2.5  # second guided search: this many times the first radius
 GUIDE_TOLERANCE, POSE_TOLERANCE = 0.1, 1e-3
@@ -159,7 +163,7 @@ class Tracker:
 
     def track_at(self, view: View, pose: GivenPose) -> Track:
         """Take a pose as it is, and look for the landmarks of the keyframes nearest in time under it."""
-        keyframe_ids = self._submap.keyframes_near(view.index)[: self._config.local_keyframes]
+        keyframe_ids = self._submap.keyframes_near(view.index)[:LOCAL_KEYFRAMES]
         self._local = LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(keyframe_ids))
         landmark_ids = np.full(len(view.features), NO_LANDMARK, np.int64)
         grid = FeatureGrid.build(view.features.uv_rect_px)
@@ -192,7 +196,7 @@ class Tracker:
 
         The tracker continues from there only after `take`.
         """
-        keyframe_ids = self._submap.keyframes_near(view.index)[: self._config.local_keyframes]
+        keyframe_ids = self._submap.keyframes_near(view.index)[:LOCAL_KEYFRAMES]
         self._local = LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(keyframe_ids))
         grid = FeatureGrid.build(view.features.uv_rect_px)
         nothing = np.full(len(view.features), NO_LANDMARK, np.int64)
@@ -206,7 +210,7 @@ class Tracker:
         ids = self._submap.landmark_of[keyframe_id]
         covisible, _ = self._submap.covisible(ids[ids >= 0])
         about = [keyframe_id, *(k for k in covisible.tolist() if k != keyframe_id)]
-        found = self._pose_from_wide_matches(view, about[: self._config.wide_keyframes])
+        found = self._pose_from_wide_matches(view, about[:WIDE_KEYFRAMES])
         if isinstance(found, Failure):
             return found
         self._local = self._local_map(found[1][found[1] >= 0])
@@ -273,7 +277,7 @@ class Tracker:
         return best
 
     def _wide_keyframes(self, index: int) -> list[int]:
-        near = self._submap.keyframes_near(index)[: self._config.wide_keyframes]
+        near = self._submap.keyframes_near(index)[:WIDE_KEYFRAMES]
         if self._n_covering == 0:
             return near
         covering = covering_keyframes(self._submap, self._n_covering, self._config.min_inliers)
@@ -391,5 +395,5 @@ class Tracker:
 
     def _local_map(self, landmark_ids: IntArray) -> LocalMap:
         keyframe_ids, _ = self._submap.covisible(landmark_ids)
-        nearest = keyframe_ids[: self._config.local_keyframes]
+        nearest = keyframe_ids[:LOCAL_KEYFRAMES]
         return LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(nearest))
