@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -46,7 +47,10 @@ def test_what_nothing_counts_is_told_while_it_goes_on(monkeypatch: pytest.Monkey
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys, "stderr", screen := Screen())
     with waiting("looking for the camera", quiet=False):
-        assert "looking for the camera" in screen.getvalue()
+        began_s = time.monotonic()
+        while "looking for the camera" not in screen.getvalue():  # a thread draws it
+            assert time.monotonic() - began_s < 20
+            time.sleep(0.01)
 
 
 @pytest.mark.parametrize(("watched", "quiet"), [(False, False), (True, True)])
