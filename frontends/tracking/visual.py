@@ -176,8 +176,8 @@ class VisualFrontEnd:
     def keyframe_due(self, track: Track) -> bool:
         """Whether the frame should become a keyframe.
 
-        Where an earlier run has left one that shows the same, that one is gone by instead: a map that is used many
-        times has as many keyframes as its place needs.
+        Where an earlier run has left one that shows the same, that one becomes the reference, and none is made: a map
+        that is used many times has as many keyframes as its place needs.
         """
         config = self._config.keyframes
         if not keyframe_due(track, self.submap, self._reference_id, config, self._first_id):
