@@ -100,7 +100,7 @@ class ShutterWatch:
         self._new_graph = new_graph
         self._connections = connections
         self._due_at: dict[int, float] = {}  # by submap, keyframes
-        self._asked: tuple[int, float, Camera] | None = None  # which submap, of which pixels
+        self._asked: tuple[object, int, float, Camera] | None = None  # what, of which submap, of which pixels
 
     def ask_if_due(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int]) -> None:
         """Ask the live submap where it is time to, and take in what it has answered.
@@ -117,10 +117,10 @@ class ShutterWatch:
                 question = self._shutter.ask(submap, self._rates(submap), self._calibration.camera)
                 if not isinstance(question, Failure):
                     self._desk.submit(JobKind.READOUT, question)
-                    self._asked = submap.id, self._shutter.readout_s, self._calibration.camera
+                    self._asked = question, submap.id, self._shutter.readout_s, self._calibration.camera
             for ended in self._desk.poll(JobKind.READOUT):
-                # What was asked of other pixels is no answer.
-                if self._asked == (submap.id, self._shutter.readout_s, self._calibration.camera):
+                # What was asked of another map, or of other pixels, is no answer.
+                if self._asked == (ended.work, submap.id, self._shutter.readout_s, self._calibration.camera):
                     self._take_answer(ended.result, live, now, lost)
 
     def _take_answer(

@@ -153,7 +153,9 @@ def _step(b: ReadoutQuestion) -> float:
     inverse = _inverse_blocks(J_point)
     g_point = J_point.T @ r
     through = cross @ inverse
-    S = H - (through @ cross.T).toarray() + DAMPING * np.diag(np.diag(H))
+    # What no observation moves (a keyframe without a landmark of enough views) stays where it is.
+    damping = np.where(np.diag(H) > 0, DAMPING * np.diag(H), 1.0)
+    S = H - (through @ cross.T).toarray() + np.diag(damping)
     # The first pose is the gauge; the damping holds the scale of the whole, which nothing else does.
     inverse_S = np.linalg.inv(S[6:, 6:])
     step = np.concatenate([np.zeros(6), -inverse_S @ (g - through @ g_point)[6:]])

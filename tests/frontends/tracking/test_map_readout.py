@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,13 +13,14 @@ from dualslam.calibration import shutter_watch
 from dualslam.calibration.shutter_watch import INFLATION, MIN_SIGMAS
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, so3
-from dualslam.core.interfaces import ReadoutEstimate
+from dualslam.core.interfaces import ReadoutEstimate, VisualOdometry
 from dualslam.core.types import Features, FloatArray, Frame, IntArray, Keyframe, View
 from dualslam.frontends.tracking.map_readout import MIN_KEYFRAMES, ReadoutQuestion, answer_readout, ask_readout
 from dualslam.frontends.tracking.rolling_shutter import correct_shutter, find_as_read, straighten
 from dualslam.map.submap import Submap
 from dualslam.system import System
 from dualslam.testing.point_world import CAMERA, RATE_HZ, PointWorld, cloud, pose_errors, system_in
+from dualslam.workers.jobs import Ended
 from tests.frontends.tracking.test_rolling_shutter import read_row_by_row, turn_rate
 
 READOUT_S = 0.025
@@ -80,12 +83,42 @@ def test_a_global_shutter_is_told_as_such(seed: int) -> None:
     assert abs(answer.more_s) < MIN_SIGMAS * INFLATION * answer.sigma_s
 
 
+def test_a_keyframe_that_shares_nothing_is_no_obstacle() -> None:
+    submap, rates = made_map(READOUT_S)
+    alone = sorted(submap.keyframes)[7]
+    submap.observations["alive"][submap.observations["kf"] == alone] = False
+    assert told(submap, rates).more_s == pytest.approx(READOUT_S, abs=0.002)
+
+
+def test_a_camera_that_does_not_turn_at_all_tells_nothing() -> None:
+    submap, rates = made_map(0.0)
+    assert not shutter_watch._is_sure(told(submap, {k: np.zeros(3) for k in rates}))
+
+
 def test_an_unsure_answer_changes_nothing() -> None:
     """Where a camera hardly turns, other errors pass for a readout."""
     assert shutter_watch._is_sure(ReadoutEstimate(0.02, 0.0009, 30, 5000))
     assert shutter_watch._is_sure(ReadoutEstimate(-0.02, 0.0009, 30, 5000))
     assert not shutter_watch._is_sure(ReadoutEstimate(0.01, 0.0009, 30, 5000))
     assert not shutter_watch._is_sure(ReadoutEstimate(-0.03, 0.002, 30, 5000))
+
+
+def test_an_answer_that_came_late_counts_for_the_map_that_was_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first map was lost before its answer was looked at; the next one asks, and meets it."""
+    system, taken = system_in(PointWorld(cloud(), walk(2)), camera={"readout_s": None}), []
+    watch, ended = system._shutter_watch, []
+    desk = SimpleNamespace(
+        n_open=lambda kind: 0, submit=lambda kind, work: ended.append(Ended(work, len(ended))), poll=lambda kind: []
+    )
+    monkeypatch.setattr(watch, "_desk", desk)
+    monkeypatch.setattr(watch, "_shutter", SimpleNamespace(is_stated=False, readout_s=0.0, ask=lambda *_: object()))
+    monkeypatch.setattr(watch, "_take_answer", lambda result, *_: taken.append(result))
+    for m in range(2):
+        submap = made_map(0.0)[0]
+        submap.id = m
+        desk.poll = (lambda kind: []) if m == 0 else (lambda kind: ended)
+        watch.ask_if_due(cast(VisualOdometry, SimpleNamespace(submap=submap)), Frame(0, 0.0, None), ())
+    assert taken == [1]
 
 
 @pytest.mark.parametrize("was_s", [0.015, 0.035])
