@@ -170,3 +170,19 @@ def test_a_film_is_cropped_more_than_its_container_says(tmp_path: Path) -> None:
 
 def test_a_focal_length_that_no_lens_has_is_not_told(tmp_path: Path) -> None:
     assert film(tmp_path / "film.mp4", 2, None).told_focal() is None
+
+
+def test_a_variable_frame_rate_is_told_by_each_frame(tmp_path: Path) -> None:
+    """Two frames as they were written, two that last twice as long: the table of durations has one more row."""
+    path = tmp_path / "film.mp4"
+    film(path, 26, None)
+    content = bytearray(path.read_bytes())
+    at = content.index(b"stts")
+    n, count, ticks = struct.unpack(">3I", content[at + 8 : at + 20])
+    assert (n, count) == (1, 4)
+    content[at + 8 : at + 20] = struct.pack(">5I", 2, 2, ticks, 2, 2 * ticks)
+    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stts"):  # all that it stands in
+        size = content.index(name) - 4
+        content[size : size + 4] = (int.from_bytes(content[size : size + 4], "big") + 8).to_bytes(4, "big")
+    path.write_bytes(content)
+    assert VideoFile(path).timestamps_s == pytest.approx(np.array([0, 1, 2, 4]) / 30)
