@@ -42,7 +42,8 @@ class Camera(BaseHTTPRequestHandler):
 
 
 @pytest.fixture
-def address() -> Iterator[str]:
+def address(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    monkeypatch.delenv("http_proxy", raising=False)  # the decoder would ask it for this machine
     server = ThreadingHTTPServer(("127.0.0.1", 0), Camera)
     server.daemon_threads = True
     thread = threading.Thread(target=server.serve_forever, daemon=True)
