@@ -193,6 +193,7 @@ def run_to_folder(
                 is_paused=None if watcher is None else watcher.is_paused,
                 interrupts=interrupts,
             )
+            system.desk.close()  # a system that broke, or was left, has not come to it
             if report.interrupted and system.rows:
                 last = next(reversed(system.rows.values()))
                 system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap)

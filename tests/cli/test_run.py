@@ -24,6 +24,7 @@ from dualslam.io.run_folder import RunFolder, read_events
 from dualslam.lab.synthetic import SyntheticSequence
 from dualslam.run.results import versions
 from dualslam.run.sources import open_source
+from dualslam.workers.jobs import InlineDesk
 from tests.cli.conftest import N_FRAMES
 from tests.cli.fakes import FakeSystem
 
@@ -188,7 +189,7 @@ def test_who_interrupts_twice_keeps_it_too(folder: Path, fake: Install, tmp_path
     assert set(load_atlas(tmp_path / "run").poses) == set(range(6))
 
 
-def test_who_leaves_the_end_of_a_run_keeps_the_pictures_of_its_last_gap(
+def test_who_leaves_the_end_of_a_run_keeps_the_pictures_of_its_last_gap_and_no_worker(
     folder: Path, fake: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object) -> None:
@@ -198,9 +199,12 @@ def test_who_leaves_the_end_of_a_run_keeps_the_pictures_of_its_last_gap(
 
     fake(lost=(N_FRAMES - 2, N_FRAMES - 1))
     monkeypatch.setattr(FakeSystem, "finish", interrupted)
+    closed: list[bool] = []
+    monkeypatch.setattr(InlineDesk, "close", lambda _: closed.append(True))
     assert main(["run", str(folder), "--out", str(tmp_path / "run"), "--quiet"]) == 130
     kept = sorted(int(path.stem) for path in (tmp_path / "run" / "samples").iterdir())
     assert kept == [N_FRAMES - 3, N_FRAMES - 2, N_FRAMES - 1]
+    assert closed, "its workers are ended"
 
 
 def test_an_interrupt_while_results_are_written_waits_for_them(
