@@ -12,14 +12,14 @@ import numpy as np
 
 from dualslam.calibration.background import Calibrations
 from dualslam.calibration.lens import Calibration
-from dualslam.calibration.shutter_watch import ShutterWatch
+from dualslam.calibration.shutter_watch import MAX_GAP_S, ShutterWatch
 from dualslam.config.settings import Config
 from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.camera.base import Camera
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
-from dualslam.core.geometry import se3
+from dualslam.core.geometry import se3, so3
 from dualslam.core.interfaces import START_REACH, MapStarter, Seeker, Shutter, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, Start, Track, View
 from dualslam.health import HealthMonitor, count_signs
@@ -156,6 +156,7 @@ class System:
         self._weak_landmarks = config.keyframes.weak_landmarks
         self.pace = Pace()
         self.on_pose: Callable[[Track], None] | None = None
+        self._last_pose: FramePose | None = None
         self._posed_at: float | None = None  # on the clock of `time.perf_counter`
         self._revisits = Revisits(
             record,
@@ -485,6 +486,25 @@ class System:
         if self._to_revisit and not n_taken:
             self._revisit(live, view)
 
+    def _with_turn_of_poses(self, submap: Submap, track: Track) -> Track:
+        """Return a frame that is to become a keyframe with the turn taken out of its pixels that its pose tells.
+
+        Matches to the frame before tell it before there is a pose, and take a part of what the camera has moved for a
+        turn.
+        """
+        view, before = track.view, self._last_pose
+        if view.turn_rad is None or before is None or before.submap_id != submap.id:
+            return track
+        gap_s = view.timestamp_s - before.timestamp_s
+        if not 0 < abs(gap_s) <= MAX_GAP_S:
+            return track
+        R_before = submap.resolve_anchor(before.keyframe_id, before.T_kf_cam)[:3, :3]
+        rate_rad_s = so3.log(R_before.T @ track.T_cam_submap[:3, :3].T) / gap_s
+        shutter, camera = self._parts.shutter, self._parts.calibration.camera
+        turn_rad = shutter.readout_s * rate_rad_s
+        features = shutter.moved(view.features, camera, turn_rad - view.turn_rad)
+        return replace(track, view=replace(view, features=features, turn_rad=turn_rad))
+
     def _ask_shutter(self, live: VisualOdometry, view: View) -> None:
         """Ask the live map how long its images were read; not where what comes back meanwhile has the pixels of now."""
         under_way = self._recoveries.is_under_way(live.submap) or self._parts.desk.n_open(JobKind.CALIBRATION)
@@ -526,6 +546,7 @@ class System:
         if self._localises:
             cast(Seeker, odometry).look_about()
         elif self._keyframe_due(odometry, track):
+            track = self._with_turn_of_poses(odometry.submap, track)
             try:
                 with self.timer.measure("mapping"):
                     report = odometry.insert_keyframe(track)
@@ -541,6 +562,7 @@ class System:
             view.index, view.timestamp_s, odometry.submap.id, odometry.reference_id, odometry.relative_pose(track)
         )
         self._record.pose(pose, track.n_matches, track.n_inliers)
+        self._last_pose = pose
         return track
 
     def _keyframe_due(self, odometry: VisualOdometry, track: Track) -> bool:

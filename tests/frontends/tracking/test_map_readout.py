@@ -13,10 +13,11 @@ from dualslam.calibration import shutter_watch
 from dualslam.calibration.shutter_watch import INFLATION, MIN_SIGMAS
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, so3
-from dualslam.core.interfaces import ReadoutEstimate, VisualOdometry
-from dualslam.core.types import Features, FloatArray, Frame, IntArray, Keyframe, View
+from dualslam.core.interfaces import KeyframeReport, ReadoutEstimate, VisualOdometry
+from dualslam.core.types import Failure, Features, FloatArray, Frame, IntArray, Keyframe, Track, View
 from dualslam.frontends.tracking.map_readout import MIN_KEYFRAMES, ReadoutQuestion, answer_readout, ask_readout
-from dualslam.frontends.tracking.rolling_shutter import correct_shutter, find_as_read, straighten
+from dualslam.frontends.tracking.rolling_shutter import TurnMeter, correct_shutter, find_as_read, straighten
+from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.map.submap import Submap
 from dualslam.system import System
 from dualslam.testing.point_world import CAMERA, RATE_HZ, PointWorld, cloud, pose_errors, system_in
@@ -186,6 +187,32 @@ def test_a_map_finds_its_shutter_and_is_put_right() -> None:
     assert rotation < 0.7 * rotation_global
     assert all(view.turn_rad is not None for view in system.buffer)
     assert not [event for event in taken_for_global.events if event.event is EventKind.SHUTTER_FOUND]
+
+
+@pytest.mark.slow
+def test_keyframes_have_the_turn_that_their_poses_tell(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever matches have told before there was a pose."""
+    T = looking_about(60)
+    world = PointWorld(cloud(length_m=4.0), T)
+    monkeypatch.setattr(TurnMeter, "rate_rad_s", lambda self, view, K: np.array([0.3, -0.3, 0.3]))
+    turns: dict[int, FloatArray] = {}
+    inserted = VisualFrontEnd.insert_keyframe
+
+    def noting(self: VisualFrontEnd, track: Track, pose_is_given: bool = False) -> KeyframeReport | Failure:
+        assert track.view.turn_rad is not None
+        turns[track.view.index] = track.view.turn_rad
+        return inserted(self, track, pose_is_given)
+
+    monkeypatch.setattr(VisualFrontEnd, "insert_keyframe", noting)
+    run_of(world, 0.004, readout_s=0.004)
+    off = [np.linalg.norm(turn / 0.004 - _turn_to(T, i)) for i, turn in turns.items()]
+    assert len(off) >= 3
+    assert np.median(off) < 0.1
+
+
+def _turn_to(T_world_cam: FloatArray, i: int) -> FloatArray:
+    """True turn from the frame before, rad/s."""
+    return RATE_HZ * so3.log(T_world_cam[i - 1, :3, :3].T @ T_world_cam[i, :3, :3])
 
 
 @pytest.mark.slow
