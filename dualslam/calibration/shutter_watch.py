@@ -16,6 +16,7 @@ from typing import Protocol
 
 import numpy as np
 
+from dualslam.calibration.background import Views
 from dualslam.calibration.lens import Calibration
 from dualslam.core.camera.base import Camera
 from dualslam.core.errors import SolverError
@@ -46,7 +47,7 @@ MAX_GAP_S = 0.2
 """Between a frame and one beside it that tells how it turns."""
 
 
-class Views(Protocol):
+class ReadViews(Views, Protocol):
     """Buffered views, which change to another shutter with the maps."""
 
     @property
@@ -62,10 +63,6 @@ class Views(Protocol):
         """Put what `change` makes of the views, oldest first, into their places."""
         ...
 
-    def map_later(self, change: Callable[[View], View], subject: str) -> None:
-        """Change each view, at the latest when somebody looks at it."""
-        ...
-
 
 class ShutterWatch:
     """Asks live submaps how long their images were read, and takes the answer in between two frames.
@@ -73,7 +70,7 @@ class ShutterWatch:
     Parameters
     ----------
     record : Record
-    buffer : Views
+    buffer : ReadViews
     calibration : Calibration
     shutter : Shutter
     desk : Desk
@@ -85,7 +82,7 @@ class ShutterWatch:
     def __init__(
         self,
         record: Record,
-        buffer: Views,
+        buffer: ReadViews,
         calibration: Calibration,
         shutter: Shutter,
         desk: Desk,
@@ -130,41 +127,28 @@ class ShutterWatch:
         if isinstance(answer, Failure) or not _is_sure(answer):
             return
         readout_s = self._shutter.readout_s + answer.more_s
-        if readout_s <= 0 or not self._change(live, answer.more_s, now):
+        if readout_s <= 0 or not self._change(submap, answer.more_s, now, live):
             return
         self._due_at[submap.id] = SOON * len(submap.keyframes)
-        changed = [m for m in sorted(lost) if self._change_lost(m, answer.more_s, now)]
+        submaps = self._record.atlas.submaps
+        changed = [m for m in sorted(lost) if self._change(submaps[m], answer.more_s, now)]
         self._take(readout_s)
         sigma_s = INFLATION * answer.sigma_s
         self._record.event(EventKind.SHUTTER_FOUND, now, submap.id, readout_s=readout_s, sigma_s=sigma_s, lost=changed)
 
-    def _change(self, live: VisualOdometry, more_s: float, now: FrameStamp) -> bool:
-        """Change the live submap, and return whether it could be solved."""
-        changed, graph = live.submap.copy(), self._new_graph()
+    def _change(self, submap: Submap, more_s: float, now: FrameStamp, live: VisualOdometry | None = None) -> bool:
+        """Change a submap, in which `live` goes on if it is given; return whether it could be solved."""
+        changed, graph = submap.copy(), self._new_graph()
         self._move(changed, more_s)
         try:
             changed.apply_estimate(*graph.rebuild(changed).values)
         except SolverError as error:
-            log.warning("submap %d keeps its shutter: %s", changed.id, error)
-            return False
-        before = live.submap.copy()
-        live.submap.take_over(changed)
-        live.adopt(graph, before)
-        self._connections.follow(before, live.submap, now)
-        return True
-
-    def _change_lost(self, submap_id: int, more_s: float, now: FrameStamp) -> bool:
-        """Change a lost submap with the live one, if it could be."""
-        submap = self._record.atlas.submaps[submap_id]
-        changed = submap.copy()
-        self._move(changed, more_s)
-        try:
-            changed.apply_estimate(*self._new_graph().rebuild(changed).values)
-        except SolverError as error:
-            log.warning("submap %d keeps its shutter: %s", submap_id, error)
+            log.warning("submap %d keeps its shutter: %s", submap.id, error)
             return False
         before = submap.copy()
         submap.take_over(changed)
+        if live is not None:
+            live.adopt(graph, before)
         self._connections.follow(before, submap, now)
         return True
 
