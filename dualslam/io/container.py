@@ -27,7 +27,8 @@ SIGNED, UNSIGNED = (21, 65, 66, 67, 74), (22, 75, 76, 77, 78)
 def equivalent_focal_mm(path: Path) -> float | None:
     """Return the focal length that a camera of 36 x 24 mm would need for the same view; None where none is told.
 
-    Whatever is no such container, or is broken before it tells, tells none.
+    Whatever is no such container, or is broken before it tells, tells none. A value that cannot be read is passed over:
+    the film and each track may have one.
     """
     try:
         with path.open("rb") as file:
@@ -35,7 +36,7 @@ def equivalent_focal_mm(path: Path) -> float | None:
             for found in _in_parents(_Boxes(file), 0, size):
                 if math.isfinite(found) and found > 0:
                     return found
-    except (OSError, ValueError, OverflowError, struct.error):
+    except (OSError, struct.error):
         return None
     return None
 
@@ -63,10 +64,8 @@ class _Boxes:
             start = end
 
     def content(self, start: int, stop: int) -> bytes:
-        """Return what is in a box."""
-        if stop - start > MAX_BYTES:
-            raise ValueError("too long to be what it says")
-        return self._read(start, stop - start)
+        """Return what is in a box; nothing of one that is too long, or too short, to be what it says."""
+        return self._read(start, stop - start) if 0 <= stop - start <= MAX_BYTES else b""
 
     def _read(self, start: int, size: int) -> bytes:
         self.file.seek(start)
@@ -111,10 +110,20 @@ def _values(boxes: _Boxes, start: int, stop: int) -> Iterator[float]:
         if name != b"data" or end - inner < 8:
             continue
         content = boxes.content(inner, end)
-        kind, value = int.from_bytes(content[1:4], "big"), content[8:]
-        if kind == TEXT:
-            yield float(value.decode("ascii").strip("\0 ").removesuffix("mm"))
-        elif kind in FLOATS:
-            yield float(struct.unpack(FLOATS[kind], value)[0])
-        elif kind in SIGNED or kind in UNSIGNED:
-            yield float(int.from_bytes(value, "big", signed=kind in SIGNED))
+        try:
+            value = _number(int.from_bytes(content[1:4], "big"), content[8:])
+        except (ValueError, OverflowError, struct.error):
+            continue
+        if value is not None:
+            yield value
+
+
+def _number(kind: int, value: bytes) -> float | None:
+    """Return a value of one of the known types, None of another; raise where it is not what its type says."""
+    if kind == TEXT:
+        return float(value.decode("ascii").strip("\0 ").removesuffix("mm"))
+    if kind in FLOATS:
+        return float(struct.unpack(FLOATS[kind], value)[0])
+    if kind in SIGNED or kind in UNSIGNED:
+        return float(int.from_bytes(value, "big", signed=kind in SIGNED))
+    return None

@@ -47,10 +47,20 @@ def check_submap(arrays: Arrays) -> None:
     _check_index("kf_landmark_of", arrays["kf_landmark_of"], -1, n_landmarks)
     seen = np.asarray(arrays["observations_alive"], bool)
     _check_index("observations_landmark", arrays["observations_landmark"][seen], 0, n_landmarks)
-    of_keyframe = dict(zip(arrays["kf_id"].tolist(), n_features.tolist(), strict=True))
-    rows = zip(arrays["observations_kf"][seen].tolist(), arrays["observations_feature"][seen].tolist(), strict=True)
-    if any(not 0 <= feature < of_keyframe.get(kf, 0) for kf, feature in rows):
+    if not _are_features(arrays["observations_kf"][seen], arrays["observations_feature"][seen], arrays, n_features):
         raise ValueError("an observation is of no feature of a keyframe")
+
+
+def _are_features(kf: NDArray[Any], feature: NDArray[Any], arrays: Arrays, n_features: NDArray[np.int64]) -> bool:
+    """Whether each pair of a keyframe's id and a feature's number is of a feature that the keyframe has."""
+    if not len(kf):
+        return True
+    if not len(n_features):
+        return False
+    order = np.argsort(arrays["kf_id"], kind="stable")
+    ids = arrays["kf_id"][order]
+    at = np.maximum(np.searchsorted(ids, kf, side="right") - 1, 0)
+    return bool(np.all((ids[at] == kf) & (feature >= 0) & (feature < n_features[order][at])))
 
 
 def _check_table(arrays: Arrays, prefix: str, like: Table, but: str = "") -> int:

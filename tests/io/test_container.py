@@ -100,6 +100,22 @@ def test_what_is_no_focal_length_is_none(tmp_path: Path, value: bytes) -> None:
     assert equivalent_focal_mm(written(tmp_path, box(b"moov", meta((KEY, value))))) is None
 
 
+@pytest.mark.parametrize(
+    "value",
+    [data(1, b"wide"), data(23, b"\0"), data(22, b"\xff" * 200), data(21, bytes(2**20)), box(b"data", b"\0\0")],
+)
+def test_one_that_cannot_be_read_is_passed_over(tmp_path: Path, value: bytes) -> None:
+    """In the film, in a track, or beside another value of the same name."""
+    good = data(21, b"\x1a")
+    for boxes in (
+        [meta((KEY, value)), box(b"trak", meta((KEY, good)))],
+        [box(b"trak", meta((KEY, value))), meta((KEY, good))],
+        [meta((KEY, value), (KEY, good))],
+        [meta((KEY, value + good))],
+    ):
+        assert equivalent_focal_mm(written(tmp_path, box(b"moov", *boxes))) == 26
+
+
 def test_films_without_one_tell_none(tmp_path: Path) -> None:
     assert equivalent_focal_mm(written(tmp_path, box(b"moov", meta(LENS)))) is None
     assert equivalent_focal_mm(written(tmp_path)) is None

@@ -174,6 +174,8 @@ def test_no_pickles(tmp_path: Path) -> None:
         ("landmarks_alive", lambda a: a.astype(float), "landmarks_alive is of type float64"),
         ("observations_landmark", lambda a: a + 1000, "observations_landmark points at what is not there"),
         ("observations_kf", lambda a: a + 1000, "an observation is of no feature of a keyframe"),
+        ("observations_feature", lambda a: a - 1, "an observation is of no feature of a keyframe"),
+        ("observations_feature", lambda a: a + 10, "an observation is of no feature of a keyframe"),  # keyframe 12's
         ("landmarks_normal", None, "landmarks_normal"),
     ],
 )
