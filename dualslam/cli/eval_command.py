@@ -8,15 +8,21 @@ from typing import Any
 
 from dualslam.core.errors import InputError
 from dualslam.io.map_files import to_plain
+from dualslam.io.video import is_live
 from dualslam.lab.metrics.trajectory_metrics import evaluate_run
-from dualslam.run.sources import open_source
+from dualslam.run.sources import ANY_FOV_DEG, SYNTHETIC, open_source
 
 
 def execute(args: argparse.Namespace) -> int:
     """Score a run folder and print it."""
     if not args.run.exists():
         raise InputError(f"{args.run} does not exist; give a run folder or a trajectory.")
-    score = evaluate_run(args.run, open_source(args.sequence))  # type: ignore[arg-type]
+    if is_live(args.sequence):
+        raise InputError(f"{args.sequence} is live: it has no ground truth.")
+    # No camera is asked for a score: a sequence without a calibration has times and true poses all the same.
+    fov_degrees = None if args.sequence.startswith(SYNTHETIC) else ANY_FOV_DEG
+    sequence = open_source(args.sequence, fov_degrees=fov_degrees)
+    score = evaluate_run(args.run, sequence)  # type: ignore[arg-type]
     print(json.dumps(to_plain(score)) if args.json else score_text(score), flush=True)
     return 0
 

@@ -324,6 +324,21 @@ def test_eval_against_another_sequence_is_bad_input(
     assert f"{run}: no pose is at the time of any frame" in captured.err
 
 
+def test_eval_needs_no_calibration(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, bare = tmp_path / "run", tmp_path / "bare"
+    assert main(["run", str(folder), "--out", str(run), "--quiet"]) == 0
+    shutil.copytree(folder, bare)
+    (bare / "calib.txt").unlink()
+    assert main(["eval", str(run), str(bare)]) == 0
+    assert capsys.readouterr().out.startswith(f"main map: coverage 100.0 % ({N_FRAMES} of {N_FRAMES} frames)")
+    (bare / "groundtruth_tum.txt").unlink()
+    for sequence, words in ((str(bare), "bare has no ground truth"), ("0", "0 is live: it has no ground truth")):
+        assert main(["eval", str(run), sequence]) == 2
+        assert words in capsys.readouterr().err
+
+
 def test_render_writes_a_sequence_and_overwrites_only_its_own(
     tmp_path: Path, world: SyntheticSequence, capsys: pytest.CaptureFixture[str]
 ) -> None:
