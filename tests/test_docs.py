@@ -12,7 +12,7 @@ from types import ModuleType
 
 import pytest
 
-from dualslam.config.files import _all_paths
+from dualslam.config.problems import all_paths
 from dualslam.config.settings import Config
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -49,8 +49,8 @@ def test_it_builds_and_asks_for_nothing_outside(site: Path) -> None:
 
 def test_every_field_of_the_configuration_is_explained(site: Path) -> None:
     text = (site / "configuration.html").read_text()
-    for path in _all_paths(Config):
-        section = any(other.startswith(f"{path}.") for other in _all_paths(Config))
+    for path in all_paths(Config):
+        section = any(other.startswith(f"{path}.") for other in all_paths(Config))
         assert (f">{path}</h" if section else f"<code>{path}</code>") in text
 
 

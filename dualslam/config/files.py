@@ -2,35 +2,21 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from dualslam.config import strict_yaml
-from dualslam.config.former import RENAMED, what_became_of
+from dualslam.config.problems import kind, sentence
 from dualslam.config.settings import Config
 from dualslam.core.errors import ConfigError
 
 Model = TypeVar("Model", bound=BaseModel)
-
-_PLAIN_WORDS = {
-    "must be an object": "must be a mapping of fields",
-    "a valid integer": "a whole number",
-    "a valid string": "a word",
-    "a valid number": "a number",
-    "a valid boolean": "true or false",
-    "a valid array": "a list",
-    "a valid list": "a list",
-    "tuple should have": "must have",
-    " after validation": "",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +71,10 @@ def load_config(path: str | Path | None = None, overrides: Iterable[str | Overri
         One sentence: where, which field, what is wrong, and the nearest known field.
     """
     data: dict[str, Any] = {}
+    if isinstance(path, Mapping):
+        raise ConfigError("load_config reads a file; of a dict, config_from_dict makes a configuration")
+    if isinstance(overrides, str | Mapping):
+        raise ConfigError('overrides is a list of texts, such as ["seed=1", "frontend.n_features=2000"]')
     if path is not None:
         data = _read(Path(path))
     parsed = [Override.parse(o) if isinstance(o, str) else o for o in overrides]
@@ -94,7 +84,16 @@ def load_config(path: str | Path | None = None, overrides: Iterable[str | Overri
 
 
 def config_from_dict(data: Mapping[str, Any], source: str = "config") -> Config:
-    """Make the configuration from nested plain values, as strictly as `load_config` does."""
+    """Make the configuration from nested plain values, as strictly as `load_config` does.
+
+    Raises
+    ------
+    ConfigError
+    """
+    if not isinstance(data, Mapping):
+        raise ConfigError(
+            f"{source}: a configuration is a mapping of fields to values, this is a {type(data).__name__}"
+        )
     return _validate(dict(data), source, [], Config)
 
 
@@ -121,7 +120,7 @@ def _read(path: Path) -> dict[str, Any]:
     if data is None:
         return {}
     if not isinstance(data, dict):
-        raise ConfigError(f"{path}: a configuration is a mapping of fields to values, this is a {_kind(data)}")
+        raise ConfigError(f"{path}: a configuration is a mapping of fields to values, this is a {kind(data)}")
     return data
 
 
@@ -143,88 +142,13 @@ def _validate(data: dict[str, Any], source: str, overrides: list[Override], mode
         # By way of JSON: strict about types there (no "5" for 5), yet lists become tuples and words become enums.
         return model.model_validate_json(json.dumps(data), strict=True)
     except ValidationError as error:
-        problems = error.errors(include_url=False)
-        path = tuple(problems[0]["loc"])
+        path = tuple(error.errors(include_url=False)[0]["loc"])
         for override in overrides:
             if override.path[: len(path)] == path or path[: len(override.path)] == override.path:
                 source = override.source
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        raise ConfigError(f"{source}: {_sentence(problems[0], path, model)}{more}") from error
+        raise ConfigError(f"{source}: {sentence(error, model)}") from error
     except TypeError as error:
         raise ConfigError(f"{source}: holds a value that YAML cannot ({error})") from error
-
-
-def _sentence(problem: Any, path: tuple[str | int, ...], root: type[BaseModel]) -> str:
-    name = ".".join(map(str, path))
-    if problem["type"] == "extra_forbidden":
-        return _unknown(path, root)
-    if problem["type"] == "missing":
-        return f"{name} is missing"
-    message = str(problem["msg"]).removeprefix("Value error, ").replace("Input should be", "must be")
-    message = message[:1].lower() + message[1:]
-    for jargon, plain in _PLAIN_WORDS.items():
-        message = message.replace(jargon, plain)
-    if message.startswith("must have"):
-        return f"{name} {message}"
-    if message.startswith("must be"):
-        shown = json.dumps(problem["input"])
-        return f"{name} {message}, not {shown if len(shown) < 60 else 'a ' + _kind(problem['input'])}"
-    return f"{name}: {message}" if name else message
-
-
-def _unknown(path: tuple[str | int, ...], root: type[BaseModel]) -> str:
-    *sections, field = map(str, path)
-    model = _model_at(root, path[:-1])
-    known = list(model.model_fields) if model else []
-    if RENAMED.get(field) in known:
-        return f"{'.'.join(map(str, path))} is now called {'.'.join([*sections, RENAMED[field]])}"
-    former = what_became_of(".".join(map(str, path)))
-    if former:
-        return former
-    section = ".".join(sections)
-    near = difflib.get_close_matches(field, known, n=1)
-    if near:
-        hint = f"did you mean {'.'.join([*sections, near[0]])}?"
-    else:
-        elsewhere = [p for p in _all_paths(root) if p.rpartition(".")[2] == field]
-        hint = f"did you mean {elsewhere[0]}?" if elsewhere else ""
-    owner = f"of {section}" if section else "at the top"
-    return f"unknown field {'.'.join(map(str, path))}{'; ' + hint if hint else ''} (fields {owner}: {', '.join(known)})"
-
-
-def _model_at(model: type[BaseModel], path: tuple[str | int, ...]) -> type[BaseModel] | None:
-    current: type[BaseModel] | None = model
-    for name in path:
-        if isinstance(name, int):
-            continue
-        if current is None or name not in current.model_fields:
-            return None
-        current = _model_in(current.model_fields[name].annotation)
-    return current
-
-
-def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """Return the model that a field holds, alone, optional or in a list; None for a plain field."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    if get_origin(annotation) in (Union, UnionType, list, tuple):
-        return next((m for m in map(_model_in, get_args(annotation)) if m), None)
-    return None
-
-
-def _all_paths(model: type[BaseModel], prefix: str = "") -> list[str]:
-    paths = []
-    for name, field in model.model_fields.items():
-        paths.append(prefix + name)
-        inner = _model_in(field.annotation)
-        if inner:
-            paths += _all_paths(inner, f"{prefix}{name}.")
-    return paths
-
-
-def _kind(value: Any) -> str:
-    kinds = {dict: "mapping", list: "list", str: "text", bool: "bool", int: "number", float: "number"}
-    return kinds.get(type(value), "null")
 
 
 # --- writing

@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+import pickle
 import re
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import given
@@ -11,7 +14,7 @@ from hypothesis import strategies as st
 
 from dualslam.config import former, strict_yaml
 from dualslam.config.files import Override, config_from_dict, dump_config, load_config
-from dualslam.config.settings import Config
+from dualslam.config.settings import Config, Corruption, GraphConfig
 from dualslam.core.errors import ConfigError
 
 
@@ -214,3 +217,41 @@ def test_every_former_setting_is_where_it_is_said_to_be() -> None:
 def test_old_names_are_answered_with_the_new_ones(old: str, new: str) -> None:
     with pytest.raises(ConfigError, match=re.escape(new)):
         load_config(overrides=[old])
+
+
+# --- made in Python
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (
+            lambda: GraphConfig(max_keyframes=-1),
+            "GraphConfig: max_keyframes must be greater than or equal to 20, not -1",
+        ),
+        (lambda: GraphConfig(max_keyframe=99), "GraphConfig: unknown field max_keyframe; did you mean max_keyframes?"),
+        (lambda: Config(graph={"max_keyframes": -1}), "Config: graph.max_keyframes must be greater than"),
+        (lambda: Config(seed=np.zeros(3)), "Config: seed must be a whole number, not a ndarray"),
+        (lambda: Corruption(kind="blur", strength=900), "Corruption: strength of blur is 900"),
+        (lambda: Config().model_copy(update={"recovry": False}), "unknown field recovry; did you mean recovery?"),
+        (lambda: setattr(Config(), "seed", 1), "Config.seed cannot be changed, a configuration is frozen"),
+        (lambda: load_config({"seed": 1}), "of a dict, config_from_dict makes a configuration"),
+        (lambda: load_config(overrides="seed=1"), "overrides is a list of texts"),
+        (lambda: config_from_dict([1]), "config: a configuration is a mapping of fields to values, this is a list"),
+    ],
+)
+def test_what_python_gives_is_refused_in_one_sentence(make: Callable[[], object], words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        make()
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_sections_made_in_python_are_as_those_of_a_file() -> None:
+    config = Config(recovery={"enabled": False, "attempts": ("live", "gap")}, graph=GraphConfig(max_keyframes=50))
+    same = load_config(overrides=["recovery.enabled=false", "recovery.attempts=[live, gap]", "graph.max_keyframes=50"])
+    assert config == same
+    assert pickle.loads(pickle.dumps(config)) == same
+    assert Config().model_copy(update={"recovery": {"enabled": False}}).recovery.enabled is False
+    with pytest.raises(ConfigError, match="seed must be a whole number"):
+        config_from_dict({"seed": "5"})  # in Python, too, a file's strictness for what could stand in a file

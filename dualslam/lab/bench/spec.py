@@ -85,7 +85,10 @@ class PlacedCorruption(StrictModel):
             raise ValueError(f"{self.kind} lasts both frames and seconds; give one of them")
         if not 0 <= self.at[0] <= self.at[1] <= 1:
             raise ValueError(f"at of {self.kind} is {list(self.at)}; it must be two shares of the clip, in order")
-        self.placed(0, 1.0, 0)  # a strength that is out of bounds is an error of the spec
+        try:
+            self.placed(0, 1.0, 0)
+        except ConfigError as error:  # a strength that is out of bounds is an error of the spec, at its place there
+            raise ValueError(str(error).removeprefix(f"{Corruption.__name__}: ")) from error
         return self
 
     def placed(self, start: int, rate_hz: float, seed: int) -> Corruption:

@@ -1,0 +1,121 @@
+"""What is wrong with a configuration, in one sentence that names the field and the nearest known one."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+
+from dualslam.config.former import RENAMED, what_became_of
+
+_PLAIN_WORDS = {
+    "must be an object": "must be a mapping of fields",
+    "a valid integer": "a whole number",
+    "a valid string": "a word",
+    "a valid number": "a number",
+    "a valid boolean": "true or false",
+    "a valid array": "a list",
+    "a valid list": "a list",
+    "tuple should have": "must have",
+    " after validation": "",
+}
+
+
+def sentence(error: ValidationError, root: type[BaseModel]) -> str:
+    """Return what is wrong with the first field that is, and how many more are.
+
+    Parameters
+    ----------
+    error : ValidationError
+        Of pydantic.
+    root : type
+        The model that was to be made.
+    """
+    problems = error.errors(include_url=False)
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    return _of_one(problems[0], tuple(problems[0]["loc"]), root) + more
+
+
+def kind(value: Any) -> str:
+    """Return what a value is, in a word."""
+    kinds = {dict: "mapping", list: "list", str: "text", bool: "bool", int: "number", float: "number"}
+    return kinds.get(type(value), "null")
+
+
+def _of_one(problem: Any, path: tuple[str | int, ...], root: type[BaseModel]) -> str:
+    name = ".".join(map(str, path))
+    if problem["type"] == "extra_forbidden":
+        return _unknown(path, root)
+    if problem["type"] == "missing":
+        return f"{name} is missing"
+    message = str(problem["msg"]).removeprefix("Value error, ").replace("Input should be", "must be")
+    message = message[:1].lower() + message[1:]
+    for jargon, plain in _PLAIN_WORDS.items():
+        message = message.replace(jargon, plain)
+    if message.startswith("must have"):
+        return f"{name} {message}"
+    if message.startswith("must be"):
+        return f"{name} {message}, not {_shown(problem['input'])}"
+    return f"{name}: {message}" if name else message
+
+
+def _unknown(path: tuple[str | int, ...], root: type[BaseModel]) -> str:
+    *sections, field = map(str, path)
+    model = _model_at(root, path[:-1])
+    known = list(model.model_fields) if model else []
+    if RENAMED.get(field) in known:
+        return f"{'.'.join(map(str, path))} is now called {'.'.join([*sections, RENAMED[field]])}"
+    former = what_became_of(".".join(map(str, path)))
+    if former:
+        return former
+    section = ".".join(sections)
+    near = difflib.get_close_matches(field, known, n=1)
+    if near:
+        hint = f"did you mean {'.'.join([*sections, near[0]])}?"
+    else:
+        elsewhere = [p for p in all_paths(root) if p.rpartition(".")[2] == field]
+        hint = f"did you mean {elsewhere[0]}?" if elsewhere else ""
+    owner = f"of {section}" if section else "at the top"
+    return f"unknown field {'.'.join(map(str, path))}{'; ' + hint if hint else ''} (fields {owner}: {', '.join(known)})"
+
+
+def _model_at(model: type[BaseModel], path: tuple[str | int, ...]) -> type[BaseModel] | None:
+    current: type[BaseModel] | None = model
+    for name in path:
+        if isinstance(name, int):
+            continue
+        if current is None or name not in current.model_fields:
+            return None
+        current = _model_in(current.model_fields[name].annotation)
+    return current
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    """Return the model that a field holds, alone, optional or in a list; None for a plain field."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    if get_origin(annotation) in (Union, UnionType, list, tuple):
+        return next((m for m in map(_model_in, get_args(annotation)) if m), None)
+    return None
+
+
+def all_paths(model: type[BaseModel], prefix: str = "") -> list[str]:
+    """Return the names of all fields, those of sections within sections with theirs."""
+    paths = []
+    for name, field in model.model_fields.items():
+        paths.append(prefix + name)
+        inner = _model_in(field.annotation)
+        if inner:
+            paths += all_paths(inner, f"{prefix}{name}.")
+    return paths
+
+
+def _shown(value: Any) -> str:
+    try:
+        shown = json.dumps(value)
+    except (TypeError, ValueError):  # what no file holds: it was given in Python
+        return f"a {type(value).__name__}"
+    return shown if len(shown) < 60 else f"a {kind(value)}"
