@@ -1,12 +1,11 @@
 """The command line (`dualslam run`, `eval`, `bench`, `render`, ...): it only words what the Python interface does.
 
-Exit status: 0 done, 1 the run could not produce a map (or a bug of ours), 2 bad usage or bad input, 130 interrupted.
+Exit status: 0 done, 1 no map could be made (or standard output not be written, or a bug of ours), 2 bad usage or bad
+input, 130 interrupted.
 """
 
 from __future__ import annotations
 
-import io
-import os
 import sys
 import tempfile
 import traceback
@@ -15,19 +14,28 @@ from pathlib import Path
 
 from dualslam.cli import logs
 from dualslam.cli.parser import parse
+from dualslam.cli.streams import lenient
 from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError
 from dualslam.core.memory import keep_freed_memory
 from dualslam.core.threads import limit_threads
 
-EXIT_DONE, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
+EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Never raises."""
-    _never_stumble_over_letters()
     limit_threads()
     keep_freed_memory()
     arguments = list(sys.argv[1:] if argv is None else argv)
+    with lenient() as out:
+        status = _run(arguments)
+        out.flush()
+        if out.problem is None or isinstance(out.problem, BrokenPipeError):  # `dualslam config | head` has enough
+            return status
+        return _say(f"standard output cannot be written: {out.problem.strerror}", status or EXIT_FAILED)
+
+
+def _run(arguments: list[str]) -> int:
     try:
         args = parse(arguments)
     except SystemExit as end:  # argparse has said what was wrong, or shown the help that was asked for
@@ -42,20 +50,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _say(error, EXIT_BAD_INPUT)
     except DualSlamError as error:
         return _say(error, EXIT_FAILED)
-    except KeyboardInterrupt:
-        return _say("interrupted", EXIT_INTERRUPTED)
-    except BrokenPipeError:  # `dualslam config | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter's last flush would complain
-        return EXIT_DONE
+    except KeyboardInterrupt as stop:
+        return _say(". ".join(["interrupted", *getattr(stop, "__notes__", ())]), EXIT_INTERRUPTED)
     except Exception as error:  # the last resort: a bug must not reach the user as a stack trace
         return _say(_report_bug(error, arguments, getattr(args, "out", None)), EXIT_FAILED)
-
-
-def _never_stumble_over_letters() -> None:
-    """Have letters that the terminal's encoding lacks (LANG=C) shown by their number."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
 
 
 def _say(sentence: object, status: int) -> int:

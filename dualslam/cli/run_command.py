@@ -70,10 +70,11 @@ def execute(args: argparse.Namespace) -> int:
             watcher=Watchers([each for each in (live, shown) if each is not None]),
         )
     status = conclude(outcome, args)
-    may_go_on = isinstance(sequence, RecordedSequence) and not args.reverse and not args.localise
-    if outcome.report.interrupted and outcome.has_map and may_go_on and not args.quiet:
+    may_go_on = outcome.report.interrupted and outcome.has_map and not args.reverse and not args.localise
+    if isinstance(sequence, RecordedSequence) and may_go_on and not args.quiet:
         following = outcome.system.numbers.index_of(max(outcome.system.rows)) + args.stride
-        print(f"to go on: the same with --start {following}, --map {outcome.out} and another --out", flush=True)
+        if following <= sequence.source_indices[-1]:
+            print(f"to go on: the same with --start {following}, --map {outcome.out} and another --out", flush=True)
     return status
 
 
@@ -88,7 +89,7 @@ def live_view(args: argparse.Namespace) -> Iterator[LiveView | None]:
     print(f"live view: {live.url}", flush=True)
     try:
         yield live
-        if sys.stdin.isatty() and live.alive:
+        if sys.stdin is not None and sys.stdin.isatty() and live.alive:
             print(f"the live view stays at {live.url} until you press Ctrl-C", flush=True)
             live.wait()
     finally:

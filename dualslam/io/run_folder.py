@@ -21,7 +21,7 @@ from dualslam.core.events import Event
 from dualslam.core.types import FrameStatus
 from dualslam.io.atomic import atomic_file, write_text
 from dualslam.io.folder_lock import FolderLock
-from dualslam.io.map_files import to_plain
+from dualslam.io.map_files import METADATA, to_plain
 from dualslam.io.trajectory_files import Trajectory, read_text, write_kitti, write_tum
 from dualslam.map.frame_records import FrameRow as FrameRow  # a row of frames.csv
 
@@ -202,6 +202,15 @@ class RunFolder:
         for file in _named(folder, _SUBMAP_NAME):
             if file.name not in kept:
                 file.unlink()
+
+    def what_is_there(self) -> str:
+        """Return a sentence on which results are written, and which are not: of a run that was cut off there."""
+        there: list[str] = []
+        missing: list[str] = []
+        for name in (CONFIG, EVENTS, FRAMES, TRAJECTORY, SUMMARY, MAP, REPORT):
+            last = self.path / name / METADATA if name == MAP else self.path / name
+            (there if last.exists() else missing).append(name)
+        return f"In {self.path} are {', '.join(there)}; not written: {', '.join(missing) or 'nothing'}."
 
     def close(self) -> None:
         """Close the event file and let another run in; more than once does no harm."""

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
+
+log = logging.getLogger(__name__)
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -16,11 +19,18 @@ class Interrupts:
     """Takes the signals that end a run, while it is entered; each asks for more than the one before.
 
     The first one asks for no further frame (`asked`). The second one leaves what is in hand, too, where the code says
-    that this may be left (`leave_at_second`). The third one acts as it would without us. What a parent process has told
-    us to ignore stays ignored (nohup). Outside the main thread, where no signal comes, nothing is done.
+    that this may be left (`leave_at_second`); elsewhere, results are being written, and it is said what they wait for.
+    The third one acts as it would without us. What a parent process has told us to ignore stays ignored (nohup).
+    Outside the main thread, where no signal comes, nothing is done.
+
+    Attributes
+    ----------
+    left : bool
+        Whether the second one has left something.
     """
 
     def __init__(self) -> None:
+        self.left = False
         self._n = 0
         self._last = 0
         self._may_leave = False
@@ -40,6 +50,7 @@ class Interrupts:
         except KeyboardInterrupt:
             if not self.asked:
                 raise
+            self.left = True
         finally:
             self._may_leave = False
 
@@ -67,6 +78,9 @@ class Interrupts:
         if self._n > 2:
             self.__exit__()
             signal.raise_signal(number)
-        elif self._n == 2 and self._may_leave:
+        elif not self._may_leave:
+            more = "one more" if self._n == 2 else "two more"
+            log.warning("the results are being written; %s of these signals would leave them unfinished", more)
+        elif self._n == 2:
             self._may_leave = False
             raise KeyboardInterrupt

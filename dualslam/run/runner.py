@@ -58,7 +58,7 @@ class RunReport:
     peak_rss_mb : float
         Highest resident memory of the process since it started, and of the largest of its children that have ended.
     interrupted : bool
-        True where a signal ended the run early.
+        True where a signal ended the run early, its end too.
     error : InputError, OutputError or None
         What ended the source early, or kept its results from being written.
     bug : Exception or None
@@ -171,7 +171,7 @@ def run_sequence(
         wall_s=clock() - began,
         cpu_s=_cpu_s() - cpu_began,
         peak_rss_mb=_peak_rss_mb(),
-        interrupted=interrupted,
+        interrupted=interrupted or stop.left,
         error=steps.error,
         bug=steps.bug,
     )

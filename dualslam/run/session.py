@@ -159,6 +159,8 @@ def run_to_folder(
     ConfigError, InputError, OutputError
     Exception
         Whatever the system raised, once what it had found until then is written; a note on it says where.
+    KeyboardInterrupt
+        If results were being written; a note on it says which are there.
     """
     given = _given(sequence, realtime)
     if focal is not None:
@@ -200,15 +202,19 @@ def run_to_folder(
             try:
                 _write_new_events(system, folder)
                 summary = _write_results(system, report, config, sequence, folder, given)
-            except OutputError as error:
-                error.add_note(f"What could be written before is in {out}.")
+            except (OutputError, KeyboardInterrupt) as end:
+                end.add_note(folder.what_is_there())
                 raise
             except Exception as error:
                 if report.bug is None:
                     raise
                 raise report.bug from error  # the map of a system that broke may be in pieces
     if not report.interrupted:
-        interrupts.act_late()
+        try:
+            interrupts.act_late()
+        except KeyboardInterrupt as late:
+            late.add_note(f"All results are in {out}.")
+            raise
     if report.bug is not None:
         report.bug.add_note(f"What was found until then is in {out}.")
         raise report.bug
@@ -295,10 +301,16 @@ class _Watched:
         try:
             self._system.finish(interrupted)
             self._show_places()
-            if self._watcher is not None:
-                self._watcher.end()
+        except KeyboardInterrupt:
+            self._end_watching()  # the run has ended for who looks on, too
+            raise
         finally:
             self._samples.finish()
+        self._end_watching()
+
+    def _end_watching(self) -> None:
+        if self._watcher is not None:
+            self._watcher.end()
 
     def _show_places(self) -> None:
         numbers = self._system.numbers

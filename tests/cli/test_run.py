@@ -10,6 +10,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.run_folder import RunFolder, read_events
 from dualslam.lab.synthetic import SyntheticSequence
 from dualslam.run.results import versions
+from dualslam.run.session import run_to_folder
 from dualslam.run.sources import open_source
 from dualslam.workers.jobs import InlineDesk
 from tests.cli.conftest import N_FRAMES
@@ -190,7 +193,7 @@ def test_who_interrupts_twice_keeps_it_too(folder: Path, fake: Install, tmp_path
 
 
 def test_who_leaves_the_end_of_a_run_keeps_the_pictures_of_its_last_gap_and_no_worker(
-    folder: Path, fake: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, fake: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(*_: object) -> None:
         signal.raise_signal(signal.SIGINT)
@@ -201,7 +204,9 @@ def test_who_leaves_the_end_of_a_run_keeps_the_pictures_of_its_last_gap_and_no_w
     monkeypatch.setattr(FakeSystem, "finish", interrupted)
     closed: list[bool] = []
     monkeypatch.setattr(InlineDesk, "close", lambda _: closed.append(True))
-    assert main(["run", str(folder), "--out", str(tmp_path / "run"), "--quiet"]) == 130
+    assert main(["run", str(folder), "--out", str(tmp_path / "run")]) == 130
+    (told,) = capsys.readouterr().out.splitlines()  # and nothing of how to go on: all frames were seen
+    assert told.startswith("interrupted: coverage ")
     kept = sorted(int(path.stem) for path in (tmp_path / "run" / "samples").iterdir())
     assert kept == [N_FRAMES - 3, N_FRAMES - 2, N_FRAMES - 1]
     assert closed, "its workers are ended"
@@ -216,9 +221,42 @@ def test_an_interrupt_while_results_are_written_waits_for_them(
 
     monkeypatch.setattr("dualslam.run.session.save_atlas", interrupted)
     assert main(["run", str(folder), "--out", str(tmp_path / "run")]) == 130
-    assert "interrupted" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "the results are being written; two more of these signals would leave them unfinished" in said
+    assert said.endswith(f"dualslam: interrupted. All results are in {tmp_path / 'run'}.\n")
     assert len(load_atlas(tmp_path / "run").poses) == N_FRAMES
     assert (tmp_path / "run" / "report.html").exists()
+
+
+def test_who_leaves_the_writing_of_results_is_told_what_is_there(
+    folder: Path, fake: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*args: object) -> None:
+        for _ in range(3):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    out = tmp_path / "run"
+    monkeypatch.setattr("dualslam.run.session.save_atlas", interrupted)
+    assert main(["run", str(folder), "--out", str(out)]) == 130
+    *warned, last = capsys.readouterr().err.splitlines()
+    assert len(warned) == 2
+    there = "config.yaml, events.jsonl, frames.csv, trajectory.txt, summary.json"
+    assert last == f"dualslam: interrupted. In {out} are {there}; not written: map, report.html."
+    assert len(rows_of(out)) == N_FRAMES
+
+
+def test_who_looks_on_sees_the_end_that_was_left(folder: Path, tmp_path: Path, world: SyntheticSequence) -> None:
+    class Leaves(FakeSystem):
+        def finish(self, interrupted: bool = False) -> None:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+
+    ended: list[bool] = []
+    watcher = Mock(is_paused=lambda: False, end=lambda: ended.append(True))
+    build: Any = lambda *_: Leaves(dict(enumerate(world.ground_truth_T_world_cam)))  # noqa: E731
+    outcome = run_to_folder(load_config(), open_source(folder), tmp_path / "run", build=build, watcher=watcher)
+    assert outcome.report.interrupted
+    assert ended == [True]
 
 
 def test_a_disk_that_is_full_for_a_while_ends_the_run_and_costs_nothing_else(
