@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from dualslam.core.camera.focal import ToldFocal
 from dualslam.core.errors import InputError
 from dualslam.io import exif
+from dualslam.io.bit_depth import WHOLE, decoded, other_type, used_bits
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
 # How the files of a format end; a file without its ending was cut off, which decoders fill with grey and do not tell.
 _ENDINGS = {b"\xff\xd8\xff": b"\xff\xd9", b"\x89PNG": b"IEND\xaeB`\x82"}
 _TAIL_BYTES = 1024
+_TORN = (zipfile.BadZipFile, zlib.error, OSError, EOFError, NotImplementedError, RuntimeError)  # what zipfile raises
 # A JPEG's thumbnail, which has an ending of its own, is in its first 64 KiB. Behind the image there may be more: phones
 # append a film.
 _HEAD_BYTES = 1 << 16
@@ -96,17 +98,19 @@ def fill_gaps(paths: Sequence[Path], expected: int) -> list[Path]:
     return [by_number.get(n, template.with_stem(f"{n:0{width}d}")) for n in range(first, last + 1)]
 
 
-def decode(data: bytes, name: str, grey: bool) -> NDArray[np.uint8]:
-    """Decode a file's bytes to (H, W) grey or (H, W, 3) RGB; `name` is for the message of `UnreadableImageError`."""
+def decode(data: bytes, name: str, grey: bool, bits: int = WHOLE) -> NDArray[np.uint8]:
+    """Decode a file's bytes to (H, W) grey or (H, W, 3) RGB.
+
+    `name` is for the message of `UnreadableImageError`; `bits`: how many of 16 the source uses (`used_bits`).
+    """
     if not data:
         raise UnreadableImageError(f"{name} is empty.")
     for start, end in _ENDINGS.items():
         if data.startswith(start) and end not in data[-_TAIL_BYTES:] and data.find(end, _HEAD_BYTES) < 0:
             raise UnreadableImageError(f"{name} is cut off: its end is missing.")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
-    except cv2.error:
-        image = None
+    image = decoded(data, grey, bits)
+    if image is None and (found := other_type(data)) is not None:
+        raise UnreadableImageError(f"{name} has values of type {found}; write it as an image of 8 or 16 bits.")
     if image is None:
         raise UnreadableImageError(f"{name} cannot be decoded: it is damaged or no image.")
     return np.asarray(image if grey else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
@@ -117,13 +121,16 @@ class ImageFiles:
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self.paths = list(paths)
+        self._bits: int | None = None
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def reader(self, grey: bool) -> ImageReader:
         """Return a reader of these files."""
-        return _FileReader(self.paths, grey)
+        if self._bits is None:
+            self._bits = used_bits(len(self), lambda i: _bytes_of(self.paths[i]), str(self.paths[0].parent))
+        return _FileReader(self.paths, grey, self._bits)
 
     def told_focal(self) -> ToldFocal | None:
         """Return what the EXIF data of the first image tell."""
@@ -131,10 +138,17 @@ class ImageFiles:
         return None if ratio is None else ToldFocal(ratio, exif.SIGMA)
 
 
+def _bytes_of(path: Path) -> bytes | None:
+    try:
+        return path.read_bytes()
+    except OSError:
+        return None  # told where the frame is read
+
+
 class _FileReader:
-    def __init__(self, paths: list[Path], grey: bool) -> None:
+    def __init__(self, paths: list[Path], grey: bool, bits: int) -> None:
         self._paths = paths
-        self._grey = grey
+        self._grey, self._bits = grey, bits
 
     def read(self, index: int) -> NDArray[np.uint8]:
         path = self._paths[index]
@@ -144,7 +158,7 @@ class _FileReader:
             raise UnreadableImageError(f"{path} does not exist.") from None
         except OSError as e:
             raise UnreadableImageError(f"{path} cannot be read: {e.strerror or e}.") from e
-        return decode(data, str(path), self._grey)
+        return decode(data, str(path), self._grey, self._bits)
 
     def close(self) -> None:
         pass
@@ -164,13 +178,18 @@ class ZippedImages:
         self.names = sorted((n for n in names if not Path(n).name.startswith(".")), key=natural_key)
         if not self.names:
             raise InputError(f"{archive} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}); check the archive.")
+        self._bits: int | None = None
 
     def __len__(self) -> int:
         return len(self.names)
 
     def reader(self, grey: bool) -> ImageReader:
         """Return a reader with its own handle of the archive."""
-        return _ZipReader(self.archive, self.names, grey)
+        reader = _ZipReader(self.archive, self.names, grey)
+        if self._bits is None:
+            self._bits = used_bits(len(self), reader.bytes_of, str(self.archive))
+        reader.bits = self._bits
+        return reader
 
     def told_focal(self) -> None:
         """Return nothing: recordings in archives have a calibration."""
@@ -181,15 +200,21 @@ class _ZipReader:
         self._zip = zipfile.ZipFile(archive)
         self._names = names
         self._grey = grey
+        self.bits = WHOLE
 
     def read(self, index: int) -> NDArray[np.uint8]:
-        name = self._names[index]
-        where = f"{name} in {self._zip.filename}"
+        where = f"{self._names[index]} in {self._zip.filename}"
         try:
-            data = self._zip.read(name)
-        except (zipfile.BadZipFile, zlib.error, OSError, EOFError, NotImplementedError, RuntimeError) as e:
+            data = self._zip.read(self._names[index])
+        except _TORN as e:
             raise UnreadableImageError(f"{where} cannot be read: {e}.") from e
-        return decode(data, where, self._grey)
+        return decode(data, where, self._grey, self.bits)
+
+    def bytes_of(self, index: int) -> bytes | None:
+        try:
+            return self._zip.read(self._names[index])
+        except _TORN:
+            return None  # told where the frame is read
 
     def close(self) -> None:
         self._zip.close()
