@@ -567,7 +567,10 @@ class System:
 
     def _keyframe_due(self, odometry: VisualOdometry, track: Track) -> bool:
         """Whether a frame is to become a keyframe, now and in this submap."""
-        if not odometry.keyframe_due(track) or self.pace.puts_off(track.n_inliers, self._weak_landmarks):
+        if not odometry.keyframe_due(track):
+            odometry.go_by_known(track)
+            return False
+        if self.pace.puts_off(track.n_inliers, self._weak_landmarks):
             return False
         if self._handover is None or odometry is not self._live or self._recoveries.is_under_way(odometry.submap):
             return True

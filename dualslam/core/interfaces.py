@@ -433,7 +433,11 @@ class VisualOdometry(Protocol):
         ...
 
     def keyframe_due(self, track: Track) -> bool:
-        """Whether the frame should become a keyframe."""
+        """Whether the frame should become a keyframe; asking changes nothing."""
+        ...
+
+    def go_by_known(self, track: Track) -> None:
+        """Go by the keyframe that is there already, of an earlier run, for a frame which would have become one."""
         ...
 
     def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:

@@ -91,6 +91,7 @@ class Handover:
         """Whether the other submap needs no keyframe of a frame, and puts it where the live one does."""
         if sighting.odometry.keyframe_due(other):
             return False
+        sighting.odometry.go_by_known(other)  # from there it is to follow
         a, b = live.submap, sighting.odometry.submap
         component = sorted(self._joined(a.id))
         if b.id not in component:

@@ -340,6 +340,7 @@ def _track_one(reverse_tracker: VisualOdometry, view: View, track: Track | Failu
     reverse_tracker.submap.count_sightings(track)
     is_new = view.index not in reverse_tracker.submap.keyframes
     if not ((is_wanted and is_new) or reverse_tracker.keyframe_due(track)):
+        reverse_tracker.go_by_known(track)
         return ReverseStep(view, track, None)
     report = reverse_tracker.insert_keyframe(track)
     return ReverseStep(view, report, None) if isinstance(report, Failure) else ReverseStep(view, track, report)

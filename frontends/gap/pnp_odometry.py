@@ -161,6 +161,10 @@ class PnpOdometry:
         """
         return track.wide or self._live.keyframe_due(track)
 
+    def go_by_known(self, track: Track) -> None:
+        """Go by the keyframe of an earlier run that is there for a frame which would have become one."""
+        self._live.go_by_known(track)
+
     def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
         """Make the frame a keyframe and solve the graph."""
         report = self._live.insert_keyframe(track, pose_is_given=track.view.index == self._relocalised)

@@ -174,23 +174,30 @@ class VisualFrontEnd:
         return se3.inverse(self.submap.T_submap_kf[self._reference_id]) @ se3.inverse(track.T_cam_submap)
 
     def keyframe_due(self, track: Track) -> bool:
-        """Whether the frame should become a keyframe.
+        """Whether the frame should become a keyframe: not where an earlier run has left one that shows the same."""
+        return self._shows_other(track) and self._known(track) is None
 
-        Where an earlier run has left one that shows the same, that one becomes the reference, and none is made: a map
-        that is used many times has as many keyframes as its place needs.
+    def go_by_known(self, track: Track) -> None:
+        """Go by the keyframe of an earlier run that is there for a frame which would have become one.
+
+        A map that is used many times has so as many keyframes as its place needs.
         """
-        config = self._config.keyframes
-        if not keyframe_due(track, self.submap, self._reference_id, config, self._first_id):
-            return False
-        known = keyframe_like(track, self.submap, self._first_id, config) if self._first_id else None
-        if known is None:
-            return True
-        if known != self._reference_id:
+        if not self._first_id or not self._shows_other(track):
+            return
+        known = self._known(track)
+        if known is not None and known != self._reference_id:
             if known in self._path:  # it is passed again
                 self._path.remove(known)
             self._meet(known)
             self._tracker.refresh()
-        return False
+
+    def _shows_other(self, track: Track) -> bool:
+        """Whether a frame shows other things than its reference keyframe, or from elsewhere."""
+        return keyframe_due(track, self.submap, self._reference_id, self._config.keyframes, self._first_id)
+
+    def _known(self, track: Track) -> int | None:
+        """Return the keyframe of an earlier run that shows the same."""
+        return keyframe_like(track, self.submap, self._first_id, self._config.keyframes) if self._first_id else None
 
     def insert_keyframe(self, track: Track, pose_is_given: bool = False) -> KeyframeReport | Failure:
         """Make the frame a keyframe: pose it by its matches, extend the map from there, solve.
