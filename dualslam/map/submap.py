@@ -113,6 +113,7 @@ class Submap:
         self.observations = Table(
             kf=(np.int64, ()), feature=(np.int64, ()), landmark=(np.int64, ()), alive=(np.bool_, ())
         )
+        self._counted: tuple[Table, tuple[int, int, int], IntArray] | None = None  # see `n_observations`
 
     @classmethod
     def from_start(cls, start: Start, submap_id: int, K: FloatArray) -> Submap:
@@ -338,8 +339,13 @@ class Submap:
     def n_observations(self, landmark_ids: IntArray) -> IntArray:
         """Return how many keyframes see each landmark."""
         obs = self.observations
-        counts = np.bincount(obs["landmark"][obs["alive"]], minlength=len(self.landmarks))
-        return counts[landmark_ids]
+        # Rows are appended, and die; none is changed otherwise. So their numbers tell whether the counts still hold:
+        # between two keyframes they always do.
+        state = (len(obs), int(np.count_nonzero(obs["alive"])), len(self.landmarks))
+        if self._counted is None or self._counted[0] is not obs or self._counted[1] != state:
+            counts = np.bincount(obs["landmark"][obs["alive"]], minlength=len(self.landmarks))
+            self._counted = (obs, state, counts)
+        return self._counted[2][landmark_ids]
 
     def covisible(self, landmark_ids: IntArray) -> tuple[IntArray, IntArray]:
         """Return the keyframes that see any of `landmark_ids` and how many each sees, most first (ties: older id)."""

@@ -103,6 +103,26 @@ class TestSubmap:
         submap.merge_landmarks(np.array([1]), np.array([twin]))  # the same by now
         assert_consistent(submap)
 
+    def test_counts_follow_every_change(self, submap: Submap) -> None:
+        """They are kept from one question to the next."""
+        asked = np.arange(5)
+        assert submap.n_observations(asked).tolist() == [3, 3, 3, 3, 3]
+        row = np.flatnonzero((submap.observations["kf"] == 20) & (submap.observations["landmark"] == 0))
+        submap.remove_observations(row)
+        assert submap.n_observations(asked).tolist() == [2, 3, 3, 3, 3]
+        submap.add_observations(20, np.array([0]), np.array([0]))  # one has died, one has come: as many as before
+        assert submap.n_observations(asked).tolist() == [3, 3, 3, 3, 3]
+        (twin,) = submap.add_landmarks(np.array([[0.0, 0, 4]]), features(1).descriptors, np.ones(1), 30)
+        assert submap.n_observations(np.array([0, twin])).tolist() == [3, 0]
+        submap.add_observations(30, np.array([5]), np.array([twin]))
+        submap.merge_landmarks(np.array([twin]), np.array([1]))
+        assert submap.n_observations(np.array([1, twin])).tolist() == [0, 3]
+        twin_map = submap.copy()
+        twin_map.remove_landmarks(np.array([2]))
+        assert twin_map.n_observations(asked).tolist() == [3, 0, 0, 3, 3]
+        submap.take_over(twin_map)
+        assert submap.n_observations(asked).tolist() == [3, 0, 0, 3, 3]
+
     def test_pixels_of_observations(self, submap: Submap) -> None:
         rows = np.array([12, 3, 7])
         uv, sigma = submap.observed_pixels(rows)
