@@ -575,7 +575,7 @@ class System:
         if self._handover is None or odometry is not self._live or self._recoveries.is_under_way(odometry.submap):
             return True
         with self.timer.measure("places"):
-            return not self._handover.waits(track, odometry, self._parts.K)
+            return not self._handover.waits(track, odometry, self._parts.K, self.pace.in_real_time)
 
     # --- graphs beside the tracking
 

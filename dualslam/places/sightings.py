@@ -15,7 +15,7 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
 from dualslam.health import judge_track
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
-from dualslam.places.recogniser import PlaceRecogniser
+from dualslam.places.recogniser import PlaceCandidate, PlaceRecogniser
 from dualslam.places.verification import PlaceVerifier
 
 N_SECONDS = 2
@@ -44,6 +44,16 @@ class Sighting:
     odometry: Seeker
     keyframe_id: int
     tracks: list[tuple[Track, FloatArray]] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class Search:
+    """A frame that is looked for in some submaps: the keyframes left to try, and where it was found."""
+
+    view: View
+    submaps: dict[int, Submap]
+    candidates: list[PlaceCandidate]
+    found: list[tuple[Sighting, Track]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,25 +157,41 @@ class Sightings:
 
     def find(self, view: View, K: FloatArray, submap_ids: Collection[int]) -> Sighting | None:
         """Pose a frame in the submap that it shows, one of these, by pixels alone."""
+        search = self.search(view, K, submap_ids)
+        while self.go_on(search):
+            pass
+        return self.outcome(search)
+
+    def search(self, view: View, K: FloatArray, submap_ids: Collection[int]) -> Search:
+        """Begin to look for a frame in the submaps that it may show: ask the index which keyframes it resembles."""
         all_submaps = {m: self._record.atlas.submaps[m] for m in submap_ids}
         submaps = {m: s for m, s in all_submaps.items() if (s.K == K).all() and m not in self._avoided}
-        found: list[tuple[Sighting, Track]] = []
-        for candidate in self._recogniser.query(view.features, submaps):
-            submap = submaps[candidate.submap_id]
-            odometry = self._new_frontend(submap, self._new_graph())
-            track = judge_track(odometry.relocalise(view, candidate.keyframe_id), self._config.health)
-            if isinstance(track, Failure):
-                continue
-            why = self._verifier.check_pose(submap, candidate.keyframe_id, track.T_cam_submap, view.features)
-            if why is not None:
-                record_refusal(self._record, view, candidate.submap_id, candidate.submap_id, candidate.keyframe_id, why)
-                continue
-            pose = odometry.relative_pose(track)
-            found.append((Sighting(odometry, candidate.keyframe_id, [(track, pose)]), track))
-        if not found:
+        return Search(view, submaps, self._recogniser.query(view.features, submaps))
+
+    def go_on(self, search: Search) -> bool:
+        """Try to pose the frame by the next keyframe that it resembles; return False where there is none any more."""
+        if not search.candidates:
+            return False
+        candidate, view = search.candidates.pop(0), search.view
+        submap = search.submaps[candidate.submap_id]
+        odometry = self._new_frontend(submap, self._new_graph())
+        track = judge_track(odometry.relocalise(view, candidate.keyframe_id), self._config.health)
+        if isinstance(track, Failure):
+            return True
+        why = self._verifier.check_pose(submap, candidate.keyframe_id, track.T_cam_submap, view.features)
+        if why is not None:
+            record_refusal(self._record, view, candidate.submap_id, candidate.submap_id, candidate.keyframe_id, why)
+            return True
+        pose = odometry.relative_pose(track)
+        search.found.append((Sighting(odometry, candidate.keyframe_id, [(track, pose)]), track))
+        return True
+
+    def outcome(self, search: Search) -> Sighting | None:
+        """Return where the frame was found, unless another place shows it as well."""
+        if not search.found:
             return None
-        best, track = max(found, key=lambda item: item[1].n_inliers)
-        for other, contender in found:
+        best, track = max(search.found, key=lambda item: item[1].n_inliers)
+        for other, contender in search.found:
             submap = best.odometry.submap
             if other.odometry.submap is not submap:
                 continue
@@ -173,7 +199,7 @@ class Sightings:
             if not same_pose(here, there, SAME_WITHIN * median_depth(submap, track)):
                 detail = f"keyframes {best.keyframe_id} and {other.keyframe_id} show the place as well, elsewhere"
                 why = Failure(FailureReason.AMBIGUOUS_MODEL, detail)
-                record_refusal(self._record, view, submap.id, submap.id, best.keyframe_id, why)
+                record_refusal(self._record, search.view, submap.id, submap.id, best.keyframe_id, why)
                 return None
         return best
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -14,7 +15,8 @@ from dualslam.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.umeyama import umeyama
-from dualslam.core.types import Frame, View
+from dualslam.core.types import Failure, Frame, Track, View
+from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.io.map_store import StoredMap, load_atlas, save_atlas
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.system import System
@@ -141,6 +143,43 @@ def test_a_run_goes_over_to_the_submap_that_has_the_place_already(tmp_path: Path
         save_atlas(folder, system.atlas, system.poses, system.camera)
     assert len(system.atlas.submaps) == n_submaps
     assert sizes[-1] <= sizes[1] + 3
+
+
+@pytest.mark.slow
+def test_in_real_time_a_frame_is_posed_by_one_other_keyframe_at_most(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same, in parts: while there is a live map, none of its frames is held up by several looks at another."""
+    small = {"max_keyframes": 20, "rollover_keyframes": 6}
+    system = run(lap(), n=100, graph=small)
+    system.finish()
+    save_atlas(tmp_path / "0", system.atlas, system.poses, system.camera)
+    tried: list[tuple[int, bool]] = []
+    relocalise = VisualFrontEnd.relocalise
+
+    def noted(front_end: VisualFrontEnd, view: View, keyframe_id: int) -> Track | Failure:
+        tried.append((len(system.rows), system.live is not None))
+        return relocalise(front_end, view, keyframe_id)
+
+    monkeypatch.setattr(VisualFrontEnd, "relocalise", noted)
+    T = ring(N_LAP)[5:95] @ se3.from_parts(np.eye(3), np.array([0.05, 0.02, 0.05]))
+    world = PointWorld(wall(), T, seed=0)
+    config = Config.model_validate(
+        {"camera": {"model_sigma_px": 0.0}, "calibration": {"refine": False}, "graph": small}
+    )
+    system = build_system(config, CAMERA, saved=load_atlas(tmp_path / "0"))
+    system._parts = replace(system._parts, view_of=lambda frame: world.view(frame.index))
+    system.pace.note(0.0)
+    assert system.pace.in_real_time
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    over = [e for e in system.events.of_kind(EventKind.RELOCALISED) if "from_submap" in e.data]
+    assert [(e.data["from_submap"], e.submap) for e in over] == [(0, 1), (1, 2)]
+    assert len(trajectories_of(system).main) == len(T)
+    in_step = Counter(step for step, live in tried if live)
+    assert len(in_step) >= 3
+    assert max(in_step.values()) == 1
 
 
 def test_the_folder_is_not_changed(first: Path) -> None:
