@@ -17,6 +17,7 @@ from dualslam.config.settings import HealthConfig
 from dualslam.core.chi_square import CHI2_90, CHI2_9999
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import KeyframeReport
+from dualslam.core.quantiles import quantile
 from dualslam.core.support import find_lack_of_support
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track
 
@@ -185,14 +186,14 @@ class HealthMonitor:
         if len(self._innovation) < MIN_INNOVATIONS or track.wide:
             return 0.0, difference
         # What drivers and hands do has heavier tails than a Gaussian: its sigma is taken from where they begin.
-        sigma = np.quantile(np.abs(self._innovation), TAIL, axis=0) / TAIL_SIGMAS
+        sigma = quantile(np.abs(self._innovation), TAIL) / TAIL_SIGMAS
         covariance = track.covariance + np.diag(sigma**2)
         return float(difference @ np.linalg.solve(covariance, difference)), difference
 
 
-def _level(recent: Collection[float], expected: float, quantile: float = 0.5) -> float:
+def _level(recent: Collection[float], expected: float, share: float = 0.5) -> float:
     """Return how many times larger a quantile of recent chi-squares is than expected, at least 1."""
-    return max(1.0, float(np.quantile(list(recent), quantile)) / expected) if recent else 1.0
+    return max(1.0, float(quantile(np.array(recent), share)) / expected) if recent else 1.0
 
 
 def count_signs(frames: Iterable[FrameHealth]) -> dict[str, int]:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.quantiles import quantile
 from dualslam.core.types import FloatArray
 
 CELL_PX = 16
@@ -39,7 +40,7 @@ def estimate_noise(image: NDArray[np.uint8]) -> float:
     whole = (darkest > 0) & (brightest < 255)
     # The mean modulus of a normal variable is sqrt(2 / pi) of its standard deviation; the filter has a norm of 6.
     sigma = np.sqrt(np.pi / 2) / 6 * np.asarray(mean)[whole]
-    return float(np.quantile(sigma, QUIET_SHARE)) if len(sigma) else 0.0
+    return float(quantile(sigma, QUIET_SHARE)) if len(sigma) else 0.0
 
 
 def noise_of_levels(sigma: float, n_levels: int, scale_factor: float) -> FloatArray:

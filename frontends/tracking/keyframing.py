@@ -6,6 +6,7 @@ import numpy as np
 
 from dualslam.config.settings import KeyframeConfig
 from dualslam.core.geometry import se3
+from dualslam.core.quantiles import median
 from dualslam.core.types import IntArray, Track
 from dualslam.map.submap import Submap
 
@@ -95,4 +96,4 @@ def parallax_deg(track: Track, submap: Submap, reference_id: int) -> float:
     depth = submap.depths(ids, T_cam_submap)
     centre = se3.inverse(T_cam_submap)[:3, 3]
     baseline = float(np.linalg.norm(centre - submap.T_submap_kf[reference_id][:3, 3]))
-    return float(np.degrees(np.arctan2(baseline, max(float(np.median(depth)), 1e-12))))
+    return float(np.degrees(np.arctan2(baseline, max(median(depth), 1e-12))))

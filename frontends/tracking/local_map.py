@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.geometry.projection import project_points
+from dualslam.core.quantiles import quantile
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.submap import Submap
 
@@ -132,4 +133,4 @@ def trusted(submap: Submap, ids: IntArray, T_cam_submap: FloatArray, min_inliers
     if np.count_nonzero(proven) < max(SAFE * min_inliers, MOST * len(ids)):
         return np.ones(len(ids), np.bool_)
     depth = submap.depths(ids, T_cam_submap)
-    return np.asarray(proven | (depth > NEARER * np.quantile(depth[proven], NEAREST)))
+    return np.asarray(proven | (depth > NEARER * quantile(depth[proven], NEAREST)))

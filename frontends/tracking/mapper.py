@@ -12,6 +12,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose
 from dualslam.core.interfaces import Frontend, MappingReport
+from dualslam.core.quantiles import median
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Keyframe, Track
 from dualslam.frontends.features.groups import rank_in_runs
 from dualslam.frontends.features.matching import FeatureGrid, match_epipolar, match_projected
@@ -252,7 +253,7 @@ class Mapper:
         if len(ids) == 0:
             return np.inf
         T_cam_submap = se3.inverse(submap.T_submap_kf[k])
-        return float(np.median(submap.depths(ids, T_cam_submap)))
+        return median(submap.depths(ids, T_cam_submap))
 
     def _scales_agree(
         self, a: Features, b: Features, fa: IntArray, fb: IntArray, depth_a: FloatArray, depth_b: FloatArray

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.core.geometry import so3
+from dualslam.core.quantiles import median
 from dualslam.core.types import FloatArray
 
 MIN_PIXELS = 20
@@ -33,7 +34,7 @@ def turn_between(K: FloatArray, uv_a_px: FloatArray, uv_b_px: FloatArray) -> Flo
     for _ in range(ROUNDS):
         off_px = _off_px(K, rays_a, rays_b, R_a_b)
         # From the spread that is there down to that of noise: the first guess may be far off.
-        narrowed = max(min(_median(off_px), 0.5 * gate), GATE_PX)
+        narrowed = max(min(median(off_px), 0.5 * gate), GATE_PX)
         is_narrow, gate = narrowed == gate, narrowed
         weight = 1 / (1 + (off_px / gate) ** 2)
         U, _, Vt = np.linalg.svd((rays_a * weight) @ rays_b.T)
@@ -43,20 +44,13 @@ def turn_between(K: FloatArray, uv_a_px: FloatArray, uv_b_px: FloatArray) -> Flo
         if is_narrow and np.abs(R_a_b - before).max() < SETTLED:
             break
     off_px = _off_px(K, rays_a, rays_b, R_a_b)
-    agree = off_px < 3 * max(_median(off_px), GATE_PX)
+    agree = off_px < 3 * max(median(off_px), GATE_PX)
     return so3.log(R_a_b) if agree.sum() >= MIN_PIXELS else None
 
 
 def _off_px(K: FloatArray, rays_a: FloatArray, rays_b: FloatArray, R_a_b: FloatArray) -> FloatArray:
     x, y, z = rays_a - R_a_b @ rays_b
     return np.asarray(K[0, 0] * np.sqrt(x * x + y * y + z * z))
-
-
-def _median(values: FloatArray) -> float:
-    """Return the median; numpy's own takes five times as long for so few."""
-    middle = (len(values) - 1) // 2, len(values) // 2
-    parted = np.partition(values, middle)
-    return 0.5 * float(parted[middle[0]] + parted[middle[1]])
 
 
 def _rays(K: FloatArray, uv_px: FloatArray) -> FloatArray:
