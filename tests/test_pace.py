@@ -95,7 +95,7 @@ def test_in_real_time_no_frame_takes_more_than_its_share_of_landmarks_into_the_i
     world = PointWorld(cloud(), hand_held(40))
     system = system_in(world, keyframes={"max_parallax_deg": 1.0})
     index = system._revisits._recogniser
-    monkeypatch.setattr("dualslam.system.TAKEN_IN_A_FRAME", 20)
+    monkeypatch.setattr("dualslam.steps.places.TAKEN_IN_A_FRAME", 20)
     grown = []
     for frame in world.frames():
         system.pace.note(0.0)

@@ -36,7 +36,8 @@ from dualslam.map.submap import Submap
 from dualslam.map.tidying import tidy
 from dualslam.recovery.executor import DeskExecutor, InlineExecutor, RecoveryExecutor
 from dualslam.recovery.walk_news import WalkWatch
-from dualslam.system import Components, System
+from dualslam.steps.components import Components
+from dualslam.system import System
 from dualslam.workers.desk import WorkerDesk
 from dualslam.workers.jobs import InlineDesk
 from dualslam.workers.start_beside import StartBeside

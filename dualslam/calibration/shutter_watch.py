@@ -11,17 +11,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
-from operator import attrgetter
 from typing import Protocol
-
-import numpy as np
 
 from dualslam.calibration.background import Views
 from dualslam.calibration.lens import Calibration
+from dualslam.calibration.turns import turn_rates
 from dualslam.core.camera.base import Camera
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
-from dualslam.core.geometry import so3
 from dualslam.core.interfaces import ReadoutEstimate, Shutter, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FloatArray, View
 from dualslam.map.connections import Connections
@@ -43,8 +40,6 @@ to 1.2 (KITTI, EuRoC), rolling ones at 5 and more."""
 MAX_SIGMA_S = 0.004
 """Inflated: where the camera turns too slowly to tell a readout time to that, other errors of the pixels pass for one
 (a rendered street, which hardly turns: -0.020 s with 0.008 claimed). There it does not matter either."""
-MAX_GAP_S = 0.2
-"""Between a frame and one beside it that tells how it turns."""
 
 
 class ReadViews(Views, Protocol):
@@ -111,7 +106,9 @@ class ShutterWatch:
         with self._record.timer.measure("shutter"):
             if n >= self._due_at.get(submap.id, FIRST_KEYFRAMES) and not self._desk.n_open(JobKind.READOUT):
                 self._due_at[submap.id] = GROWTH * n
-                question = self._shutter.ask(submap, self._rates(submap), self._calibration.camera)
+                question = self._shutter.ask(
+                    submap, turn_rates(submap, self._record.poses.values()), self._calibration.camera
+                )
                 if not isinstance(question, Failure):
                     self._desk.submit(JobKind.READOUT, question)
                     self._asked = question, submap.id, self._shutter.readout_s, self._calibration.camera
@@ -155,7 +152,7 @@ class ShutterWatch:
     def _move(self, submap: Submap, more_s: float) -> None:
         """Take so much more of the readout out of a submap's keyframes; poses and points stay."""
         submap.relative_poses = {}  # they were measured with the pixels of before
-        rates = self._rates(submap)
+        rates = turn_rates(submap, self._record.poses.values())
         for k in rates.keys() & submap.keyframes.keys():
             keyframe = submap.keyframes[k]
             features = self._shutter.moved(keyframe.features, self._calibration.camera, more_s * rates[k])
@@ -165,29 +162,20 @@ class ShutterWatch:
         """Let the buffered frames and those to come be read in the time that was found."""
         rates: dict[int, FloatArray] = {}
         for submap in self._record.atlas.submaps.values():
-            rates.update(self._rates(submap))
-        camera, indices = self._calibration.camera, self._buffer.indices
-        known = {i: rates[i] for i in indices if i in rates}
+            rates.update(turn_rates(submap, self._record.poses.values()))
+        camera = self._calibration.camera
+        known = {i: rates[i] for i in self._buffer.indices if i in rates}
         self._shutter.take(readout_s, known, self._buffer.newest(2), camera.K)
-        correction = self._shutter.correction(indices, camera)
-        if correction is None:
-            self._buffer.change_all(lambda views: self._shutter.all_corrected(views, camera))
-        else:
-            self._buffer.map_later(correction, "shutter")
+        correct_views(self._buffer, self._shutter, camera)
 
-    def _rates(self, submap: Submap) -> dict[int, FloatArray]:
-        """Return how the camera turns at the frames that a submap has posed (rad/s, in its own axes)."""
-        posed = sorted((p for p in self._record.poses.values() if p.submap_id == submap.id), key=attrgetter("index"))
-        if len(posed) < 2:
-            return {}
-        t = np.array([p.timestamp_s for p in posed])
-        R = np.array([submap.resolve_anchor(p.keyframe_id, p.T_kf_cam)[:3, :3] for p in posed])
-        n = np.arange(len(posed))
-        apart = np.abs(np.diff(t)) > MAX_GAP_S
-        first = n - ~np.concatenate([[True], apart])
-        last = n + ~np.concatenate([apart, [True]])
-        turn = so3.log(R[first].swapaxes(1, 2) @ R[last])
-        return {posed[i].index: turn[i] / (t[last[i]] - t[first[i]]) for i in n[first < last].tolist()}
+
+def correct_views(buffer: ReadViews, shutter: Shutter, camera: Camera) -> None:
+    """Let the buffered views be read in the time that the shutter has now."""
+    correction = shutter.correction(buffer.indices, camera)
+    if correction is None:
+        buffer.change_all(lambda views: shutter.all_corrected(views, camera))
+    else:
+        buffer.map_later(correction, "shutter")
 
 
 def _is_sure(answer: ReadoutEstimate) -> bool:

@@ -121,7 +121,7 @@ def system_in(world: PointWorld, **settings: object) -> System:
             return Failure(FailureReason.UNREADABLE, "torn")
         return world.view(frame.index)
 
-    system._parts = replace(system._parts, view_of=view_of)
+    system._state.parts = replace(system._state.parts, view_of=view_of)
     return system
 
 

@@ -32,14 +32,14 @@ def run(polls: int, n_frames: int = N_FRAMES, blind: range = range(0)) -> System
         "recovery": {"enabled": False},
     }
     system, world = build_system(Config.model_validate(settings), wrong_camera(WRONG)), CalibrationWorld()
-    calibration = system._parts.calibration
-    system._calibrations._desk = LateDesk(system._parts.desk, polls)
+    calibration = system._state.parts.calibration
+    system._calibrations._desk = LateDesk(system._state.parts.desk, polls)
 
     def view_of(frame: Frame) -> object:
         view = world.view(frame, calibration)
         return replace(view, features=view.features.take(np.arange(0))) if frame.index in blind else view
 
-    system._parts = replace(system._parts, view_of=view_of)  # type: ignore[arg-type]
+    system._state.parts = replace(system._state.parts, view_of=view_of)  # type: ignore[arg-type]
     for i in range(n_frames):
         system.step(Frame(i, i / 30, None))
     system.finish()
@@ -64,7 +64,7 @@ def test_a_late_answer_is_as_good_as_one_in_time(in_time: System, polls: int) ->
     assert found.frame == asked.frame + polls
     assert found.data["log_focal"] == pytest.approx(asked.data["log_focal"], abs=1e-12)  # the same snapshot was asked
     (submap,) = late.atlas.submaps.values()
-    camera = late._parts.calibration.camera
+    camera = late._state.parts.calibration.camera
     np.testing.assert_array_equal(submap.K, camera.K)
     for keyframe in submap.keyframes.values():
         np.testing.assert_allclose(keyframe.features.uv_rect_px, camera.rectify(keyframe.features.uv_px)[0])
@@ -82,7 +82,7 @@ def test_an_answer_for_a_map_that_was_lost_meanwhile_changes_nothing(in_time: Sy
     assert not system.events.of_kind(EventKind.CALIBRATED)
     kept = system.events.of_kind(EventKind.CALIBRATION_KEPT)[0]
     assert "live no more" in kept.data["reason"]
-    np.testing.assert_array_equal(system._parts.calibration.camera.K, wrong_camera(WRONG).K)
+    np.testing.assert_array_equal(system._state.parts.calibration.camera.K, wrong_camera(WRONG).K)
     assert all((submap.K == wrong_camera(WRONG).K).all() for submap in system.atlas.submaps.values())
 
 

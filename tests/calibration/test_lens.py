@@ -214,8 +214,8 @@ def run_point_world(refine: bool) -> System:
     }
     config = Config.model_validate(settings)
     system, world = build_system(config, wrong_camera(WRONG)), CalibrationWorld()
-    calibration = system._parts.calibration
-    system._parts = replace(system._parts, view_of=lambda frame: world.view(frame, calibration))
+    calibration = system._state.parts.calibration
+    system._state.parts = replace(system._state.parts, view_of=lambda frame: world.view(frame, calibration))
     for i in range(N_FRAMES):
         system.step(Frame(i, i / 30, None))
     system.finish()
@@ -233,7 +233,8 @@ def test_the_system_finds_its_camera() -> None:
     # The newest keyframe came after the change, the first before it: both are rectified by the same camera now.
     for k in (min(submap.keyframes), max(submap.keyframes)):
         features = submap.keyframes[k].features
-        np.testing.assert_allclose(features.uv_rect_px, system._parts.calibration.camera.rectify(features.uv_px)[0])
+        camera = system._state.parts.calibration.camera
+        np.testing.assert_allclose(features.uv_rect_px, camera.rectify(features.uv_px)[0])
     again = run_point_world(refine=True)
     for i, pose in system.poses.items():
         assert np.array_equal(pose.T_kf_cam, again.poses[i].T_kf_cam)

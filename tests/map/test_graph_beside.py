@@ -79,9 +79,9 @@ def test_with_another_camera_a_replica_is_made_anew() -> None:
 def beside(world: PointWorld, polls: int, **settings: object) -> System:
     """A system whose graphs are solved inline, but come back late, by way of a delta as to another process."""
     system = system_in(world, **settings)
-    desk = LateDesk(InlineDesk(graph_handlers(system._config)), polls)
-    graphs = BesideGraphs(desk, window_solver(system._config))
-    system._parts = replace(system._parts, new_graph=graphs.new_graph, graphs=graphs)
+    desk = LateDesk(InlineDesk(graph_handlers(system._state.config)), polls)
+    graphs = BesideGraphs(desk, window_solver(system._state.config))
+    system._state.parts = replace(system._state.parts, new_graph=graphs.new_graph, graphs=graphs)
     system._recoveries._new_graph = graphs.new_graph
     system._calibrations._new_graph = graphs.new_graph
     return system
@@ -115,7 +115,7 @@ def test_a_graph_that_answers_late_is_as_good_as_one_in_time(world: PointWorld, 
     assert all(row.status is FrameStatus.TRACKED for row in list(system.rows.values())[5:])
     assert_right(system, world)
     assert_consistent(system.atlas.submaps[0])
-    graphs = system._parts.graphs
+    graphs = system._state.parts.graphs
     assert graphs is not None
     assert graphs.lag(system.atlas.submaps[0]) == 0
 
@@ -148,7 +148,7 @@ def test_a_process_that_is_killed_costs_the_map_nothing(world: PointWorld) -> No
     settings = {"recovery": {"enabled": False, "workers": 1}, "calibration": {"refine": False}}
     config = Config.model_validate(DENSE | settings | {"camera": {"model_sigma_px": 0.0}})
     system = build_system(config, CAMERA)
-    system._parts = replace(system._parts, view_of=lambda frame: world.view(frame.index))
+    system._state.parts = replace(system._state.parts, view_of=lambda frame: world.view(frame.index))
     desk = system.desk
     assert isinstance(desk, WorkerDesk)
     for frame in world.frames():

@@ -120,7 +120,7 @@ def test_frames_without_a_map_are_found_in_any_submap(loops: bool) -> None:
 def test_a_loop_whose_covariances_come_late_is_closed_when_they_have_come(polls: int) -> None:
     world = lap()
     system = system_in(world)
-    system._connections._covariances._desk = desk = LateDesk(system._parts.desk, polls)
+    system._connections._covariances._desk = desk = LateDesk(system._state.parts.desk, polls)
     closed_at = None
     for frame in world.frames():
         system.step(frame)
@@ -140,7 +140,7 @@ def test_a_worker_that_dies_over_a_search_costs_that_search_alone() -> None:
     """The first two searches that would have found the loop come to nothing; those after them close it."""
     world = lap()
     system = system_in(world)
-    inner, lost = system._parts.desk, []
+    inner, lost = system._state.parts.desk, []
 
     class Deadly(InlineDesk):
         def submit(self, kind: JobKind, work: PlaceSearch) -> None:
@@ -166,7 +166,7 @@ def test_a_worker_that_dies_over_a_search_costs_that_search_alone() -> None:
 def test_a_loop_that_still_waits_when_the_run_ends_is_closed_then() -> None:
     world = lap()
     system = system_in(world)
-    system._connections._covariances._desk = LateDesk(system._parts.desk, 100_000)
+    system._connections._covariances._desk = LateDesk(system._state.parts.desk, 100_000)
     for frame in world.frames():
         system.step(frame)
     assert not system.atlas.links

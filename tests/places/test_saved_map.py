@@ -51,7 +51,7 @@ def go_on(folder: Path, world: PointWorld, localise: bool = False, n: int | None
     def view_of(frame: Frame) -> View:
         return world.view(frame.index)
 
-    system._parts = replace(system._parts, view_of=view_of)
+    system._state.parts = replace(system._state.parts, view_of=view_of)
     for frame in world.frames()[:n]:
         system.step(frame)
     system.finish()

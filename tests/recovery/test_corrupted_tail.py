@@ -32,8 +32,8 @@ def run(degrees: float, seed: int) -> tuple[System, PointWorld]:
     fault = Corruption(
         kind=CorruptionKind.WRONG_POSE, start=FORCED.start, length=len(FORCED), strength=degrees, seed=seed
     )
-    faults, parts = FaultScript([fault]), system._parts
-    system._parts = replace(
+    faults, parts = FaultScript([fault]), system._state.parts
+    system._state.parts = replace(
         parts, view_of=faults.around_views(parts.view_of), new_odometry=faults.around_odometry(parts.new_odometry)
     )
     for frame in world.frames():

@@ -172,14 +172,14 @@ def test_tracking_goes_on_with_no_jump_that_the_motion_model_could_not_explain(w
 def miscalibrated(f: float, covered: range, settings: dict[str, object]) -> tuple[System, CalibrationWorld]:
     """Build a system that is told a focal length `f` times too long, before a lens that is covered for a while."""
     system, world = build_system(Config.model_validate(settings), wrong_camera(f)), CalibrationWorld()
-    calibration, rng = system._parts.calibration, np.random.default_rng(0)
+    calibration, rng = system._state.parts.calibration, np.random.default_rng(0)
 
     def view_of(frame: Frame) -> View:
         if frame.index in covered:
             return View(frame.index, frame.timestamp_s, random_features(rng))
         return world.view(frame, calibration)
 
-    system._parts = replace(system._parts, view_of=view_of)
+    system._state.parts = replace(system._state.parts, view_of=view_of)
     return system, world
 
 
@@ -203,7 +203,7 @@ def test_the_camera_has_been_refined_meanwhile() -> None:
     submap = system.atlas.submaps[1]
     assert min(submap.keyframes) < min(covered)
     for keyframe in submap.keyframes.values():
-        uv_rect_px, _ = system._parts.calibration.camera.rectify(keyframe.features.uv_px)
+        uv_rect_px, _ = system._state.parts.calibration.camera.rectify(keyframe.features.uv_px)
         np.testing.assert_allclose(keyframe.features.uv_rect_px, uv_rect_px)
     ids = sorted(submap.keyframes)
     truth = np.stack([world.T_world_cam(k) for k in ids])
@@ -233,7 +233,7 @@ def test_maps_of_a_wrong_camera_are_linked_after_both_have_been_calibrated() -> 
     (linked,) = system.events.of_kind(EventKind.LINKED)
     assert linked.frame >= calibrated.frame > refused[0].frame
     for submap in system.atlas.submaps.values():
-        np.testing.assert_array_equal(submap.K, system._parts.calibration.camera.K)
+        np.testing.assert_array_equal(submap.K, system._state.parts.calibration.camera.K)
     main = trajectories_of(system).main
     translation, rotation = pose_errors(main.T_world_cam, np.stack([world.T_world_cam(i) for i in main.index]))
     assert translation.max() < POSITION_M

@@ -22,17 +22,17 @@ N = 40
 
 
 def server(system: System) -> StartServer:
-    frontend = create_frontend(system._config.frontend)
-    return StartServer(partial(new_initialiser, system._config, frontend, SIZE_PX))
+    frontend = create_frontend(system._state.config.frontend)
+    return StartServer(partial(new_initialiser, system._state.config, frontend, SIZE_PX))
 
 
 def beside(world: PointWorld, polls: int) -> tuple[System, LateDesk]:
     """A system in real time whose start comes `polls` frames late."""
     system = system_in(world)
     desk = LateDesk(InlineDesk({JobKind.START: server(system)}), polls)
-    inline = system._parts.new_starter
-    system._parts = replace(system._parts, new_starter=lambda: StartBeside(desk, inline(), CAMERA.K))
-    system._starter = system._parts.new_starter()
+    inline = system._state.parts.new_starter
+    system._state.parts = replace(system._state.parts, new_starter=lambda: StartBeside(desk, inline(), CAMERA.K))
+    system._starting._starter = system._state.parts.new_starter()
     system.pace.note(0.0)
     return system, desk
 
@@ -79,7 +79,7 @@ class Dying:
 def test_a_search_that_is_lost_is_begun_anew_with_all_frames(world: PointWorld) -> None:
     system = system_in(world)
     dying = Dying(server(system), server(system))
-    starter = StartBeside(InlineDesk({JobKind.START: dying}), system._parts.new_starter(), CAMERA.K)
+    starter = StartBeside(InlineDesk({JobKind.START: dying}), system._state.parts.new_starter(), CAMERA.K)
     found = [starter.add(view, briefly=True) for view in world.views()]
     assert dying.asked[:3] == [1, 1, 3], "with the third, all three are sent"
     assert any(isinstance(f, Start) for f in found)
@@ -88,18 +88,19 @@ def test_a_search_that_is_lost_is_begun_anew_with_all_frames(world: PointWorld) 
 def test_answers_to_an_earlier_search_are_not_taken(world: PointWorld) -> None:
     system, views = system_in(world), world.views()
     desk = LateDesk(InlineDesk({JobKind.START: server(system)}), 0)
-    earlier, n = StartBeside(desk, system._parts.new_starter(), CAMERA.K), 0
+    earlier, n = StartBeside(desk, system._state.parts.new_starter(), CAMERA.K), 0
     while not any(isinstance(ended.result, Start) for _, ended in desk.waiting.get(JobKind.START, [])):
         assert not earlier.add(views[n], briefly=True)
         n += 1
-    later = StartBeside(desk, system._parts.new_starter(), CAMERA.K)
+    later = StartBeside(desk, system._state.parts.new_starter(), CAMERA.K)
     assert not later.add(views[n], briefly=True), "the start that waits there is not its own"
     assert not desk.waiting[JobKind.START] or desk.waiting[JobKind.START][0][1].work.views[-1].index == n
 
 
 def test_without_haste_it_searches_here(world: PointWorld) -> None:
     system = system_in(world)
-    here, there = system._parts.new_starter(), StartBeside(InlineDesk({}), system._parts.new_starter(), CAMERA.K)
+    new_starter = system._state.parts.new_starter
+    here, there = new_starter(), StartBeside(InlineDesk({}), new_starter(), CAMERA.K)
     assert isinstance(here, Initialiser)
     for view in world.views():
         mine, theirs = here.add(view), there.add(view)

@@ -149,12 +149,12 @@ def test_pixels_are_put_back_to_where_they_were_read() -> None:
 def run_of(world: PointWorld, true_readout_s: float, **camera: object) -> System:
     """Run the system on a world that is read row by row."""
     system = system_in(world, camera={"model_sigma_px": 0.0, **camera})
-    shutter = system._parts.shutter
+    shutter = system._state.parts.shutter
 
     def view_of(frame: Frame) -> View:
         return shutter.shutter_corrected(read_row_by_row(world, frame.index, true_readout_s), CAMERA)
 
-    system._parts = replace(system._parts, view_of=view_of)
+    system._state.parts = replace(system._state.parts, view_of=view_of)
     for frame in world.frames():
         system.step(frame)
     return system

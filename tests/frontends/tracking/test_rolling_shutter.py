@@ -218,12 +218,12 @@ def run_over_a_turn(**camera: object) -> tuple[System, FloatArray]:
     turning[:, :3, 3] = 0
     world = PointWorld(cloud(), np.concatenate([turning, turning[-1] @ moving]))
     system = system_in(world, camera={"model_sigma_px": 0.0, **camera})
-    shutter = system._parts.shutter
+    shutter = system._state.parts.shutter
 
     def view_of(frame: Frame) -> View:
         return shutter.shutter_corrected(read_row_by_row(world, frame.index, READOUT_S), CAMERA)
 
-    system._parts = replace(system._parts, view_of=view_of)
+    system._state.parts = replace(system._state.parts, view_of=view_of)
     for frame in world.frames():
         system.step(frame)
     return system, world.T_world_cam

@@ -27,10 +27,10 @@ def run(*corruptions: dict[str, object], backwards: bool = False, **settings: ob
     world = PointWorld(cloud(), hand_held(N))
     system = system_in(world, **settings)
     script = FaultScript([Corruption.model_validate(c) for c in corruptions])
-    system._parts = replace(
-        system._parts,
-        view_of=script.around_views(system._parts.view_of),
-        new_odometry=script.around_odometry(system._parts.new_odometry),
+    system._state.parts = replace(
+        system._state.parts,
+        view_of=script.around_views(system._state.parts.view_of),
+        new_odometry=script.around_odometry(system._state.parts.new_odometry),
     )
     for frame in world.frames()[:: -1 if backwards else 1]:
         system.step(frame)
@@ -141,8 +141,8 @@ def test_a_killed_worker_costs_its_recovery_and_nothing_else(workers: int) -> No
     world = PointWorld(cloud(), hand_held(70), covered=frozenset(range(35, 50)))
     system = system_in(world, recovery={"enabled": True, "workers": workers})
     script = FaultScript([Corruption.model_validate({"kind": "kill_worker", "start": 30})])
-    system._parts = replace(system._parts, view_of=script.around_views(system._parts.view_of))
-    desk = system._parts.desk
+    system._state.parts = replace(system._state.parts, view_of=script.around_views(system._state.parts.view_of))
+    desk = system._state.parts.desk
     if isinstance(desk, WorkerDesk):
         desk.on_start = script.kill_worker
     else:

@@ -1,0 +1,51 @@
+"""The parts that a system is made of: what knows the front ends and the solver comes from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from dualslam.calibration.lens import Calibration
+from dualslam.core.atlas_problem import AtlasSolver
+from dualslam.core.bundle import BundleAdjuster
+from dualslam.core.interfaces import MapStarter, Seeker, Shutter, SubmapGraph, VisualOdometry
+from dualslam.core.types import Failure, FloatArray, Frame, View
+from dualslam.map.graph_beside import BesideGraphs
+from dualslam.map.submap import Submap
+from dualslam.places.sightings import PlaceParts
+from dualslam.recovery.executor import RecoveryExecutor
+from dualslam.recovery.walk_news import WalkWatch
+from dualslam.workers.jobs import Desk
+
+
+@dataclass(frozen=True, slots=True)
+class Components:
+    """The parts that the composition root puts in: the system itself knows neither front end nor solver.
+
+    `new_relocaliser`: a front end that finds its submap again wherever it is seen, and tracks from there.
+    `walk_watch`: hears of walks back that are under way. `desk`: does the work beside the tracking; reverse tracking
+    has an executor of its own, which may use the same desk. `graphs`: carries changes to submaps' graphs in another
+    process and back, if they are solved there. `open_features`: starts one more process, and returns a function that
+    has the features of a frame found there.
+    """
+
+    view_of: Callable[[Frame], View | Failure]
+    new_starter: Callable[[], MapStarter]
+    new_graph: Callable[[], SubmapGraph]
+    new_odometry: Callable[[Submap, SubmapGraph], VisualOdometry]
+    new_relocaliser: Callable[[Submap, SubmapGraph], Seeker]
+    calibration: Calibration
+    shutter: Shutter
+    recovery: RecoveryExecutor
+    walk_watch: WalkWatch
+    atlas_solver: AtlasSolver
+    adjust_bundle: BundleAdjuster
+    places: PlaceParts
+    desk: Desk
+    graphs: BesideGraphs | None = None
+    open_features: Callable[[], Callable[[Frame], Frame]] | None = None
+
+    @property
+    def K(self) -> FloatArray:
+        """(3, 3) intrinsics of the rectified pixels, as they are known now."""
+        return self.calibration.camera.K

@@ -1,0 +1,178 @@
+"""Without a live map: a lost one, or any other, is found again, or the next one starts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dualslam.calibration.shutter_watch import correct_views
+from dualslam.core.errors import SolverError
+from dualslam.core.events import EventKind
+from dualslam.core.geometry import se3
+from dualslam.core.interfaces import START_REACH, SubmapGraph
+from dualslam.core.types import Failure, FailureReason, Start, Track, View
+from dualslam.map.submap import Submap
+from dualslam.map.trajectory import FramePose
+from dualslam.places.sightings import Sightings
+from dualslam.recovery.manager import Recoveries
+from dualslam.steps.state import State
+from dualslam.steps.tracking import Tracking
+
+
+class Starting:
+    """Finds a map again, or starts one.
+
+    Parameters
+    ----------
+    state : State
+    tracking : Tracking
+    recoveries : Recoveries
+    sightings : Sightings
+        Tells whether any submap shows a frame.
+    """
+
+    def __init__(self, state: State, tracking: Tracking, recoveries: Recoveries, sightings: Sightings) -> None:
+        self._state = state
+        self._tracking = tracking
+        self._recoveries = recoveries
+        self._sightings = sightings
+        self._starter = state.parts.new_starter()
+        self._n_without_map = 0  # frames
+
+    def begin_anew(self, lost: list[View]) -> None:
+        """Look for the next map's start from these frames on."""
+        self._starter = self._state.parts.new_starter()
+        for view in lost:
+            self._starter.collect(view)
+
+    # --- a map that is there
+
+    def find_again(self, view: View) -> Track | None:
+        """Continue in the map that was lost last, or in any other, if the frames of now show it."""
+        if self._state.relocaliser.note(view) and (track := self._find_lost(view)):
+            return track
+        return self._find_any(view)
+
+    def _find_lost(self, view: View) -> Track | None:
+        """Continue in the map that was lost last, once two frames in a row show it."""
+        state = self._state
+        with state.record.timer.measure("relocalisation"):
+            relocaliser = state.relocaliser.sighted(view)
+        if relocaliser is None:
+            return None
+        track = self._tracking.track(relocaliser, view)
+        if isinstance(track, Failure):
+            if track.reason is FailureReason.SOLVER:
+                state.relocaliser.end()
+            return None
+        state.live = relocaliser
+        state.relocaliser.end()
+        state.record.event(EventKind.RELOCALISED, view, relocaliser.submap.id, n_inliers=track.n_inliers)
+        self._go_on(relocaliser.submap, view)
+        return track
+
+    def _find_any(self, view: View) -> Track | None:
+        """Continue in any submap that a few frames in a row show: at once in a saved map, else where no map starts."""
+        state, record = self._state, self._state.record
+        self._n_without_map += len(view.features) >= state.config.tracking.min_inliers
+        recovery = state.config.recovery
+        after = 0 if state.saved is not None else recovery.relocalise_after if recovery.enabled else None
+        if not record.atlas.submaps or after is None or self._n_without_map <= after:
+            return None
+        with record.timer.measure("places"):
+            found = self._sightings.sighted(view, state.parts.K)
+        if found is None:
+            return None
+        state.live, submap = found.odometry, found.odometry.submap
+        state.relocaliser.end()
+        self._n_without_map = 0
+        state.begin_health()
+        for track, T_kf_cam in (*found.earlier, (found.track, state.live.relative_pose(found.track))):
+            at = track.view
+            pose = FramePose(at.index, at.timestamp_s, submap.id, found.reference, T_kf_cam)
+            record.pose(pose, track.n_matches, track.n_inliers)
+        first = found.earlier[0][0]
+        record.event(
+            EventKind.RELOCALISED,
+            view,
+            submap.id,
+            n_inliers=first.n_inliers,
+            other_frame=found.reference,
+            frames=len(found.earlier) + 1,
+        )
+        if not state.localises:
+            self._go_on(submap, first.view)
+        return found.track
+
+    def _go_on(self, submap: Submap, since: View) -> None:
+        """Go on in a submap that was found again, and doubt it until the camera's velocity has agreed."""
+        self._state.leaps.begin(since)
+        self._recoveries.found_again(submap)
+        self._state.buffer.thaw()
+
+    # --- a new map
+
+    def find_start(self, view: View) -> Start | Failure:
+        """Look for the start of a map that ends at this frame, or at one before it if it was looked for meanwhile."""
+        state, shutter = self._state, self._state.parts.shutter
+        with state.record.timer.measure("shutter"):
+            readout_s = shutter.readout_s
+            may_start = shutter.may_start(view, state.parts.calibration.camera)
+            if shutter.readout_s != readout_s:
+                view = self._correct_shutter(view)
+        if not may_start:
+            return Failure(FailureReason.DOUBTFUL_INITIALISATION, "a fast turn before the shutter is known")
+        with state.record.timer.measure("initialisation"):
+            start = self._starter.add(view, briefly=state.pace.in_real_time)
+        if isinstance(start, Failure) and start.reason is FailureReason.DOUBTFUL_INITIALISATION:
+            state.record.event(EventKind.INITIALISATION_REFUSED, view, None, reason=start.detail, **start.numbers)
+        return start
+
+    def _correct_shutter(self, view: View) -> View:
+        """Take the shutter that was found out of the frames so far; the starter begins anew. Returns the view's own."""
+        state, shutter = self._state, self._state.parts.shutter
+        state.record.event(EventKind.SHUTTER_FOUND, view, None, readout_s=shutter.readout_s)
+        correct_views(state.buffer, shutter, state.parts.calibration.camera)
+        state.relocaliser.end()  # it is of the pixels of before
+        *waiting, newest = state.buffer.newest(START_REACH + 1)
+        self.begin_anew([earlier for earlier in waiting if state.record.rows[earlier.index].submap is None])
+        return newest
+
+    def begin(self, start: Start) -> Track | Failure:
+        """Make a submap of a start, and pose the frames before and between by reverse tracking over the buffer."""
+        state, record, view = self._state, self._state.record, start.views[-1]
+        submap = Submap.from_start(start, len(record.atlas.submaps), state.parts.K)
+        graph = state.parts.new_graph()
+        try:
+            with record.timer.measure("graph"):
+                estimate = graph.update(submap)
+        except SolverError as error:
+            return Failure(FailureReason.SOLVER, str(error), start.numbers)
+        submap.apply_estimate(*estimate.values)
+        self._record_start(submap, start)
+        self._track_in(submap, graph, view)
+        ids = submap.landmark_of[view.index]
+        n = int((ids >= 0).sum())
+        T_cam_submap = se3.inverse(submap.T_submap_kf[view.index])
+        return Track(view, T_cam_submap, T_cam_submap, ids, np.zeros(0, np.int64), n, n, 1.0, False, np.zeros((6, 6)))
+
+    def _record_start(self, submap: Submap, start: Start) -> None:
+        record = self._state.record
+        kind = EventKind.INITIALISED if not record.atlas.submaps else EventKind.REINITIALISED
+        record.atlas.add(submap)
+        for k, keyframe in submap.keyframes.items():
+            record.pose(FramePose(k, keyframe.timestamp_s, submap.id, k, np.eye(4)))
+            row = record.rows[k]
+            row.n_matches = row.n_inliers = int((submap.landmark_of[k] >= 0).sum())
+        record.event(kind, start.views[-1], submap.id, first_view=start.views[0].index, **start.numbers)
+
+    def _track_in(self, submap: Submap, graph: SubmapGraph, view: View) -> None:
+        """Let a new submap be the live one, and reverse tracking start from it."""
+        state = self._state
+        state.live = state.parts.new_odometry(submap, graph)
+        state.relocaliser.end()
+        state.live.start_at(view.index)
+        self._n_without_map = 0
+        state.begin_health()
+        self._recoveries.start(submap, view)
+        self._recoveries.collect(state.live, view)
+        state.buffer.thaw()
