@@ -40,8 +40,6 @@ MIN_SHIFT_PX = 3.0
 models get wrong. Only there can a readout be told from that, and only there does it matter."""
 LAG, SPACING = 3, 3
 """Frames between the views of a pair, far enough for the turn to change; and between pairs, which do not overlap."""
-SPACING_KNOWN = 6
-"""Between pairs once a time is known, which they only improve; a map tells it better than they do (`ask`)."""
 SUSPICION = 1 / 9
 """Share of the evidence that makes a rolling shutter likely: one sigma of three."""
 MAX_PAIRS = 60
@@ -176,8 +174,6 @@ class ReadoutEstimator:
     ----------
     suspects : bool
         Whether a rolling shutter is likely, though its time is not known yet.
-    is_known : bool
-        Whether a time was told with the evidence asked for.
     is_done : bool
         Whether more frames would hardly change the time.
     """
@@ -189,7 +185,7 @@ class ReadoutEstimator:
         self._recent: list[tuple[View, FloatArray | None]] = []
         self._chi2 = np.zeros(len(READOUTS_S))
         self._n_pairs = 0
-        self.suspects = self.is_known = self.is_done = False
+        self.suspects = self.is_done = False
         self._n_frames = 0
 
     def add(self, view: View, before_rad_s: FloatArray | None, camera: Camera) -> float | None:
@@ -199,7 +195,7 @@ class ReadoutEstimator:
         """
         self._recent = [*self._recent[-LAG - 2 :], (view, before_rad_s)]
         self._n_frames += 1
-        if len(self._recent) < LAG + 3 or self._n_frames % (SPACING_KNOWN if self.is_known else SPACING):
+        if len(self._recent) < LAG + 3 or self._n_frames % SPACING:
             return None
         (a, to_a), (_, from_a), (b, to_b), (_, from_b) = (self._recent[n] for n in (1, 2, -2, -1))
         if to_a is None or from_a is None or to_b is None or from_b is None:
@@ -218,7 +214,6 @@ class ReadoutEstimator:
         self.suspects = best > 0 and evidence > SUSPICION * self._min_evidence
         # A lowest value at the rim of what is tried is no minimum yet.
         known = evidence > self._min_evidence and best < len(READOUTS_S) - 1
-        self.is_known |= known
         self.is_done = known and (
             best == 0 or self._n_pairs >= ENOUGH_PAIRS or self._curvature(best) > ENOUGH_CURVATURE
         )
@@ -240,8 +235,8 @@ class ReadoutEstimator:
     def _misfits(self, a: Features, rate_a: FloatArray, b: Features, rate_b: FloatArray, camera: Camera) -> FloatArray:
         """Return the robust chi-square (T,) of the best relative pose of two views for each readout time.
 
-        Poses come from RANSAC with the shortest and with the longest time, and are refined from one time to the next,
-        up and down: RANSAC's own scatter would drown what the times differ by.
+        Poses come from RANSAC with the shortest and with the longest time, and are refined with each: RANSAC's own
+        scatter would drown what the times differ by.
         """
         sigma_px = np.sqrt(0.5 * (a.sigma_px**2 + b.sigma_px**2))
         lens = poselib_camera(camera.K, (camera.width, camera.height))
@@ -250,19 +245,20 @@ class ReadoutEstimator:
             tuple(correct_shutter(x, camera, s * rate).uv_rect_px for x, rate in ((a, rate_a), (b, rate_b)))
             for s in READOUTS_S
         ]
-        ransac = {"max_epipolar_error": gate_px, "max_iterations": 100, "min_iterations": 30, "seed": self._seed}
-        refine = {"loss_type": "CAUCHY", "loss_scale": gate_px, "max_iterations": 10}
-        misfits = np.full(len(READOUTS_S), np.inf)
-        for n_first, step in ((0, 1), (len(READOUTS_S) - 1, -1)):
-            pose = poselib.estimate_relative_pose(*straight[n_first], lens, lens, ransac, {})[0]
-            for n in range(len(READOUTS_S))[::step]:
-                uv_a, uv_b = straight[n]
-                pose, _ = poselib.refine_relative_pose(uv_a, uv_b, pose, lens, lens, refine)
+        ransac = {"max_epipolar_error": gate_px, "max_iterations": 500, "min_iterations": 100, "seed": self._seed}
+        first = [poselib.estimate_relative_pose(*straight[n], lens, lens, ransac, {})[0] for n in (0, -1)]
+        refine = {"loss_type": "CAUCHY", "loss_scale": gate_px, "max_iterations": 25}
+        misfits = []
+        for uv_a, uv_b in straight:
+            of_pose = []
+            for start in first:
+                pose, _ = poselib.refine_relative_pose(uv_a, uv_b, start, lens, lens, refine)
                 T_b_a = np.eye(4)
                 T_b_a[:3] = pose.Rt
                 error2 = sampson_error(fundamental_from_pose(camera.K, T_b_a), uv_a, uv_b) / sigma_px**2
-                misfits[n] = min(misfits[n], float((CHI2_95[1] * np.log1p(error2 / CHI2_95[1])).sum()))
-        return misfits
+                of_pose.append(float((CHI2_95[1] * np.log1p(error2 / CHI2_95[1])).sum()))
+            misfits.append(min(of_pose))
+        return np.array(misfits)
 
 
 def _is_fast(rate_rad_s: FloatArray, camera: Camera) -> bool:
