@@ -197,9 +197,14 @@ class System:
         Returns
         -------
         FrameResult
+
+        Raises
+        ------
+        InputError
+            If it cannot be the next frame: one that came already, or after the end.
         """
         state, started, self._tracking.posed_at = self._state, time.perf_counter(), None
-        source, frame = frame, replace(frame, index=self.numbers.number(frame.index))
+        source, frame = frame, self.numbers.numbered(frame)
         self.rows[frame.index] = FrameRow(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
         # 1. What was found beside the tracking meanwhile comes into the map between two frames.
         self._graphs.collect(frame)
@@ -227,6 +232,7 @@ class System:
         interrupted : bool
             Someone is waiting: leave out the last reverse tracking, which the growth of the live map would earn.
         """
+        self.numbers.end()
         state, last = self._state, next(reversed(self.rows.values()), None)
         self._graphs.finish(last)
         self._recoveries.finish(state.live, last, interrupted or state.localises)

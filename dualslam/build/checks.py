@@ -6,9 +6,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
-from dualslam.core.errors import ConfigError
+from dualslam.core.camera.base import Camera
+from dualslam.core.errors import ConfigError, InputError
 from dualslam.frontends.features.motion_statistics import nearest_search
 from dualslam.frontends.registry import check_frontend
+from dualslam.io.map_store import StoredMap
 
 
 def check_config(config: Config) -> None:
@@ -29,6 +31,19 @@ def check_config(config: Config) -> None:
         if not attempt.is_live:
             with naming_attempt(number):
                 check_frontend(auxiliary_config(attempt))
+
+
+def check_given(camera: Camera, saved: StoredMap | None) -> None:
+    """Refuse what is no camera and no saved map, such as a path to one.
+
+    Raises
+    ------
+    InputError
+    """
+    if not isinstance(camera, Camera):
+        raise InputError(f"the camera is a {type(camera).__name__}; a sequence has one, as sequence.camera.")
+    if saved is not None and not isinstance(saved, StoredMap):
+        raise InputError(f"the saved map is a {type(saved).__name__}; load_atlas reads one.")
 
 
 def auxiliary_config(attempt: AttemptConfig) -> FrontendConfig:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.build.checks import check_config
+from dualslam.build.checks import check_config, check_given
 from dualslam.build.parts import (
     atlas_solver,
     bundle_adjuster,
@@ -73,10 +73,13 @@ def build_system(
 
     Raises
     ------
+    InputError
+        As `check_given`.
     ConfigError
         As `check_config`, and where an extra or weights that a front end needs are missing.
     """
     check_config(config)
+    check_given(camera, saved)
     frontend = create_frontend(config.frontend)
     size_px = (camera.width, camera.height)
     known = camera if saved is None else _camera_of(saved, camera)

@@ -7,12 +7,14 @@ at the centre of the top-left pixel; a submap's lengths are in its own monocular
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.errors import InputError
 from dualslam.core.grey_image import GreyImage
 
 FloatArray = NDArray[np.float64]
@@ -48,6 +50,11 @@ class Frame:
         Empty, or the reason why the image is missing.
     features : Features or None
         What was found in the image already, as the front end's `extract` returns it.
+
+    Raises
+    ------
+    InputError
+        If it is no such thing: what is wrong is told before anything is done with it.
     """
 
     index: int
@@ -55,6 +62,23 @@ class Frame:
     image: NDArray[np.uint8] | None
     error: str = ""
     features: Features | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be a frame."""
+        if not isinstance(self.index, int | np.integer) or self.index < 0:
+            raise InputError(f"a frame's index is {self.index!r}; frames are counted from 0 in whole numbers.")
+        if not isinstance(self.timestamp_s, int | float | np.number) or not math.isfinite(self.timestamp_s):
+            raise InputError(f"frame {self.index}: its time is {self.timestamp_s!r}; it must be a number of seconds.")
+        if self.image is None:
+            return
+        if not isinstance(self.image, np.ndarray):
+            raise InputError(f"frame {self.index}: its image is a {type(self.image).__name__}; it must be an array.")
+        is_colour = self.image.ndim == 3 and self.image.shape[2] == 3
+        if self.image.dtype != np.uint8 or not (self.image.ndim == 2 or is_colour) or self.image.size == 0:
+            raise InputError(
+                f"frame {self.index}: its image is {self.image.shape} {self.image.dtype}; "
+                "it must be (H, W) or (H, W, 3) RGB uint8, values from 0 to 255."
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)

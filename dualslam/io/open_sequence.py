@@ -33,6 +33,9 @@ class SourceFormat(Protocol):
         ...
 
 
+NOT_READ = frozenset({".avif", ".cr2", ".dng", ".exr", ".gif", ".heic", ".heif", ".jxl", ".nef"})
+"""Images that no reader of ours opens, by how their files end."""
+
 # The surer the sign, the earlier; the plain folder of images takes what no other does.
 FORMATS: tuple[SourceFormat, ...] = (euroc, tum_rgbd, kitti, tum_mono, dataset_folder, folder)
 
@@ -115,6 +118,11 @@ def _open_recording(source: Path, given: Given) -> Recording:
         if known.recognises(source):
             log.debug("%s: read as %s", source, known)
             return known.open_recording(source, given)
+    others = sorted({p.suffix.lower() for p in source.iterdir()} & NOT_READ)
+    if others:
+        raise InputError(
+            f"{source} holds {' and '.join(others)} files, which are not read; convert them to PNG or JPEG."
+        )
     raise InputError(
         f"{source} is no sequence that can be read: it holds neither images nor a layout of ours, KITTI odometry, "
         "TUM RGB-D, TUM-Mono or EuRoC; check the path."

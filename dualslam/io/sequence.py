@@ -82,6 +82,10 @@ class Selection:
 
     def __post_init__(self) -> None:
         """Refuse numbers that select nothing."""
+        for name in ("start", "stride", "max_frames"):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, int | np.integer):
+                raise InputError(f"{name} is {value!r}; it must be a whole number.")
         if self.start < 0:
             raise InputError(f"start is {self.start}; it counts frames from 0.")
         if self.stride < 1:

@@ -8,7 +8,11 @@ index in the source.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
+
+from dualslam.core.errors import InputError
+from dualslam.core.types import Frame
 
 FRAMES_IN_EVENTS = (
     "agreeing_keyframes",
@@ -42,6 +46,33 @@ class FrameNumbers:
         self.first_id = first_id
         self.first_index = first_index
         self._index_of: dict[int, int] = {}
+        self._last: int | None = None
+        self._ended = False
+
+    def end(self) -> None:
+        """Take no more frames."""
+        self._ended = True
+
+    def numbered(self, frame: Frame) -> Frame:
+        """Return the next frame with its number in the place of its index.
+
+        Raises
+        ------
+        InputError
+            If it cannot be the next one.
+        """
+        if not isinstance(frame, Frame):
+            raise InputError(f"step takes a dualslam.Frame(index, timestamp_s, image), not a {type(frame).__name__}.")
+        if self._ended:
+            raise InputError(f"frame {frame.index} comes after finish(), which ends a run: build another system.")
+        number = self.number_of(int(frame.index))
+        if self._last is not None and number <= self._last:
+            raise InputError(
+                f"frame {frame.index} comes after frame {self.index_of(self._last)}: the index of each frame must lie "
+                "beyond the last one's, in one direction, as frames are told apart by it."
+            )
+        self._last = number
+        return replace(frame, index=self.number(int(frame.index)))
 
     def number(self, index: int) -> int:
         """Return the number of a frame, by its index; the first that is asked for is the first frame."""

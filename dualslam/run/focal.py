@@ -51,9 +51,10 @@ def with_camera_found(config: Config, sequence: RecordedSequence) -> tuple[Recor
     size_px = sequence.camera.width, sequence.camera.height
     found = find_focal(config, islice(sequence, SEARCHED_FRAMES), size_px, sequence.told_focal())
     if isinstance(found, Failure):
+        n_frames = min(len(sequence), SEARCHED_FRAMES)
         raise InputError(
-            f"{sequence.name} has no calibration, and its first {SEARCHED_FRAMES} frames do not tell the focal length "
-            f"({found.detail}); give a camera file, or a field of view in degrees."
+            f"{sequence.name} has no calibration, and its first {n_frames} frames do not tell the "
+            f"focal length ({found.detail}); give a camera file, or a field of view in degrees."
         )
     return sequence.with_camera(found.camera()), found
 

@@ -162,6 +162,8 @@ def run_to_folder(
     KeyboardInterrupt
         If results were being written; a note on it says which are there.
     """
+    if not hasattr(sequence, "camera"):
+        raise InputError(f"the sequence is a {type(sequence).__name__}; open_source opens one.")
     given = _given(sequence, realtime)
     if focal is not None:
         given["focal_search"] = focal.as_dict()

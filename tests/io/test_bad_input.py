@@ -108,6 +108,8 @@ def test_no_image_at_all_can_be_read(dataset: Path) -> None:
 def test_nothing_there(tmp_path: Path) -> None:
     raises_sentence(tmp_path / "nowhere", "nowhere does not exist", "give a sequence folder")
     raises_sentence(tmp_path, "no sequence that can be read", "check the path")
+    (tmp_path / "IMG_0001.HEIC").touch()
+    raises_sentence(tmp_path, "holds .heic files, which are not read", "convert them to PNG or JPEG")
     (tmp_path / "images").mkdir()
     raises_sentence(tmp_path, "holds no images", fov_degrees=90)
     (tmp_path / "notes.md").write_text("hello")

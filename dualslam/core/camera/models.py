@@ -242,7 +242,7 @@ def camera_from_dict(values: Mapping[str, Any]) -> Camera:
 
 def camera_from_fov(width: int, height: int, degrees: float) -> PinholeCamera:
     """Return a pinhole camera with the given horizontal field of view and its principal point in the middle."""
-    if not 0 < degrees < 180:
-        raise InputError(f"camera: field of view is {degrees} degrees, it must be between 0 and 180")
+    if not isinstance(degrees, int | float | np.number) or not 0 < degrees < 180:
+        raise InputError(f"camera: field of view is {degrees!r} degrees, it must be between 0 and 180")
     f = 0.5 * width / math.tan(math.radians(0.5 * degrees))
     return PinholeCamera(width, height, f, f, 0.5 * (width - 1), 0.5 * (height - 1))
