@@ -84,7 +84,9 @@ def _share_in(landmark_ids: IntArray, submap: Submap, keyframe_id: int) -> float
     reference = reference[reference >= 0]
     established = submap.n_observations(reference) >= min(ESTABLISHED, len(submap.keyframes))
     reference = reference[established]
-    return float(np.isin(reference, landmark_ids).mean()) if len(reference) else 0.0
+    shown = np.zeros(len(submap.landmarks), np.bool_)
+    shown[landmark_ids[landmark_ids >= 0]] = True
+    return float(shown[reference].mean()) if len(reference) else 0.0
 
 
 def parallax_deg(track: Track, submap: Submap, reference_id: int) -> float:

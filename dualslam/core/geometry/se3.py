@@ -23,7 +23,9 @@ _C5 = [(-1.0) ** k * (k + 1) / factorial(2 * k + 5) for k in range(so3.N_TERMS)]
 def from_parts(R: ArrayLike, t: ArrayLike) -> FloatArray:
     """Assemble poses (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3), broadcast against each other."""
     rotation, translation = np.asarray(R, np.float64), np.asarray(t, np.float64)
-    shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    # Most are single poses; what is asked for the others takes three times as long as all the rest.
+    single = rotation.ndim == 2 and translation.ndim == 1
+    shape = () if single else np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     T = np.zeros((*shape, 4, 4))
     T[..., :3, :3] = rotation
     T[..., :3, 3] = translation
