@@ -56,7 +56,7 @@ class _Bar(RunState):
 
 
 def final_line(outcome: Outcome) -> str:
-    """Return coverage, submaps, failures, speed and place in one line."""
+    """Return coverage, submaps, failures, speed, why there is no map, and place in one line."""
     s = outcome.summary
     parts = [
         f"coverage {100 * s['coverage']:.1f} % ({s['posed']} of {s['frames']} frames)",
@@ -78,7 +78,8 @@ def final_line(outcome: Outcome) -> str:
     parts.append(f"{s['fps']:.1f} frames/s")
     nothing = "not found in the saved map: " if s["first_id"] else "no map: "
     lead = "interrupted: " if s["interrupted"] else "" if outcome.has_map else nothing
-    return f"{lead}{', '.join(parts)}; results in {outcome.out}"
+    why = f"; {s['no_map']}" if s.get("no_map") else ""
+    return f"{lead}{', '.join(parts)}{why}; results in {outcome.out}"
 
 
 def stage_table(outcome: Outcome) -> str:

@@ -58,7 +58,8 @@ def headline(run: RunData) -> str:
     """Tell the outcome of the run in one sentence."""
     n = len(run.rows)
     if not len(run.main):
-        return f"No map: none of {count(n, 'frame')} has a pose."
+        why = run.summary.get("no_map")
+        return f"No map: none of {count(n, 'frame')} has a pose{'' if why is None else f'; {why}'}."
     posed = f"{100 * len(run.main) / max(n, 1):.1f} % of {count(n, 'frame')} are posed in the main map"
     told = stories(run)
     if not told:

@@ -27,6 +27,7 @@ from dualslam.lab.disturbances import corrupted
 from dualslam.map.frame_records import FrameResult
 from dualslam.report import PlaceAlbum, SampleKeeper, read_run, report_page
 from dualslam.run.interrupts import Interrupts
+from dualslam.run.no_map import StartRefusals
 from dualslam.run.results import frame_rows, summarise, trajectories_of, truth_of_frames
 from dualslam.run.runner import RunReport, run_sequence
 from dualslam.system import System
@@ -177,8 +178,11 @@ def run_to_folder(
     with RunFolder(out, overwrite=overwrite) as folder:
         folder.write_config(dump_config(config))
 
+        refusals = StartRefusals()
+
         def after_frame(result: FrameResult) -> None:
             _write_new_events(system, folder)
+            refusals.note(result)
             if on_frame is not None:
                 on_frame(result)
 
@@ -203,6 +207,7 @@ def run_to_folder(
                 system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap)
             try:
                 _write_new_events(system, folder)
+                given["no_map"] = None if system.poses or saved_map is not None else refusals.sentence()
                 summary = _write_results(system, report, config, sequence, folder, given)
             except (OutputError, KeyboardInterrupt) as end:
                 end.add_note(folder.what_is_there())

@@ -108,7 +108,7 @@ class StartBeside:
         self._n_new = min(self._n_new + 1, len(self._views))
 
     def _found(self) -> Start | Failure:
-        found: Start | Failure = Failure(FailureReason.TOO_FEW_MATCHES, "a start is being looked for")
+        found: Start | Failure = Failure(FailureReason.BUSY, "a start is being looked for")
         for ended in self._desk.poll(JobKind.START):
             if ended.work.session != self._session:
                 continue

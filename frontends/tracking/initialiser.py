@@ -7,7 +7,7 @@ part in the estimate, agree with the points by their own pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -127,21 +127,26 @@ class Initialiser:
                 self._top = max(at - 1, 0)
             if at == 0 or start.reason is FailureReason.LOW_PARALLAX:
                 self._turn = self._top = min(self._top + 1, farthest)
+                if self._turn == at:
+                    break  # it would be this pair once more
             else:
                 self._turn = at - 1
         return best
 
     def try_pair(self, first: int, last: int) -> Start | Failure:
-        """Try to start from two of the collected views (positions in the list)."""
+        """Try to start from two of the collected views (positions in the list).
+
+        Where they show too little parallax, the failure's numbers hold by how much the image has moved all the same.
+        """
         a, b = self._views[first], self._views[last]
         matches = self._match(a.features, b.features)
         if len(matches) < self._config.min_matches:
             return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(matches)} matches, {self._config.min_matches} needed")
         pair = self._best_pose(a, b, matches)
-        if isinstance(pair, Failure):
-            return pair
-        views = [a, *self._witnesses(first, last), b]
-        return self._verify(pair, views)
+        start = self._verify(pair, [a, *self._witnesses(first, last), b]) if isinstance(pair, _Pair) else pair
+        if isinstance(start, Failure) and start.reason is FailureReason.LOW_PARALLAX:
+            return replace(start, numbers={**start.numbers, "shift_px": _shift_px(a, b, matches)})
+        return start
 
     # --- two views
 
@@ -350,6 +355,12 @@ def _turned(uv_a: FloatArray, K: FloatArray, T_b_a: FloatArray) -> FloatArray:
     """Return where pixels of the first view are in the second if they show what is infinitely far."""
     rays = np.column_stack([uv_a, np.ones(len(uv_a))]) @ (K @ T_b_a[:3, :3] @ np.linalg.inv(K)).T
     return np.asarray(rays[:, :2] / np.where(np.abs(rays[:, 2:]) > 1e-9, rays[:, 2:], np.nan))
+
+
+def _shift_px(a: View, b: View, matches: Matches) -> float:
+    """Return by how much matches have moved in the image (median)."""
+    moved = b.features.uv_rect_px[matches.index[:, 1]] - a.features.uv_rect_px[matches.index[:, 0]]
+    return float(np.median(np.linalg.norm(moved, axis=1)))
 
 
 def _direction_angle_deg(T_1: FloatArray, T_2: FloatArray) -> float:

@@ -83,4 +83,7 @@ def test_frames_that_the_saved_map_does_not_show_are_told(tmp_path: Path) -> Non
     assert line.startswith("not found in the saved map: coverage 0.0 %")
     assert "280 frames posed in submaps that are not joined to the saved map" in line
     outcome.summary["first_id"] = 0
-    assert final_line(outcome).startswith("no map: ")  # type: ignore[arg-type]
+    outcome.summary["no_map"] = "nothing moves"
+    line = final_line(outcome)  # type: ignore[arg-type]
+    assert line.startswith("no map: ")
+    assert line.endswith(f"; nothing moves; results in {tmp_path}")

@@ -56,6 +56,7 @@ def test_a_run_leaves_all_that_it_should(
     summary = json.loads((out / "summary.json").read_text())
     assert summary["coverage"] == 1.0
     assert summary["seed"] == 3
+    assert summary["no_map"] is None
     assert summary["ate_rmse_m"] < 1e-6
     assert set(summary["latency_ms"]) == {"median", "p95", "p99", "max"}
     assert {"numpy", "gtsam", "dualslam", "python"} <= set(summary["versions"])
@@ -155,6 +156,15 @@ def test_no_map_is_status_1_and_a_row_for_every_frame(
     assert capsys.readouterr().out.startswith("no map: coverage 0.0 %")
     assert len(rows_of(tmp_path / "run")) == N_FRAMES
     assert (tmp_path / "run" / "trajectory.txt").read_text() == ""
+
+
+def test_why_there_is_no_map_is_told_in_every_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    assert main(["run", "synthetic:street,frames=2", "--out", str(out)]) == 1
+    why = "too short: 2 images"
+    assert f"; {why}; results in {out}" in capsys.readouterr().out
+    assert json.loads((out / "summary.json").read_text())["no_map"] == why
+    assert f"none of 2 frames has a pose; {why}." in (out / "report.html").read_text()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -234,3 +234,28 @@ def test_pairs_far_enough_apart_are_tried_and_no_nearer_ones_in_vain(
     assert late.count(8) + late.count(16) > 0.45 * len(late)
     assert {8, 16, 32} <= set(late), "farther ones are asked again: the camera may stand still meanwhile"
     assert 2 not in late
+
+
+def test_while_nothing_moves_no_pair_is_tried_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    starter, tried = initialiser(), []
+
+    def judge(first: int, last: int) -> Failure:
+        tried.append((first, last))
+        return Failure(FailureReason.LOW_PARALLAX, "")
+
+    monkeypatch.setattr(starter, "try_pair", judge)
+    for view in PointWorld(cloud(), path(80, np.zeros(3), np.zeros(3))).views():
+        starter.add(view)
+    assert len(tried) == len(set(tried)) > 70
+
+
+def test_too_little_parallax_says_how_far_the_image_has_moved() -> None:
+    """A turn of 0.02 rad moves the image by about that much of the focal length."""
+    world = PointWorld(cloud(), path(3, np.zeros(3), np.array([0, 0.01, 0])))
+    starter = initialiser()
+    for view in world.views():
+        starter.collect(view)
+    refusal = starter.try_pair(0, 2)
+    assert isinstance(refusal, Failure)
+    assert refusal.reason is FailureReason.LOW_PARALLAX
+    assert refusal.numbers["shift_px"] == pytest.approx(0.02 * CAMERA.K[0, 0], rel=0.2)
