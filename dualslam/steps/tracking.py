@@ -64,6 +64,7 @@ class Tracking:
         """Whether a frame is to become a keyframe, now and in this submap."""
         state = self._state
         if not odometry.keyframe_due(track):
+            odometry.go_by_known(track)
             return False
         if state.pace.puts_off(track.n_inliers, state.config.keyframes.weak_landmarks):
             return False
