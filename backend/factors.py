@@ -8,7 +8,7 @@ import numpy as np
 from dualslam.backend.convert import pose_key, to_pose3
 from dualslam.backend.noise import GAUGE_RANGE_RATIO, GAUGE_SIGMA, PixelNoise, pose_sigmas
 from dualslam.core.types import FloatArray, IntArray
-from dualslam.map.submap import RelativePose
+from dualslam.map.anchors import RelativePose
 
 
 def insert_projections(

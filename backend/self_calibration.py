@@ -32,8 +32,8 @@ from dualslam.core.bundle import BundleProblem
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import LensCorrection, correction_of, given_camera
 from dualslam.core.chi_square import CHI2_999
+from dualslam.core.estimates import CalibrationEstimate, PreferredCamera
 from dualslam.core.geometry import so3
-from dualslam.core.interfaces import CalibrationEstimate, PreferredCamera
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
 

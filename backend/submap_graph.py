@@ -20,19 +20,18 @@ from dualslam.backend.bayes_tree import BayesTree, UpdateStatistics
 from dualslam.backend.factor_index import INSERT_SIGMAS, FactorIndex, Plan
 from dualslam.backend.factors import insert_projections
 from dualslam.backend.noise import LEAST_NOISE, OUTLIER_CHI2, PixelNoise, residual_variance
-from dualslam.backend.observability import compute_residuals, take_mask
+from dualslam.backend.observability import compute_residuals
 from dualslam.backend.point_refinement import refine_points
 from dualslam.backend.points_beside import landmarks_beside, triangulated_covariances, views_of
+from dualslam.backend.reading import READ_ALL, READ_WINDOW, choose_part
 from dualslam.backend.solver import N_LAST, IncrementalSolver, SolverFailure, optimise_batch
 from dualslam.backend.ties import TieChanges, Ties
 from dualslam.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
-from dualslam.core.interfaces import GraphEstimate
+from dualslam.core.estimates import GraphEstimate
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 
-READ_WINDOW = 20
-"""Keyframes (the last inserted ones, and their landmarks) whose estimate is read after each update; 0 reads all."""
 READ_ALL_EVERY = 10
 """Each so-many-th update reads the whole estimate."""
 REBUILD_ITERATIONS = 8
@@ -289,31 +288,19 @@ class ISam2SubmapGraph:
         rebuild, it is the whole submap. `optimum`: of all that the graph can bear, to be told in place of its own.
         """
         assert self._solver is not None
-        obs, rows = submap.observations, self._factor_index.rows
-        kf, lm = obs["kf"][: len(rows)], obs["landmark"][: len(rows)]
+        rows = self._factor_index.rows
         entering = plan.entering if plan is not None else np.zeros(0, np.int64)
-        # Rows of keyframes that were culled since the last plan are dead, but not out yet.
-        inside = np.flatnonzero(rows["admitted"] & obs["alive"][: len(rows)])
-        in_graph = take_mask(lm[rows["factor"] >= 0], len(submap.landmarks))
-        keyframes, row = np.array(sorted(self._factor_index.keyframes), np.int64), inside
-        window = 0 if rebuilt or plan is None else READ_WINDOW
-        if window and len(keyframes) > window:
-            recent = np.union1d(np.array(list(submap.keyframes)[-window:], np.int64), kf[entering])
-            row = inside[take_mask(recent, int(max(kf.max(initial=0), recent.max())) + 1)[kf[inside]]]
-            keyframes = keyframes if everything else recent
-        else:
-            everything = True
-        seen = take_mask(lm[inside if everything else row], len(submap.landmarks))
-        if everything:
-            seen |= in_graph
-        landmarks = np.flatnonzero(seen & in_graph)
+        whole = rebuilt or plan is None
+        part = choose_part(submap, self._factor_index, entering, READ_ALL if whole else READ_WINDOW, everything)
+        kf, lm, inside, row = part.kf, part.lm, part.inside, part.row
+        keyframes, landmarks, everything = part.keyframes, part.landmarks, part.is_whole
         if optimum is None:
             T, xyz_graph = self._solver.estimate(keyframes, landmarks, everything)
         else:
             T, xyz_graph = np.array([optimum.poses[k] for k in keyframes.tolist()]), optimum.xyz_mu[landmarks]
         poses = dict(zip(keyframes.tolist(), T, strict=True))
         newest = None if everything else list(submap.keyframes)[-REFINED_KEYFRAMES:]
-        beside = landmarks_beside(submap, inside, in_graph, newest)
+        beside = landmarks_beside(submap, inside, part.in_graph, newest)
         xyz = (submap.landmarks["xyz_mu"] if optimum is None else optimum.xyz_mu).copy()
         xyz[landmarks] = xyz_graph
         xyz[beside] = self._refined(submap, poses, xyz, beside, inside)

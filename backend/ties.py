@@ -13,7 +13,8 @@ from dualslam.backend.factors import baseline_factor, pose_prior, relative_pose
 from dualslam.backend.gauge import Gauge, choose_gauge
 from dualslam.backend.observability import find_components
 from dualslam.core.types import FloatArray, IntArray
-from dualslam.map.submap import RelativePose, Submap
+from dualslam.map.anchors import RelativePose
+from dualslam.map.submap import Submap
 
 HOLD_ROTATION_RAD, HOLD_TRANSLATION_MU = 0.01, 0.02
 """Sigmas of the loose prior that holds a keyframe with too few ties where it is."""

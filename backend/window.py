@@ -17,8 +17,8 @@ from dualslam.backend.noise import LEAST_NOISE, OUTLIER_CHI2, residual_variance
 from dualslam.backend.observability import reproject
 from dualslam.backend.point_refinement import huber, projection_jacobian
 from dualslam.backend.selection import rank_in_runs, spread_evenly
+from dualslam.core.estimates import GraphEstimate
 from dualslam.core.geometry import se3, so3
-from dualslam.core.interfaces import GraphEstimate
 from dualslam.core.sums import sum_by
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap

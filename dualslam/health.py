@@ -15,8 +15,8 @@ import numpy as np
 
 from dualslam.config.settings import HealthConfig
 from dualslam.core.chi_square import CHI2_90, CHI2_9999
+from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import se3
-from dualslam.core.interfaces import KeyframeReport
 from dualslam.core.quantiles import quantile
 from dualslam.core.support import find_lack_of_support
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dualslam.config.settings import HealthConfig
+from dualslam.core.estimates import GraphEstimate, KeyframeReport, MappingReport
 from dualslam.core.geometry import se3
-from dualslam.core.interfaces import GraphEstimate, KeyframeReport, MappingReport
 from dualslam.core.types import Failure, FailureReason, Features, Track, View
 from dualslam.health import HealthMonitor, count_signs
 from dualslam.testing.point_world import random_features

@@ -13,12 +13,14 @@ from dualslam.build.checks import auxiliary_config, naming_attempt
 from dualslam.build.parts import bundle_adjuster, window_solver
 from dualslam.config.settings import AttemptConfig, Config
 from dualslam.core.camera.base import Camera
-from dualslam.core.interfaces import Frontend, PreferredCamera, SubmapGraph
+from dualslam.core.estimates import PreferredCamera
+from dualslam.core.interfaces import Frontend, SubmapGraph
 from dualslam.core.types import IntArray
 from dualslam.frontends.features.image_features import ImageFeatures
 from dualslam.frontends.gap.auxiliary_features import AuxiliaryFeatures, BufferedFeatures, OwnFeatures
-from dualslam.frontends.gap.pnp_odometry import PnpOdometry, Route
+from dualslam.frontends.gap.pnp_odometry import PnpOdometry
 from dualslam.frontends.gap.refinding import Refinder
+from dualslam.frontends.gap.route import Route
 from dualslam.frontends.registry import FOR_WALKS, create_frontend
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.health import judge_track

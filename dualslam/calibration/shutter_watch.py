@@ -18,8 +18,9 @@ from dualslam.calibration.lens import Calibration
 from dualslam.calibration.turns import turn_rates
 from dualslam.core.camera.base import Camera
 from dualslam.core.errors import SolverError
+from dualslam.core.estimates import ReadoutEstimate
 from dualslam.core.events import EventKind
-from dualslam.core.interfaces import ReadoutEstimate, Shutter, SubmapGraph, VisualOdometry
+from dualslam.core.interfaces import Shutter, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FloatArray, View
 from dualslam.map.connections import Connections
 from dualslam.map.record import FrameStamp, Record

@@ -20,7 +20,8 @@ from dualslam.core.types import Features, Keyframe
 from dualslam.io.atomic import atomic_file, write_text
 from dualslam.io.map_checks import check_submap
 from dualslam.io.trajectory_files import read_text
-from dualslam.map.submap import Anchor, RelativePose, Submap
+from dualslam.map.anchors import Anchor, RelativePose
+from dualslam.map.submap import Submap
 from dualslam.map.tables import Table
 
 Arrays = Mapping[str, NDArray[Any]]

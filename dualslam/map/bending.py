@@ -9,8 +9,9 @@ import numpy as np
 
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FloatArray
+from dualslam.map.anchors import Anchor, RelativePose
 from dualslam.map.atlas import Link
-from dualslam.map.submap import Anchor, RelativePose, Submap
+from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
 from dualslam.map.warp import Warp
 

@@ -20,7 +20,8 @@ from itertools import count
 import numpy as np
 
 from dualslam.core.errors import SolverError
-from dualslam.core.interfaces import GraphEstimate, SubmapGraph
+from dualslam.core.estimates import GraphEstimate
+from dualslam.core.interfaces import SubmapGraph
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.late_estimate import apply_late
 from dualslam.map.submap import Submap

@@ -9,8 +9,9 @@ import numpy as np
 
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.anchors import Anchor
 from dualslam.map.atlas import Atlas, Link
-from dualslam.map.submap import Anchor, Submap
+from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 from dualslam.map.trajectory import FramePose
 

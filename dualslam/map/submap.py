@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,45 +10,10 @@ from numpy.typing import NDArray
 
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe, Start, Track
-from dualslam.map.tables import Table
+from dualslam.map.anchors import Anchor, RelativePose
+from dualslam.map.tables import Table, landmark_table, observation_table
 
 NO_LANDMARK = -1
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Anchor:
-    """Where a culled keyframe (or a plain frame) stands: a pose relative to a keyframe that is still there."""
-
-    keyframe_id: int
-    T_kf_cam: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RelativePose:
-    """Where a keyframe stands by what is no observation of the submap's landmarks: a gap relocalisation.
-
-    Attributes
-    ----------
-    keyframe_id : int
-        Relative to which other keyframe.
-    T_ref_kf : (4, 4)
-    covariance : (6, 6)
-        Of xi in ``T_ref_kf @ exp(xi)``: rotation, translation; positive definite.
-    """
-
-    keyframe_id: int
-    T_ref_kf: FloatArray
-    covariance: FloatArray
-
-    def scaled(self, scale: float) -> RelativePose:
-        """Return the same in another unit of length."""
-        T, units = self.T_ref_kf.copy(), np.repeat([1.0, scale], 3)
-        T[:3, 3] *= scale
-        return RelativePose(self.keyframe_id, T, units[:, None] * self.covariance * units)
-
-    def seen_from(self, keyframe_id: int, T_kf_ref: FloatArray) -> RelativePose:
-        """Return the same relative to another keyframe, of which the old one's place is known."""
-        return RelativePose(keyframe_id, T_kf_ref @ self.T_ref_kf, self.covariance)
 
 
 class Submap:
@@ -97,22 +61,8 @@ class Submap:
         self.relative_poses: dict[int, RelativePose] = {}
         self.gauge: tuple[int, int] = (-1, -1)
         self.condemned: set[int] = set()
-        self.landmarks = Table(
-            xyz_mu=(np.float64, (3,)),
-            alive=(np.bool_, ()),
-            descriptor=(descriptor.dtype, descriptor.shape),
-            normal=(np.float64, (3,)),
-            distance_mu=(np.float64, ()),
-            scale=(np.float64, ()),
-            first_kf=(np.int64, ()),
-            replaced_by=(np.int64, ()),
-            n_visible=(np.int64, ()),
-            n_found=(np.int64, ()),
-            condemned=(np.bool_, ()),
-        )
-        self.observations = Table(
-            kf=(np.int64, ()), feature=(np.int64, ()), landmark=(np.int64, ()), alive=(np.bool_, ())
-        )
+        self.landmarks = landmark_table(descriptor)
+        self.observations = observation_table()
         self._counted: tuple[Table, tuple[int, int, int], IntArray] | None = None  # see `n_observations`
 
     @classmethod

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.types import Features, FloatArray, IntArray, Keyframe
-from dualslam.map.submap import NO_LANDMARK, Anchor, RelativePose, Submap
+from dualslam.map.anchors import Anchor, RelativePose
+from dualslam.map.submap import NO_LANDMARK, Submap
 
 N_RECENT = 8
 """Keyframes whose poses and landmarks are sent each time: the window adjustment has moved them."""

@@ -58,3 +58,25 @@ class Table:
         n = len(next(iter(columns.values())))
         table.append(n, **columns)
         return table
+
+
+def landmark_table(descriptor: NDArray[np.generic]) -> Table:
+    """Return an empty table of landmarks; `descriptor`: an example row, which gives type and length."""
+    return Table(
+        xyz_mu=(np.float64, (3,)),
+        alive=(np.bool_, ()),
+        descriptor=(descriptor.dtype, descriptor.shape),
+        normal=(np.float64, (3,)),
+        distance_mu=(np.float64, ()),
+        scale=(np.float64, ()),
+        first_kf=(np.int64, ()),
+        replaced_by=(np.int64, ()),
+        n_visible=(np.int64, ()),
+        n_found=(np.int64, ()),
+        condemned=(np.bool_, ()),
+    )
+
+
+def observation_table() -> Table:
+    """Return an empty table of observations."""
+    return Table(kf=(np.int64, ()), feature=(np.int64, ()), landmark=(np.int64, ()), alive=(np.bool_, ()))

@@ -15,7 +15,8 @@ import numpy as np
 
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe
-from dualslam.map.submap import NO_LANDMARK, Anchor, Submap
+from dualslam.map.anchors import Anchor
+from dualslam.map.submap import NO_LANDMARK, Submap
 from dualslam.map.submap_change import change_of_frame
 
 Rectify = Callable[[Keyframe], Keyframe]

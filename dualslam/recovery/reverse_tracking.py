@@ -20,8 +20,9 @@ import numpy as np
 
 from dualslam.config.settings import FusionConfig, RecoveryConfig
 from dualslam.core.errors import SolverError
+from dualslam.core.estimates import KeyframeReport
 from dualslam.core.events import Event, EventKind
-from dualslam.core.interfaces import KeyframeReport, SubmapGraph, VisualOdometry
+from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, Track, View
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose

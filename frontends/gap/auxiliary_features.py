@@ -9,7 +9,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.rectification import rectify
 from dualslam.core.types import Failure, FailureReason, Features, View
 from dualslam.frontends.features.image_features import ImageFeatures
-from dualslam.frontends.tracking.rolling_shutter import correct_shutter
+from dualslam.frontends.tracking.row_shifts import correct_shutter
 
 
 class AuxiliaryFeatures(Protocol):

@@ -15,23 +15,25 @@ gap, posed by itself, sees the same points where they should be.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Set
 from dataclasses import dataclass, replace
-from itertools import chain, islice
+from itertools import chain
 
 import numpy as np
 
 from dualslam.config.settings import Config
 from dualslam.core.bundle import BundleAdjuster
+from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, refine_pose
-from dualslam.core.interfaces import Frontend, KeyframeReport, SubmapGraph
+from dualslam.core.interfaces import Frontend, SubmapGraph
 from dualslam.core.support import find_lack_of_support
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray, Matches, Track, View
 from dualslam.frontends.gap.auxiliary_features import AuxiliaryFeatures
 from dualslam.frontends.gap.auxiliary_map import AuxiliaryMap, triangulate
 from dualslam.frontends.gap.consensus import CONFIRMING_SHARE, BeyondGap, confirmed_share
 from dualslam.frontends.gap.relocalisation import GapPose, relocalise_across_gap
+from dualslam.frontends.gap.route import Route, find_lack
 from dualslam.frontends.gap.second_pose import refuse_look_alike
 from dualslam.frontends.gap.uncertainty import SMALL_STEP
 from dualslam.frontends.tracking.resection import resect
@@ -42,28 +44,7 @@ from dualslam.map.submap import NO_LANDMARK, Submap
 FOLLOW_FRAMES = 2  # frames that the next one is matched with
 POINT_FRAMES = 6  # frames that a point is triangulated from
 GAP_FRAMES = 5  # frames before a gap that those beyond it are matched with
-MIN_CONTRAST = 4.0  # standard deviation of the greys; sensors have a noise of 1 to 3, and blank images have that alone
 SEED_KEYFRAMES = 8  # keyframes of the submap that the walk starts from
-N_PREFETCHED = 2  # usable frames beyond the one at hand: a gap relocalisation takes two
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Route:
-    """What a walk sets out from, and what it will come to.
-
-    Attributes
-    ----------
-    own : sequence of View
-        Of the submap's own keyframes.
-    ahead : sequence of View
-        In the order in which they will be given.
-    overlap_id : int
-        The first frame on the way that an older submap holds: a gap lies before it.
-    """
-
-    own: Sequence[View]
-    ahead: Sequence[View]
-    overlap_id: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,9 +94,9 @@ class PnpOdometry:
         self._auxiliary = auxiliary
         self._auxiliary_features = features
         self._route = route
-        self._place_on_route = {view.index: place for place, view in enumerate(route.ahead)}
         self._adjuster = adjuster
         self._config = config
+        self._min_features = config.tracking.min_inliers
         self._size_px = size_px
         self._map = AuxiliaryMap(live.submap)
         self._tracks_live = tracks_live
@@ -201,9 +182,11 @@ class PnpOdometry:
                 self._map.put(view.index, self.reference_id, track.T_cam_submap)
                 self._pending[view.index] = view
                 return track
-        features: Features | Failure | None = self._lack(view)
+        features: Features | Failure | None = find_lack(view, self._min_features)
         if features is None:
-            self._auxiliary_features.prefetch(chain(self._needed().values(), [view], self._usable_after(view)))
+            self._auxiliary_features.prefetch(
+                chain(self._needed().values(), [view], self._route.usable_after(view, self._min_features))
+            )
             self._catch_up()
             features = self._look_at(view)
         if isinstance(features, Failure):
@@ -258,29 +241,15 @@ class PnpOdometry:
         if index > self._route.overlap_id:
             self._auxiliary_features.prefetch([self._pending[k] for k in self._pending_keyframes()])
 
-    def _usable_after(self, view: View) -> Iterator[View]:
-        """Yield the next frames on the route in which features can be found."""
-        place = self._place_on_route.get(view.index, len(self._route.ahead))
-        usable = (after for after in self._route.ahead[place + 1 :] if self._lack(after) is None)
-        return islice(usable, N_PREFETCHED)
-
     def _features(self, view: View) -> Features | Failure:
-        lack = self._lack(view)
+        lack = find_lack(view, self._min_features)
         return self._look_at(view) if lack is None else lack
 
     def _look_at(self, view: View) -> Features | Failure:
         features = self._auxiliary_features.of(view)
-        if not isinstance(features, Failure) and len(features) < self._config.tracking.min_inliers:
+        if not isinstance(features, Failure) and len(features) < self._min_features:
             return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features of {self._auxiliary.name} in the image")
         return features
-
-    def _lack(self, view: View) -> Failure | None:
-        """Return why a frame is not worth a look."""
-        if len(view.features) < self._config.tracking.min_inliers:
-            return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image")
-        if view.image is not None and view.image.pixels()[::8, ::8].std() < MIN_CONTRAST:
-            return Failure(FailureReason.NO_TEXTURE, "a blank image")
-        return None
 
     def _matches(self, features: Features, frames: list[int]) -> dict[int, Matches]:
         return {k: self._auxiliary.match_wide(self._map.features(k), features) for k in reversed(frames)}

@@ -29,7 +29,7 @@ from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Failure, Features, FloatArray, IntArray, Track, View
 from dualslam.frontends.gap.patches import HALF_PX, Pyramid, build_pyramid, match_patches
 from dualslam.frontends.gap.uncertainty import pose_uncertainty
-from dualslam.frontends.tracking.rolling_shutter import find_as_read, straighten
+from dualslam.frontends.tracking.row_shifts import find_as_read, straighten
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 

@@ -8,10 +8,11 @@ import numpy as np
 
 from dualslam.config.settings import MappingConfig
 from dualslam.core.chi_square import CHI2_95
+from dualslam.core.estimates import MappingReport
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose
-from dualslam.core.interfaces import Frontend, MappingReport
+from dualslam.core.interfaces import Frontend
 from dualslam.core.quantiles import median
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Keyframe, Track
 from dualslam.frontends.features.groups import rank_in_runs

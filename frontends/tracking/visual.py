@@ -11,14 +11,16 @@ from collections.abc import Set
 import numpy as np
 
 from dualslam.config.settings import Config
+from dualslam.core.estimates import GraphEstimate, KeyframeReport
 from dualslam.core.geometry import se3
-from dualslam.core.interfaces import Frontend, GraphEstimate, KeyframeReport, SubmapGraph, WindowSolver
+from dualslam.core.interfaces import Frontend, SubmapGraph, WindowSolver
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like
 from dualslam.frontends.tracking.mapper import Mapper
 from dualslam.frontends.tracking.tracker import GivenPose, Tracker
-from dualslam.map.submap import RelativePose, Submap
+from dualslam.map.anchors import RelativePose
+from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 
 REBUILD_INLIER_RATIO = 0.65

@@ -9,7 +9,7 @@ from dualslam.backend.edge_covariance import _linearise, _unit, edge_covariances
 from dualslam.backend.local_ba import bundle_adjust
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, sim3
-from dualslam.map.submap import RelativePose
+from dualslam.map.anchors import RelativePose
 from dualslam.testing.atlas_world import DriftingMap
 from dualslam.testing.point_world import CAMERA
 

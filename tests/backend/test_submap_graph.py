@@ -12,7 +12,7 @@ from dualslam.backend.window import NumpyWindowSolver
 from dualslam.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
-from dualslam.map.submap import RelativePose
+from dualslam.map.anchors import RelativePose
 from dualslam.testing.graph_scene import Feeder, make_scene, pose_errors
 
 OPTIMUM_MU, OPTIMUM_RAD = 5e-3, 5e-3

@@ -16,9 +16,9 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import LensCorrection, correction_of
 from dualslam.core.camera.rectification import rectify
 from dualslam.core.errors import SolverError
+from dualslam.core.estimates import CalibrationEstimate
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, so3
-from dualslam.core.interfaces import CalibrationEstimate
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Frame, View
 from dualslam.map.propagation import propagate_anchors, propagate_poses
 from dualslam.map.submap import Submap

@@ -17,7 +17,8 @@ from dualslam.core.types import Features, Keyframe
 from dualslam.io import load_map, load_submap, map_files, save_map, save_submap
 from dualslam.io.map_files import Arrays, load_arrays, save_arrays, submap_to_arrays
 from dualslam.io.map_store import submap_path
-from dualslam.map.submap import RelativePose, Submap
+from dualslam.map.anchors import RelativePose
+from dualslam.map.submap import Submap
 
 
 def features(rng: np.random.Generator, n: int) -> Features:

@@ -19,9 +19,10 @@ from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure, FailureReason
 from dualslam.io.map_files import load_arrays, save_arrays
 from dualslam.io.map_store import load_atlas, save_atlas
+from dualslam.map.anchors import Anchor
 from dualslam.map.atlas import Link, LinkKind
 from dualslam.map.bending import bend_submap
-from dualslam.map.submap import Anchor, Submap
+from dualslam.map.submap import Submap
 from dualslam.map.warp import Warp
 from dualslam.testing.atlas_world import LINK_SIGMAS, DriftingMap, lap_in_submaps
 

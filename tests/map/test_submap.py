@@ -11,7 +11,8 @@ from dualslam.core.events import EventKind, EventLog
 from dualslam.core.geometry import se3
 from dualslam.core.stage_timer import StageTimer
 from dualslam.core.types import Keyframe, Start, View
-from dualslam.map.submap import NO_LANDMARK, RelativePose, Submap
+from dualslam.map.anchors import RelativePose
+from dualslam.map.submap import NO_LANDMARK, Submap
 from dualslam.map.tables import Table
 from dualslam.testing.point_world import make_features, path
 

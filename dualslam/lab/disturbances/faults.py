@@ -16,8 +16,9 @@ import numpy as np
 
 from dualslam.config.corruption import INTERNAL_KINDS, Corruption, CorruptionKind
 from dualslam.core.errors import SolverError
+from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import so3
-from dualslam.core.interfaces import KeyframeReport, Seeker, SubmapGraph, VisualOdometry
+from dualslam.core.interfaces import Seeker, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, Track, View
 from dualslam.map.submap import Submap
 from dualslam.recovery.executor import Outcome, RecoveryExecutor

@@ -22,8 +22,8 @@ import numpy as np
 
 from dualslam.config.calibration_config import CalibrationConfig
 from dualslam.config.settings import LinkingConfig
+from dualslam.core.estimates import PreferredCamera
 from dualslam.core.geometry import so3
-from dualslam.core.interfaces import PreferredCamera
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking.estimate import LinkEstimate

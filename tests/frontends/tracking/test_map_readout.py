@@ -11,12 +11,14 @@ import pytest
 
 from dualslam.calibration import shutter_watch
 from dualslam.calibration.shutter_watch import INFLATION, MIN_SIGMAS
+from dualslam.core.estimates import KeyframeReport, ReadoutEstimate
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, so3
-from dualslam.core.interfaces import KeyframeReport, ReadoutEstimate, VisualOdometry
+from dualslam.core.interfaces import VisualOdometry
 from dualslam.core.types import Failure, Features, FloatArray, Frame, IntArray, Keyframe, Track, View
 from dualslam.frontends.tracking.map_readout import MIN_KEYFRAMES, ReadoutQuestion, answer_readout, ask_readout
-from dualslam.frontends.tracking.rolling_shutter import TurnMeter, correct_shutter, find_as_read, straighten
+from dualslam.frontends.tracking.rolling_shutter import TurnMeter
+from dualslam.frontends.tracking.row_shifts import correct_shutter, find_as_read, straighten
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.map.submap import Submap
 from dualslam.system import System

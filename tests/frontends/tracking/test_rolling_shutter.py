@@ -12,13 +12,9 @@ from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray, Frame, View
 from dualslam.frontends.features.orb import OrbFrontend
-from dualslam.frontends.tracking.rolling_shutter import (
-    READOUTS_S,
-    RollingShutter,
-    TurnMeter,
-    _mean,
-    correct_shutter,
-)
+from dualslam.frontends.tracking.pair_readout import READOUTS_S, _mean
+from dualslam.frontends.tracking.rolling_shutter import RollingShutter, TurnMeter
+from dualslam.frontends.tracking.row_shifts import correct_shutter
 from dualslam.frontends.tracking.turning import turn_between
 from dualslam.system import System
 from dualslam.testing.point_world import (

@@ -10,8 +10,8 @@ import pytest
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.config.settings import Config, KeyframeConfig
 from dualslam.core.chi_square import CHI2_95
+from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.interfaces import KeyframeReport
 from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe, Track, View
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like, parallax_deg

@@ -15,8 +15,8 @@ from dualslam.build import adjust_submap
 from dualslam.config.calibration_config import CalibrationConfig
 from dualslam.config.settings import LinkingConfig
 from dualslam.core.camera.models import PinholeCamera
+from dualslam.core.estimates import PreferredCamera
 from dualslam.core.geometry import se3, sim3, so3
-from dualslam.core.interfaces import PreferredCamera
 from dualslam.core.types import Failure, FailureReason, IntArray
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking import NO_BEND, Bend, LinkEstimate, check_camera, propagate_to_live_end

@@ -1,0 +1,188 @@
+"""What the interfaces hand over: estimates of a graph, a camera and a shutter, and what a keyframe did to the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dualslam.core.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from dualslam.core.camera.corrected import LensCorrection
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraphEstimate:
+    """What a solved graph hands back to its submap: refined variables, and how well the newest factors fit.
+
+    Attributes
+    ----------
+    keyframe_ids : (K,) int64, T_submap_kf : (K, 4, 4)
+    landmark_ids : (L,) int64, xyz_mu : (L, 3)
+    outlier_rows : (R,) int64
+        Rows of the submap's observation table whose residual is beyond the graph's chi-square gate.
+    chi2_newest : float
+        Mean squared whitened residual per degree of freedom of the factors added last (1 is expected).
+    noise2 : float
+        Variance that the whitened residuals have (1 where the pixels' sigmas are right): what gates go by.
+    rebuilt : bool
+        True where the solver threw and the graph was made anew from the submap's arrays.
+    seconds : float
+        CPU time of the calling thread.
+    """
+
+    keyframe_ids: IntArray
+    T_submap_kf: FloatArray
+    landmark_ids: IntArray
+    xyz_mu: FloatArray
+    outlier_rows: IntArray
+    chi2_newest: float
+    noise2: float
+    rebuilt: bool
+    seconds: float
+
+    @property
+    def values(self) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
+        """Arguments of `Submap.apply_estimate`."""
+        return self.keyframe_ids, self.T_submap_kf, self.landmark_ids, self.xyz_mu
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationEstimate:
+    """What a submap's observations say about the camera that took them.
+
+    Attributes
+    ----------
+    correction : LensCorrection
+        Of the calibration that was given.
+    covariance : (5, 5)
+        Of ``correction.vector``, inflated for the correlation of neighbouring observations.
+    distance2 : float
+        Squared Mahalanobis distance from the correction that the submap was made with, whose covariance counts too
+        where it was estimated.
+    accepted : bool
+        Whether it is significantly better than that.
+    cost_before, cost_after : float
+        Sum of the Huber losses; before: poses and points as they were.
+    n_keyframes, n_observations : int
+    seconds : float
+    """
+
+    correction: LensCorrection
+    covariance: FloatArray
+    distance2: float
+    accepted: bool
+    cost_before: float
+    cost_after: float
+    n_keyframes: int
+    n_observations: int
+    seconds: float
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """All of it by name, for the event log."""
+        names = ("log_focal", "du_px", "dv_px", "k1", "k2")
+        sigmas = np.sqrt(np.diag(self.covariance)).tolist()
+        return {
+            **dict(zip(names, self.correction.vector.tolist(), strict=True)),
+            **{f"{name}_sigma": sigma for name, sigma in zip(names, sigmas, strict=True)},
+            "distance2": self.distance2,
+            "cost_before": self.cost_before,
+            "cost_after": self.cost_after,
+            "keyframes": self.n_keyframes,
+            "observations": self.n_observations,
+            "seconds": self.seconds,
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreferredCamera:
+    """The camera that keyframes of a submap would rather have than the one that rectified their features.
+
+    Attributes
+    ----------
+    log_focal : float
+        The logarithm of both focal lengths that their pixels ask for, less that of the camera's.
+    log_focal_sigma : float
+    distance2 : float
+        Squared Mahalanobis distance of the whole correction from the camera's.
+    beyond_chance : bool
+        Whether the pixels contradict the camera.
+    keyframe_ids : (K,) int64
+    T_now, T_preferred : (K, 4, 4)
+        Their poses by the same pixels, and by these alone, under the camera of now and under the preferred one; each in
+        a frame and unit of its own.
+    """
+
+    log_focal: float
+    log_focal_sigma: float
+    distance2: float
+    beyond_chance: bool
+    keyframe_ids: IntArray
+    T_now: FloatArray
+    T_preferred: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class MappingReport:
+    """What one keyframe added and removed."""
+
+    n_new: int
+    n_merged: int
+    n_culled: int
+    n_extended: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeReport:
+    """What a keyframe did to the map and how its graph took it.
+
+    Attributes
+    ----------
+    mapping : MappingReport
+    posed : GraphEstimate
+        With the keyframe's matches alone, before anything was placed from its pose.
+    grown : GraphEstimate, optional
+        With what was then added; None where the graph takes it in later.
+    culled_keyframe : int, optional
+    solver_failed : bool
+        It threw and had to be made anew.
+    """
+
+    mapping: MappingReport
+    posed: GraphEstimate
+    grown: GraphEstimate | None
+    culled_keyframe: int | None
+    solver_failed: bool = False
+
+    @property
+    def rebuilt(self) -> bool:
+        """Whether the graph was made anew, for whatever reason."""
+        return self.posed.rebuilt or (self.grown is not None and self.grown.rebuilt)
+
+    @property
+    def graph_seconds(self) -> float:
+        """Time that the window and the graph took."""
+        return self.posed.seconds + (self.grown.seconds if self.grown is not None else 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class ReadoutEstimate:
+    """By how much longer images are read, from the first row to the last, than their features were corrected for.
+
+    Attributes
+    ----------
+    more_s : float
+        Negative: they are read for less long.
+    sigma_s : float
+        Its standard deviation, by the residuals' own noise.
+    n_keyframes, n_observations : int
+        That told it.
+    """
+
+    more_s: float
+    sigma_s: float
+    n_keyframes: int
+    n_observations: int

@@ -1,0 +1,45 @@
+"""Where frames and keyframes stand by other keyframes of their submap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.core.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Anchor:
+    """Where a culled keyframe (or a plain frame) stands: a pose relative to a keyframe that is still there."""
+
+    keyframe_id: int
+    T_kf_cam: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativePose:
+    """Where a keyframe stands by what is no observation of the submap's landmarks: a gap relocalisation.
+
+    Attributes
+    ----------
+    keyframe_id : int
+        Relative to which other keyframe.
+    T_ref_kf : (4, 4)
+    covariance : (6, 6)
+        Of xi in ``T_ref_kf @ exp(xi)``: rotation, translation; positive definite.
+    """
+
+    keyframe_id: int
+    T_ref_kf: FloatArray
+    covariance: FloatArray
+
+    def scaled(self, scale: float) -> RelativePose:
+        """Return the same in another unit of length."""
+        T, units = self.T_ref_kf.copy(), np.repeat([1.0, scale], 3)
+        T[:3, 3] *= scale
+        return RelativePose(self.keyframe_id, T, units[:, None] * self.covariance * units)
+
+    def seen_from(self, keyframe_id: int, T_kf_ref: FloatArray) -> RelativePose:
+        """Return the same relative to another keyframe, of which the old one's place is known."""
+        return RelativePose(keyframe_id, T_kf_ref @ self.T_ref_kf, self.covariance)
