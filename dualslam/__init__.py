@@ -1,4 +1,4 @@
-"""Monocular SLAM on GTSAM submaps that recovers from tracking failure by walking backwards in time.
+"""Monocular SLAM on GTSAM submaps that recovers from tracking failure by reverse tracking.
 
 The Python interface; each name is imported when it is first used, so ``import dualslam`` is light and sets nothing::
 

@@ -174,7 +174,7 @@ class System:
         """
         return None if self._state.parts.open_features is None else self._state.parts.open_features()
 
-    def is_walking_back(self, submap_id: int) -> bool:
+    def is_tracking_in_reverse(self, submap_id: int) -> bool:
         """Whether reverse tracking from a submap is under way."""
         return self._recoveries.is_under_way(self.atlas.submaps[submap_id])
 

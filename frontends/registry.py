@@ -33,7 +33,7 @@ EXTRA_OPTIONS: Mapping[str, str] = {"kornia": "dualslam.frontends.features.korni
 
 FOR_WALKS = ("extract", "match_wide")
 FOR_MAPS = (*FOR_WALKS, "distance", "scale_factor", "n_octaves", "max_distance", "max_distance_strict")
-"""What a front end must have: to pose the frames of a walk back as a further attempt, and to make maps."""
+"""What a front end must have: to pose the frames of reverse tracking as a further attempt, and to make maps."""
 
 OptionsT = TypeVar("OptionsT", bound=BaseModel)
 

@@ -58,7 +58,7 @@ def test_all_frames_are_posed_and_right(plain: System, world: PointWorld) -> Non
     assert not plain.events.of_kind(EventKind.FAILED, EventKind.GRAPH_REBUILT)
 
 
-def test_the_frames_before_the_start_are_posed_by_walking_back() -> None:
+def test_the_frames_before_the_start_are_posed_in_reverse() -> None:
     """The camera stands still first: the start comes late, and none of the frames before it is lost."""
     still = np.repeat(np.eye(4)[None], 15, 0)
     world = PointWorld(cloud(), np.concatenate([still, path(25, np.array([0.08, 0, 0.02]), np.array([0, -0.005, 0]))]))
@@ -166,7 +166,7 @@ def test_a_lost_map_that_is_seen_again_before_another_starts_is_gone_on_with() -
     assert len(system.atlas.submaps) == 1
     assert [k for k in kinds(system) if k in (EventKind.FAILED, EventKind.REINITIALISED)] == [EventKind.FAILED]
     indices, T = main_trajectory(system)
-    assert [i for i in range(70) if i not in indices] == list(range(25, 50)), "the first frame is walked back to"
+    assert [i for i in range(70) if i not in indices] == list(range(25, 50)), "the first frame is tracked back to"
     assert_right(indices[5:], T[5:], world)
     assert system.rows[69].status is FrameStatus.TRACKED
 

@@ -1,4 +1,4 @@
-"""Draw docs/failure.svg: a failure, the walk back in time and the fusion, from a real run on a synthetic street.
+"""Draw docs/failure.svg: a failure, reverse tracking and the fusion, from a real run on a synthetic street.
 
     python tools/failure_picture.py
 
@@ -103,7 +103,7 @@ class Picture:
         """Return the picture."""
         panels = [self._failure(), self._make_attempt(), self._fused()]
         words = [self._words(i, *text) for i, text in enumerate(self._texts())]
-        label = "Three steps of a recovery: a map is lost, a new map walks back in time, a similarity joins the two"
+        label = "Three steps of a recovery: a map is lost, a new map tracks in reverse, a similarity joins the two"
         return tag(
             "svg",
             tag("title", label),
@@ -187,7 +187,7 @@ class Picture:
                 "blue: the map that was lost",
             ),
             (
-                "2  A new map walks back in time",
+                "2  A new map tracks in reverse",
                 "in a frame and unit of its own, from images alone,",
                 f"until it holds {len(d['agreeing_keyframes'])} keyframes of the old one.",
             ),

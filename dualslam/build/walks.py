@@ -1,4 +1,4 @@
-"""What a walk back in time is made of: the live front end, and the attempts by others."""
+"""What reverse tracking is made of: the live front end, and the attempts by others."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from dualslam.recovery.linking.gates import DESCRIPTOR_RADIUS_PX
 from dualslam.recovery.reverse_tracking import Attempt, RecoveryParts
 
 FEATURE_THREADS = 2
-"""That find other front ends' features beside a walk back, where the tracking waits for it."""
+"""That find other front ends' features beside reverse tracking, where the tracking waits for it."""
 
 
 def _preferred_camera(
@@ -49,7 +49,7 @@ def recovery_parts(
     frontend: Frontend | None = None,
     n_threads: int = FEATURE_THREADS,
 ) -> RecoveryParts:
-    """Build what a walk back in time is made of, for images of this width and height; see `RecoveryParts.budget_s`.
+    """Build what reverse tracking is made of, for images of this width and height; see `RecoveryParts.budget_s`.
 
     `frontend`: the live one, where this process has it already: it may hold networks. `n_threads`: that find other
     front ends' features beside the walk; the results do not depend on it.

@@ -18,7 +18,7 @@ from dualslam.map.graph_beside import GraphServer
 from dualslam.map.skeleton import answer_edges
 from dualslam.places import PlaceVerifier
 from dualslam.places.search import search_places
-from dualslam.recovery.reverse_tracking import walk_back
+from dualslam.recovery.reverse_tracking import recover_in_steps
 from dualslam.recovery.scale_watch import SCALE_HANDLERS
 from dualslam.recovery.walk_news import WalkWatch
 from dualslam.workers.desk import Lane, WorkerDesk
@@ -63,7 +63,7 @@ READOUT_HANDLERS: Handlers = {JobKind.READOUT: answer_readout}
 
 
 def inline_handlers(config: Config, verifier: PlaceVerifier) -> Handlers:
-    """Build what is done at once where there are no workers; walks back have an executor of their own."""
+    """Build what is done at once where there are no workers; reverse tracking has an executor of its own."""
     return {
         **edge_handlers(config),
         **SCALE_HANDLERS,
@@ -88,13 +88,13 @@ def map_handlers(config: Config, size_px: tuple[int, int]) -> Handlers:
 
 
 def walk_handlers(config: Config, size_px: tuple[int, int], n_threads: int) -> Handlers:
-    """Build what a worker for long work does: walks back, calibrations, the search for places, and for the atlas."""
+    """Build what a worker for long work does: reverse tracking, calibrations, the search for places, the atlas."""
     budget_s = WORKER_BUDGET * config.recovery.time_limit_s
     frontend = create_frontend(config.frontend)
     parts = recovery_parts(config, size_px, budget_s, frontend, n_threads)
     verifier = place_parts(config, frontend, size_px).verifier
     return {
-        JobKind.WALK: lambda job: walk_back(job, parts),
+        JobKind.WALK: lambda job: recover_in_steps(job, parts),
         **edge_handlers(config),
         **SCALE_HANDLERS,
         **READOUT_HANDLERS,

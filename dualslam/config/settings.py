@@ -105,7 +105,7 @@ class HealthConfig(StrictModel):
 
 
 class AttemptConfig(StrictModel):
-    """One attempt at a recovery: where its walk back takes the poses from. It may be written as one word, which is
+    """One attempt at a recovery: where its poses come from. It may be written as one word, which is
     `live`, `gap` (`{frontend: sift, tracking: live}`) or a front end's name.
     """
 
@@ -148,7 +148,7 @@ class AttemptConfig(StrictModel):
 
 
 class RecoveryConfig(StrictModel):
-    """The walk back in time that joins a new submap to the one that was lost."""
+    """Reverse tracking that joins a new submap to the one that was lost."""
 
     enabled: bool = True
     """Off: a lost track ends the submap, and the next one stays apart from it."""
@@ -161,21 +161,21 @@ class RecoveryConfig(StrictModel):
     """In this order, each from the same snapshot of the new map, until one leads to a link. A list of words will do,
     such as `[live, gap, sift]`; an attempt with settings is written `{frontend: sift, n_features: 3000}`."""
     relocalise_after: int | None = Field(15, ge=0)
-    """Frames that show something without a start, after which a lost map is looked for, and continued where it is
-    seen again; null: never. A map that starts sooner is better linked, by all that a walk back finds: most start within
-    2 to 5 frames, unless the camera turns in place, and then it may come back to what the lost map shows before any
-    can start."""
+    """Frames that show something without a start, after which a lost map is looked for, and continued where it is seen
+    again; null: never. A map that starts sooner is better linked, by all that reverse tracking finds: most start within
+    2 to 5 frames, unless the camera turns in place, and then it may come back to what the lost map shows before any can
+    start."""
     retry_keyframes: tuple[int, ...] = (5, 15)
-    """Keyframes of the new map, from its start on, at which a walk back that has found no link, or left buffered frames
-    without a pose, is made again: the map knows depths better then, and more of the scene. It is too when the camera
-    has been calibrated since, and, if any number stands here, when the run ends and the map has grown since. One for
-    poses alone that finds none is the last."""
+    """Keyframes of the new map, from its start on, at which reverse tracking that has found no link, or left buffered
+    frames without a pose, is made again: the map knows depths better then, and more of the scene. It is too when the
+    camera has been calibrated since, and, if any number stands here, when the run ends and the map has grown since. One
+    for poses alone that finds none is the last."""
     covering_keyframes: int = Field(20, ge=0)
     """Keyframes that a walk which only poses frames, or a search for a lost map, matches widely at most, beyond those
     nearest in time: the ones that together show the most of the map, since in a gap the
     camera may have looked anywhere. Each costs about 2 ms of CPU for a frame that is not found."""
     workers: int = Field(0, ge=0, le=16)
-    """Processes for long work beside the tracking, which never waits for it (`--workers`): walks back and
+    """Processes for long work beside the tracking, which never waits for it (`--workers`): reverse tracking and
     self-calibration. With any there is one more, which solves the live map's graph. 0: inline, in the tracking process,
     which waits: the only way in which the same seed gives the same trajectory."""
     time_limit_s: float = Field(120.0, gt=0)
@@ -186,7 +186,7 @@ class RecoveryConfig(StrictModel):
 
 
 class BufferConfig(StrictModel):
-    """The frames that a walk back in time can still read."""
+    """The frames that reverse tracking can still read."""
 
     duration_s: float = Field(10.0, gt=0)
     """Seconds of video that are kept (the paper's k) while there is a map to track; before it and after it, all is."""
@@ -260,8 +260,8 @@ class LinkingConfig(StrictModel):
 
     @property
     def max_live_scale_sigma(self) -> float:
-        """Largest standard deviation of the scale at the new map's live end, with what the walk back has lost of it on
-        the way from there to the overlap; and beyond a gap over which wide matching has skipped while tracking.
+        """Largest standard deviation of the scale at the new map's live end, with what reverse tracking has lost of it
+        on the way from there to the overlap; and beyond a gap over which wide matching has skipped while tracking.
         """
         return self.wrong_scale / 2
 
@@ -274,8 +274,8 @@ class LinkingConfig(StrictModel):
 
     @property
     def max_gap_scale_sigma(self) -> float:
-        """Largest standard deviation of the scale beyond a gap of a walk back, by the Hessian of its wide matches: the
-        landmarks that are found again beyond the gap halve it, if the gap relocalisation is right.
+        """Largest standard deviation of the scale beyond a gap of reverse tracking, by the Hessian of its wide matches:
+        the landmarks that are found again beyond the gap halve it, if the gap relocalisation is right.
         """
         return self.wrong_scale
 
@@ -293,9 +293,9 @@ class AuditConfig(StrictModel):
     """Whether a map is asked, once it has matured, if it is right."""
 
     enabled: bool = True
-    """Whether the younger part of a map walks back over its start, confirms it or cuts it off (a walk over some ten
-    keyframes a map; off as well where recovery is, `recovery.enabled`), and whether a map is parted where it has not
-    handed its scale on."""
+    """Whether the younger part of a map tracks in reverse over its start, confirms it or cuts it off (a walk over some
+    ten keyframes a map; off as well where recovery is, `recovery.enabled`), and whether a map is parted where it has
+    not handed its scale on."""
 
 
 class AtlasConfig(StrictModel):

@@ -18,7 +18,7 @@ def keep_freed_memory() -> bool:
     """Tell the C library to keep freed memory for what is allocated next.
 
     glibc gives arrays of some size back to the system at once, which hands out fresh pages, zeroed, for the next ones:
-    a fifth of the CPU time of a walk back with SIFT on KITTI. Results are the same.
+    a fifth of the CPU time of reverse tracking with SIFT on KITTI. Results are the same.
 
     Call it in a program of your own as in ours; importing dualslam does not call it.
 

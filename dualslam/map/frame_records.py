@@ -12,7 +12,7 @@ from dualslam.core.types import Failure, FloatArray, FrameStatus
 
 @dataclass(slots=True)
 class FrameRow:
-    """What became of one frame so far: a row of ``frames.csv``. A later walk back in time may still pose it.
+    """What became of one frame so far: a row of ``frames.csv``. Reverse tracking may still pose it later.
 
     Attributes
     ----------

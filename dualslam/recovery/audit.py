@@ -1,8 +1,8 @@
-"""The start of a map, asked again once the map has matured: a walk back over it, on its own triangulations.
+"""The start of a map, asked again once the map has matured: reverse tracking over it, on its own triangulations.
 
 A start rests on two or three views, and all that follows inherits what is wrong with it. Later the map knows better,
 and the frames of the start are still buffered. So the younger half of the map alone, without anything that only the
-start has seen, walks back over these frames as a new map walks back over a lost one; and the two are compared frame by
+start has seen, tracks in reverse over these frames as a new map does over a lost one; and the two are compared frame by
 frame. Where they agree the start is confirmed. Where they part for good, and the walk is the one that holds its scale
 and explains no less of the images, the start is cut off: it becomes a submap of its own, and its frames take the walk's
 poses.
@@ -100,7 +100,7 @@ def cut_start(submap: Submap, first: int) -> None:
 def judge_start(
     live: Submap, poses: Mapping[int, FramePose], n_inliers: Mapping[int, int], job: RecoveryJob, result: RecoveryResult
 ) -> AuditReport:
-    """Compare the start of a map with what the walk back has found.
+    """Compare the start of a map with what reverse tracking has found.
 
     Parameters
     ----------

@@ -78,7 +78,7 @@ class Audits:
         )
 
     def take(self, job: RecoveryJob, result: RecoveryResult | Failure, now: FrameStamp, take_in: TakeIn) -> None:
-        """Compare a map's start with the walk back over it, and act on the verdict."""
+        """Compare a map's start with reverse tracking over it, and act on the verdict."""
         record, submap = self._record, self._record.atlas.submaps[job.submap.id]
         if isinstance(result, Failure):
             record.event(EventKind.AUDITED, now, submap.id, verdict=str(Verdict.UNDECIDED), detail=result.detail)

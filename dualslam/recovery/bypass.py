@@ -1,4 +1,4 @@
-"""Frames of a lost map that change to the map that walked back over them, or stay without a pose."""
+"""Frames of a lost map that change to the map that has tracked over them in reverse, or stay without a pose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The frames that a walk back in time can still read: features and grey images, in both directions of time.
+"""The frames that reverse tracking can still read: features and grey images, in both directions of time.
 
 K = k + k_r frames: the last k while all is well, and all that came since while the live submap is lost. Memory has a
 hard bound, which k frames and a short loss stay far below. A long loss (a lens that stays covered) reaches it, and then

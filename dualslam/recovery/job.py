@@ -1,4 +1,4 @@
-"""What a walk back in time is given, and what it returns: data that can be pickled."""
+"""What reverse tracking is given, and what it returns: data that can be pickled."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dualslam.recovery.overlap_refinement import OverlapReport
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecoveryJob:
-    """Everything that a walk back needs, as it was when the new submap started. It can be pickled.
+    """Everything that reverse tracking needs, as it was when the new submap started. It can be pickled.
 
     Attributes
     ----------

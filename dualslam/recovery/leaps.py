@@ -222,7 +222,7 @@ class LeapWatch:
         self.end()
         centres = np.array([submap.resolve_anchor(p.keyframe_id, p.T_kf_cam)[:3, 3] for p in poses])
         times *= np.sign(usual_s or 1.0)
-        # A walk back may have posed frames before the first one: the leap is before these.
+        # Reverse tracking may have posed frames before the first one: the leap is before these.
         missing = np.flatnonzero(np.diff(times[: place + 1]) > MISSING * abs(usual_s))
         if not len(missing):
             return None

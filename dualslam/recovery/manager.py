@@ -57,7 +57,7 @@ class _UnderWay:
 
 
 class Recoveries:
-    """Starts a walk back for each new submap, and merges what it found at a frame boundary.
+    """Starts reverse tracking for each new submap, and merges what it found at a frame boundary.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class Recoveries:
             self._lost[submap_id] = Loss(onset, cause, first_lost)
 
     def is_under_way(self, submap: Submap) -> bool:
-        """Whether a walk back from a submap has not come to its end yet."""
+        """Whether reverse tracking from a submap has not come to its end yet."""
         return submap.id in self._under_way
 
     def found_again(self, submap: Submap) -> None:
@@ -122,7 +122,7 @@ class Recoveries:
         self._settle(live.submap.id, live)
 
     def start(self, submap: Submap, newest: View, now: FrameStamp | None = None) -> None:
-        """Start the walk back from a new submap: over the frames without a pose, then on into the lost submaps.
+        """Start reverse tracking from a new submap: over the frames without a pose, then on into the lost submaps.
 
         It begins at its keyframe `newest`, also where it is made again later (`now`).
         """
@@ -141,7 +141,7 @@ class Recoveries:
         self._submit(submap, newest, self._views_before(newest, submap), onsets, now)
 
     def retry(self, submap: Submap, now: FrameStamp, last_chance: bool = False) -> None:
-        """Walk back again where something was left to find, once the new map has grown or its camera was calibrated.
+        """Track in reverse again where something was left to find, once the map has grown or its camera was calibrated.
 
         A link, while the buffer holds frames that a lost map saw; else poses of buffered frames that have none.
         `last_chance`: no frame comes any more.
@@ -159,7 +159,7 @@ class Recoveries:
             self._submit(submap, way[0], way[1:], {}, now)
 
     def audit_if_due(self, submap: Submap, now: FrameStamp) -> None:
-        """Walk back over the start of a map that has matured, as long as the buffer holds it: once a map."""
+        """Track in reverse over the start of a map that has matured, as long as the buffer holds it: once a map."""
         if submap.id in self._under_way or (job := self._audits.due(submap, now)) is None:
             return
         self._under_way[submap.id] = _UnderWay(time.perf_counter(), len(submap.keyframes), again=False)
@@ -200,7 +200,7 @@ class Recoveries:
         self._take(self._executor.poll(), live, now)
 
     def finish(self, live: VisualOdometry | None, last: FrameStamp | None, interrupted: bool) -> None:
-        """Walk back once more, merge what is under way after the last frame, if it ends soon, and end the executor.
+        """Track in reverse once more, merge what is under way after the last frame if it ends soon; end the executor.
 
         `interrupted`: no walk is begun any more.
         """

@@ -1,4 +1,4 @@
-"""What a walk back added to a snapshot of a submap, put into that submap as it has become meanwhile.
+"""What reverse tracking added to a snapshot of a submap, put into that submap as it has become meanwhile.
 
 Three states of one submap: the snapshot (`base`), the snapshot with what the walk added (`grown`), and the submap that
 went on (`live`): it may have grown at its other end, been solved again, changed its camera, or been archived. Landmark
@@ -24,7 +24,7 @@ Rectify = Callable[[Keyframe], Keyframe]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Merged:
-    """A submap with what a walk back added, not solved yet.
+    """A submap with what reverse tracking added, not solved yet.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Merged:
 
 
 def merge_recovery(live: Submap, base: Submap, grown: Submap, rectify: Rectify) -> Merged:
-    """Put the additions of a walk back into a copy of the live submap.
+    """Put the additions of reverse tracking into a copy of the live submap.
 
     Parameters
     ----------

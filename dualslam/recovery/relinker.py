@@ -1,4 +1,4 @@
-"""When a walk back tries to link its submap with the lost ones, and when it has tried enough."""
+"""When reverse tracking tries to link its submap with the lost ones, and when it has tried enough."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Algorithm 1: walk back in time from a new submap until it overlaps a lost one so well that a Sim(3) links the two.
+"""Algorithm 1: reverse tracking from a new submap until it overlaps a lost one so well that a Sim(3) links the two.
 
 The walk is a visual front end, given the buffered frames latest first. It sees images and features only, never the
 old map's poses or landmarks: a link must not confirm itself. What it takes from the old map is which frames were
@@ -42,7 +42,7 @@ Judge = Callable[[Track | Failure], Track | Failure]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attempt:
-    """One way to walk back, by the name of the front end that its poses come from."""
+    """One way to track in reverse, by the name of the front end that its poses come from."""
 
     name: str
     new_odometry: Callable[[RecoveryJob, Submap, SubmapGraph], VisualOdometry]
@@ -73,15 +73,15 @@ class RecoveryParts:
 def run_recovery(
     job: RecoveryJob, parts: RecoveryParts, tell: Callable[[WalkNews], None] | None = None
 ) -> RecoveryResult | Failure:
-    """Walk back from the job's submap until a link to a lost one passes its gates, or no frames are left.
+    """Track in reverse from the job's submap until a link to a lost one passes its gates, or no frames are left.
 
     The job is left as it was. Where there is no map to link with, the live features pose the frames before the start.
     `tell` is called now and then with how far it has come.
     """
-    return result_of(walk_back(job, parts), tell)
+    return result_of(recover_in_steps(job, parts), tell)
 
 
-def walk_back(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNews, None, RecoveryResult | Failure]:
+def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNews, None, RecoveryResult | Failure]:
     """Do what `run_recovery` does; yields how far it has come, and nothing depends on who takes notice."""
     started, cpu_started = time.perf_counter(), time.process_time()
     best: _Progress | None = None
@@ -296,7 +296,7 @@ def _event_of(job: RecoveryJob, progress: _Progress, attempt: str, seconds: floa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReverseStep:
-    """One frame of a walk back: where it was found to be or why not, and whether it became a keyframe."""
+    """One frame of reverse tracking: where it was found to be or why not, and whether it became a keyframe."""
 
     view: View
     track: Track | Failure
@@ -326,7 +326,7 @@ def track_in_reverse(
         try:
             step = _track_one(reverse_tracker, view, judge(reverse_tracker.track(view)), view.index in keyframe_ids)
         except SolverError as error:
-            log.warning("the walk back ends: %s", error)
+            log.warning("reverse tracking ends: %s", error)
             return
         yield step
         n_failed = 0 if step.track else n_failed + 1

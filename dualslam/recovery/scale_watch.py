@@ -141,7 +141,7 @@ class ScaleWatch:
         if end == len(ids):
             return None  # the map was parted meanwhile: nothing is left behind the group
         if _n_ties(submap, ids, begin, end, n_views=2) >= FIRM_TIES:
-            return None  # a walk back, or a loop, has tied them meanwhile
+            return None  # reverse tracking, or a loop, has tied them meanwhile
         seam = min(range(begin, end + 1), key=lambda place: _n_ties(submap, ids, place, place))
         first = int(ids[seam])
         return None if _is_linked(submap.id, first, links) else ScaleLoss(int(group[0]), first, sigma)

@@ -1,4 +1,4 @@
-"""When a walk back is made again, and over which frames: those without a pose, and what leads to them."""
+"""When reverse tracking is made again, and over which frames: those without a pose, and what leads to them."""
 
 from __future__ import annotations
 

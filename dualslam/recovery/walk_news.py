@@ -1,4 +1,4 @@
-"""What is told of a walk back while it is under way, to those who look on: it never changes the walk.
+"""What is told of reverse tracking while it is under way, to those who look on: it never changes the walk.
 
 News are whole, not what is new since the last: one that is lost matters to nobody.
 """
@@ -23,7 +23,7 @@ MAX_POINTS = 128
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WalkNews:
-    """How far a walk back has come.
+    """How far reverse tracking has come.
 
     Attributes
     ----------

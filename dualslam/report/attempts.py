@@ -1,4 +1,4 @@
-"""Tables of one failure's recovery: the walks back, and the links that were tried, with their numbers and verdicts."""
+"""Tables of one failure's recovery: reverse tracking and the links that were tried, with numbers and verdicts."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _LINK = ("back at", "verdict", "attempt", "keyframes", "matches", "inliers", "sc
 
 
 def attempt_table(walks: Sequence[Event]) -> Markup:
-    """Return a table of the attempts to walk back."""
+    """Return a table of the attempts at reverse tracking."""
     return (
-        _titled("Walks back in time", _table(_WALK, [_attempt_cells(event) for event in walks]), None)
+        _titled("Reverse tracking", _table(_WALK, [_attempt_cells(event) for event in walks]), None)
         if walks
         else join(None)
     )

@@ -35,7 +35,7 @@ class FailureStory:
     restart : dict or None
         Where the next map began.
     walks : list of dict
-        Attempts to walk back from a later map to the lost one.
+        Attempts at reverse tracking from a later map to the lost one.
     broken : list of dict
         Recoveries that came to nothing by themselves: the worker died, the solver failed.
     tries : list of dict
@@ -168,7 +168,7 @@ def _told(run: RunData, story: FailureStory) -> str:
     )
     if story.walks and "k_r" in story.walks[0]:
         k, k_r = story.walks[0]["k"], story.walks[0]["k_r"]
-        told.append(f"The walk back could read {k} frames from before the loss and {k_r} since (k and k_r).")
+        told.append(f"Reverse tracking could read {k} frames from before the loss and {k_r} since (k and k_r).")
     return " ".join([*told, _outcome(story)])
 
 
@@ -181,16 +181,17 @@ def _outcome(story: FailureStory) -> str:
         bypassed = (story.fused or {}).get("bypassed")
         bypass = f" By-passed at the lost map's end: {count(bypassed, 'frame')}." if bypassed else ""
         return (
-            f"Walking back in time, the recovery linked it{took}{after}: {_link_words(link)}.{bypass}"
+            f"By reverse tracking, the recovery linked it{took}{after}: {_link_words(link)}.{bypass}"
             if "scale" in link
             else f"The recovery linked the two{took}{after}.{bypass}"
         )
     if story.absorbed is not None:
         frames = count(story.absorbed["frames"], "frame")
-        return f"Walking back in time, submap {story.absorbed['submap']} posed all its {frames}: no link is needed."
+        return f"By reverse tracking, submap {story.absorbed['submap']} posed all its {frames}: no link is needed."
     broken = "".join(f" A recovery failed: {e.get('detail') or e.get('reason')}." for e in story.broken)
     if not refused:
-        why = "the walk back in time met too few keyframes of the lost map" if story.walks else "there was no walk back"
+        met_few = "reverse tracking met too few keyframes of the lost map"
+        why = met_few if story.walks else "there was no reverse tracking"
         return f"No link was tried: {why}.{broken}"
     reasons = Counter(str(e.get("reason", "?")).replace("_", " ") for e in refused)
     common = ", ".join(f"{reason} ({n})" if len(reasons) > 1 else reason for reason, n in reasons.most_common(3))

@@ -122,7 +122,7 @@ def _tiles(run: RunData) -> Markup:
 def _recovery_words(summary: dict[str, Any]) -> str:
     seconds = sorted(summary.get("recovery_s") or [])
     if not seconds:
-        return "links made by a walk back in time"
+        return "links made by reverse tracking"
     return f"links made; {number(seconds[len(seconds) // 2])} s each (median)"
 
 

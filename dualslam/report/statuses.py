@@ -9,7 +9,7 @@ from dualslam.core.types import FrameStatus
 
 MEANING: dict[FrameStatus, str] = {
     FrameStatus.TRACKED: "posed by the live front end",
-    FrameStatus.RECOVERED: "posed by the walk back in time",
+    FrameStatus.RECOVERED: "posed by reverse tracking",
     FrameStatus.BYPASSED: "end of a lost map, posed in the new one",
     FrameStatus.LOST: "no pose: the map could not explain the frame",
     FrameStatus.INITIALISING: "no pose: there was no map",

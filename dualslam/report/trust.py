@@ -27,8 +27,9 @@ def trust_section(run: RunData) -> Markup:
     """Return the words, the table of verdicts, and the strips of what is claimed."""
     rows = [_row(event, *told) for event in run.events if (told := _told(event)) is not None]
     words = (
-        "Once a map has matured it walks back over its own start, on points of its own: what agrees is confirmed, what "
-        "does not is cut off and posed again. Links, gaps and places that two answers explain alike are not believed."
+        "Once a map has matured it tracks in reverse over its own start, on points of its own: what agrees is "
+        "confirmed, what does not is cut off and posed again. Links, gaps and places that two answers explain alike "
+        "are not believed."
     )
     verdicts = cards(_HEADS, rows) if rows else tag("p", "Nothing was audited or doubted.", cls="empty")
     strips = (
@@ -52,7 +53,8 @@ def _told(event: dict[str, Any]) -> tuple[str, str] | None:
     """Return the question and its outcome, where an event is about trust."""
     kind, detail = event.get("event"), str(event.get("detail") or "")
     if kind == "audited":
-        return "its start, walked back over", " ".join(filter(None, [str(event["verdict"]), detail and f"({detail})"]))
+        verdict = " ".join(filter(None, [str(event["verdict"]), detail and f"({detail})"]))
+        return "its start, by reverse tracking", verdict
     if kind == "cut":
         left = len(event.get("left", ()))
         return "its start was wrong", f"cut off; {event['reposed']} frames posed again, {left} left without"

@@ -23,10 +23,10 @@ class Components:
     """The parts that the composition root puts in: the system itself knows neither front end nor solver.
 
     `new_relocaliser`: a front end that finds its submap again wherever it is seen, and tracks from there.
-    `walk_watch`: hears of walks back that are under way. `desk`: does the work beside the tracking; reverse tracking
-    has an executor of its own, which may use the same desk. `graphs`: carries changes to submaps' graphs in another
-    process and back, if they are solved there. `open_features`: starts one more process, and returns a function that
-    has the features of a frame found there.
+    `walk_watch`: hears of reverse tracking that is under way. `desk`: does the work beside the tracking; reverse
+    tracking has an executor of its own, which may use the same desk. `graphs`: carries changes to submaps' graphs in
+    another process and back, if they are solved there. `open_features`: starts one more process, and returns a function
+    that has the features of a frame found there.
     """
 
     view_of: Callable[[Frame], View | Failure]

@@ -107,7 +107,7 @@ class LiveView:
         self._save()
 
     def _on_walk(self, news: WalkNews) -> None:
-        """Tell of a walk back, for which the run itself waits where there are no workers."""
+        """Tell of reverse tracking, for which the run itself waits where there are no workers."""
         assert self._teller is not None
         self._teller.note_walk(news)
         if self._last is not None:

@@ -36,7 +36,7 @@ POINT_SHARE = 0.15
 WHOLE, FOLLOW, FREE = "the whole map", "follow the camera", "free"
 UP = (0.0, -1.0, 0.0)
 WALK_RGB = (245, 245, 245)
-"""Of the way of a walk back that is under way: no submap's."""
+"""Of the way of reverse tracking that is under way: no submap's."""
 GROWN, SHRUNK = 1.1, 0.8
 """So many times as large as it was when it was shown whole, a map is shown whole again."""
 NARROW_PX, COVERED = 640, 0.6
@@ -222,7 +222,7 @@ class Page:
         camera.color = rgb(colour)
 
     def _move_walkers(self) -> None:
-        """Show how far each walk back has come: its way, and a camera where it has posed a frame last."""
+        """Show how far reverse tracking has come: its way, and a camera where it has posed a frame last."""
         lines = self._scene.walk_lines()
         self._ways.visible = bool(len(lines))
         if len(lines):
@@ -254,7 +254,7 @@ class Page:
                 self._note_event(event)
         submaps = [f"{count(len(message.components), 'map')} of {count(len(self._scene.drawn), 'submap')}"]
         at = {walk.submap_id: f" ({walk.words})" for walk in self._scene.walks}
-        submaps += [f"walking back in time from submap {m}{at.get(m, '')}" for m in message.walking]
+        submaps += [f"tracking in reverse from submap {m}{at.get(m, '')}" for m in message.walking]
         if message.backlog:
             submaps.append(f"{count(message.backlog, 'job')} beside the tracking")
         lead = "the run is over" if message.over else f"frame {message.frame}, {message.timestamp_s:.2f} s"

@@ -37,7 +37,7 @@ LEAST_EXTENT = 2.0
 """A map's first landmarks are about 1 away."""
 TIMELINE_PX = (480, 28)
 MARK_PX, MARK_RGB = 2, (255, 255, 255)
-"""Half the width of the mark at the frame where a walk back is."""
+"""Half the width of the mark at the frame where reverse tracking is."""
 FEATURE_RGB, MATCHED_RGB = (150, 150, 150), (60, 220, 90)
 
 
@@ -62,7 +62,7 @@ class Drawn:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnWalk:
-    """A walk back that is under way.
+    """Reverse tracking that is under way.
 
     Attributes
     ----------
@@ -183,7 +183,7 @@ class LiveScene:
         return look_at, look_at - distance * AHEAD
 
     def walk_lines(self) -> NDArray[np.float32]:
-        """Return the ways of the walks back that are under way as lines, (N, 2, 3)."""
+        """Return the ways of the reverse tracking that is under way as lines, (N, 2, 3)."""
         lines = [np.stack([walk.way[:-1], walk.way[1:]], axis=1) for walk in self.walks]
         return np.concatenate(lines) if lines else np.zeros((0, 2, 3), np.float32)
 

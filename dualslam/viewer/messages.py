@@ -92,7 +92,7 @@ class EventWords:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Walk:
-    """A walk back that is under way. `place`: where its frame stands among all statuses; None where nowhere."""
+    """Reverse tracking that is under way. `place`: where its frame stands among all statuses; None where nowhere."""
 
     news: WalkNews
     place: int | None
@@ -124,7 +124,7 @@ class Message:
     events : tuple of EventWords
         New ones.
     walking : tuple of int
-        Submaps that are being walked back from.
+        Submaps that are being tracked from in reverse.
     walks : tuple of Walk
         Those walks of which anything is known.
     backlog : int
@@ -179,7 +179,7 @@ class Teller:
         system.on_pose = keep
 
     def note_walk(self, news: WalkNews) -> None:
-        """Keep what a walk back has told, for the next message."""
+        """Keep what reverse tracking has told, for the next message."""
         self._walks[news.submap_id] = news
 
     def tell(self, frame: Frame, result: FrameResult, over: bool = False, within_step: bool = False) -> Message:
@@ -191,7 +191,7 @@ class Teller:
         n_statuses = len(system.rows) - within_step  # what becomes of the newest is not known yet
         statuses = tuple(str(row.status) for row in islice(system.rows.values(), before, n_statuses))
         self._n_statuses = n_statuses
-        walking = tuple(m for m in system.atlas.submaps if system.is_walking_back(m))
+        walking = tuple(m for m in system.atlas.submaps if system.is_tracking_in_reverse(m))
         return Message(
             result.index,
             frame.timestamp_s,

@@ -11,8 +11,8 @@ from dualslam.map.frame_records import FrameResult
 from dualslam.recovery.walk_news import WalkNews
 from dualslam.system import System
 
-FINISHING = "all frames are in: ending the walks back, writing the results"
-"""Said once no frame is left to count: a last walk back may take seconds."""
+FINISHING = "all frames are in: ending reverse tracking, writing the results"
+"""Said once no frame is left to count: the last reverse tracking may take seconds."""
 IN_PLACE_S, LINE_S = 0.5, 15.0
 """Between two lines where the next takes the place of the one before, and where it stands below it."""
 
@@ -48,7 +48,7 @@ class RunState:
         self._last = result
         if self._walk is not None and self._system is not None:
             submap_id = self._walk.submap_id
-            self._walk = self._walk if self._system.is_walking_back(submap_id) else None
+            self._walk = self._walk if self._system.is_tracking_in_reverse(submap_id) else None
         self.changed()
 
     def is_paused(self) -> bool:
@@ -69,7 +69,7 @@ class RunState:
 
     @property
     def words(self) -> str:
-        """What is being done: posing frames, walking back, ending."""
+        """What is being done: posing frames, tracking in reverse, ending."""
         said = []
         if self.n_done == self.n_frames:
             said.append(FINISHING)
@@ -80,7 +80,7 @@ class RunState:
         if self._walk is not None:
             walk = self._walk
             said.append(
-                f"walking back in time from submap {walk.submap_id}: at frame {walk.frame}, {walk.n_posed} posed"
+                f"tracking in reverse from submap {walk.submap_id}: at frame {walk.frame}, {walk.n_posed} posed"
             )
         return "; ".join(said)
 

@@ -173,7 +173,7 @@ def _send_frames(stream: rr.RecordingStream, clock: _Clock, playback: Playback) 
 
 
 def _send_events(stream: rr.RecordingStream, clock: _Clock, events: Sequence[dict[str, Any]]) -> None:
-    """Send each event at the frame that it names: a walk back in time names frames before those that it came after."""
+    """Send each event at the frame that it names: reverse tracking names frames before those that it came after."""
     if not events:
         return
     times = clock.at(np.array([float(e["timestamp_s"]) for e in events]), np.array([int(e["frame"]) for e in events]))

@@ -3,10 +3,10 @@
 A process, because GTSAM holds the interpreter's lock while it solves. A worker that dies, or takes longer than its
 time, costs the job that it was busy with: the job ends as a `Failure`, and a fresh worker takes the place.
 
-Workers stand in lanes. One is for what the live map asks for all the time, so that no walk back of 20 s stands before
-its graph; one is for walks and whatever else may take long. Where cores are short, the system's scheduler gives way to
-the tracking first, then to the live map's lane (`Lane.niceness`). A lane's queue is bounded, and its most urgent kind
-goes first.
+Workers stand in lanes. One is for what the live map asks for all the time, so that no reverse tracking of 20 s stands
+before its graph; one is for walks and whatever else may take long. Where cores are short, the system's scheduler gives
+way to the tracking first, then to the live map's lane (`Lane.niceness`). A lane's queue is bounded, and its most urgent
+kind goes first.
 
 Workers are spawned, so a script of one's own that asks for them must be importable: what it runs stands under
 ``if __name__ == "__main__":``.

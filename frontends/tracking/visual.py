@@ -1,7 +1,7 @@
 """The visual front end: frames in, keyframes of one submap out, in either direction of time.
 
-The same object tracks live frames, walks back from a new submap's first keyframe to frames before it, and walks back
-through a buffer to an older submap: the only difference is the order in which it is given the frames.
+The same object tracks live frames, and tracks in reverse from a new submap's first keyframe, to the frames before it
+and through a buffer to an older submap: the only difference is the order in which it is given the frames.
 """
 
 from __future__ import annotations

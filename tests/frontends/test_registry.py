@@ -86,7 +86,7 @@ def test_what_is_no_front_end_is_a_config_error(name: str, said: str) -> None:
 
 
 class Half:
-    """What poses the frames of a walk back, and no more."""
+    """What poses the frames of reverse tracking, and no more."""
 
     extract = match_wide = None
 

@@ -1,4 +1,4 @@
-"""A map that has matured walks back over its start: a right start is confirmed, a wrong one is cut off and re-posed."""
+"""A matured map tracks in reverse over its start: a right one is confirmed, a wrong one is cut off and re-posed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A walk back that ends late: what it found comes into a map that has gone on, by any schedule."""
+"""Reverse tracking that ends late: what it found comes into a map that has gone on, by any schedule."""
 
 from __future__ import annotations
 

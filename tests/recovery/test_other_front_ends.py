@@ -1,4 +1,4 @@
-"""Failure, the walk back, the link and the map's files, with descriptors that are nothing like ORB's."""
+"""Failure, reverse tracking, the link and the map's files, with descriptors that are nothing like ORB's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Failure, the walk back, the link: on scenes of points, with the truth known."""
+"""Failure, reverse tracking, the link: on scenes of points, with the truth known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When a walk back tries to link, and when it has tried enough."""
+"""When reverse tracking tries to link, and when it has tried enough."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def holding(submap_id: int, keyframes: range) -> Submap:
 
 
 def tries_of_a_walk(n: int, **settings: Any) -> tuple[list[int], int | None]:
-    """Walk back from keyframe 199 over n more; return the numbers shared at each try, and at which it was enough."""
+    """Track back from keyframe 199 over n more; return the numbers shared at each try, and at which it was enough."""
     old, new = holding(0, range(200)), holding(1, range(200, 210))
     asked: list[int] = []
 

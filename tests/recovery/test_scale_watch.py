@@ -1,4 +1,4 @@
-"""A map that does not hand its scale on is parted there, and only there; a walk back may join the two again."""
+"""A map that does not hand its scale on is parted there, and only there; reverse tracking may join the two again."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def parted(monkeypatch: pytest.MonkeyPatch, recovery: bool) -> tuple[System, Poi
     return system, world, loss
 
 
-def test_both_parts_are_joined_by_a_walk_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_parts_are_joined_by_reverse_tracking(monkeypatch: pytest.MonkeyPatch) -> None:
     system, world, loss = parted(monkeypatch, recovery=True)
     (failed,) = system.events.of_kind(EventKind.FAILED)
     assert failed.data["reason"] == "scale_lost"

@@ -151,7 +151,7 @@ class TestFramesBeforeTheStart:
         assert all(system.rows[i].status is FrameStatus.INITIALISING for i in range(N_BEHIND))
         assert_right(system, world, range(N_BEHIND, N_BEHIND + N_SWEEP))
 
-    def test_a_map_that_stays_small_walks_back_once_more_at_the_end_of_the_run(self) -> None:
+    def test_a_map_that_stays_small_tracks_in_reverse_once_more_at_the_end_of_the_run(self) -> None:
         world = away_first()
         system, watched = watched_system(world, retry_keyframes=[1000])
         for frame in world.frames():

@@ -1,4 +1,4 @@
-"""What is told of a walk back while it is under way: where it is, in order, and nothing that changes it."""
+"""What is told of reverse tracking while it is under way: where it is, in order, and nothing that changes it."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_news_are_lost_where_nobody_takes_them_and_nobody_waits() -> None:
 
 
 def test_frames_are_told_as_the_source_counts_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A sequence that is read from its end: a walk back in time leads to larger indices."""
+    """A sequence that is read from its end: reverse tracking leads to larger indices."""
     monkeypatch.setattr(walk_news, "EVERY_S", 0.0)
     told: list[WalkNews] = []
     system = system_in(world(), recovery={"enabled": True, "attempts": ["live"]})

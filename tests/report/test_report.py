@@ -81,7 +81,7 @@ def test_it_says_what_happened(broken_run: RunData) -> None:
     assert "<b>0 features</b>" in text  # as words
     assert "The one link that was tried was refused: too few inliers" in text
     assert "refused: too few inliers - 9 inliers, 20 needed" in text
-    assert "Walks back in time" in text
+    assert "Reverse tracking" in text
     assert "20 frames from before the loss and 7 since" in text
     for words in ("sift", "9 frames", "the buffer ends", "1.25 s", "31", "0.72 ± 0.21 %", "± 0.13°", "4 shared"):
         assert words in text

@@ -38,7 +38,7 @@ COVERED = frozenset(range(60, 80))
 
 
 class Run:
-    """A run that was told of after every frame, and all that was told; another teller tells of walks back besides."""
+    """A run that was told of after every frame, and all that was told; another tells of reverse tracking besides."""
 
     def __init__(self) -> None:
         self.world: PointWorld = lap(N + 12, covered=COVERED)
@@ -120,7 +120,7 @@ def test_only_what_changed_is_told_again(told: Run) -> None:
     assert not any(message.changed for message in lost[1:5])
 
 
-# --- a walk back as it happens
+# --- reverse tracking as it happens
 
 
 def test_a_walk_is_drawn_beside_the_lost_map_and_goes_when_it_ends(told: Run) -> None:

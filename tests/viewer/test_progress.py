@@ -24,7 +24,7 @@ class Walking:
     def watch_walks(self, on_walk: object) -> None:
         self.tell = on_walk
 
-    def is_walking_back(self, submap_id: int) -> bool:
+    def is_tracking_in_reverse(self, submap_id: int) -> bool:
         return self.is_walking
 
 
@@ -68,7 +68,7 @@ def test_each_line_says_how_far_and_what() -> None:
     lines = stream.getvalue().splitlines()
     assert lines[0].startswith("1 of 4 frames, 0:00 left: tracked, submap 0, 80 landmarks")
     assert lines[1].endswith("left: lost")
-    assert lines[2].endswith("lost; walking back in time from submap 1: at frame 17, 3 posed")
+    assert lines[2].endswith("lost; tracking in reverse from submap 1: at frame 17, 3 posed")
     assert "tracked" in lines[3]
     assert "at frame 17" in lines[3]
     assert lines[4] == lines[5] == f"4 of 4 frames: {FINISHING}"
@@ -79,7 +79,7 @@ def test_the_end_waits_for_a_walk() -> None:
     step(shown, 0)
     system.tell(news(5))  # type: ignore[operator]
     assert (
-        stream.getvalue().splitlines()[-1].endswith("results; walking back in time from submap 1: at frame 5, 3 posed")
+        stream.getvalue().splitlines()[-1].endswith("results; tracking in reverse from submap 1: at frame 5, 3 posed")
     )
 
 
@@ -91,7 +91,7 @@ def test_on_a_terminal_a_line_takes_the_place_of_the_one_before() -> None:
     shown.end()
     assert stream.getvalue().count("\n") == 1
     first, second = stream.getvalue().split("\r")[1:3]
-    assert first.startswith("frame 0: walking back")
+    assert first.startswith("frame 0: tracking in reverse")
     assert second.rstrip() == "frame 1: tracked, submap 0, 80 landmarks"
     assert len(second) == len(first), "nothing of a longer one stays"
 

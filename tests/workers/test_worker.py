@@ -47,7 +47,7 @@ class Catcher:
 
 @pytest.fixture(scope="module")
 def job() -> RecoveryJob:
-    """A walk back that ends with a link."""
+    """Reverse tracking that ends with a link."""
     world = PointWorld(cloud(), hand_held(60), covered=COVERED)
     system, catcher = system_in(world, recovery={"enabled": True}), Catcher()
     system._recoveries._executor = catcher

@@ -4,7 +4,7 @@ A monocular map drifts, so that no single similarity takes the whole of it to th
 how the two maps lie to each other at their overlap. Truth is taken there, from the frames of either map near it, and
 from no more of them than it takes to tell: what drifts farther off, before or after, is not the link's doing.
 
-With one exception. A walk back leads from the new map's start to the overlap, and a scale that it loses on the way
+With one exception. Reverse tracking leads from the new map's start to the overlap, and a scale that it loses on the way
 makes a link wrong for all that comes after, however well it fits at the overlap. So the scale is judged a second time
 at the new map's live end, by the first frames that the old map never saw.
 """

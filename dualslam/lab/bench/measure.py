@@ -51,7 +51,7 @@ def breakages(events: Sequence[Event]) -> tuple[Breakage, ...]:
     last: dict[int, dict[str, Any]] = {}  # the last loss of each submap
     looked_for: dict[int, list[dict[str, Any]]] = {}  # by the recovery's submap
     made: Counter[int] = Counter()
-    again: set[int] = set()  # submaps whose walk back is a retry
+    again: set[int] = set()  # submaps whose reverse tracking is a retry
     for event in events:
         submap = -1 if event.submap is None else event.submap
         if event.event is EventKind.FAILED:

@@ -55,7 +55,7 @@ class Breakage:
     restart_s : float or None
         The same in seconds of the source.
     attempts : int
-        Attempts that the first walk back of a recovery made.
+        Attempts that the first reverse tracking of a recovery made.
     succeeded_at : int or None
         The one of these that linked the map, from 1.
     recovery_s : float or None
@@ -63,7 +63,7 @@ class Breakage:
     relocalised : bool
         Whether the map was seen again, and continued, before another had started.
     retries : int
-        Walks back that were made again later, once the new map had grown; their attempts are not counted above.
+        Reverse tracking that was made again later, once the new map had grown; its attempts are not counted above.
     linked_by_retry : bool
     merged : bool
         Whether it was joined by a place that a later map saw again.

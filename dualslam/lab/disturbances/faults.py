@@ -1,6 +1,6 @@
 """Faults inside the system: a script that the composition root puts around the parts, frame by frame.
 
-Only the live track is disturbed. A walk back in time meets the same frames later, and undisturbed: what is tested is
+Only the live track is disturbed. Reverse tracking meets the same frames later, and undisturbed: what is tested is
 whether redundancy helps.
 """
 

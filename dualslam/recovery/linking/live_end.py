@@ -27,7 +27,7 @@ is what is known badly, has grown."""
 def propagate_to_live_end(
     link: LinkEstimate, new: Submap, live_since: int, config: LinkingConfig, bend: Bend = NO_BEND
 ) -> LinkEstimate | Failure:
-    """Add to a link's covariance what the walk back has lost of the scale, and refuse it where that is too much.
+    """Add to a link's covariance what reverse tracking has lost of the scale, and refuse it where that is too much.
 
     So does what the map may be bent by its camera.
 

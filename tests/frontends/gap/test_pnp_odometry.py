@@ -23,7 +23,7 @@ from tests.frontends.tracking.test_tracking import front_end
 
 POSITION_M, ROTATION_RAD = 0.06, 0.005
 KEYFRAMES = [40, 43, 46, 49]
-"""Of the submap that the walk back starts from, at its truth."""
+"""Of the submap that reverse tracking starts from, at its truth."""
 FAR_M = 60.0
 """Thrice what the scene measures."""
 DRIVE = path(60, np.array([0.05, 0.0, 0.2]), np.array([0.0, 0.004, 0.0]))

@@ -115,7 +115,7 @@ def test_what_has_nothing_right_is_refused(make, layout):
 @pytest.mark.parametrize("ties", [0.0, 0.3])
 @pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (1, 2, 3))])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_walk_back_over_a_corrupted_tail(layout, seed, ties):
+def test_reverse_tracking_over_a_corrupted_tail(layout, seed, ties):
     """The first link that a walk makes stands on the healthy part, and names the place where the tail begins."""
     for oldest in range(13, 3, -1):
         case, result = offer(adversaries.corrupted_tail, (layout, seed, oldest, ties), None)
