@@ -22,6 +22,7 @@ from dualslam.map.record import Record
 from dualslam.map.worlds import Worlds
 from dualslam.places.handover import Handover
 from dualslam.places.revisits import Revisits
+from dualslam.places.sightings import Relocalised
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.manager import Recoveries
 from dualslam.recovery.relocaliser import Relocaliser
@@ -277,7 +278,11 @@ class System:
         state = self._state
         track = self._tracking.track(live, view)
         if isinstance(track, Failure):
-            return self._lose(live, view, track)
+            if (found := self._places.seen_instead(live, view)) is None:
+                return self._lose(live, view, track)
+            state.lost = []
+            self.buffer.thaw()
+            return self._go_over(found, live, view)
         if state.localises:
             return track
         state.lost = []
@@ -289,13 +294,16 @@ class System:
             self._begin_anew()
             return contradicted
         if (found := self._places.seen_from(live, track)) is not None:
-            self._endings.archive(live, "an earlier map goes on")
-            return self._places.go_over(found, live.submap.id, view)
+            return self._go_over(found, live, view)
         if live.reference_id == view.index:
             self._grow(live, view)
         else:
             self._places.catch_up(live, view)
         return track
+
+    def _go_over(self, found: Relocalised, live: VisualOdometry, view: View) -> Track:
+        self._endings.archive(live, "an earlier map goes on")
+        return self._places.go_over(found, live.submap.id, view)
 
     def _grow(self, live: VisualOdometry, view: View) -> None:
         """After a keyframe: ask the live map what it knows now, and what it can be linked with; a full one ends."""

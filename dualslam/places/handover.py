@@ -12,7 +12,7 @@ import numpy as np
 
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.interfaces import VisualOdometry
-from dualslam.core.types import Failure, FloatArray, Track
+from dualslam.core.types import Failure, FloatArray, Track, View
 from dualslam.map.record import Record
 from dualslam.places.sightings import SAME_WITHIN, Relocalised, Search, Sighting, Sightings, median_depth, same_pose
 
@@ -111,6 +111,21 @@ class Handover:
         if isinstance(found, Failure) or not self._has(track, live, sighting, found.track):
             return None
         return found
+
+    def follow_alone(self, view: View, live: VisualOdometry) -> Relocalised | None:
+        """Show a frame that the live map could not pose to the submap that seems to have the place.
+
+        It had the place by a frame that both posed alike, and by each frame since: the map that ends here was about
+        to go over to it.
+        """
+        self._forget_another(live)
+        if self._sighting is None:
+            return None
+        found = self._sightings.follow(self._sighting, view)
+        if found is None:
+            return None
+        self._sighting = None
+        return None if isinstance(found, Failure) else found
 
     def _forget_another(self, live: VisualOdometry) -> None:
         """Forget what was seen from another live map."""

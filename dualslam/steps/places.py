@@ -95,6 +95,13 @@ class PlaceKeeping:
         with self._state.record.timer.measure("places"):
             return self._handover.follow(track, live)
 
+    def seen_instead(self, live: VisualOdometry, view: View) -> Relocalised | None:
+        """Return the submap of an earlier run that the live one was about to go over to, where it shows the frame."""
+        if self._handover is None:
+            return None
+        with self._state.record.timer.measure("places"):
+            return self._handover.follow_alone(view, live)
+
     def go_over(self, found: Relocalised, from_submap: int, view: View) -> Track:
         """Go on in the submap of an earlier run that has this place already; the live one is archived."""
         state = self._state

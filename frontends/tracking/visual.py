@@ -247,7 +247,9 @@ class VisualFrontEnd:
         """Let the graph take in what has come since its last update, where that is due."""
         self._since_graph += 1
         young = len(self.submap.keyframes) <= YOUNG_MAP
-        due = rebuild or young or self._window is None or self._since_graph >= self._config.graph.update_every
+        # In the map of an earlier run keyframes are rare: what waits for the next one waits for long.
+        rare = any(k < self._first_id for k in self.submap.keyframes)
+        due = rebuild or young or rare or self._window is None or self._since_graph >= self._config.graph.update_every
         return self._solve(rebuild) if due else None
 
     def _note_gap(self, track: Track | Failure) -> None:
