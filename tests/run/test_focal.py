@@ -89,7 +89,8 @@ def test_where_nothing_moves_exif_data_are_taken_at_their_word(tmp_path: Path) -
     assert 0.1 < (high - low) / found.focal_px < 0.2
 
 
-@pytest.mark.parametrize("off", [1.0, pytest.param(1.6, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("off", [1.0, 1.6])
 def test_the_frames_are_asked_all_the_same(tmp_path: Path, off: float) -> None:
     """What is told may be of another lens, or of an image that was cropped: the frames have the last word."""
     world = make_sequence("room", 70, 3, 320, 240)

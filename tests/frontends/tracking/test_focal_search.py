@@ -40,6 +40,7 @@ def test_a_hand_held_camera_tells_its_focal_length(seed: int) -> None:
     assert low <= found.fov_deg <= high
 
 
+@pytest.mark.slow
 def test_a_lens_is_found_with_the_focal_length() -> None:
     camera = DivisionCamera(*SIZE_PX, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, k=-0.3)
     found = search(features_of(PointWorld(cloud(), hand_held(60)), camera))
