@@ -1,5 +1,11 @@
 """Tests compute as the command line does: with one thread for each numerical library, or sums round otherwise."""
 
+import signal
+
 from dualslam.core.threads import limit_threads
 
 limit_threads()
+
+# A shell hands Ctrl-C to what it starts in the background (`&`, nohup) as ignored; tests that interrupt a run need it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
