@@ -222,23 +222,6 @@ class Connections:
             moved=moved,
         )
 
-    def join_landmarks(self, submap_id: int, landmark_pairs: IntArray) -> None:
-        """Let landmarks of a loop within a submap be one.
-
-        The loop is in its observations then: how a solution has bent the submap is evidence of its own from now on.
-
-        Parameters
-        ----------
-        submap_id : int
-        landmark_pairs : (I, 2) int64
-            The first of each pair stays.
-        """
-        submap = self._atlas.submaps[submap_id]
-        current = submap.current_ids(landmark_pairs.ravel()).reshape(-1, 2)
-        current = current[(current >= 0).all(axis=1)]
-        submap.merge_landmarks(current[:, 0], current[:, 1])
-        self._atlas.warps.pop(submap_id, None)
-
     def open_graph(self, submap_id: int) -> SubmapGraph:
         """Return the graph of any submap, made from its arrays, which stay as they are: to ask it for covariances.
 

@@ -282,23 +282,6 @@ def solve(submap: Submap) -> None:
     submap.apply_estimate(*estimate.values)
 
 
-def test_landmarks_of_a_loop_that_become_one_do_not_speak_against_it() -> None:
-    world = DriftingMap(130, drift=2 * np.array([1e-3] * 3 + [2e-3] * 3 + [4e-3]), seed=2)
-    for k in range(130):
-        world.add(k)
-    solve(world.submap)
-    report = world.connections.connect([world.loop((0, 3), (0, 123))], world.now)
-    pairs = the_same_points(world, 0, 0, (list(range(12)), list(range(112, 130))))
-    world.connections.join_landmarks(0, pairs)
-    solve(world.submap)
-    good = rms(world.errors())
-    world.connections.settle(world.now)
-    event = world.record.events.of_kind(EventKind.ATLAS_SOLVED)[-1]
-    assert event.data["drift"] < 2
-    assert event.data["largest_bend"] < 0.3 * max(report.bent.values())
-    assert rms(world.errors()) < 1.2 * good
-
-
 class FrontEnd:
     """Notes what it is told."""
 
