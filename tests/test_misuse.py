@@ -13,6 +13,8 @@ from dualslam.core.camera.models import camera_from_fov
 from dualslam.core.types import Frame
 from dualslam.testing.point_world import CAMERA
 
+SEQUENCE = dualslam.open_source("synthetic:room,frames=2,width=64,height=48")
+
 
 def system() -> dualslam.System:
     return dualslam.build_system(dualslam.Config(), CAMERA)
@@ -27,6 +29,12 @@ def system() -> dualslam.System:
         (lambda _: camera_from_fov(640, 480, "70"), "field of view is .70. degrees"),
         (lambda here: dualslam.open_source(here, max_frames=10.0), "max_frames is 10.0; it must be a whole number"),
         (lambda here: dualslam.run_to_folder(dualslam.Config(), [], here), "the sequence is a list; open_source"),
+        (lambda here: dualslam.trajectories_of(here), "takes a system, not a PosixPath; of a run folder, read_run"),
+        (lambda here: dualslam.report_page(here), "is not the folder of a finished run"),
+        (lambda here: dualslam.comparison_page([here]), "is not the folder of a finished run"),
+        (lambda _: dualslam.dump_config({"seed": 1}), "the configuration is a dict; load_config or config_from_dict"),
+        (lambda _: dualslam.evaluate_run([], SEQUENCE), "the run is a list; give the path of its folder"),
+        (lambda here: dualslam.evaluate_run(here, []), "the sequence is a list; open_source opens one"),
         (lambda _: system().step(np.zeros((4, 4), np.uint8)), r"step takes a dualslam.Frame\("),
     ],
 )

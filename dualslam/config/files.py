@@ -108,7 +108,15 @@ def model_from_dict(model: type[Model], data: Mapping[str, Any], source: str) ->
 
 
 def dump_config(config: BaseModel) -> str:
-    """Return the whole configuration as YAML, each field under a comment that says what it means."""
+    """Return the whole configuration as YAML, each field under a comment that says what it means.
+
+    Raises
+    ------
+    ConfigError
+        If it is no configuration.
+    """
+    if not isinstance(config, BaseModel):
+        raise ConfigError(f"the configuration is a {type(config).__name__}; load_config or config_from_dict makes one")
     return "\n".join(_dump_fields(config, indent=0)) + "\n"
 
 

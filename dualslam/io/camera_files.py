@@ -28,6 +28,7 @@ import yaml
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import (
+    MODELS,
     FovCamera,
     KannalaBrandtCamera,
     PinholeCamera,
@@ -69,6 +70,11 @@ def read_camera_file(path: str | Path) -> Camera:
         return _from_orb_slam(content, str(path))
     if any(key in content for key in _MATRIX_KEYS):
         return _from_matrix(content, str(path))
+    if "model" not in content:
+        raise InputError(
+            f"{path} does not say which camera it is: add `model: pinhole` (or {', '.join(list(MODELS)[1:])}) to "
+            "fx, fy, cx, cy, width and height, or give a file that OpenCV, ROS or ORB-SLAM reads."
+        )
     if content.get("model") in (PinholeCamera.model, RadTanCamera.model) and _is_negative(content.get("fy")):
         log.info("%s: fy is negative, so its y-axis points up; here it points down", path)
         content = {**content, "fy": -content["fy"]} | ({"p1": -content["p1"]} if content.get("p1") else {})

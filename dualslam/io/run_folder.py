@@ -59,6 +59,7 @@ _FILES = (
     MAP_PAGE,
     GROUND_TRUTH,
 )
+_NOT_OF_EVERY_RUN = frozenset({SUBMAPS, GROUND_TRUTH, MAP_PAGE})
 _SUBMAP_NAME = re.compile(r"\d+\.txt")
 _SAMPLE_NAME = re.compile(r"\d+\.jpg")
 _MAP_NAME = re.compile(r"[\w.-]+\.(npz|json)")
@@ -207,9 +208,15 @@ class RunFolder:
         """Return a sentence on which results are written, and which are not: of a run that was cut off there."""
         there: list[str] = []
         missing: list[str] = []
-        for name in (CONFIG, EVENTS, FRAMES, TRAJECTORY, SUMMARY, MAP, REPORT):
-            last = self.path / name / METADATA if name == MAP else self.path / name
-            (there if last.exists() else missing).append(name)
+        for name in (CONFIG, EVENTS, FRAMES, TRAJECTORY, SUBMAPS, SUMMARY, GROUND_TRUTH, MAP, MAP_PAGE, REPORT):
+            if name == SUBMAPS:
+                is_there = bool(unlinked_submaps(self.path))
+            else:
+                is_there = (self.path / name / METADATA if name == MAP else self.path / name).exists()
+            if is_there:
+                there.append(f"{name}/" if name in (SUBMAPS, MAP) else name)
+            elif name not in _NOT_OF_EVERY_RUN:
+                missing.append(f"{name}/" if name == MAP else name)
         return f"In {self.path} are {', '.join(there)}; not written: {', '.join(missing) or 'nothing'}."
 
     def close(self) -> None:

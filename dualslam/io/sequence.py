@@ -105,7 +105,8 @@ class RecordedSequence:
     """Frames of a recording, in either direction of time, read ahead on a thread of its own.
 
     Iterating again reads again. A frame whose image cannot be read, or is of another size than the camera's, has
-    ``image=None`` and says why in `error`; reading goes on.
+    ``image=None`` and says why in `error`; reading goes on. The log has the first of these frames, and their number
+    where the reading ends.
 
     Attributes
     ----------
@@ -157,17 +158,24 @@ class RecordedSequence:
 
     def _read(self) -> Iterator[Frame]:
         reader = self._recording.images.reader(self._grey)
+        n_read = n_unreadable = 0
         try:
             for index, timestamp_s in zip(self.source_indices.tolist(), self.frame_timestamps.tolist(), strict=True):
-                yield self._frame(reader, index, timestamp_s)
+                frame = self._frame(reader, index, timestamp_s)
+                n_read += 1
+                if frame.image is None:
+                    n_unreadable += 1
+                    log.log(logging.INFO if n_unreadable > 1 else logging.WARNING, "frame %d: %s", index, frame.error)
+                yield frame
         finally:
             reader.close()
+            if n_unreadable > 1:
+                log.warning("%s: %d of the %d images that were read are unusable", self.name, n_unreadable, n_read)
 
     def _frame(self, reader: ImageReader, index: int, timestamp_s: float) -> Frame:
         try:
             image = reader.read(index)
         except UnreadableImageError as e:
-            log.warning("frame %d: %s", index, e)
             return Frame(index, timestamp_s, None, str(e))
         height, width = image.shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
@@ -175,7 +183,6 @@ class RecordedSequence:
                 f"image {index} of {self.name} is {width} x {height} pixels, "
                 f"the camera {self.camera.width} x {self.camera.height}."
             )
-            log.warning("frame %d: %s", index, error)
             return Frame(index, timestamp_s, None, error)
         return Frame(index, timestamp_s, image)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from dualslam.report.canvas import Canvas
 from dualslam.report.markup import Markup, document, join, number, number_row, stretched, table, tag
 from dualslam.report.page import headline
 from dualslam.report.placement import Placed, align, extent, plane_from_above
-from dualslam.report.run_data import PosedRows, RunData
+from dualslam.report.run_data import PosedRows, RunData, read_run
 from dualslam.report.statuses import MEANING, WITHOUT_POSE, count, span, stretches
 
 N_STYLES = 6
@@ -32,8 +33,18 @@ _HEIGHTS: dict[FrameStatus, float] = {
 Measure = tuple[str, Callable[[dict[str, Any]], str]]
 
 
-def comparison_page(runs: Sequence[RunData]) -> str:
-    """Return a page for several runs."""
+def comparison_page(runs: Sequence[RunData | str | Path]) -> str:
+    """Return a page for several runs, or for the runs in several folders.
+
+    Raises
+    ------
+    InputError
+        If a folder cannot be read as a run's (`read_run`).
+    """
+    return _page([run if isinstance(run, RunData) else read_run(run) for run in runs])
+
+
+def _page(runs: Sequence[RunData]) -> str:
     names = run_names(runs)
     title = ", ".join(names)
     leads = [tag("li", tag("b", name), f": {headline(run)}") for name, run in zip(names, runs, strict=True)]

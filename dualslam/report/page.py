@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from dualslam.config.settings import Config
@@ -14,7 +15,7 @@ from dualslam.report.event_words import event_words
 from dualslam.report.failures import failures_section, stories
 from dualslam.report.markup import Markup, cards, document, duration, join, number, table, tag
 from dualslam.report.places import places_section
-from dualslam.report.run_data import RunData
+from dualslam.report.run_data import RunData, read_run
 from dualslam.report.statuses import WITHOUT_POSE, count
 from dualslam.report.timeline import timeline
 from dualslam.report.top_view import top_view
@@ -25,8 +26,16 @@ MAX_EVENTS = 500
 _EVENT_COLUMNS = {"frame": "num", "time": "num", "event": None, "submap": "num", "what belongs to it": "words"}
 
 
-def report_page(run: RunData) -> str:
-    """Return the whole page."""
+def report_page(run: RunData | str | Path) -> str:
+    """Return the whole page of a run, or of the run in a folder.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be read as one (`read_run`).
+    """
+    if not isinstance(run, RunData):
+        run = read_run(run)
     sequence = run.summary.get("sequence", run.name)
     body = [
         tag("header", tag("h1", str(sequence)), tag("p", headline(run), cls="lead"), _warnings(run), _tiles(run)),

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from dualslam.config.settings import Config
+from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.memory import peak_rss_mb
@@ -52,7 +53,18 @@ class Trajectories:
 
 
 def trajectories_of(system: System) -> Trajectories:
-    """Compose the poses of all frames, each from its own keyframe, by the map as it is now."""
+    """Compose the poses of all frames, each from its own keyframe, by the map as it is now.
+
+    Raises
+    ------
+    InputError
+        If it is given no system, such as the path of a run folder.
+    """
+    if not hasattr(system, "atlas"):
+        raise InputError(
+            f"trajectories_of takes a system, not a {type(system).__name__}; "
+            "of a run folder, read_run has the trajectories: main and unlinked."
+        )
     count = dict.fromkeys(system.atlas.submaps, 0)
     for pose in system.poses.values():
         count[pose.submap_id] += pose.index in system.rows

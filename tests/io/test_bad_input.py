@@ -54,6 +54,16 @@ def test_a_bad_image_is_an_unreadable_frame(dataset: Path, damage: Callable[[Pat
     assert frames[which].timestamp_s == pytest.approx(100 + 0.1 * which)
 
 
+def test_images_of_mixed_sizes_are_told_once_and_counted(dataset: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for i in (1, 3, 4):
+        cv2.imwrite(str(dataset / "images" / f"{i:06d}.png"), np.zeros((10, 20), np.uint8))
+    frames = list(open_sequence(dataset))
+    assert [f.index for f in frames if "20 x 10" in f.error] == [1, 3, 4]
+    first, count = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
+    assert first == "frame 1: image 1 of walk_01 is 20 x 10 pixels, the camera 32 x 24."
+    assert count == "walk_01: 3 of the 6 images that were read are unusable"
+
+
 def test_an_image_that_was_lost_from_numbered_files_keeps_its_place(dataset: Path, image_number) -> None:
     (dataset / "images" / "000002.png").unlink()
     frames = list(open_sequence(dataset))

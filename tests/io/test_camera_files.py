@@ -126,7 +126,7 @@ def test_the_fov_model_of_tum_mono_is_relative_to_the_image(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("c.yaml", "fx: 1\n", "'model'"),
+        ("c.yaml", "fx: 1\n", "add `model: pinhole`"),
         ("c.yaml", "model: pinhole\nfx: 500\n", "'width' is missing"),
         ("c.yaml", "model: pinhole\nfx: .nan\nfy: 5\ncx: 3\ncy: 3\nwidth: 8\nheight: 8\n", "fx is nan"),
         ("c.yaml", "- 1\n- 2\n", "is not a camera file"),
@@ -189,3 +189,13 @@ def test_a_y_axis_that_points_up_is_turned_down(tmp_path: Path, name: str, text:
     v = -480 * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + 239.5
     ours = camera.project(np.column_stack([x, -y, np.ones(20)]))
     np.testing.assert_allclose(ours, np.column_stack([u, v]), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "content", ["camera_model: omni\n", "fx: 500\nfy: 500\ncx: 320\ncy: 240\nwidth: 640\nheight: 480\n"]
+)
+def test_a_file_that_does_not_say_which_camera_it_is(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(content)
+    with pytest.raises(InputError, match=r"camera\.yaml does not say which camera it is: add `model: pinhole` \(or"):
+        read_camera_file(path)

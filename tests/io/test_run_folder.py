@@ -91,6 +91,21 @@ def test_a_run_that_posed_nothing(tmp_path: Path) -> None:
     assert len(read_frames(run.path / "frames.csv")) == 3
 
 
+def test_what_a_run_that_was_cut_off_has_left(tmp_path: Path) -> None:
+    with RunFolder(tmp_path / "run") as run:
+        run.write_config({"seed": 3})
+        run.write(record())
+        run.write_truth(posed([2]))
+        (run.path / "map").mkdir()
+        (run.path / "map" / "landmarks.npz").write_bytes(b"a map without its last file")
+        words = run.what_is_there()
+        run.write_map_page("<html>")
+        later = run.what_is_there()
+    there = "config.yaml, events.jsonl, frames.csv, trajectory.txt, submaps/, summary.json, groundtruth.txt"
+    assert words == f"In {run.path} are {there}; not written: map/, report.html."
+    assert f"{there}, map.html;" in later
+
+
 def test_nothing_is_overwritten_without_being_told(tmp_path: Path) -> None:
     path = tmp_path / "run"
     path.mkdir()

@@ -216,8 +216,13 @@ def evaluate_run(
     Raises
     ------
     InputError
-        If the run has no trajectory or the sequence no ground truth, or no pose is at the time of any frame.
+        If the run has no trajectory or the sequence no ground truth, or no pose is at the time of any frame; if either
+        is something else, such as a list of poses.
     """
+    if not isinstance(run, str | Path):
+        raise InputError(f"the run is a {type(run).__name__}; give the path of its folder or of its trajectory.")
+    if not hasattr(sequence, "ground_truth"):
+        raise InputError(f"the sequence is a {type(sequence).__name__}; open_source opens one.")
     truth = sequence.ground_truth
     if truth is None:
         raise InputError(f"{sequence.name} has no ground truth; a run is evaluated against one.")
