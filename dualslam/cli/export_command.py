@@ -71,7 +71,11 @@ def _check_out(args: argparse.Namespace) -> None:
         if args.out.is_dir():
             raise OutputError(f"{args.out} is a folder, and {args.to} is one file; name another with --out.")
         check_free(args.out, args.overwrite, "another with --out")
-        args.out.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        (args.out if is_folder else args.out.parent).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        problem = error.strerror or error
+        raise OutputError(f"{args.out} cannot be written: {problem}; name another with --out.") from error
 
 
 def _copy_trajectory(args: argparse.Namespace) -> int:

@@ -207,3 +207,11 @@ def test_freed_memory_is_kept() -> None:
 def test_where_recovery_runs(options: str, workers: int) -> None:
     args = parse(["run", "here", "--out", "there", *options.split()])
     assert config_of(args).recovery.workers == workers
+
+
+@pytest.mark.parametrize("form", ["ply", "tum", "colmap"])
+def test_an_export_to_where_no_folder_can_be(form: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    out = tmp_path / "file" / "deeper" / "map"
+    assert main(["export", str(tmp_path), "--to", form, "--out", str(out)]) == 2
+    assert f"{out} cannot be written: Not a directory; name another with --out." in one_sentence(capsys)
