@@ -79,6 +79,7 @@ def _unit_ms(sequence: str) -> float:
     """CPU time of one extraction, milliseconds, on the sequence's first frames."""
     images = [f.image for f in islice(open_source(sequence), UNIT_FRAMES) if f.image is not None]
     grey = [image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
+    cv2.setNumThreads(1)  # its threads would count as time, and not alike on every machine
     orb = cv2.ORB.create(2000)
     orb.detectAndCompute(grey[0], None)  # type: ignore[call-overload]
     start = time.process_time()
