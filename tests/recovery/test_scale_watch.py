@@ -127,6 +127,7 @@ def parted(monkeypatch: pytest.MonkeyPatch, recovery: bool) -> tuple[System, Poi
     return system, world, loss
 
 
+@pytest.mark.slow
 def test_both_parts_are_joined_by_reverse_tracking(monkeypatch: pytest.MonkeyPatch) -> None:
     system, world, loss = parted(monkeypatch, recovery=True)
     (failed,) = system.events.of_kind(EventKind.FAILED)

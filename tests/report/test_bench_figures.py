@@ -15,6 +15,7 @@ from dualslam.report.bench_figures import draw_statuses
 from tests.lab.bench.fakes import SPEC, describe, run_fake
 
 
+@pytest.mark.slow
 def test_every_figure_is_drawn(tmp_path: Path) -> None:
     records = [run_fake(trial) for trial in plan_trials(SPEC, describe)]
     files = draw_figures(SPEC, bench_tables(SPEC, records), records, tmp_path)

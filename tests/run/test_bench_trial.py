@@ -79,6 +79,7 @@ def test_a_bug_leaves_its_traceback_in_the_folder(
     assert "ZeroDivisionError" in (tmp_path / "trials" / trial.key / "error.log").read_text()
 
 
+@pytest.mark.slow
 def test_the_command_writes_tables_and_runs_nothing_twice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, out = tmp_path / "tiny.yaml", tmp_path / "out"
     path.write_text(SPEC)

@@ -30,6 +30,7 @@ def write(folder: Path, images: list[np.ndarray], exif: Image.Exif | bytes = b""
     return folder
 
 
+@pytest.mark.slow
 def test_the_beginning_tells_the_field_of_view(tmp_path: Path) -> None:
     world = make_sequence("room", 70, 3, 320, 240)
     folder = write(tmp_path / "images", [world.frame(i).image for i in range(70)])

@@ -136,7 +136,8 @@ def test_a_corrupted_run_can_be_made_again_from_its_config(tmp_path: Path) -> No
     assert (tmp_path / "clean" / "trajectory.txt").read_bytes() != texts[0]
 
 
-@pytest.mark.parametrize("workers", [pytest.param(0, marks=pytest.mark.slow), 1])
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [0, 1])
 def test_a_killed_worker_costs_its_recovery_and_nothing_else(workers: int) -> None:
     world = PointWorld(cloud(), hand_held(70), covered=frozenset(range(35, 50)))
     system = system_in(world, recovery={"enabled": True, "workers": workers})
