@@ -10,14 +10,17 @@ import pytest
 
 import dualslam
 from dualslam.core.camera.models import camera_from_fov
+from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame
 from dualslam.testing.point_world import CAMERA
-
-SEQUENCE = dualslam.open_source("synthetic:room,frames=2,width=64,height=48")
 
 
 def system() -> dualslam.System:
     return dualslam.build_system(dualslam.Config(), CAMERA)
+
+
+def sequence() -> Sequence:
+    return dualslam.open_source("synthetic:room,frames=2,width=64,height=48")
 
 
 @pytest.mark.parametrize(
@@ -33,7 +36,7 @@ def system() -> dualslam.System:
         (lambda here: dualslam.report_page(here), "is not the folder of a finished run"),
         (lambda here: dualslam.comparison_page([here]), "is not the folder of a finished run"),
         (lambda _: dualslam.dump_config({"seed": 1}), "the configuration is a dict; load_config or config_from_dict"),
-        (lambda _: dualslam.evaluate_run([], SEQUENCE), "the run is a list; give the path of its folder"),
+        (lambda _: dualslam.evaluate_run([], sequence()), "the run is a list; give the path of its folder"),
         (lambda here: dualslam.evaluate_run(here, []), "the sequence is a list; open_source opens one"),
         (lambda _: system().step(np.zeros((4, 4), np.uint8)), r"step takes a dualslam.Frame\("),
     ],

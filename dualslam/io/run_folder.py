@@ -59,7 +59,9 @@ _FILES = (
     MAP_PAGE,
     GROUND_TRUTH,
 )
-_NOT_OF_EVERY_RUN = frozenset({SUBMAPS, GROUND_TRUTH, MAP_PAGE})
+_RESULTS = (CONFIG, EVENTS, FRAMES, TRAJECTORY, f"{SUBMAPS}/", SUMMARY, GROUND_TRUTH, f"{MAP}/", MAP_PAGE, REPORT)
+"""In the order in which a person is told of them."""
+_NOT_OF_EVERY_RUN = frozenset({f"{SUBMAPS}/", GROUND_TRUTH, MAP_PAGE})
 _SUBMAP_NAME = re.compile(r"\d+\.txt")
 _SAMPLE_NAME = re.compile(r"\d+\.jpg")
 _MAP_NAME = re.compile(r"[\w.-]+\.(npz|json)")
@@ -206,17 +208,12 @@ class RunFolder:
 
     def what_is_there(self) -> str:
         """Return a sentence on which results are written, and which are not: of a run that was cut off there."""
-        there: list[str] = []
-        missing: list[str] = []
-        for name in (CONFIG, EVENTS, FRAMES, TRAJECTORY, SUBMAPS, SUMMARY, GROUND_TRUTH, MAP, MAP_PAGE, REPORT):
-            if name == SUBMAPS:
-                is_there = bool(unlinked_submaps(self.path))
-            else:
-                is_there = (self.path / name / METADATA if name == MAP else self.path / name).exists()
-            if is_there:
-                there.append(f"{name}/" if name in (SUBMAPS, MAP) else name)
-            elif name not in _NOT_OF_EVERY_RUN:
-                missing.append(f"{name}/" if name == MAP else name)
+        is_there = {name: (self.path / name).exists() for name in _RESULTS}
+        # A folder may be there before what it is for.
+        is_there[f"{SUBMAPS}/"] = bool(unlinked_submaps(self.path))
+        is_there[f"{MAP}/"] = (self.path / MAP / METADATA).exists()
+        there = [name for name, found in is_there.items() if found]
+        missing = [name for name, found in is_there.items() if not found and name not in _NOT_OF_EVERY_RUN]
         return f"In {self.path} are {', '.join(there)}; not written: {', '.join(missing) or 'nothing'}."
 
     def close(self) -> None:
