@@ -63,7 +63,7 @@ class Submap:
         self.condemned: set[int] = set()
         self.landmarks = landmark_table(descriptor)
         self.observations = observation_table()
-        self._counted: tuple[Table, tuple[int, int, int], IntArray] | None = None  # see `n_observations`
+        self._counted: tuple[Table, BoolArray, IntArray] | None = None  # see `n_observations`
 
     @classmethod
     def from_start(cls, start: Start, submap_id: int, K: FloatArray) -> Submap:
@@ -289,12 +289,18 @@ class Submap:
     def n_observations(self, landmark_ids: IntArray) -> IntArray:
         """Return how many keyframes see each landmark."""
         obs = self.observations
-        # Rows are appended, and die; none is changed otherwise. So their numbers tell whether the counts still hold:
-        # between two keyframes they always do.
-        state = (len(obs), int(np.count_nonzero(obs["alive"])), len(self.landmarks))
-        if self._counted is None or self._counted[0] is not obs or self._counted[1] != state:
-            counts = np.bincount(obs["landmark"][obs["alive"]], minlength=len(self.landmarks))
-            self._counted = (obs, state, counts)
+        # Rows are appended, and die; none is changed otherwise. So the counts follow from the rows that have come or
+        # died since the last question.
+        alive, landmark = obs["alive"], obs["landmark"]
+        if self._counted is None or self._counted[0] is not obs:
+            self._counted = (obs, np.zeros(0, np.bool_), np.zeros(0, np.int64))
+        _, was, counts = self._counted
+        n = len(self.landmarks)
+        died, new = np.flatnonzero(was != alive[: len(was)]), landmark[len(was) :][alive[len(was) :]]
+        if len(died) or len(was) < len(alive) or len(counts) < n:
+            change = np.bincount(new, minlength=n) - np.bincount(landmark[died], minlength=n)
+            change[: len(counts)] += counts
+            self._counted = (obs, alive.copy(), change)
         return self._counted[2][landmark_ids]
 
     def covisible(self, landmark_ids: IntArray) -> tuple[IntArray, IntArray]:
