@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from operator import attrgetter
 
 import cv2
 import numpy as np
@@ -88,11 +89,13 @@ def select_spread(xy: IntArray, response: FloatArray, n_wanted: int) -> IntArray
         return np.arange(len(xy))
     if n_wanted == 0:
         return np.empty(0, np.int64)
-    low = xy.min(axis=0)
-    extent = xy.max(axis=0) - low + 1
-    cell_px = max(1.0, float(np.sqrt(extent[0] * extent[1] / n_wanted)))
-    column, row = ((xy - low) / cell_px).astype(np.int64).T
-    cell = row * int(extent[0] / cell_px + 1) + column
+    u, v = xy.T.copy()  # numpy is several times as fast along rows of their own
+    u -= u.min()
+    v -= v.min()
+    width, height = int(u.max()) + 1, int(v.max()) + 1
+    cell_px = max(1.0, float(np.sqrt(width * height / n_wanted)))
+    column, row = ((each / cell_px).astype(np.int64) for each in (u, v))
+    cell = row * int(width / cell_px + 1) + column
     # FAST scores are whole numbers below 256, so one integer key sorts by two things at once, and with the row in its
     # last bits, which makes it unique, any sort does: numpy's quickest is ten times as fast as its stable one. Ties go
     # to the earlier corner, and the choice depends on nothing but the image.
@@ -269,7 +272,7 @@ def _fast(
         return np.empty((0, 2), np.int64), np.empty(0)
     xy = np.asarray(cv2.KeyPoint.convert(keypoints)).astype(np.int64)
     xy += np.repeat(np.array(corners), counts, axis=0)
-    return xy, np.array([keypoint.response for keypoint in keypoints])
+    return xy, np.fromiter(map(attrgetter("response"), keypoints), np.float64, len(keypoints))
 
 
 def _occupied_cells(xy: IntArray, window: tuple[int, int, int, int], cell_px: int) -> BoolArray:

@@ -70,6 +70,8 @@ PATCH_RADIUS_PX = 15
 """Radius of the disc whose intensity centroid gives the orientation, in pixels of the level (ORB, section 3.2)."""
 DESCRIPTOR_BYTES = 32
 PATCH_SIDE_PX = 2 * PATCH_RADIUS_PX + 1
+PATCHES_AT_ONCE = 128
+"""Of which moments are taken: as numbers of four bytes, more would not fit into a core's cache."""
 MARGIN_PX = PATCH_RADIUS_PX + 1
 """Rim of each level without corners, so that the orientation sees nothing beyond the image."""
 NOISE_CONTRAST = 5.0
@@ -235,7 +237,10 @@ class OrbFrontend(OptionedFrontend):
 
     def _angles(self, patches: NDArray[np.uint8]) -> FloatArray:
         """Direction from each patch's centre to its centre of mass, (N,)."""
-        moments = patches.reshape(-1, PATCH_SIDE_PX**2).astype(np.float32) @ self._moments
+        moments = np.empty((len(patches), 2), np.float32)
+        for begin in range(0, len(patches), PATCHES_AT_ONCE):
+            part = patches[begin : begin + PATCHES_AT_ONCE].reshape(-1, PATCH_SIDE_PX**2)
+            np.matmul(part.astype(np.float32), self._moments, out=moments[begin : begin + len(part)])
         return np.asarray(np.arctan2(moments[:, 1], moments[:, 0]), np.float64)
 
     def _descriptors(

@@ -70,29 +70,52 @@ def distort_radtan(xy: FloatArray, k: tuple[float, ...], p1: float, p2: float) -
     """Return distorted points (N, 2) of Brown's model with OpenCV's order of terms."""
     x, y = xy[:, 0], xy[:, 1]
     s = x * x + y * y
-    total = np.zeros_like(s)
-    for c in reversed(k):
-        total = (total + c) * s
-    factor = 1.0 + total
-    xd = x * factor + 2 * p1 * x * y + p2 * (s + 2 * x * x)
-    yd = y * factor + p1 * (s + 2 * y * y) + 2 * p2 * x * y
-    return np.stack([xd, yd], 1)
+    return np.stack(_distorted(x, y, s, _factor(s, k), p1, p2), 1)
 
 
 def radtan_jacobian(xy: FloatArray, k: tuple[float, ...], p1: float, p2: float) -> FloatArray:
     """Return d(distorted)/d(undistorted), (N, 2, 2), of `distort_radtan`."""
     x, y = xy[:, 0], xy[:, 1]
     s = x * x + y * y
-    total, slope = np.zeros_like(s), np.zeros_like(s)
-    for i in reversed(range(len(k))):
-        total = (total + k[i]) * s
-        slope = slope * s + (i + 1) * k[i]  # d(factor) / ds
-    factor = 1.0 + total
     J = np.empty((len(xy), 2, 2))
-    J[:, 0, 0] = factor + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-    J[:, 0, 1] = J[:, 1, 0] = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    J[:, 1, 1] = factor + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    J[:, 0, 0], J[:, 0, 1], J[:, 1, 1] = _derivatives(x, y, _factor(s, k), _factor_slope(s, k), p1, p2)
+    J[:, 1, 0] = J[:, 0, 1]
     return J
+
+
+def _factor(s: FloatArray, k: tuple[float, ...]) -> FloatArray:
+    """Return by how much points of squared radius s are moved outwards: ``1 + k[0] s + k[1] s^2 + ...``."""
+    total = np.zeros_like(s)
+    for c in reversed(k):
+        total = (total + c) * s
+    return 1.0 + total
+
+
+def _factor_slope(s: FloatArray, k: tuple[float, ...]) -> FloatArray:
+    """Return the derivative of `_factor` by s."""
+    slope = np.zeros_like(s)
+    for i in reversed(range(len(k))):
+        slope = slope * s + (i + 1) * k[i]
+    return slope
+
+
+def _distorted(
+    x: FloatArray, y: FloatArray, s: FloatArray, factor: FloatArray, p1: float, p2: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the distorted x and y."""
+    xd = x * factor + 2 * p1 * x * y + p2 * (s + 2 * x * x)
+    yd = y * factor + p1 * (s + 2 * y * y) + 2 * p2 * x * y
+    return xd, yd
+
+
+def _derivatives(
+    x: FloatArray, y: FloatArray, factor: FloatArray, slope: FloatArray, p1: float, p2: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return d(xd)/dx, d(xd)/dy, which is d(yd)/dx too, and d(yd)/dy."""
+    xx = factor + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    xy = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    yy = factor + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return xx, xy, yy
 
 
 def undistort_division(xy_distorted: FloatArray, k: float) -> FloatArray:
@@ -117,16 +140,20 @@ def undistort_radtan(xy_distorted: FloatArray, k: tuple[float, ...], p1: float, 
     xy = xy_distorted * (r / np.where(r_distorted > 0, r_distorted, 1.0))[:, None]
     if p1 == 0.0 and p2 == 0.0:
         return np.where(at_edge[:, None], np.nan, xy)
-    error = np.zeros_like(xy)
+    (x, y), (x_distorted, y_distorted) = xy.T.copy(), xy_distorted.T.copy()
+    error = np.zeros_like(x)
     for _ in range(12):
-        error = distort_radtan(xy, k, p1, p2) - xy_distorted
-        J = radtan_jacobian(xy, k, p1, p2)
-        det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] ** 2
+        s = x * x + y * y
+        factor = _factor(s, k)
+        xd, yd = _distorted(x, y, s, factor, p1, p2)
+        d_xx, d_xy, d_yy = _derivatives(x, y, factor, _factor_slope(s, k), p1, p2)
+        error_x, error_y = xd - x_distorted, yd - y_distorted
+        det = d_xx * d_yy - d_xy**2
         inverse = 1.0 / np.where(det > 1e-6, det, np.nan)
-        step_x = (J[:, 1, 1] * error[:, 0] - J[:, 0, 1] * error[:, 1]) * inverse
-        step_y = (J[:, 0, 0] * error[:, 1] - J[:, 0, 1] * error[:, 0]) * inverse
-        xy = xy - np.stack([step_x, step_y], 1)
-        if not (np.abs(error) > TOLERANCE).any():
+        step_x, step_y = (d_yy * error_x - d_xy * error_y) * inverse, (d_xx * error_y - d_xy * error_x) * inverse
+        x, y = x - step_x, y - step_y
+        error = np.maximum(np.abs(error_x), np.abs(error_y))
+        if not (error > TOLERANCE).any():
             break
-    good = (np.abs(error).max(1) < 1e-9) & ((xy * xy).sum(1) <= limit * limit)
-    return np.where(good[:, None], xy, np.nan)
+    good = (error < 1e-9) & (x * x + y * y <= limit * limit)
+    return np.where(good[:, None], np.stack([x, y], 1), np.nan)
