@@ -22,6 +22,8 @@ ASPECT_SIGMA, SKEW_SIGMA, TANGENTIAL_SIGMA = 1e-4, 1e-7, 1e-7
 MIN_NOISE_RATIO = 0.05
 """Residuals smaller than this share of their sigmas would be an exact simulation."""
 CALIBRATION_KEY = 1 << 60
+HELD_SIGMA = 1e-5
+"""Prior sigma of a correction that is to stay where it is."""
 MAX_ITERATIONS, TOLERANCE = 100, 1e-5
 """Most need a few. Where the focal length is far off, the way is long and bent, as lens and focal length make up for
 each other: Ceres' rule for the damping gets there, GTSAM's own stays near the start (KITTI 03 from 36 % off)."""
@@ -55,6 +57,20 @@ class CalibratedOptimum:
     cost_after: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """The optimum of a problem, with what its covariance is made from; `vector`: the `Cal3DS2`."""
+
+    problem: BundleProblem
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    T_submap_kf: FloatArray
+    xyz_mu: FloatArray
+    vector: FloatArray
+    cost_before: float
+    cost_after: float
+
+
 class _BehindCameraError(RuntimeError):
     """Points of the optimum lie behind a camera that saw them: the factor counts no error there, and fixes nothing."""
 
@@ -64,7 +80,7 @@ class _BehindCameraError(RuntimeError):
 
 
 def optimise_with_camera(
-    problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float, mean: FloatArray | None = None
+    problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float
 ) -> CalibratedOptimum:
     """Minimise over poses, points and calibration, without the few points that a step has put behind a camera.
 
@@ -73,17 +89,36 @@ def optimise_with_camera(
     problem : BundleProblem
         In the rectified pixels of the camera as it was given; `fixed` is not looked at.
     start, prior : (5,)
-        The correction to begin at, and the prior sigmas of its parts.
+        The correction to begin at, and the prior sigmas of its parts about zero.
     robust_k : float
         Huber threshold in sigmas.
-    mean : (5,), optional
-        Of the prior; zero if it is not given.
 
     Raises
     ------
     RuntimeError, LinAlgError, ...
         What GTSAM and numpy raise (`dualslam.backend.solver.GTSAM_ERRORS`).
     """
+    found = _in_front(problem, start, prior, robust_k, np.zeros(5))
+    correction, J = _from_cal3_ds2(found.vector, problem.K)
+    marginal = np.asarray(gtsam.Marginals(found.graph, found.values).marginalCovariance(CALIBRATION_KEY))
+    noise_ratio = _noise_ratio(found.problem, found.T_submap_kf, found.xyz_mu, correction)
+    return CalibratedOptimum(
+        found.T_submap_kf, correction, J @ marginal @ J.T, noise_ratio, found.cost_before, found.cost_after
+    )
+
+
+def poses_with_camera(problem: BundleProblem, correction: FloatArray, robust_k: float) -> FloatArray:
+    """Return the poses (K, 4, 4) that `optimise_with_camera` would find, were the camera to stay as it is.
+
+    `correction`: (5,), of the camera as it was given.
+    """
+    return _in_front(problem, correction, np.full(5, HELD_SIGMA), robust_k, correction).T_submap_kf
+
+
+def _in_front(
+    problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float, mean: FloatArray
+) -> _Found:
+    """Minimise without the points that a step has put behind a camera; `mean`: of the prior."""
     for _ in range(MAX_DROPS):
         try:
             return _optimise(problem, start, prior, robust_k, mean)
@@ -104,8 +139,8 @@ def _without(problem: BundleProblem, points: IntArray) -> BundleProblem:
 
 
 def _optimise(
-    problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float, mean: FloatArray | None
-) -> CalibratedOptimum:
+    problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float, mean: FloatArray
+) -> _Found:
     """Minimise over poses, points and calibration; the points are eliminated first, the calibration last."""
     p = problem
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -118,7 +153,7 @@ def _optimise(
     far = int(np.argmax(distance))
     graph.push_back(pose_prior(0, p.T_submap_kf[0]))
     graph.push_back(baseline_factor(0, far, float(distance[far])))
-    expected = _to_cal3_ds2(p.K, np.zeros(5) if mean is None else mean)
+    expected = _to_cal3_ds2(p.K, mean)
     of_prior = gtsam.noiseModel.Gaussian.Covariance(_prior(p.K, prior))
     graph.push_back(gtsam.PriorFactorCal3DS2(CALIBRATION_KEY, expected, of_prior))
     values.insert(CALIBRATION_KEY, _to_cal3_ds2(p.K, start))
@@ -135,14 +170,12 @@ def _optimise(
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
         result = optimizer.optimize()
     T, xyz = convert.poses_of(result), convert.points_of(result)
-    found = np.asarray(result.atCal3DS2(CALIBRATION_KEY).vector())
-    correction, J = _from_cal3_ds2(found, p.K)
+    vector = np.asarray(result.atCal3DS2(CALIBRATION_KEY).vector())
     behind = np.unique(p.point[_depths(p, T, xyz) <= MIN_DEPTH_MU])
     if len(behind):
-        raise _BehindCameraError(behind, replace(p, T_submap_kf=T, xyz_mu=xyz), correction)
-    marginal = np.asarray(gtsam.Marginals(graph, result).marginalCovariance(CALIBRATION_KEY))
-    noise_ratio = _noise_ratio(p, T, xyz, correction)
-    return CalibratedOptimum(T, correction, J @ marginal @ J.T, noise_ratio, before, float(optimizer.error()))
+        reached = replace(p, T_submap_kf=T, xyz_mu=xyz)
+        raise _BehindCameraError(behind, reached, _from_cal3_ds2(vector, p.K)[0])
+    return _Found(p, graph, result, T, xyz, vector, before, float(optimizer.error()))
 
 
 def _depths(problem: BundleProblem, T: FloatArray, xyz: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from dualslam.backend.calibration_bundle import CalibratedOptimum, optimise_with_camera
+from dualslam.backend.calibration_bundle import CalibratedOptimum, optimise_with_camera, poses_with_camera
 from dualslam.backend.observability import compute_depth_sigmas, compute_residuals
 from dualslam.backend.solver import GTSAM_ERRORS, SolverFailure
 from dualslam.config.calibration_config import CalibrationConfig
@@ -60,8 +60,6 @@ MIN_VIEWS = 3
 MAX_DEPTH_SIGMA = 0.3
 """Relative; landmarks whose distance is known no better make the problem singular and say nothing."""
 MIN_OBSERVATIONS = 1000
-HELD_SIGMA = 1e-5
-"""Prior sigma of a correction that is to stay where it is."""
 MAX_PRIOR_SIGMAS = 6.0
 """A correction farther from the given calibration than this says that something else is wrong."""
 
@@ -136,8 +134,7 @@ def find_preferred_camera(
         return None
     try:
         now, preferred = (
-            optimise_with_camera(problem, held, np.full(5, HELD_SIGMA), robust_k, held).T_submap_kf
-            for held in (present.vector, answer.correction)
+            poses_with_camera(problem, correction, robust_k) for correction in (present.vector, answer.correction)
         )
     except (*GTSAM_ERRORS, np.linalg.LinAlgError):
         return None
