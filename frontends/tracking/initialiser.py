@@ -31,6 +31,7 @@ from dualslam.core.types import (
     View,
 )
 from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
+from dualslam.frontends.tracking.near_points import N_PROOF, nearer_than_proven
 from dualslam.frontends.tracking.resection import resect
 from dualslam.frontends.tracking.two_view_hypotheses import MIN_NOISE2, propose_relative_poses
 
@@ -44,7 +45,6 @@ MAX_VIEWS = 120
 LAGS = (2, 4, 8, 16, 32, START_REACH)  # frames back that are tried as the first view
 MAX_PAIRS = 2  # tried with each view, in turn: what two views farther apart lack, the next two lack most often as well
 N_WITNESSES = 3  # frames between the two views that must agree
-N_PROOF = 3  # views that prove a point
 PROVEN = 1 / 3  # share of the points, and of those that a start needs, that are proven; it is made of these alone
 NEAR = 0.5  # share of the points that a start needs at least which must be near: on a road these fix the motion
 RUNNER_UP = 0.75  # a pose that explains less than this share of what the best one does is out of the question,
@@ -281,7 +281,11 @@ class Initialiser:
         # less noisy than supposed: as a point right before the camera, which pins it. So a point is taken on the word
         # of three views, by a gate in the residuals' own variance.
         inlier &= result.chi2 < CHI2_99[2] * float(np.clip(chi2, MIN_NOISE2, 1.0))
-        proven = keep & _agreeing(problem, inlier) & (np.bincount(problem.point[inlier], minlength=len(xyz)) >= N_PROOF)
+        n_views = np.bincount(problem.point[inlier], minlength=len(xyz))
+        proven = keep & _agreeing(problem, inlier) & (n_views >= N_PROOF)
+        # Of a pattern that repeats itself, a third view of five fits by chance. Right before the camera, where it would
+        # weigh most, a point is taken on the word of all of them, unless others that all have seen are as near.
+        proven &= ~nearer_than_proven(result.xyz_mu[:, 2], proven & (n_views == len(views)))
         if proven.sum() < PROVEN * max(int(keep.sum()), self._config.min_points):
             detail = f"three views prove {proven.sum()} of {keep.sum()} points"
             return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers)

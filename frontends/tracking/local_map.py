@@ -8,18 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.geometry.projection import project_points
-from dualslam.core.quantiles import quantile
 from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.frontends.tracking.near_points import N_PROOF, nearer_than_proven
 from dualslam.map.submap import Submap
 
 VIEW_COSINE_MIN = 0.5  # a patch seen from more than 60 degrees off its mean direction does not look the same
-N_PROOF = 3
-"""Keyframes that prove a landmark: two show it on the epipolar line of each other, where anything may be."""
 SAFE, MOST = 2, 0.5
 """With fewer proven landmarks than so many times the inliers that are asked for, or than this share, all are used."""
-NEARER, NEAREST = 0.5, 0.05
-"""Of the unproven ones, those are left out that are nearer than so many times the depth of the nearest proven ones
-(this share): their lever is twice as long."""
 
 
 def covering_keyframes(submap: Submap, at_most: int, min_new: int) -> list[int]:
@@ -123,14 +118,8 @@ class LocalMap:
 
 
 def trusted(submap: Submap, ids: IntArray, T_cam_submap: FloatArray, min_inliers: int) -> BoolArray:
-    """Return which landmarks a pose is estimated from: not unproven ones right before the camera.
-
-    What two views show is on the epipolar line of either, and may be anything. Of the wrong ones those with the
-    longest lever weigh most, which are nearer than all that three keyframes see: they hold the camera where it
-    is, and a turn takes the place of its motion.
-    """
+    """Return which landmarks a pose is estimated from: not unproven ones right before the camera."""
     proven = np.asarray(submap.n_observations(ids) >= N_PROOF)
     if np.count_nonzero(proven) < max(SAFE * min_inliers, MOST * len(ids)):
         return np.ones(len(ids), np.bool_)
-    depth = submap.depths(ids, T_cam_submap)
-    return np.asarray(proven | (depth > NEARER * quantile(depth[proven], NEAREST)))
+    return ~nearer_than_proven(submap.depths(ids, T_cam_submap), proven)

@@ -1,0 +1,36 @@
+"""Points right before the camera have the longest lever: a pose goes by those alone that views enough have proven."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dualslam.core.quantiles import quantile
+from dualslam.core.types import BoolArray, FloatArray
+
+N_PROOF = 3
+"""Views that prove a point: two show it on the epipolar line of each other, where anything may be."""
+NEARER, NEAREST = 0.5, 0.05
+"""Too near is what is nearer than so many times the depth of the nearest proven points (this share of them): the lever
+is twice as long."""
+
+
+def nearer_than_proven(depth: FloatArray, proven: BoolArray) -> BoolArray:
+    """Return which points are unproven, and nearer than any proof reaches.
+
+    On a scene that repeats itself wrong matches lie on the epipolar line, too: as points at any depth. Of these the
+    near ones weigh most: they hold the camera where it is, and a turn takes the place of its motion. Where true points
+    are near, some are proven, and unproven ones beside them stay.
+
+    Parameters
+    ----------
+    depth : (N,) float64
+    proven : (N,) bool
+
+    Returns
+    -------
+    (N,) bool
+        All False where nothing is proven.
+    """
+    if not proven.any():
+        return np.zeros(len(depth), np.bool_)
+    return np.asarray(~proven & (depth <= NEARER * quantile(depth[proven], NEAREST)))
