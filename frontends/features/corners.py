@@ -195,9 +195,9 @@ def _peaks(patches: NDArray[np.uint8]) -> tuple[NDArray[np.float32], IntArray]:
     """Difference of Gaussians about its extremum beside each patch's centre (N, 3, 3), upwards, and where that is."""
     centre, reach = patches.shape[1] // 2, _DOG_REACH_PX + 2
     part = slice(centre - reach, centre + reach + 1)
-    grey = patches[:, part, part].reshape(len(patches), (2 * reach + 1) ** 2).astype(np.float32)
+    grey = patches[:, part, part].astype(np.float32).reshape(len(patches), (2 * reach + 1) ** 2)
     response = (grey @ _dog_weights()).reshape(-1, 5, 5)
-    response *= np.where(response[:, 2:3, 2:3] < 0, -1, 1)
+    response *= np.where(response[:, 2:3, 2:3] < 0, np.float32(-1), np.float32(1))
     v, u = np.divmod(response[:, 1:4, 1:4].reshape(-1, 9).argmax(axis=1), 3)
     peaks = sliding_window_view(response, (3, 3), axis=(1, 2))[np.arange(len(u)), v, u]
     return peaks, np.stack([u - 1, v - 1], axis=1)

@@ -30,9 +30,11 @@ def test_share_out_fills_what_poor_levels_leave() -> None:
 def test_select_spread_counts(n_wanted: int) -> None:
     rng = np.random.default_rng(0)
     xy, response = rng.integers(16, 600, (3000, 2)), rng.integers(1, 256, 3000).astype(float)
-    rows = select_spread(xy, response, n_wanted)
+    given = np.asfortranarray(xy)
+    rows = select_spread(given, response, n_wanted)
     assert len(rows) == min(n_wanted, 3000)
     assert (np.diff(rows) > 0).all()
+    np.testing.assert_array_equal(given, xy)
 
 
 def test_select_spread_takes_the_strongest_of_a_crowd_and_the_lonely() -> None:
