@@ -55,6 +55,11 @@ class Leap:
         return self.n_asked >= MIN_ASKED and self.off_mu > ALLOWED * self.usual_mu
 
     @property
+    def is_usual(self) -> bool:
+        """Whether the camera moves so elsewhere, too."""
+        return self.n_asked >= MIN_ASKED and self.off_mu <= self.usual_mu
+
+    @property
     def numbers(self) -> dict[str, float]:
         """For the event log."""
         return {"leap_off": self.off_mu, "leap_usual": self.usual_mu, "leap_asked": float(self.n_asked)}
@@ -138,7 +143,8 @@ def refuse_leaps(
 ) -> Failure | None:
     """Return why a walk's leaps are not to be believed, by what another map of the same run shows of its camera.
 
-    A leap that has rivals is believed only where the camera cannot have moved as any of them says.
+    A leap that has rivals is believed only where it is a usual one and the camera cannot have moved as any of them
+    says: what repeats itself has poses for many places, and the right one need not be among those found.
 
     Parameters
     ----------
@@ -149,21 +155,23 @@ def refuse_leaps(
     rivals : sequence of Rival
     """
     usual_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
-    leaps_at = np.flatnonzero(np.diff(times_s) > MISSING * usual_s)
-    for i in leaps_at.tolist():
-        leap = _leap_at(i, times_s, centres, times_known_s, centres_known)
+    known = times_known_s, centres_known
+    missing = np.flatnonzero(np.diff(times_s) > MISSING * usual_s).tolist()
+    leaps = {i: _leap_at(i, times_s, centres, *known) for i in missing}
+    for leap in leaps.values():
         if leap is not None and leap.is_refused:
             return _refusal(leap)
     for rival in rivals:
-        later = leaps_at[times_s[leaps_at] >= rival.timestamp_s]
-        leap = None
-        if len(later):
+        at = next((i for i in leaps if times_s[i] >= rival.timestamp_s), None)
+        measured = None if at is None else leaps[at]
+        if at is not None and measured is not None and measured.is_usual:
             moved = centres.copy()
-            moved[: later[0] + 1] = se3.act(rival.T_rival_walked, centres[: later[0] + 1])
-            leap = _leap_at(int(later[0]), times_s, moved, times_known_s, centres_known)
-        if leap is None or not leap.is_refused:
-            detail = "beyond the gap two poses are alike, and the camera may have come to either"
-            return Failure(FailureReason.LOOK_ALIKE, detail, {} if leap is None else leap.numbers)
+            moved[: at + 1] = se3.act(rival.T_rival_walked, centres[: at + 1])
+            measured = _leap_at(at, times_s, moved, *known)
+            if measured is not None and measured.is_refused:
+                continue
+        detail = "beyond the gap two poses are alike, and the camera may have come to either"
+        return Failure(FailureReason.LOOK_ALIKE, detail, {} if measured is None else measured.numbers)
     return None
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from dualslam.core.events import EventKind
 from dualslam.core.types import FailureReason, FloatArray
-from dualslam.recovery.leaps import MIN_ASKED, Rival, measure_leap, refuse_leaps
+from dualslam.recovery.leaps import MIN_ASKED, Rival, measure_leap, refuse_leaps, usual_difference
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
 
 RATE_HZ = 20.0
@@ -83,6 +83,12 @@ def test_a_leap_with_a_rival_is_believed_where_the_camera_cannot_have_come_to_it
     refused = refuse_leaps(t_new, p_new, t[old], p[old], [far, near])
     assert refused is not None
     assert refused.reason is FailureReason.LOOK_ALIKE
+    unusual = p_new.copy()
+    unusual[:30, 0] -= 1.5 * usual_difference(t[old], p[old], float(t_new[30] - t_new[29]))[0]
+    assert refuse_leaps(t_new, unusual, t[old], p[old]) is None
+    refused = refuse_leaps(t_new, unusual, t[old], p[old], [far])
+    assert refused is not None
+    assert refused.reason is FailureReason.LOOK_ALIKE, "the right one need not be among those found"
     p_new[:30, 0] -= 1.5  # the walk has taken the wrong one
     refused = refuse_leaps(t_new, p_new, t[old], p[old], [Rival(float(t_new[29]), np.linalg.inv(period))])
     assert refused is not None
