@@ -197,9 +197,10 @@ class PnpOdometry:
                 return track
         features: Features | Failure | None = find_lack(view, self._min_features)
         if features is None:
-            self._auxiliary_features.prefetch(
-                chain(self._needed().values(), [view], self._route.usable_after(view, self._min_features))
-            )
+            # The frame that confirms another is the last that is needed: the live front end goes on from there.
+            is_last = self._tracks_live and self._beyond is not None
+            ahead = () if is_last else self._route.usable_after(view, self._min_features)
+            self._auxiliary_features.prefetch(chain(self._needed().values(), [view], ahead))
             self._catch_up()
             features = self._look_at(view)
         if isinstance(features, Failure):

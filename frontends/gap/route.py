@@ -10,7 +10,7 @@ from dualslam.core.types import Failure, FailureReason, View
 
 MIN_CONTRAST = 4.0
 """Standard deviation of the greys: sensors have a noise of 1 to 3, and blank images have that alone."""
-N_PREFETCHED = 2
+N_PREFETCHED = 1
 """Usable frames beyond the one at hand: a gap relocalisation takes two."""
 
 
