@@ -70,7 +70,8 @@ class KeyframeConfig(StrictModel):
     """When a frame becomes a keyframe."""
 
     max_tracked_ratio: float = Field(0.6, gt=0, le=1)
-    """A keyframe is due when fewer than this share of the last keyframe's landmarks is still tracked."""
+    """A keyframe is due when fewer than this share of the last keyframe's landmarks is still tracked; from 1.4
+    degrees of parallax on; with less a smaller one, half of it where the camera turns in place."""
     max_parallax_deg: float = Field(4.0, gt=0)
     """Parallax at which a keyframe is due whatever is tracked."""
     max_frames: int = Field(30, ge=1)

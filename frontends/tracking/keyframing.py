@@ -12,6 +12,10 @@ from dualslam.map.submap import Submap
 
 MIN_PARALLAX_DEG = 0.5
 """...and the camera has moved enough to see the scene's median depth under this angle (or tracking is weak)."""
+FULL_PARALLAX_DEG, LEAST = 1.4, 0.6
+"""Parallax from which on `max_tracked_ratio` holds as it is; with less it is smaller in proportion, down to this share.
+At 1 degree half of the scene is too far to be triangulated (`mapping.min_parallax_deg`), and a pixel is a tenth of the
+depth. With 2 degrees and a half `euroc_takeoff` breaks: its bench has left before a keyframe comes."""
 
 N_LIKE = 5
 """Keyframes of earlier runs, those that see most of what a frame sees, that are asked whether one shows the same."""
@@ -75,7 +79,8 @@ def _shows_other(share: float, parallax: float, n_frames: int, config: KeyframeC
     if parallax < MIN_PARALLAX_DEG:
         # A turn in place reveals nothing that could be triangulated, until half of what was known is out of view.
         return share < 0.5 * config.max_tracked_ratio
-    return share < config.max_tracked_ratio or n_frames >= config.max_frames
+    worth = min(max(parallax / FULL_PARALLAX_DEG, LEAST), 1.0)
+    return share < worth * config.max_tracked_ratio or n_frames >= config.max_frames
 
 
 def _share_in(landmark_ids: IntArray, submap: Submap, keyframe_id: int) -> float:

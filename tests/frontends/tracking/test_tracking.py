@@ -332,6 +332,25 @@ class TestKeyframing:
         assert due
         assert due[0] > 9
 
+    def test_with_little_parallax_more_has_to_be_lost(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8], start_at=8)
+        seen = live.submap.landmark_of[8]
+        seen = seen[(seen >= 0) & (live.submap.n_observations(seen) >= 3)]
+        config = KeyframeConfig(max_tracked_ratio=0.6, weak_landmarks=10)
+        verdicts = {0.25: (True, True), 0.5: (False, True), 0.65: (False, False)}  # with little, and with much
+        for share, (with_little, with_much) in verdicts.items():
+            held = seen[: round(share * len(seen))]
+            due: dict[bool, set[bool]] = {True: set(), False: set()}
+            for i in range(9, 20):
+                track = tracked(live, world.view(i))
+                ids = np.where(np.isin(track.landmark_ids, seen), NO_LANDMARK, track.landmark_ids)
+                ids[np.flatnonzero(ids == NO_LANDMARK)[: len(held)]] = held
+                shown = replace(track, landmark_ids=ids)
+                parallax = parallax_deg(shown, live.submap, 8)
+                if 0.5 < parallax < 1.0 or 1.5 < parallax < config.max_parallax_deg:
+                    due[parallax < 1.0].add(keyframe_due(shown, live.submap, 8, config))
+            assert due == {True: {with_little}, False: {with_much}}, share
+
     def test_parallax_is_the_angle_of_the_baseline(self, world: PointWorld) -> None:
         live = front_end(world, [0, 4, 8], start_at=8)
         track = tracked(live, world.view(12))
