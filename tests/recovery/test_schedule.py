@@ -117,7 +117,7 @@ class TestFramesBeforeTheStart:
     def test_the_same_in_a_sequence_that_is_read_backwards(self) -> None:
         forwards = away_first()
         world = PointWorld(forwards.xyz, forwards.T_world_cam[::-1])
-        system, watched = watched_system(world, enabled=False, retry_keyframes=[8])
+        system, watched = watched_system(world, enabled=False, retry_keyframes=[9])
         for frame in reversed(world.frames()):
             system.step(frame)
         system.finish()
