@@ -228,8 +228,6 @@ class Track:
         Whether guided matching failed and the pose came from wide matching.
     covariance : (6, 6) float64
         Of `T_cam_submap`, for a left perturbation (rotation, translation).
-    T_rival : (4, 4) float64 or None
-        Beyond a gap: another ``T_cam_submap`` that explains nearly as much. Who goes on has to tell the two apart.
     """
 
     view: View
@@ -242,7 +240,6 @@ class Track:
     chi2: float
     wide: bool
     covariance: FloatArray
-    T_rival: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,6 @@ from dualslam.core.geometry import sim3
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import FloatArray
 from dualslam.map.atlas import Atlas
-from dualslam.map.submap import Submap
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,21 +22,6 @@ class FramePose:
     submap_id: int
     keyframe_id: int
     T_kf_cam: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Path:
-    """Where a camera was in a submap: times (N,), ascending, and centres (N, 3)."""
-
-    times_s: FloatArray
-    centres: FloatArray
-
-    @classmethod
-    def of(cls, poses: Iterable[FramePose], submap: Submap) -> Path:
-        """Return the path of frames that are posed in a submap."""
-        ordered = sorted(poses, key=lambda pose: pose.timestamp_s)
-        centres = [submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)[:3, 3] for pose in ordered]
-        return cls(np.array([pose.timestamp_s for pose in ordered]), np.array(centres).reshape(-1, 3))
 
 
 def compose(poses: Iterable[FramePose], atlas: Atlas, S_world_submap: dict[int, FloatArray]) -> Trajectory:

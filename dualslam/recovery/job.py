@@ -8,7 +8,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.events import Event
 from dualslam.core.types import Failure, FloatArray, View
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose, Path
+from dualslam.map.trajectory import FramePose
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.linking import LinkEstimate
 from dualslam.recovery.overlap_refinement import OverlapReport
@@ -41,10 +41,6 @@ class RecoveryJob:
         Whether the submap is one without its start, which the walk is to be compared with (`recovery/audit.py`).
     tries : LinkTries
         What earlier walks have tried in vain.
-    poses : tuple of FramePose
-        Of the frames that the new submap has posed.
-    paths : dict of int to Path
-        For each lost submap the camera's path in it.
     """
 
     submap: Submap
@@ -57,8 +53,6 @@ class RecoveryJob:
     camera_covariance: FloatArray | None
     is_audit: bool = False
     tries: LinkTries = field(default_factory=LinkTries)
-    poses: tuple[FramePose, ...] = ()
-    paths: dict[int, Path] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,8 +90,7 @@ class RecoveryResult:
     seconds, cpu_s : float
         Wall time of all attempts, and CPU time of the process, whose threads find features beside the walk.
     looks_alike : bool
-        Whether it found no believable pose beyond a gap: two were alike, or the camera cannot have moved so. No later
-        walk over it would tell more.
+        Whether beyond a gap two poses explained as much: no later walk over it would tell them apart.
     tries : LinkTries
         The job's, with the tries of this walk.
     """

@@ -7,12 +7,10 @@ nothing is missing. So no unit is needed, and a hand is judged as a hand, a car 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
@@ -55,30 +53,9 @@ class Leap:
         return self.n_asked >= MIN_ASKED and self.off_mu > ALLOWED * self.usual_mu
 
     @property
-    def is_usual(self) -> bool:
-        """Whether the camera moves so elsewhere, too."""
-        return self.n_asked >= MIN_ASKED and self.off_mu <= self.usual_mu
-
-    @property
     def numbers(self) -> dict[str, float]:
         """For the event log."""
         return {"leap_off": self.off_mu, "leap_usual": self.usual_mu, "leap_asked": float(self.n_asked)}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Rival:
-    """Another answer to where the camera is beyond a gap, which explains nearly as much of what is seen there.
-
-    Attributes
-    ----------
-    timestamp_s : float
-        Of the frame for which it was found.
-    T_rival_walked : (4, 4) float64
-        Moves all that lies beyond the gap from where the walk has it to where the rival does.
-    """
-
-    timestamp_s: float
-    T_rival_walked: FloatArray
 
 
 def measure_leap(times_s: FloatArray, centres: FloatArray, last_before: int) -> Leap | None:
@@ -135,16 +112,9 @@ def usual_difference(times_s: FloatArray, centres: FloatArray, leap_s: float) ->
 
 
 def refuse_leaps(
-    times_s: FloatArray,
-    centres: FloatArray,
-    times_known_s: FloatArray,
-    centres_known: FloatArray,
-    rivals: Sequence[Rival] = (),
+    times_s: FloatArray, centres: FloatArray, times_known_s: FloatArray, centres_known: FloatArray
 ) -> Failure | None:
     """Return why a walk's leaps are not to be believed, by what another map of the same run shows of its camera.
-
-    A leap that has rivals is believed only where it is a usual one and the camera cannot have moved as any of them
-    says: what repeats itself has poses for many places, and the right one need not be among those found.
 
     Parameters
     ----------
@@ -152,38 +122,20 @@ def refuse_leaps(
         Of the frames of the walk and those that it set out from, by ascending time.
     times_known_s : (M,), centres_known : (M, 3)
         Of the other map's, in the unit of the walk's.
-    rivals : sequence of Rival
     """
-    usual_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
-    known = times_known_s, centres_known
-    missing = np.flatnonzero(np.diff(times_s) > MISSING * usual_s).tolist()
-    leaps = {i: _leap_at(i, times_s, centres, *known) for i in missing}
-    for leap in leaps.values():
-        if leap is not None and leap.is_refused:
-            return _refusal(leap)
-    for rival in rivals:
-        at = next((i for i in leaps if times_s[i] >= rival.timestamp_s), None)
-        measured = None if at is None else leaps[at]
-        if at is not None and measured is not None and measured.is_usual:
-            moved = centres.copy()
-            moved[: at + 1] = se3.act(rival.T_rival_walked, centres[: at + 1])
-            measured = _leap_at(at, times_s, moved, *known)
-            if measured is not None and measured.is_refused:
-                continue
-        detail = "beyond the gap two poses are alike, and the camera may have come to either"
-        return Failure(FailureReason.LOOK_ALIKE, detail, {} if measured is None else measured.numbers)
-    return None
-
-
-def _leap_at(
-    i: int, times_s: FloatArray, centres: FloatArray, times_known_s: FloatArray, centres_known: FloatArray
-) -> Leap | None:
-    """Measure the leap after row i by another map; None where one side is too short, or the leap too long."""
-    leap_s, usual_s = float(times_s[i + 1] - times_s[i]), float(np.median(np.diff(times_s)))
-    if leap_s > MAX_LEAP_S:
+    if len(times_s) < 2 * WINDOW_FRAMES:
         return None
-    off = _off(times_s, centres, i, i + 1, max(WINDOW_S, WINDOW_FRAMES * usual_s), usual_s)
-    return None if off is None else Leap(off, *usual_difference(times_known_s, centres_known, leap_s))
+    usual_s = float(np.median(np.diff(times_s)))
+    window_s = max(WINDOW_S, WINDOW_FRAMES * usual_s)
+    for i in np.flatnonzero(np.diff(times_s) > MISSING * usual_s).tolist():
+        leap_s = float(times_s[i + 1] - times_s[i])
+        off = _off(times_s, centres, i, i + 1, window_s, usual_s) if leap_s <= MAX_LEAP_S else None
+        if off is None:
+            continue
+        leap = Leap(off, *usual_difference(times_known_s, centres_known, leap_s))
+        if leap.is_refused:
+            return _refusal(leap)
+    return None
 
 
 def _refusal(leap: Leap) -> Failure:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import takewhile
 from typing import Any
+
+import numpy as np
 
 from dualslam.calibration.lens import Calibration
 from dualslam.config.settings import RecoveryConfig
@@ -22,13 +24,14 @@ from dualslam.map.record import FrameStamp, Record
 from dualslam.map.solving import solve
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
-from dualslam.map.trajectory import FramePose, Path
+from dualslam.map.trajectory import FramePose
 from dualslam.recovery.audits import Audits
 from dualslam.recovery.bypass import absorb
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.fusion import fuse
 from dualslam.recovery.job import RecoveredFrame, RecoveryJob, RecoveryResult
+from dualslam.recovery.leaps import refuse_leaps
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.merge import Merged, merge_recovery
 from dualslam.recovery.overlap_refinement import gauge_at_overlap
@@ -165,27 +168,21 @@ class Recoveries:
     def _submit(
         self, submap: Submap, newest: View, views: Iterable[View], onsets: dict[int, int], now: FrameStamp | None
     ) -> None:
-        atlas = self._record.atlas
         job = RecoveryJob(
             submap=submap.copy(),
             newest_id=newest.index,
-            lost={m: atlas.submaps[m].copy() for m in onsets},
+            lost={m: self._record.atlas.submaps[m].copy() for m in onsets},
             onsets=onsets,
             views=tuple(views),
             own=tuple(view for view in self._buffer if view.index in submap.keyframes),
             camera=self._calibration.camera,
             camera_covariance=self._calibration.covariance,
             tries=self._tries.copy(),
-            poses=tuple(self._posed_in(submap)),
-            paths={m: Path.of(self._posed_in(atlas.submaps[m]), atlas.submaps[m]) for m in onsets},
         )
         self._retries.start_of(submap, newest.index)
         n_live = self._retries.n_live(submap, (now or newest).index)
         self._under_way[submap.id] = _UnderWay(time.perf_counter(), n_live, again=now is not None)
         self._executor.submit(job)
-
-    def _posed_in(self, submap: Submap) -> Iterator[FramePose]:
-        return (pose for pose in self._record.poses.values() if pose.submap_id == submap.id)
 
     def _way_to_gaps(self, submap: Submap) -> list[View]:
         """Return the buffered frames without a pose, and what leads to them from the submap; the latest first.
@@ -228,6 +225,9 @@ class Recoveries:
                     self._tries.take_over(lost, result.tries)
             if walk.again and not job.onsets and not self._poses_any(result):
                 continue  # the last one for these frames; what it would add to the map is not worth a solution
+            if not isinstance(result, Failure) and (refused := self._refuse_leaps(result)) is not None:
+                self._failed(job, now, refused, time.perf_counter() - walk.began_s)
+                continue
             if not isinstance(result, Failure):
                 with self._record.timer.measure("merging"):
                     self._take_in(job, result, live, now, walk.began_s)
@@ -236,6 +236,19 @@ class Recoveries:
                 continue
             if unlinked or self._way_to_gaps(self._record.atlas.submaps[job.submap.id]):
                 self._retries.leave_open(job.submap.id, walk.n_live, job.camera)
+
+    def _refuse_leaps(self, result: RecoveryResult) -> Failure | None:
+        """Return why a link is not to be believed whose walk has leapt as the lost map's camera never moved."""
+        if result.link is None:
+            return None
+        old, new = self._record.atlas.submaps[result.link.old_id], result.submap
+        walked = {frame.pose.index: frame.pose for frame in result.frames}
+        ours = [p for p in self._record.poses.values() if p.submap_id == new.id and p.index not in walked]
+        ours = [p for p in ours if p.keyframe_id in new.keyframes] + list(walked.values())
+        theirs = [p for p in self._record.poses.values() if p.submap_id == old.id]
+        t_new, centres = _path_of(ours, new)
+        t_old, centres_old = _path_of(theirs, old)
+        return refuse_leaps(t_new, centres, t_old, centres_old / float(sim3.scale(result.link.estimate.S_old_new)))
 
     def _poses_any(self, result: RecoveryResult | Failure) -> bool:
         """Whether a walk has found a pose for a frame that has none."""
@@ -354,6 +367,13 @@ class Recoveries:
         if live is not None:
             settled.update(next(c for c in self._record.atlas.components() if live.submap.id in c))
         self._lost = {m: loss for m, loss in self._lost.items() if m not in settled}
+
+
+def _path_of(poses: list[FramePose], submap: Submap) -> tuple[FloatArray, FloatArray]:
+    """Return times (N,), ascending, and centres (N, 3) of frames posed in a map."""
+    poses = sorted(poses, key=lambda pose: pose.timestamp_s)
+    centres = [submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)[:3, 3] for pose in poses]
+    return np.array([pose.timestamp_s for pose in poses]), np.array(centres).reshape(-1, 3)
 
 
 def _same_camera(job: RecoveryJob, submap: Submap) -> bool:

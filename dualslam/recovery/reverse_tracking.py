@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,17 +22,14 @@ from dualslam.config.settings import FusionConfig, RecoveryConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.events import Event, EventKind
-from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, Track, View
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose, Path
+from dualslam.map.trajectory import FramePose
 from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult
-from dualslam.recovery.leaps import refuse_leaps
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.linking import NO_BEND, Bend, LinkEstimate
 from dualslam.recovery.overlap_refinement import OverlapReport, refine_overlap
-from dualslam.recovery.progress import Progress
 from dualslam.recovery.relinker import Linker, LinkTry, Relinker
 from dualslam.recovery.schedule import way_to_gaps
 from dualslam.recovery.walk_news import WalkNews, WalkTrace
@@ -87,7 +84,7 @@ def run_recovery(
 def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNews, None, RecoveryResult | Failure]:
     """Do what `run_recovery` does; yields how far it has come, and nothing depends on who takes notice."""
     started, cpu_started = time.perf_counter(), time.process_time()
-    best: Progress | None = None
+    best: _Progress | None = None
     problem = Failure(FailureReason.SOLVER)
     events: list[Event] = []
     looks_alike, tries = False, job.tries.copy()
@@ -100,18 +97,10 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
             problem = progress
             continue
         events += progress.events
-        looks_alike |= progress.looks_alike and progress.link is None
-        ends = progress.ends_recovery
-        if job.lost and progress.is_doubtful:
-            # What is posed beyond the gap is not to be believed; what is on this side of it stays.
-            before = replace(job, views=tuple(view for view in job.views if view.index > progress.beyond))
-            progress = yield from _make_attempt(before, parts, attempt, until, tries)
-            if isinstance(progress, Failure):
-                problem = progress
-                break
+        looks_alike |= progress.looks_alike
         if best is None or progress.link is not None:
             best = progress
-        if ends:
+        if progress.link is not None or progress.needs_camera or progress.needs_live_end or progress.looks_alike:
             break
     if best is None:
         return problem
@@ -120,9 +109,54 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
     return RecoveryResult(best.submap, frames, best.link, tuple(events), seconds, cpu_s, looks_alike, tries)
 
 
+@dataclass(slots=True, eq=False)
+class _Progress:
+    """The state of one attempt."""
+
+    submap: Submap
+    frames: dict[int, RecoveredFrame] = field(default_factory=dict)  # in the order in which they were posed first
+    events: list[Event] = field(default_factory=list)
+    link: FoundLink | None = None
+    n_keyframes: int = 0
+    n_gaps: int = 0
+    n_skipped: int = 0  # frames without a pose between some that have one
+    n_unusable: int = 0  # the last frames
+    out_of_time: bool = False
+    given_up: bool = False
+    needs_camera: bool = False  # no other walk would do better, before the camera is calibrated
+    needs_live_end: bool = False  # nor before the live end has grown, from which all of them set out
+    looks_alike: bool = False  # beyond a gap: what one front end cannot tell apart another may not even notice
+    why_unusable: str = ""
+    why_not_linked: str = ""
+
+    @property
+    def verdict(self) -> str:
+        if self.link is not None:
+            return "linked"
+        ended = "out of time" if self.out_of_time else self.why_unusable if self.n_unusable else "the buffer ends"
+        ended = "given up" if self.given_up else ended
+        return f"{ended}; no link: {self.why_not_linked}" if self.why_not_linked else ended
+
+    def note_unusable(self, failure: Failure) -> None:
+        self.n_unusable += 1
+        self.looks_alike |= failure.reason is FailureReason.LOOK_ALIKE
+        self.why_unusable = failure.detail or str(failure.reason)
+
+    def note_posed(self, frame: RecoveredFrame, new_keyframe: bool) -> None:
+        self.frames.setdefault(frame.pose.index, frame)
+        self.n_keyframes += new_keyframe
+        self.n_gaps += self.n_unusable > 0
+        self.n_skipped += self.n_unusable
+        self.n_unusable = 0
+
+    def note_confirmed(self, frame: RecoveredFrame) -> None:
+        self.frames.setdefault(frame.pose.index, frame)
+        self.n_skipped -= 1
+
+
 def _make_attempt(
     job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float, tries: LinkTries
-) -> Generator[WalkNews, None, Progress | Failure]:
+) -> Generator[WalkNews, None, _Progress | Failure]:
     """Make one attempt, from a copy of the job's submap; it stops at the time `until`."""
     started = time.perf_counter()
     submap, graph = job.submap.copy(), parts.new_graph()
@@ -135,7 +169,7 @@ def _make_attempt(
     reverse_tracker.start_at(job.newest_id)
     relinker = Relinker(submap, job.lost, job.onsets, parts.link)
     reverse_tracker.keep(relinker.keyframe_ids)  # redundant or not: linking stands on keyframes that both maps hold
-    progress = Progress(submap)
+    progress = _Progress(submap)
     # Frames before a start are worth a look each, however many show nothing; no map waits for the end of that walk.
     max_gap_frames = parts.config.max_gap_frames if job.lost else len(job.views)
     views = job.views if job.lost else _there_and_back(job.views, progress)
@@ -150,15 +184,14 @@ def _make_attempt(
         if isinstance(step.track, Failure):
             progress.note_unusable(step.track)
             continue
-        frame = _recovered_frame(reverse_tracker, step.view, step.track)
-        progress.note_posed(step.track, frame, step.report is not None)
+        progress.note_posed(_recovered_frame(reverse_tracker, step.view, step.track), step.report is not None)
         if (earlier := reverse_tracker.confirmed()) is not None:
-            progress.note_confirmed(earlier, _recovered_frame(reverse_tracker, earlier.view, earlier))
+            progress.note_confirmed(_recovered_frame(reverse_tracker, earlier.view, earlier))
             trace.note_confirmed(earlier)
         if step.view.index not in submap.keyframes:
             continue
         for tried in relinker.attempts(step.view.index):
-            found = _fused(tried, job, submap, attempt.name, parts, tries, progress)
+            found = _fused(tried, job, submap, attempt.name, parts, tries)
             if not isinstance(found, Failure):
                 progress.link = found
                 break
@@ -167,11 +200,7 @@ def _make_attempt(
             progress.needs_camera |= found.reason is FailureReason.CAMERA
             # What was lost across a gap the others lose as well: they cross it by the same matches, or by fewer.
             progress.needs_live_end |= found.reason is FailureReason.SCALE_LOST and progress.n_gaps > 0
-            progress.looks_alike |= found.reason in (FailureReason.LEAP, FailureReason.LOOK_ALIKE)
             progress.given_up |= progress.needs_camera or found.reason is FailureReason.SCALE_LOST
-            progress.given_up |= found.reason is FailureReason.LEAP
-            # As long as no frames enough lie beyond the gap nothing is measured, and more may tell.
-            progress.given_up |= found.reason is FailureReason.LOOK_ALIKE and bool(found.numbers)
             progress.events.append(_refusal(tried, found, attempt.name, step.view, submap.id))
         progress.given_up |= relinker.has_seen_enough
         if progress.link is not None or progress.given_up:
@@ -181,7 +210,7 @@ def _make_attempt(
     return progress
 
 
-def _there_and_back(views: tuple[View, ...], progress: Progress) -> Iterator[View]:
+def _there_and_back(views: tuple[View, ...], progress: _Progress) -> Iterator[View]:
     """Yield the views, and then, the other way round, those that the walk has found no pose for.
 
     A camera that turns away slowly and comes back at once is lost in reverse, and followed forwards.
@@ -191,18 +220,9 @@ def _there_and_back(views: tuple[View, ...], progress: Progress) -> Iterator[Vie
 
 
 def _fused(
-    tried: LinkTry,
-    job: RecoveryJob,
-    submap: Submap,
-    attempt: str,
-    parts: RecoveryParts,
-    tries: LinkTries,
-    progress: Progress,
+    tried: LinkTry, job: RecoveryJob, submap: Submap, attempt: str, parts: RecoveryParts, tries: LinkTries
 ) -> FoundLink | Failure:
-    """Refine the overlap and with it the link, which must hold as far as where the walk set out, and beyond.
-
-    And the camera must be able to have moved so where the walk has leapt.
-    """
+    """Refine the overlap and with it the link, which must hold as far as where the walk set out, and beyond."""
     found = tried.result
     if isinstance(found, Failure):
         return found
@@ -228,23 +248,10 @@ def _fused(
     again = tries.judge(tried.old_id, link.numbers["sigma_scale"], parts.max_scale_sigma)
     if again is not None:
         return again
-    refused = _refuse_leaps(job, refined, progress, tried.old_id, link)
-    if refused is not None:
-        return refused
     if refined is not submap:
         submap.take_over(refined)
-    told = {"tries": tries.refused[tried.old_id] + 1.0, "rivals": float(len(progress.rivals))}
-    return FoundLink(tried.old_id, replace(link, numbers=link.numbers | told), report, attempt)
-
-
-def _refuse_leaps(
-    job: RecoveryJob, submap: Submap, progress: Progress, old_id: int, link: LinkEstimate
-) -> Failure | None:
-    """Return why a link is not to be believed whose walk has leapt as the lost map's camera never moved."""
-    own = [p for p in job.poses if p.index not in progress.frames and p.keyframe_id in submap.keyframes]
-    path = Path.of([*own, *(frame.pose for frame in progress.frames.values())], submap)
-    known, unit = job.paths[old_id], float(sim3.scale(link.S_old_new))
-    return refuse_leaps(path.times_s, path.centres, known.times_s, known.centres / unit, progress.rivals)
+    link = replace(link, numbers=link.numbers | {"tries": tries.refused[tried.old_id] + 1.0})
+    return FoundLink(tried.old_id, link, report, attempt)
 
 
 def _recovered_frame(reverse_tracker: VisualOdometry, view: View, track: Track) -> RecoveredFrame:
@@ -265,7 +272,7 @@ def _refusal(tried: LinkTry, failure: Failure, attempt: str, view: View, submap_
     return Event(EventKind.LINK_REFUSED, view.index, view.timestamp_s, submap_id, data)
 
 
-def _event_of(job: RecoveryJob, progress: Progress, attempt: str, seconds: float) -> Event:
+def _event_of(job: RecoveryJob, progress: _Progress, attempt: str, seconds: float) -> Event:
     """One attempt in one line, at the frame where it ended."""
     by_index = {view.index: view for view in (*job.own, *job.views)}
     frames = list(progress.frames.values())

@@ -34,7 +34,7 @@ from dualslam.frontends.gap.auxiliary_map import AuxiliaryMap, triangulate
 from dualslam.frontends.gap.consensus import CONFIRMING_SHARE, BeyondGap, confirmed_share
 from dualslam.frontends.gap.relocalisation import GapPose, relocalise_across_gap
 from dualslam.frontends.gap.route import Route, find_lack
-from dualslam.frontends.gap.second_pose import find_second_pose
+from dualslam.frontends.gap.second_pose import refuse_look_alike
 from dualslam.frontends.gap.uncertainty import SMALL_STEP
 from dualslam.frontends.tracking.resection import resect
 from dualslam.frontends.tracking.tracker import GivenPose
@@ -52,28 +52,14 @@ class _Beyond(BeyondGap):
     """A frame beyond a gap, with its view."""
 
     view: View
-    T_rival: FloatArray | None
 
     def track(self, T_cam_submap: FloatArray) -> Track:
         """Return the frame with a pose that it was given in the end, and no landmarks."""
         wide, ids = self.pose, np.full(len(self.view.features), NO_LANDMARK, np.int64)
+        n, n_inliers = len(wide.inliers), int(wide.inliers.sum())
+        numbers = (n, n_inliers, wide.chi2)
         none = np.zeros(0, np.int64)
-        T_rival = self.T_rival
-        if T_rival is not None:  # it moves along
-            T_rival = T_rival @ se3.inverse(wide.T_cam_submap) @ T_cam_submap
-        return Track(
-            self.view,
-            T_cam_submap,
-            T_cam_submap,
-            ids,
-            none,
-            n_matches=len(wide.inliers),
-            n_inliers=int(wide.inliers.sum()),
-            chi2=wide.chi2,
-            wide=True,
-            covariance=wide.covariance,
-            T_rival=T_rival,
-        )
+        return Track(self.view, T_cam_submap, T_cam_submap, ids, none, *numbers, wide=True, covariance=wide.covariance)
 
 
 class PnpOdometry:
@@ -120,6 +106,7 @@ class PnpOdometry:
         self._confirmed: tuple[_Beyond, FloatArray] | None = (
             None  # with its pose from the last gap relocalisation's frame
         )
+        self._doubt: Failure | None = None  # what was found to look alike beyond the gap at hand
         self._beyond: _Beyond | None = None  # the last frame beyond a gap, until another confirms it
 
     # --- the VisualOdometry protocol, as far as the live front end does it
@@ -214,12 +201,8 @@ class PnpOdometry:
             pose = self._relocalise(view, features)
         if isinstance(pose, Failure):
             return pose
-        if isinstance(pose, Track):
-            track = pose
-        else:
-            T_rival = None if self._beyond is None else self._beyond.T_rival
-            track = replace(self._live.track_at(view, pose), T_rival=T_rival)
-        self._following, self._beyond = True, None
+        track = pose if isinstance(pose, Track) else self._live.track_at(view, pose)
+        self._following, self._beyond, self._doubt = True, None, None
         self._map.put(view.index, self.reference_id, track.T_cam_submap)
         self._forget()
         return track
@@ -327,12 +310,18 @@ class PnpOdometry:
             self._config.seed,
         )
         wide = self._judge(found)
+        if not isinstance(wide, Failure):
+            refused = self._refuse_look_alike(wide, features, frames)
+            wide = wide if refused is None else refused
+        if isinstance(wide, Failure) and wide.reason is FailureReason.LOOK_ALIKE:
+            self._map.drop(index)
+            return wide
         if isinstance(wide, Failure):
             step = self._small_step(view, found) if isinstance(found, GapPose) else None
             if step is None:
                 self._map.drop(index)
             return wide if step is None else step
-        self._beyond = _Beyond(features, rows[wide.inliers], wide, view, self._rival(wide, features, frames))
+        self._beyond = _Beyond(features, rows[wide.inliers], wide, view)
         if before is None:
             return Failure(FailureReason.UNCONFIRMED, "the first frame beyond a gap", wide.numbers)
         matches = self._auxiliary.match_wide(before.features, features).index
@@ -369,12 +358,14 @@ class PnpOdometry:
         self._live.take(track)
         return track
 
-    def _rival(self, wide: GapPose, features: Features, frames: list[int]) -> FloatArray | None:
-        """Return another pose of the frame that explains nearly as much as its gap relocalisation, if there is one."""
+    def _refuse_look_alike(self, wide: GapPose, features: Features, frames: list[int]) -> Failure | None:
+        """Return why a gap relocalisation is not believed, if another pose explains nearly as much."""
+        if self._doubt is not None:
+            return self._doubt
         last = frames[-1]
         rows = self._map.rows_with_track(last)
         xyz, good = triangulate(self._map.views(last, rows, frames), self.submap.K)
-        second = find_second_pose(
+        self._doubt = refuse_look_alike(
             self._auxiliary,
             self._map.features(last).descriptors[rows[good]],
             xyz[good],
@@ -384,7 +375,7 @@ class PnpOdometry:
             self._size_px,
             self._config.seed,
         )
-        return second.T_cam_w if second is not None and second.makes_doubtful else None
+        return self._doubt
 
     def _judge(self, wide: GapPose | Failure) -> GapPose | Failure:
         """Hold a gap relocalisation to what health asks of a track, and to the scale that it must not lose."""

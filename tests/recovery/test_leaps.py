@@ -7,7 +7,7 @@ import pytest
 
 from dualslam.core.events import EventKind
 from dualslam.core.types import FailureReason, FloatArray
-from dualslam.recovery.leaps import MIN_ASKED, Rival, measure_leap, refuse_leaps, usual_difference
+from dualslam.recovery.leaps import MIN_ASKED, measure_leap, refuse_leaps
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
 
 RATE_HZ = 20.0
@@ -69,42 +69,6 @@ def test_a_walk_that_has_leapt_is_judged_by_the_lost_map(seed: int) -> None:
     assert refused is not None
     assert refused.reason is FailureReason.LEAP
     assert refuse_leaps(t_new, p_new, t[old][:5], p[old][:5]) is None
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_a_leap_with_a_rival_is_believed_where_the_camera_cannot_have_come_to_it(seed: int) -> None:
-    t, p = way(200, seed)
-    old, new = slice(0, 100), slice(80, 200)
-    t_new, p_new = without(t[new], p[new], 30, 10)
-    period, hair = np.eye(4), np.eye(4)
-    period[0, 3], hair[0, 3] = -1.5, 0.01
-    far, near = Rival(float(t_new[29]), period), Rival(float(t_new[28]), hair)
-    assert refuse_leaps(t_new, p_new, t[old], p[old], [far]) is None
-    refused = refuse_leaps(t_new, p_new, t[old], p[old], [far, near])
-    assert refused is not None
-    assert refused.reason is FailureReason.LOOK_ALIKE
-    unusual = p_new.copy()
-    unusual[:30, 0] -= 1.5 * usual_difference(t[old], p[old], float(t_new[30] - t_new[29]))[0]
-    assert refuse_leaps(t_new, unusual, t[old], p[old]) is None
-    refused = refuse_leaps(t_new, unusual, t[old], p[old], [far])
-    assert refused is not None
-    assert refused.reason is FailureReason.LOOK_ALIKE, "the right one need not be among those found"
-    p_new[:30, 0] -= 1.5  # the walk has taken the wrong one
-    refused = refuse_leaps(t_new, p_new, t[old], p[old], [Rival(float(t_new[29]), np.linalg.inv(period))])
-    assert refused is not None
-    assert refused.reason is FailureReason.LEAP
-
-
-@pytest.mark.parametrize(("length", "known"), [(10, 5), (60, 100), (0, 100)])
-def test_a_leap_with_a_rival_is_not_believed_where_velocities_tell_nothing(length: int, known: int) -> None:
-    """Too little is known of the camera, the leap takes three seconds, or there is none in time."""
-    t, p = way(200, 1)
-    t_new, p_new = without(t[80:], p[80:], 30, length)
-    period = np.eye(4)
-    period[0, 3] = -1.5
-    refused = refuse_leaps(t_new, p_new, t[:known], p[:known], [Rival(float(t_new[29]), period)])
-    assert refused is not None
-    assert refused.reason is FailureReason.LOOK_ALIKE
 
 
 def test_a_map_that_has_leapt_as_its_camera_never_moves_ends_there() -> None:
