@@ -298,9 +298,9 @@ class Submap:
         n = len(self.landmarks)
         died, new = np.flatnonzero(was != alive[: len(was)]), landmark[len(was) :][alive[len(was) :]]
         if len(died) or len(was) < len(alive) or len(counts) < n:
-            change = np.bincount(new, minlength=n) - np.bincount(landmark[died], minlength=n)
-            change[: len(counts)] += counts
-            self._counted = (obs, alive.copy(), change)
+            updated = np.bincount(new, minlength=n) - np.bincount(landmark[died], minlength=n)
+            updated[: len(counts)] += counts
+            self._counted = (obs, alive.copy(), updated)
         return self._counted[2][landmark_ids]
 
     def covisible(self, landmark_ids: IntArray) -> tuple[IntArray, IntArray]:
