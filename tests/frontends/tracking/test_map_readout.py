@@ -183,10 +183,10 @@ def test_a_map_finds_its_shutter_and_is_put_right() -> None:
     for each in (system, taken_for_global):
         submap = each.atlas.submaps[0]
         ids = sorted(submap.keyframes)
-        errors.append([float(np.median(error)) for error in pose_errors(submap.keyframe_poses(ids), T[ids])])
+        errors.append([float(np.sqrt(np.mean(error**2))) for error in pose_errors(submap.keyframe_poses(ids), T[ids])])
     (position, rotation), (position_global, rotation_global) = errors
     assert position < 0.7 * position_global
-    assert rotation < 0.85 * rotation_global  # taken for global it is bent less than it was with more keyframes
+    assert rotation < 0.7 * rotation_global
     assert all(view.turn_rad is not None for view in system.buffer)
     assert not [event for event in taken_for_global.events if event.event is EventKind.SHUTTER_FOUND]
 
