@@ -8,7 +8,7 @@ import json
 import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -114,6 +114,7 @@ class RunFolder:
     def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
         self.path = Path(path)
         self._events: IO[str] | None = None
+        self._config: str | None = None
         self.n_events = 0
         check_vacant(self.path, overwrite=overwrite)
         with ExitStack() as undo:
@@ -125,7 +126,7 @@ class RunFolder:
                 for file in _run_files(self.path):
                     if file.name != EVENTS:  # by which the next one knows that this is a run's folder
                         file.unlink()
-                self._events = (self.path / EVENTS).open("w", encoding="utf-8", newline="\n")
+                self._events = self._open_events()
             except OSError as e:
                 raise _not_writable(self.path, e) from e
             undo.pop_all()
@@ -139,6 +140,27 @@ class RunFolder:
         """Write the resolved configuration: YAML text, or a mapping to be dumped."""
         text = config if isinstance(config, str) else yaml.safe_dump(to_plain(config), sort_keys=False)
         write_text(self.path / CONFIG, text)
+        self._config = text
+
+    def restore(self) -> None:
+        """Write again what somebody has removed from the folder while the run went on.
+
+        Without its event file `n_events` is 0 again: all events are to be appended once more.
+        """
+        if self._config is not None and not (self.path / CONFIG).exists():
+            log.warning("%s was removed while the run went on; its results are written again", self.path / CONFIG)
+            write_text(self.path / CONFIG, self._config)
+        if self._events is not None and not (self.path / EVENTS).exists():
+            with suppress(OSError):  # of the file that is gone
+                self._events.close()
+            try:
+                self.path.mkdir(parents=True, exist_ok=True)
+                self._events, self.n_events = self._open_events(), 0
+            except OSError as e:
+                raise _not_writable(self.path, e) from e
+
+    def _open_events(self) -> IO[str]:
+        return (self.path / EVENTS).open("w", encoding="utf-8", newline="\n")
 
     def append_event(self, event: Event) -> None:
         """Append an event to ``events.jsonl`` and flush it, so that a crash of the process cannot take it back."""

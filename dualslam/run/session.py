@@ -206,6 +206,7 @@ def run_to_folder(
                 last = next(reversed(system.rows.values()))
                 system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap)
             try:
+                folder.restore()
                 _write_new_events(system, folder)
                 given["no_map"] = None if system.poses or saved_map is not None else refusals.sentence()
                 summary = _write_results(system, report, config, sequence, folder, given)

@@ -292,6 +292,23 @@ def test_a_disk_that_is_full_for_a_while_ends_the_run_and_costs_nothing_else(
     assert [event["event"] for event in read_events(out / "events.jsonl")] == ["initialised", "failed"]
 
 
+def test_a_run_folder_that_is_removed_while_the_run_goes_on_costs_nothing(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+
+    def remove(frame: Frame) -> None:
+        if frame.index == 12:
+            shutil.rmtree(out)
+
+    fake(lost=(6, 7), before_step=remove)
+    assert main(["run", str(folder), "--out", str(out)]) == 0
+    assert "was removed while the run went on" in capsys.readouterr().err
+    assert [event["event"] for event in read_events(out / "events.jsonl")] == ["initialised", "failed", "initialised"]
+    assert len(rows_of(out)) == N_FRAMES
+    assert {"config.yaml", "trajectory.txt", "map", "report.html"} <= {path.name for path in out.iterdir()}
+
+
 def test_a_bug_in_the_system_leaves_its_log_in_the_run_folder(
     folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
