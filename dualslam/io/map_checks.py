@@ -1,4 +1,4 @@
-"""Whether the arrays of a stored submap fit together: what they index is there, and what is computed with is finite."""
+"""Whether the arrays of a stored map fit together: what they index is there, and what is computed with is finite."""
 
 from __future__ import annotations
 
@@ -12,6 +12,70 @@ from dualslam.map.submap import Submap
 from dualslam.map.tables import Table
 
 Arrays = Mapping[str, NDArray[Any]]
+Rows = Mapping[str, tuple[str, tuple[int, ...]]]
+"""Arrays of one length, by name: the kind of their numbers (as `numpy.dtype.kind`) and the shape of a row."""
+
+LINK_ROWS: Rows = {
+    "ab": ("i", (2,)),
+    "S_a_b": ("f", (4, 4)),
+    "covariance": ("f", (7, 7)),
+    "keyframes_ab": ("i", (2,)),
+    "doubtful": ("b", ()),
+    "rejected": ("b", ()),
+}
+PLACED_ROWS: Rows = {"placed": ("i", ()), "S_world_submap": ("f", (4, 4))}
+WARP_ROWS: Rows = {"warp": ("i", (2,)), "warp_S": ("f", (4, 4))}
+HELD_ROWS: Rows = {"held": ("i", (2,))}
+FRAME_ROWS: Rows = {
+    "index": ("i", ()),
+    "timestamp_s": ("f", ()),
+    "submap": ("i", ()),
+    "keyframe": ("i", ()),
+    "T_kf_cam": ("f", (4, 4)),
+}
+_SUBMAP_ROWS: tuple[Rows, ...] = (
+    {
+        "kf_id": ("i", ()),
+        "kf_timestamp_s": ("f", ()),
+        "kf_n_features": ("i", ()),
+        "kf_T_submap_kf": ("f", (4, 4)),
+    },
+    {"anchor_id": ("i", ()), "anchor_kf": ("i", ()), "anchor_T_kf_cam": ("f", (4, 4))},
+    {
+        "relative_id": ("i", ()),
+        "relative_kf": ("i", ()),
+        "relative_T_ref_kf": ("f", (4, 4)),
+        "relative_covariance": ("f", (6, 6)),
+    },
+    {"kf_landmark_of": ("i", ())},
+    {"gauge": ("i", ())},
+    {"condemned": ("i", ())},
+    {"K": ("f", (3,))},
+)
+
+
+def check_rows(arrays: Arrays, *groups: Rows) -> None:
+    """Refuse arrays of another kind or shape than they are written in, and numbers that are not finite.
+
+    Arrays that are not there pass: which may be missing is for the reader to know.
+
+    Raises
+    ------
+    ValueError
+    """
+    for rows in groups:
+        there = {name: row for name, row in rows.items() if name in arrays}
+        n = next((len(arrays[name]) if arrays[name].ndim else 0 for name in there), 0)
+        for name, (kind, shape) in there.items():
+            found = arrays[name]
+            if found.dtype.kind != kind:
+                raise ValueError(f"{name} is of type {found.dtype}")
+            _check_shape(arrays, [name], (n, *shape))
+            if not np.isfinite(found).all():
+                raise ValueError(f"{name} holds a number that is not finite")
+            # By its volume: a similarity keeps the sense of turning, and its scale is above 0.
+            if shape == (4, 4) and not (np.linalg.det(found[:, :3, :3]) > 0).all():
+                raise ValueError(f"{name} holds a matrix that is no transform")
 
 
 def check_submap(arrays: Arrays) -> None:
@@ -24,12 +88,10 @@ def check_submap(arrays: Arrays) -> None:
     ValueError
         If one is of another shape or type, not finite, or points at what is not there.
     """
+    check_rows(arrays, *_SUBMAP_ROWS)
     fresh = Submap(0, np.eye(3), np.zeros_like(arrays["landmarks_descriptor"][:0]).reshape(-1)[:0])
     n_landmarks = _check_table(arrays, "landmarks_", fresh.landmarks, but="descriptor")
     _check_table(arrays, "observations_", fresh.observations)
-    n_keyframes = len(arrays["kf_id"])
-    _check_shape(arrays, ["kf_id", "kf_timestamp_s", "kf_n_features"], (n_keyframes,))
-    _check_shape(arrays, ["kf_T_submap_kf"], (n_keyframes, 4, 4))
     _check_shape(arrays, ["K"], (3, 3))
     n_features = np.asarray(arrays["kf_n_features"], np.int64)
     if (n_features < 0).any():
@@ -38,7 +100,6 @@ def check_submap(arrays: Arrays) -> None:
     _check_length(arrays, ["kf_landmark_of", *features], int(n_features.sum()))
     alive = np.asarray(arrays["landmarks_alive"], bool)
     for name, values in (
-        *((name, arrays[name]) for name in ("K", "kf_timestamp_s", "kf_T_submap_kf")),
         *((name, arrays[name]) for name in features if name != "features_descriptors"),
         ("landmarks_xyz_mu", arrays["landmarks_xyz_mu"][alive]),
     ):

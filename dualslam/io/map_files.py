@@ -68,7 +68,14 @@ def load_arrays(
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; check the path.") from None
     except (OSError, ValueError, zipfile.BadZipFile, zlib.error, EOFError, KeyError, TypeError, AttributeError) as e:
-        raise InputError(f"{path} is no map file, or is damaged: {e}.") from e
+        # Where numpy sees no archive of its own it speaks of pickles, and of how to load one unsafely.
+        problem = "it is no archive of arrays" if isinstance(e, ValueError) and "pickle" in str(e) else _reason(e)
+        raise InputError(f"{path} is no map file, or is damaged: {problem}. Give another map, or make it again.") from e
+
+
+def _reason(error: Exception) -> str:
+    words = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return words.rstrip(".")
 
 
 def save_map(folder: str | Path, arrays: Mapping[str, Arrays], metadata: Mapping[str, Any]) -> None:
@@ -136,8 +143,10 @@ def _read_metadata(folder: Path) -> tuple[list[str], dict[str, Any], dict[str, s
         files = {str(group): Path(str(name)).name for group, name in document.get("files", {}).items()}
         if not all(isinstance(group, str) for group in groups):
             raise TypeError("a group is named by a word")
-    except (KeyError, TypeError, ValueError, AttributeError):
-        raise InputError(f"{path} is not the metadata of a map, or is damaged.") from None
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
+        raise InputError(
+            f"{path} is not the metadata of a map, or is damaged. Give another map, or make it again."
+        ) from None
     if version > MAP_FORMAT:
         raise InputError(f"{path} is of format {version}, newer than this version of dualslam reads ({MAP_FORMAT}).")
     return groups, metadata, files

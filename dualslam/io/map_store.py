@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import camera_from_dict
 from dualslam.core.errors import InputError
+from dualslam.io.map_checks import FRAME_ROWS, HELD_ROWS, LINK_ROWS, PLACED_ROWS, WARP_ROWS, check_rows
 from dualslam.io.map_files import (
     METADATA,
     Arrays,
@@ -32,7 +33,7 @@ from dualslam.map.warp import Warp
 
 LINKS, FRAMES, SUBMAP, SOLUTION = "links", "frames", "submap_", "solution"
 _OTHER = (LINKS, FRAMES, SOLUTION)
-_DAMAGE = (KeyError, ValueError, IndexError, TypeError)
+_DAMAGE = (KeyError, ValueError, IndexError, TypeError, OverflowError)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,15 +133,16 @@ def load_atlas(folder: str | Path) -> StoredMap:
         atlas = Atlas()
         for name in sorted(groups.keys() - set(_OTHER)):
             atlas.add(submap_from_arrays(groups[name]))
-        _join(atlas, groups[LINKS], groups.get(SOLUTION), metadata)
+        _join(atlas, atlas.submaps, groups[LINKS], groups.get(SOLUTION), metadata)
         frames = groups[FRAMES]
+        check_rows(frames, FRAME_ROWS)
         columns = (frames[name].tolist() for name in ("index", "timestamp_s", "submap", "keyframe"))
         rows = zip(*columns, frames["T_kf_cam"], strict=True)
         _check_frames(frames, atlas)
         poses = {index: FramePose(index, t, m, k, T_kf_cam) for index, t, m, k, T_kf_cam in rows}
         camera = _camera(metadata)
     except _DAMAGE as error:
-        raise InputError(f"{folder} is no map of this version, or is damaged: {error}.") from error
+        raise InputError(_damaged(folder, error)) from error
     return StoredMap(atlas, poses, camera)
 
 
@@ -157,7 +159,7 @@ def load_camera(folder: str | Path) -> Camera | None:
     try:
         return _camera(metadata)
     except _DAMAGE as error:
-        raise InputError(f"{folder} is no map of this version, or is damaged: {error}.") from error
+        raise InputError(_damaged(folder, error)) from error
 
 
 def load_joints(folder: str | Path) -> tuple[list[int], Atlas]:
@@ -180,10 +182,10 @@ def load_joints(folder: str | Path) -> tuple[list[int], Atlas]:
         files = array_files(folder)
         solution = load_arrays(files[SOLUTION]) if SOLUTION in groups else None
         atlas = Atlas()
-        _join(atlas, load_arrays(files[LINKS]), solution, metadata)
+        _join(atlas, ids, load_arrays(files[LINKS]), solution, metadata)
         return ids, atlas
     except _DAMAGE as error:
-        raise InputError(f"{folder} is no map of this version, or is damaged: {error}.") from error
+        raise InputError(_damaged(folder, error)) from error
 
 
 def _solution_arrays(atlas: Atlas) -> dict[str, NDArray[Any]]:
@@ -199,12 +201,18 @@ def _solution_arrays(atlas: Atlas) -> dict[str, NDArray[Any]]:
     }
 
 
-def _join(atlas: Atlas, links: Arrays, solution: Arrays | None, metadata: Mapping[str, Any]) -> None:
+def _join(
+    atlas: Atlas, ids: Collection[int], links: Arrays, solution: Arrays | None, metadata: Mapping[str, Any]
+) -> None:
     """Fill in how the submaps of an atlas are joined; `solution` is None for a map of an earlier version."""
+    check_rows(links, LINK_ROWS)
     for link in _links(links, metadata):
+        if not {link.a, link.b} <= set(ids):
+            raise ValueError(f"a link joins the submaps {link.a} and {link.b}, of which one is not there")
         atlas.link(link)
     if solution is None:
         return
+    check_rows(solution, PLACED_ROWS, WARP_ROWS, HELD_ROWS)
     atlas.placement = dict(zip(solution["placed"].tolist(), solution["S_world_submap"], strict=True))
     for m in np.unique(solution["warp"][:, 0]).tolist():
         own = solution["warp"][:, 0] == m
@@ -224,13 +232,11 @@ def _links(arrays: Arrays, metadata: Mapping[str, Any]) -> list[Link]:
     for (a, b), S, C, kind, shared, (k_a, k_b), may_doubt, refused in rows:
         if kind is LinkKind.ROLLOVER and not C.any():  # an earlier version took these links as exact
             C = np.diag(ROLLOVER_SIGMAS**2)
-        links.append(Link(a, b, S, C, kind, tuple(shared), k_a, k_b, may_doubt, refused))
+        links.append(Link(a, b, S, C, kind, tuple(map(int, shared)), k_a, k_b, may_doubt, refused))
     return links
 
 
 def _check_frames(frames: Arrays, atlas: Atlas) -> None:
-    if not (np.isfinite(frames["T_kf_cam"]).all() and np.isfinite(frames["timestamp_s"]).all()):
-        raise ValueError(f"{FRAMES} holds a number that is not finite")
     for m, k in set(zip(frames["submap"].tolist(), frames["keyframe"].tolist(), strict=True)):
         try:
             atlas.submaps[m].keyframe_for(k)
@@ -248,5 +254,15 @@ def _map_folder(folder: str | Path) -> Path:
     return own
 
 
+def _damaged(folder: Path, error: Exception) -> str:
+    problem = f"{error} is missing" if isinstance(error, KeyError) else str(error).rstrip(".")
+    return f"{folder} is no map of this version, or is damaged: {problem}. Give another map, or make it again."
+
+
 def _camera(metadata: Mapping[str, Any]) -> Camera | None:
-    return camera_from_dict(metadata["camera"]) if metadata.get("camera") else None
+    if metadata.get("camera") is None:
+        return None
+    try:
+        return camera_from_dict(metadata["camera"])
+    except (AttributeError, InputError) as error:
+        raise ValueError(f"{METADATA}: {error}") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
@@ -11,14 +12,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.geometry import se3
 from dualslam.core.types import Features, Keyframe
 from dualslam.io import load_map, load_submap, map_files, save_map, save_submap
 from dualslam.io.map_files import Arrays, load_arrays, save_arrays, submap_to_arrays
-from dualslam.io.map_store import submap_path
+from dualslam.io.map_store import load_atlas, save_atlas, submap_path
 from dualslam.map.anchors import RelativePose
+from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.submap import Submap
+from dualslam.map.trajectory import FramePose
 
 
 def features(rng: np.random.Generator, n: int) -> Features:
@@ -190,6 +194,74 @@ def test_arrays_that_do_not_fit_together(
     np.savez(tmp_path / "s.npz", **arrays)
     with pytest.raises(InputError, match=f"s.npz is no submap of this version, or is damaged: .*{words}"):
         load_submap(tmp_path / "s.npz")
+
+
+def change_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+def change_array(path: Path, name: str, change: Callable[[NDArray[Any]], NDArray[Any]]) -> None:
+    arrays = load_arrays(path)
+    save_arrays(path, {**arrays, name: change(arrays[name])})
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda at: change_json(at / "map.json", lambda d: d.update(format=float("inf"))), "not the metadata of a map"),
+        (lambda at: change_json(at / "map.json", lambda d: d.update(format=99)), "newer than this version"),
+        (lambda at: (at / "map.json").write_text("[" * 100_000), "not the metadata of a map"),
+        (lambda at: change_json(at / "map.json", lambda d: d["metadata"].update(camera=-1)), r"map\.json: "),
+        (
+            lambda at: change_json(at / "map.json", lambda d: d["metadata"].update(camera={"model": "eye"})),
+            r"map\.json: camera: field 'model' is 'eye'",
+        ),
+        (lambda at: change_json(at / "map.json", lambda d: d["metadata"].update(link_keyframes=[[[]]])), "damaged"),
+        (lambda at: change_json(at / "map.json", lambda d: d["metadata"].pop("link_kinds")), "'link_kinds' is missing"),
+        (
+            lambda at: change_array(at / "links.npz", "ab", lambda a: a + 5),
+            "submaps 9 and 10, of which one",
+        ),
+        (
+            lambda at: change_array(at / "links.npz", "S_a_b", np.zeros_like),
+            "a matrix that is no transform",
+        ),
+        (lambda at: change_array(at / "links.npz", "S_a_b", lambda a: a[None]), "S_a_b is of shape"),
+        (lambda at: change_array(at / "frames.npz", "index", lambda a: a.astype(str)), "index is of type"),
+        (lambda at: change_array(at / "frames.npz", "T_kf_cam", lambda a: a * np.nan), "number that is not finite"),
+        (
+            lambda at: change_array(at / "submap_04.npz", "kf_landmark_of", lambda a: a * 1.0),
+            "kf_landmark_of is of type",
+        ),
+        (
+            lambda at: change_array(at / "submap_04.npz", "kf_n_features", lambda a: a * np.nan),
+            "kf_n_features is of type",
+        ),
+        (
+            lambda at: (at / "submap_05.npz").write_bytes(b"x" * 400),
+            "submap_05.npz is no map file",
+        ),
+    ],
+)
+def test_a_saved_map_that_was_edited_is_refused_in_one_sentence(
+    tmp_path: Path, submap: Submap, damage: Callable[[Path], object], words: str
+) -> None:
+    atlas = Atlas()
+    atlas.add(submap)
+    other = Submap(5, np.eye(3), np.zeros(32, np.uint8))
+    other.add_keyframe(Keyframe(30, 3.0, features(np.random.default_rng(0), 4)), np.eye(4))
+    atlas.add(other)
+    atlas.link(Link(4, 5, np.eye(4), np.eye(7), LinkKind.RECOVERY, (12,)))
+    pose = FramePose(11, 1.1, 4, 10, np.eye(4))
+    save_atlas(tmp_path / "map", atlas, {11: pose}, PinholeCamera(640, 480, 500.0, 500.0, 320.0, 240.0))
+    assert load_atlas(tmp_path).poses.keys() == {11}
+    damage(tmp_path / "map")
+    with pytest.raises(InputError, match=words) as refused:
+        load_atlas(tmp_path)
+    assert str(tmp_path) in str(refused.value)
+    assert "pickle" not in str(refused.value)
 
 
 def test_damaged_files(tmp_path: Path, submap: Submap) -> None:
