@@ -20,7 +20,7 @@ from dualslam.io.atomic import write_text
 from dualslam.io.map_store import StoredMap
 from dualslam.io.metric_scale import read_scale
 from dualslam.io.run_folder import TRAJECTORY, TRAJECTORY_KITTI, read_summary
-from dualslam.io.trajectory_files import read_kitti, read_tum, write_tum
+from dualslam.io.trajectory_files import read_kitti, read_text, read_tum, write_tum
 from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.run.sources import open_images_of_run
 
@@ -84,9 +84,11 @@ def _copy_trajectory(args: argparse.Namespace) -> int:
     source = args.run / TRAJECTORIES[args.to]
     if not source.is_file():
         raise InputError(f"{args.run} has no {source.name}; give a run folder.")
+    if not read_text(source).strip():
+        raise InputError(f"{args.run} has no trajectory to export: no frame was posed.")
     metres = read_scale(args.run)
     if metres is None:
-        write_text(args.out, source.read_text())
+        write_text(args.out, read_text(source))
     elif args.to == "tum":
         trajectory = read_tum(source)
         write_tum(args.out, replace(trajectory, T_world_cam=_in_metres(trajectory.T_world_cam, metres)))

@@ -20,7 +20,7 @@ class CalibrationConfig(StrictModel):
     """Keyframes of the window, neighbours in time; of all such windows the one with most turning."""
     max_observations: int = Field(15000, ge=1000)
     """Observations that go into the estimate: they bound its time (about 1 s)."""
-    log_focal_sigma: float = Field(0.05, gt=0)
+    log_focal_sigma: float = Field(0.05, ge=1e-6)
     """Prior of the log of both focal lengths. A chequerboard gives 0.003, a data sheet 0.05, the depth camera's focal
     length taken for the colour camera's 0.1. It need not be tight: where the motion does not fix the focal length,
     nothing is changed at all."""

@@ -26,7 +26,7 @@ class FrontendConfig(StrictModel):
 class CameraConfig(StrictModel):
     """What is known of the camera beyond its calibration file."""
 
-    model_sigma_px: float = Field(0.8, ge=0)
+    model_sigma_px: float = Field(0.8, ge=0, le=100)
     """Error of the camera model itself at a pixel (one sigma), beside the noise of the features: chequerboard
     calibrations and rectified data sets are off by half a pixel to a pixel towards the rim of the image."""
     readout_s: float | None = Field(None, ge=0, le=0.1)

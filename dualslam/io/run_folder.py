@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import logging
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -62,6 +63,20 @@ _FILES = (
 _RESULTS = (CONFIG, EVENTS, FRAMES, TRAJECTORY, f"{SUBMAPS}/", SUMMARY, GROUND_TRUTH, f"{MAP}/", MAP_PAGE, REPORT)
 """In the order in which a person is told of them."""
 _NOT_OF_EVERY_RUN = frozenset({f"{SUBMAPS}/", GROUND_TRUTH, MAP_PAGE})
+_SUMMARY_KINDS: Mapping[str, tuple[tuple[type, ...], str]] = {
+    **dict.fromkeys(("frames", "posed", "failures", "recoveries", "submaps", "first_id"), ((int,), "a whole number")),
+    **dict.fromkeys(("coverage",), ((int, float), "a number")),
+    **dict.fromkeys(("camera", "versions", "latency_ms", "stages_cpu_s"), ((dict,), "a mapping")),
+    "first_index": ((int, type(None)), "a whole number"),
+    "sequence": ((str,), "a word"),
+}
+"""Of what others build on in a summary: an earlier version may have written less."""
+_EVENT_KINDS: Mapping[str, tuple[tuple[type, ...], str]] = {
+    "event": ((str,), "a word"),
+    "frame": ((int,), "a whole number"),
+    "timestamp_s": ((int, float), "a number"),
+    "submap": ((int, type(None)), "a whole number"),
+}
 _SUBMAP_NAME = re.compile(r"\d+\.txt")
 _SAMPLE_NAME = re.compile(r"\d+\.jpg")
 _MAP_NAME = re.compile(r"[\w.-]+\.(npz|json)")
@@ -298,13 +313,13 @@ def read_frames(path: str | Path) -> list[FrameRow]:
             rows.append(
                 FrameRow(
                     index=int(row["index"]),
-                    timestamp_s=float(row["timestamp_s"]),
+                    timestamp_s=_finite(row["timestamp_s"]),
                     status=FrameStatus(row["status"]),
                     submap=int(row["submap"]) if row["submap"] else None,
                     in_main_map=row["in_main_map"] == "1",
                     n_matches=int(row["n_matches"]),
                     n_inliers=int(row["n_inliers"]),
-                    latency_ms=float(row["latency_ms"]),
+                    latency_ms=_finite(row["latency_ms"]),
                     sigma_position_rel=_sigma(row.get("sigma_position_rel")),
                     sigma_scale=_sigma(row.get("sigma_scale")),
                 )
@@ -312,6 +327,13 @@ def read_frames(path: str | Path) -> list[FrameRow]:
         except (TypeError, ValueError) as e:
             raise InputError(f"{path}, line {number}: not a row of frames.csv ({e}).") from None
     return rows
+
+
+def _finite(cell: str) -> float:
+    value = float(cell)
+    if not math.isfinite(value):
+        raise ValueError(f"{cell} is no finite number")
+    return value
 
 
 def _sigma(cell: str | None) -> float | None:
@@ -335,6 +357,9 @@ def read_summary(run: Path) -> dict[str, Any]:
         raise InputError(f"{path} is no valid JSON: {error}.") from None
     if not isinstance(summary, dict):
         raise InputError(f"{path} is no summary of a run.")
+    for name, (kinds, what) in _SUMMARY_KINDS.items():
+        if name in summary and not isinstance(summary[name], kinds):
+            raise InputError(f"{path} is damaged: {name} is not {what}. Give another run, or run it again.")
     return summary
 
 
@@ -352,6 +377,9 @@ def read_events(path: str | Path) -> list[dict[str, Any]]:
             break
         if not isinstance(event, dict) or "event" not in event:
             raise InputError(f"{path}, line {number} is not an event.")
+        for name, (kinds, what) in _EVENT_KINDS.items():
+            if name in event and not isinstance(event[name], kinds):
+                raise InputError(f"{path}, line {number}: {name} is not {what}.")
         events.append(event)
     return events
 

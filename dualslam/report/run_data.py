@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from dualslam.io import run_folder
 from dualslam.io.map_files import METADATA, load_arrays
 from dualslam.io.map_store import load_joints, submap_path
 from dualslam.io.run_folder import FrameRow, read_events, read_frames, unlinked_submaps
-from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate, nearest_in_time, read_text, read_tum
+from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate, read_text, read_tum
 from dualslam.map.atlas import joined
 
 MAX_POINTS = 2500
@@ -125,15 +124,18 @@ def read_run(path: str | Path) -> RunData:
     times = np.array([row.timestamp_s for row in rows])
     config_text = read_text(path / run_folder.CONFIG)
     truth_file = path / run_folder.GROUND_TRUTH
+    events = read_events(path / run_folder.EVENTS)
+    if not all("timestamp_s" in event and "frame" in event for event in events):
+        raise InputError(f"{path / run_folder.EVENTS} is damaged: an event has no frame or no time.")
     return RunData(
         path=path,
         rows=rows,
-        events=read_events(path / run_folder.EVENTS),
-        summary=_mapping(path / run_folder.SUMMARY, json.loads),
+        events=events,
+        summary=run_folder.read_summary(path),
         config=_mapping(path / run_folder.CONFIG, strict_yaml.loads),
         config_text=config_text,
-        main=_on_rows(read_tum(path / run_folder.TRAJECTORY, allow_empty=True), times),
-        unlinked={m: _on_rows(read_tum(file), times) for m, file in unlinked_submaps(path).items()},
+        main=_on_rows(path / run_folder.TRAJECTORY, times),
+        unlinked={m: _on_rows(file, times) for m, file in unlinked_submaps(path).items()},
         truth=_truth_on_rows(read_tum(truth_file, allow_empty=True), times) if truth_file.exists() else _no_rows(),
         points=_map_points(path / run_folder.MAP, {row.submap for row in rows if row.in_main_map}),
         samples=run_folder.read_samples(path),
@@ -156,12 +158,19 @@ def _no_rows() -> PosedRows:
     return PosedRows(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
 
 
-def _on_rows(trajectory: Trajectory, times_s: FloatArray) -> PosedRows:
-    """Give each pose its row: their times were written from the same numbers."""
+def _on_rows(file: Path, times_s: FloatArray) -> PosedRows:
+    """Read a trajectory, and give each pose its row: their times were written from the same numbers."""
+    trajectory = read_tum(file, allow_empty=True)
     if not len(trajectory):
         return _no_rows()
     order = np.argsort(times_s, kind="stable")
-    row = order[nearest_in_time(times_s[order], trajectory.timestamps_s)]
+    at, near = associate(times_s[order], trajectory.timestamps_s, MAX_DT_S)
+    if not near.all():
+        raise InputError(
+            f"{file} has a pose at {trajectory.timestamps_s[np.argmin(near)]:.6f} s, where {run_folder.FRAMES} has no "
+            "frame: one of the two is cut off, or of another run. Give another run, or run it again."
+        )
+    row = order[at]
     ascending = np.argsort(row, kind="stable")
     return PosedRows(row[ascending], trajectory.T_world_cam[ascending])
 

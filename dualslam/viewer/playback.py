@@ -14,7 +14,7 @@ from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure, FloatArray, FrameStatus, IntArray
 from dualslam.io.map_files import METADATA, load_arrays
 from dualslam.io.map_store import submap_path
-from dualslam.io.run_folder import EVENTS, MAP, SUMMARY, FrameRow
+from dualslam.io.run_folder import MAP, SUMMARY, FrameRow
 from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.report.placement import align
 from dualslam.report.run_data import CONDEMNED, PosedRows, RunData, are_shown, linked_submaps
@@ -106,8 +106,6 @@ def play(run: RunData) -> Playback:
     InputError
         If the map or an event is damaged or is not of these frames, or the run does not name its camera.
     """
-    if not all("timestamp_s" in event and "frame" in event for event in run.events):
-        raise InputError(f"{run.path / EVENTS} is damaged: an event has no frame or no time.")
     order = np.argsort([row.timestamp_s for row in run.rows], kind="stable")
     rows = [run.rows[i] for i in order.tolist()]
     at = np.empty(len(order), np.int64)

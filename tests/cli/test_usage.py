@@ -53,6 +53,11 @@ def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
         ("run synthetic:street --out there --set frontend.n_feature=3", "did you mean frontend.n_features?"),
         ("run synthetic:street --out there --config none.yaml", "none.yaml: the configuration cannot be read"),
         ("config --set seed=x", "seed must be a whole number"),
+        ("config --set camera.model_sigma_px=.inf", "camera.model_sigma_px must be less than or equal to 100"),
+        (
+            "config --set calibration.log_focal_sigma=1e-300",
+            "log_focal_sigma must be greater than or equal to 0.000001",
+        ),
         ("config --seed 18446744073709551616", "seed must be less than or equal to 18446744073709551615"),
         ("config --frontend sift9", "no front end is called 'sift9'"),
         ("config --frontend os:path", "frontend.name: 'os:path' is no front end"),

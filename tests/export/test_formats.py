@@ -164,6 +164,7 @@ def test_scaled_keeps_what_is_seen(exported: ExportedMap) -> None:
         (["nowhere", "--to", "ply", "--out", "map.ply"], "nowhere"),
         (["run", "--to", "colmap", "--out", "taken"], "taken is there already"),
         (["run", "--to", "ply", "--out", "taken"], "is a folder"),
+        (["run", "--to", "tum", "--out", "a.txt"], "run has no trajectory to export: no frame was posed"),
         (["run", "--to", "tum", "--out", "a.txt", "--distance", "0", "1", "2"], "--distance"),
         (["run", "--to", "ply", "--out", "a.ply", "--distance", "0", "x", "2"], "--distance"),
     ],
@@ -177,6 +178,7 @@ def test_bad_input_is_one_sentence(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "trajectory.txt").touch()
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "mine").write_text("keep")
     try:
@@ -187,4 +189,5 @@ def test_bad_input_is_one_sentence(
     error = capsys.readouterr().err.strip()
     assert sentence in error
     assert len(error.splitlines()) == 1
+    assert not (tmp_path / "a.txt").exists()
     assert (tmp_path / "taken" / "mine").read_text() == "keep"

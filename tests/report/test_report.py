@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -325,6 +326,41 @@ def test_a_folder_that_is_no_run_is_bad_input(tmp_path: Path) -> None:
         read_run(tmp_path)
     with pytest.raises(InputError, match="no such folder"):
         read_run(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "words"),
+    [
+        (
+            "frames.csv",
+            r"(?s)(submap,.*?\n)(.*\n){5}",
+            r"\1",
+            r"trajectory\.txt has a pose at .* has no frame",
+        ),
+        ("frames.csv", r"(?s)\n.*", "\n", r"frames\.csv has no frame"),
+        ("frames.csv", r",\d+\.\d{3},", ",inf,", "line 2: not a row of frames.csv .inf is no finite number"),
+        (
+            "summary.json",
+            r'"coverage": [\d.]+',
+            '"coverage": "all"',
+            "coverage is not a number",
+        ),
+        ("summary.json", r'"first_id": \d+', '"first_id": null', "first_id is not a whole number"),
+        ("events.jsonl", r'"frame": \d+', '"frame": []', "line 1: frame is not a whole number"),
+        ("events.jsonl", r'"frame": \d+, ', "", "an event has no frame or no time"),
+        ("events.jsonl", r'"timestamp_s": [\d.]+', '"timestamp_s": "x"', "line 1: timestamp_s is not a number"),
+    ],
+)
+def test_a_run_folder_that_was_cut_off_or_edited_is_one_sentence(
+    broken_run: RunData, tmp_path: Path, file: str, old: str, new: str, words: str
+) -> None:
+    run = shutil.copytree(broken_run.path, tmp_path / "edited")
+    text = (run / file).read_text()
+    edited = re.sub(old, new, text, count=1)
+    assert edited != text
+    (run / file).write_text(edited)
+    with pytest.raises(InputError, match=words):
+        read_run(run)
 
 
 def test_markup_escapes_what_is_not_markup() -> None:

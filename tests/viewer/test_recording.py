@@ -283,9 +283,14 @@ def damage_map(folder: Path) -> None:
     (folder / "map" / "submap_00.npz").write_bytes(b"no archive")
 
 
-def map_of_another_run(folder: Path) -> None:
+def cut_off_frames(folder: Path) -> None:
     lines = (folder / "frames.csv").read_text().splitlines()
     (folder / "frames.csv").write_text("\n".join([lines[0], *lines[2:]]) + "\n")
+
+
+def map_of_another_run(folder: Path) -> None:
+    frames = (folder / "frames.csv").read_text()
+    (folder / "frames.csv").write_text(frames.replace("\n0,", "\n999,"))
 
 
 def forget_camera(folder: Path) -> None:
@@ -301,6 +306,7 @@ def damage_event(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
+        (cut_off_frames, "trajectory.txt has a pose at 0.000000 s, where frames.csv has no frame"),
         (damage_map, "submap_00.npz is no map file"),
         (map_of_another_run, "is not the map of this run: its keyframe 0"),
         (forget_camera, "does not name the camera"),
