@@ -8,6 +8,7 @@ part in the estimate, agree with the points by their own pixels.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from dualslam.core.bundle import BundleAdjuster, BundleProblem
 from dualslam.core.chi_square import CHI2_95, CHI2_99, MEDIAN_CHI2
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
-from dualslam.core.geometry.projection import projection_jacobians, refine_pose
+from dualslam.core.geometry.projection import refine_pose
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.interfaces import START_REACH, Frontend
 from dualslam.core.types import (
@@ -31,9 +32,10 @@ from dualslam.core.types import (
     View,
 )
 from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
+from dualslam.frontends.tracking.direction import direction_angle_deg, direction_sigma_deg
 from dualslam.frontends.tracking.near_points import N_PROOF, nearer_than_proven
 from dualslam.frontends.tracking.resection import resect
-from dualslam.frontends.tracking.two_view_hypotheses import MIN_NOISE2, propose_relative_poses
+from dualslam.frontends.tracking.two_view_hypotheses import MIN_NOISE2, RelativePoses
 
 MAX_CHI2 = 2.5
 """Mean squared whitened residual per degree of freedom after the bundle adjustment (1 is expected)."""
@@ -49,6 +51,8 @@ PROVEN = 1 / 3  # share of the points, and of those that a start needs, that are
 NEAR = 0.5  # share of the points that a start needs at least which must be near: on a road these fix the motion
 RUNNER_UP = 0.75  # a pose that explains less than this share of what the best one does is out of the question,
 UNEXPLAINED_TIMES, UNEXPLAINED_MORE = 2, 20  # and so is one that leaves more than twice as many, and a layer's worth
+SAME_DEG = 10.0  # directions of translation that far apart are two answers
+DIRECTION_MARGIN = 2.0  # a bundle adjustment makes a direction's sigma 0.5 to 1.7 times what it was (70 pairs)
 AT_INFINITY_SIGMAS = 3.0  # a match whose parallax is less than so much noise says nothing of the sign of its depth
 
 
@@ -93,6 +97,7 @@ class Initialiser:
             nearest_search(frontend)  # a front end without it is told so before the first frame
         self._adjuster = adjuster
         self._config = config
+        self._loose_direction_sigma_deg = DIRECTION_MARGIN * config.max_direction_sigma_deg
         self._K = K
         self._size_px = size_px
         self._seed = seed
@@ -160,28 +165,54 @@ class Initialiser:
         fa, fb = matches.index[:, 0], matches.index[:, 1]
         uv_a, uv_b = a.features.uv_rect_px[fa], b.features.uv_rect_px[fb]
         sigma = np.maximum(a.features.sigma_px[fa], b.features.sigma_px[fb])
-        n_near = int(NEAR * self._config.min_points)
-        hypotheses = propose_relative_poses(uv_a, uv_b, sigma, self._K, self._size_px, self._seed, n_near)
-        if isinstance(hypotheses, Failure):
-            return hypotheses
-        pairs = [self._evaluate(a, b, matches, T_b_a) for T_b_a in hypotheses.T_b_a]
-        contenders = _contenders(pairs, len(matches))
+        poses = RelativePoses(uv_a, uv_b, sigma, self._K, self._size_px, self._seed)
+        if poses.n_moved < int(NEAR * self._config.min_points):
+            detail = f"a turn explains all but {poses.n_moved} of {len(matches)} matches"
+            return Failure(FailureReason.LOW_PARALLAX, detail)
+        pairs = [self._evaluate(a, b, matches, T_b_a) for T_b_a in poses.of_turns()]
+        if (hopeless := self._hopeless(pairs, len(matches))) is not None:
+            return hopeless
+        of_most = self._evaluate(a, b, matches, poses.of_essential_matrix())
+        pairs = [of_most, *pairs]
+        if (hopeless := self._hopeless(pairs, len(matches))) is not None:
+            return hopeless
+        pairs += [self._evaluate(a, b, matches, T_b_a) for T_b_a in poses.of_plane(of_most.T_b_a)]
+        contenders = _contenders(pairs, len(matches), max(pair.n_explained for pair in pairs))
         best = max(contenders, key=lambda p: int(p.good.sum()))
         n_good = int(best.good.sum())
-        numbers = {
-            "n_matches": float(len(matches)),
-            "n_points": float(n_good),
-            "parallax_deg": best.parallax_deg,
-            "homography_share": hypotheses.homography_share,
-        }
+        numbers = {"n_matches": float(len(matches)), "n_points": float(n_good), "parallax_deg": best.parallax_deg}
         if n_good < self._config.min_points:
             return Failure(FailureReason.TOO_FEW_INLIERS, f"{n_good} points of {len(matches)} matches", numbers)
         if best.n_near < NEAR * self._config.min_points:
             detail = f"median parallax {best.parallax_deg:.2f} deg, {best.n_near} near points"
             return Failure(FailureReason.LOW_PARALLAX, detail, numbers)
-        if any(_direction_angle_deg(best.T_b_a, other.T_b_a) > 10 for other in contenders):
+        if any(direction_angle_deg(best.T_b_a, other.T_b_a) > SAME_DEG for other in contenders):
             return Failure(FailureReason.AMBIGUOUS_MODEL, "two poses explain the views alike", numbers)
+        if (direction := self._direction_sigma_deg(best)) > self._loose_direction_sigma_deg:
+            return _direction_unknown(direction, numbers)
         return best
+
+    def _hopeless(self, pairs: list[_Pair], n_matches: int) -> Failure | None:
+        """Return why no start comes of two views, whatever else explains them; None where that is open.
+
+        Most pairs of a camera that turns on the spot end here, before what is dear about a pair. Poses that explain so
+        much that none, were it to explain all, can put them out of the question: where two of them differ, or one does
+        not fix its direction, the views allow either more than one answer or this one.
+        """
+        sure = _contenders(pairs, n_matches, n_matches)
+        # The best pose, whichever it is, is far from one of two that are twice as far apart.
+        if any(direction_angle_deg(p.T_b_a, q.T_b_a) > 2 * SAME_DEG for p, q in combinations(sure, 2)):
+            return Failure(FailureReason.AMBIGUOUS_MODEL, "two poses explain the views alike")
+        for pair in sure:
+            enough = pair.good.sum() >= self._config.min_points
+            if enough and (direction := self._direction_sigma_deg(pair)) > self._loose_direction_sigma_deg:
+                return _direction_unknown(direction, {})
+        return None
+
+    def _direction_sigma_deg(self, pair: _Pair) -> float:
+        """Return how well two views alone know the direction, before any bundle adjustment."""
+        sigma_px = pair.b.features.sigma_px[pair.matches.index[pair.good, 1]]
+        return direction_sigma_deg(self._K, np.eye(4), se3.inverse(pair.T_b_a), pair.xyz[pair.good], sigma_px)
 
     def _evaluate(self, a: View, b: View, matches: Matches, T_b_a: FloatArray) -> _Pair:
         fa, fb = matches.index[:, 0], matches.index[:, 1]
@@ -267,7 +298,11 @@ class Initialiser:
         except SolverError as error:
             return Failure(FailureReason.SOLVER, str(error), numbers)
         inlier = result.chi2 < CHI2_95[2]
-        direction = direction_sigma_deg(problem, result.T_submap_kf, result.xyz_mu, inlier)
+        rows = _seen_by_both(problem, inlier)
+        T_first, T_last = result.T_submap_kf[[0, -1]]
+        direction = direction_sigma_deg(
+            self._K, T_first, T_last, result.xyz_mu[problem.point[rows]], problem.sigma_px[rows]
+        )
         chi2 = float(np.median(result.chi2)) / MEDIAN_CHI2[2]
         numbers = {**numbers, "chi2": chi2, "direction_sigma_deg": direction}
         in_front = np.all(se3.act(se3.inverse(result.T_submap_kf), result.xyz_mu)[..., 2] > 0, axis=0)
@@ -292,9 +327,7 @@ class Initialiser:
         if not numbers["chi2"] < MAX_CHI2:
             return Failure(FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {numbers['chi2']:.1f}", numbers)
         if not direction < self._config.max_direction_sigma_deg:
-            return Failure(
-                FailureReason.LOW_PARALLAX, f"direction of translation known to {direction:.1f} deg only", numbers
-            )
+            return _direction_unknown(direction, numbers)
         feature = feature.copy()
         feature[view_of[~inlier], point_of[~inlier]] = -1
         depth = float(np.median(result.xyz_mu[proven, 2]))
@@ -311,46 +344,25 @@ def _agreeing(problem: BundleProblem, inlier: BoolArray) -> BoolArray:
     return agrees
 
 
-def direction_sigma_deg(problem: BundleProblem, T_w_cam: FloatArray, xyz: FloatArray, inlier: BoolArray) -> float:
-    """Standard deviation of the direction from the first to the last camera, by the two views' Hessian, degrees.
-
-    The points are eliminated by the Schur complement; the scale, which two views cannot tell, is held by its own prior.
-    """
-    last = len(T_w_cam) - 1
-    in_first = np.zeros(len(xyz), bool)
+def _seen_by_both(problem: BundleProblem, inlier: BoolArray) -> IntArray:
+    """Return the last view's observations of points that the first sees, too."""
+    in_first = np.zeros(len(problem.xyz_mu), bool)
     in_first[problem.point[(problem.kf == 0) & inlier]] = True
-    rows = np.flatnonzero((problem.kf == last) & inlier & in_first[problem.point])
-    points = xyz[problem.point[rows]]
-    sigma = problem.sigma_px[rows]
-    H_pp = np.zeros((len(rows), 3, 3))
-    for v in (0, last):
-        _, J_point = projection_jacobians(problem.K, se3.inverse(T_w_cam[v]), points)
-        H_pp += np.einsum("nki,nkj->nij", J_point, J_point) / sigma[:, None, None] ** 2
-    J_pose, J_point = projection_jacobians(problem.K, se3.inverse(T_w_cam[last]), points)
-    weight = 1 / sigma[:, None, None] ** 2
-    H_cp = np.einsum("nki,nkj->nij", J_pose, J_point) * weight
-    H_cc = (np.einsum("nki,nkj->nij", J_pose, J_pose) * weight).sum(0)
-    try:
-        S = H_cc - np.einsum("nij,njk,nlk->il", H_cp, np.linalg.inv(H_pp), H_cp)
-        t_cam = se3.inverse(T_w_cam[last])[:3, 3]
-        along = np.zeros(6)
-        along[3:] = t_cam / np.linalg.norm(t_cam)
-        S += np.outer(along, along) * np.trace(H_cc)
-        covariance = np.linalg.inv(S)[3:, 3:]
-    except np.linalg.LinAlgError:
-        return float("inf")
-    across = np.eye(3) - np.outer(along[3:], along[3:])
-    variance = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
-    return float(np.degrees(np.sqrt(max(variance, 0.0)) / np.linalg.norm(t_cam)))
+    last = len(problem.T_submap_kf) - 1
+    return np.flatnonzero((problem.kf == last) & inlier & in_first[problem.point])
 
 
-def _contenders(pairs: list[_Pair], n_matches: int) -> list[_Pair]:
-    """Return the pairs whose pose explains nearly as many matches as any.
+def _direction_unknown(direction_sigma_deg: float, numbers: dict[str, float]) -> Failure:
+    detail = f"direction of translation known to {direction_sigma_deg:.1f} deg only"
+    return Failure(FailureReason.LOW_PARALLAX, detail, numbers)
+
+
+def _contenders(pairs: list[_Pair], n_matches: int, most: int) -> list[_Pair]:
+    """Return the pairs whose pose explains nearly as many matches as the one that explains `most`.
 
     Points without parallax are no points of a map, and yet they speak for a pose: beside a near plane, the pose that
     takes a turn for parallax has more points, and the true one explains as many matches.
     """
-    most = max(pair.n_explained for pair in pairs)
     bound = UNEXPLAINED_TIMES * (n_matches - most) + UNEXPLAINED_MORE
     return [p for p in pairs if p.n_explained >= RUNNER_UP * most and n_matches - p.n_explained <= bound]
 
@@ -365,9 +377,3 @@ def _shift_px(a: View, b: View, matches: Matches) -> float:
     """Return by how much matches have moved in the image (median)."""
     moved = b.features.uv_rect_px[matches.index[:, 1]] - a.features.uv_rect_px[matches.index[:, 0]]
     return float(np.median(np.linalg.norm(moved, axis=1)))
-
-
-def _direction_angle_deg(T_1: FloatArray, T_2: FloatArray) -> float:
-    t1, t2 = T_1[:3, 3], T_2[:3, 3]
-    cosine = t1 @ t2 / max(float(np.linalg.norm(t1) * np.linalg.norm(t2)), 1e-12)
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

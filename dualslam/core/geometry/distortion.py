@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from dualslam.core.types import FloatArray
@@ -29,6 +31,7 @@ def radial_derivative(r: FloatArray, k: tuple[float, ...]) -> FloatArray:
     return 1.0 + total
 
 
+@lru_cache(maxsize=64)  # of one lens it is asked for with each image
 def radial_limit(k: tuple[float, ...]) -> float:
     """Return the radius up to which `radial` grows, so that it has an inverse: infinite for most lenses."""
     coefficients = [(2 * i + 3) * k[i] for i in reversed(range(len(k)))] + [1.0]
