@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -17,7 +18,7 @@ from dualslam.core.estimates import PreferredCamera
 from dualslam.core.interfaces import Frontend, SubmapGraph
 from dualslam.core.types import IntArray
 from dualslam.frontends.features.image_features import ImageFeatures
-from dualslam.frontends.gap.auxiliary_features import AuxiliaryFeatures, BufferedFeatures, OwnFeatures
+from dualslam.frontends.gap.auxiliary_features import Auxiliary, BufferedFeatures, OwnFeatures
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry
 from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.gap.route import Route
@@ -97,37 +98,45 @@ def _attempts(
 ) -> tuple[Attempt, ...]:
     """Build the attempts; those with the same auxiliary front end share what it finds in the images."""
     auxiliaries: dict[str, ImageFeatures] = {}  # by their settings
+    own = Auxiliary(frontend, OwnFeatures())
     attempts = []
     for number, attempt in enumerate(config.recovery.attempts):
         if attempt.is_live:
-            attempts.append(_attempt_by(frontend, lambda camera: OwnFeatures(), attempt, config, live, size_px))
+            attempts.append(_attempt_by(lambda camera: (own,), attempt, config, live, size_px))
             continue
         wanted = auxiliary_config(attempt)
         key = wanted.model_dump_json()
         if key not in auxiliaries:
             with naming_attempt(number):
                 auxiliaries[key] = ImageFeatures(create_frontend(wanted, FOR_WALKS), n_threads)
-        features_for = partial(BufferedFeatures, auxiliaries[key], config.camera.model_sigma_px)
-        attempts.append(_attempt_by(auxiliaries[key].frontend, features_for, attempt, config, live, size_px))
+        other = partial(_buffered, auxiliaries[key], config)
+        thorough = _attempt_by(partial(_after, (), other), attempt, config, live, size_px)
+        short = _attempt_by(partial(_after, (own,), other), attempt, config, live, size_px)
+        attempts.append(replace(short, thorough=thorough) if attempt.tracking == "live" else thorough)
     return tuple(attempts)
 
 
+def _buffered(images: ImageFeatures, config: Config, camera: Camera) -> Auxiliary:
+    return Auxiliary(images.frontend, BufferedFeatures(images, config.camera.model_sigma_px, camera))
+
+
+def _after(first: tuple[Auxiliary, ...], other: Callable[[Camera], Auxiliary], camera: Camera) -> tuple[Auxiliary, ...]:
+    return (*first, other(camera))
+
+
 def _attempt_by(
-    auxiliary: Frontend,
-    features_for: Callable[[Camera], AuxiliaryFeatures],
+    auxiliaries: Callable[[Camera], tuple[Auxiliary, ...]],
     attempt: AttemptConfig,
     config: Config,
     live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
     size_px: tuple[int, int],
 ) -> Attempt:
-    """Build an attempt in which a front end, which may be the live one itself, gives the live one its poses."""
+    """Build an attempt in which front ends, of which the live one may be one, give the live one its poses."""
     tracks_live = attempt.is_live or attempt.tracking == "live"
 
     def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> PnpOdometry:
-        reverse_tracker, features = live(job, submap, graph), features_for(job.camera)
-        overlap_id = max((k for lost in job.lost.values() for k in lost.keyframes), default=job.newest_id)
-        route = Route(job.own, job.views, overlap_id)
+        reverse_tracker, route = live(job, submap, graph), Route(job.own, job.views)
         adjuster = bundle_adjuster(config)
-        return PnpOdometry(reverse_tracker, auxiliary, features, route, adjuster, config, size_px, tracks_live)
+        return PnpOdometry(reverse_tracker, auxiliaries(job.camera), route, adjuster, config, size_px, tracks_live)
 
     return Attempt(attempt.name, new_odometry)

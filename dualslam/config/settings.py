@@ -157,10 +157,10 @@ class RecoveryConfig(StrictModel):
     """Frames in a row that reverse tracking may skip, because none of its keyframes can be matched in them. A walk that
     links no map, but poses the frames before a start, goes on to the end of the buffer."""
     attempts: tuple[AttemptConfig, ...] = Field(
-        (AttemptConfig(frontend="sift", tracking="live"), AttemptConfig(), AttemptConfig(frontend="sift")), min_length=1
+        (AttemptConfig(frontend="sift", tracking="live"), AttemptConfig(frontend="sift")), min_length=1
     )
     """In this order, each from the same snapshot of the new map, until one leads to a link. A list of words will do,
-    such as `[live, gap, sift]`; an attempt with settings is written `{frontend: sift, n_features: 3000}`."""
+    such as `[gap, live, sift]`; an attempt with settings is written `{frontend: sift, n_features: 3000}`."""
     relocalise_after: int | None = Field(15, ge=0)
     """Frames that show something without a start, after which a lost map is looked for, and continued where it is seen
     again; null: never. A map that starts sooner is better linked, by all that reverse tracking finds: most start within

@@ -256,6 +256,11 @@ class VisualOdometry(Protocol):
         """Return ``T_kf_cam``: the track's pose relative to the reference keyframe; its own is the identity."""
         ...
 
+    @property
+    def took_short_cut(self) -> bool:
+        """Whether features at hand have crossed a gap where others, that give more matches, were not asked."""
+        ...
+
     def confirmed(self) -> Track | None:
         """Return the earlier frame, given without a pose, that the last one has confirmed the pose of."""
         ...

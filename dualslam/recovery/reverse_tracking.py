@@ -42,10 +42,14 @@ Judge = Callable[[Track | Failure], Track | Failure]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attempt:
-    """One way to track in reverse, by the name of the front end that its poses come from."""
+    """One way to track in reverse, by the name of the front end that its poses come from.
+
+    `thorough`: the same way without short cuts, made where those that it took lead to no link.
+    """
 
     name: str
     new_odometry: Callable[[RecoveryJob, Submap, SubmapGraph], VisualOdometry]
+    thorough: Attempt | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +93,10 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
     events: list[Event] = []
     looks_alike, tries = False, job.tries.copy()
     until = np.inf if parts.budget_s is None else started + parts.budget_s
-    for attempt in parts.attempts if job.lost else (parts.posing,):
+    ways = list(parts.attempts if job.lost else (parts.posing,))
+    thorough: Attempt | None = None
+    while ways:
+        attempt = ways.pop(0)
         if best is not None and time.perf_counter() > until:
             break
         progress = yield from _make_attempt(job, parts, attempt, until, tries)
@@ -98,10 +105,14 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
             continue
         events += progress.events
         looks_alike |= progress.looks_alike
-        if best is None or progress.link is not None:
+        came_as_far = best is not None and len(progress.frames) >= len(best.frames)
+        if best is None or progress.link is not None or (attempt is thorough and came_as_far):
             best = progress
         if progress.link is not None or progress.needs_camera or progress.needs_live_end or progress.looks_alike:
             break
+        if progress.took_short_cut and attempt.thorough is not None:
+            thorough = attempt.thorough
+            ways.insert(0, thorough)
     if best is None:
         return problem
     seconds, cpu_s = time.perf_counter() - started, time.process_time() - cpu_started
@@ -121,6 +132,7 @@ class _Progress:
     n_gaps: int = 0
     n_skipped: int = 0  # frames without a pose between some that have one
     n_unusable: int = 0  # the last frames
+    took_short_cut: bool = False
     out_of_time: bool = False
     given_up: bool = False
     needs_camera: bool = False  # no other walk would do better, before the camera is calibrated
@@ -184,6 +196,7 @@ def _make_attempt(
         if isinstance(step.track, Failure):
             progress.note_unusable(step.track)
             continue
+        progress.took_short_cut = reverse_tracker.took_short_cut
         progress.note_posed(_recovered_frame(reverse_tracker, step.view, step.track), step.report is not None)
         if (earlier := reverse_tracker.confirmed()) is not None:
             progress.note_confirmed(_recovered_frame(reverse_tracker, earlier.view, earlier))
@@ -198,8 +211,10 @@ def _make_attempt(
             tries.note_try(tried.old_id, found.reason)
             progress.why_not_linked = found.detail
             progress.needs_camera |= found.reason is FailureReason.CAMERA
-            # What was lost across a gap the others lose as well: they cross it by the same matches, or by fewer.
-            progress.needs_live_end |= found.reason is FailureReason.SCALE_LOST and progress.n_gaps > 0
+            # What was lost across a gap the others lose as well: they cross it by the same matches, or by fewer. Only
+            # where a short cut was taken there are more.
+            was_lost = found.reason is FailureReason.SCALE_LOST and progress.n_gaps > 0
+            progress.needs_live_end |= was_lost and not progress.took_short_cut
             progress.given_up |= progress.needs_camera or found.reason is FailureReason.SCALE_LOST
             progress.events.append(_refusal(tried, found, attempt.name, step.view, submap.id))
         progress.given_up |= relinker.has_seen_enough

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Protocol
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.rectification import rectify
+from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Failure, FailureReason, Features, View
 from dualslam.frontends.features.image_features import ImageFeatures
 from dualslam.frontends.tracking.row_shifts import correct_shutter
@@ -22,6 +24,14 @@ class AuxiliaryFeatures(Protocol):
     def prefetch(self, views: Iterable[View]) -> None:
         """Say which views will be asked for next, in this order: their features may be found beforehand."""
         ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Auxiliary:
+    """A front end that poses frames, and where its features come from."""
+
+    frontend: Frontend
+    features: AuxiliaryFeatures
 
 
 class OwnFeatures:

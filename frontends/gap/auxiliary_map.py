@@ -62,6 +62,15 @@ class AuxiliaryMap:
         """Frames with features and a pose, in the order in which they were posed."""
         return [index for index in self._place if index in self._features]
 
+    @property
+    def posed(self) -> list[int]:
+        """Frames with a pose, with or without features, in the order in which they were posed."""
+        return list(self._place)
+
+    def has_features(self, index: int) -> bool:
+        """Whether a frame's features were taken in."""
+        return index in self._features
+
     def features(self, index: int) -> Features:
         """Return the features of a frame."""
         return self._features[index]
@@ -86,9 +95,9 @@ class AuxiliaryMap:
             self._extend(other, index, found.index)
 
     def drop(self, index: int) -> None:
-        """Forget a frame that found no pose."""
-        del self._features[index], self._track_of[index]
-        self._place.pop(index, None)
+        """Forget a frame that found no pose, or no features."""
+        for of in (self._features, self._track_of, self._place):
+            of.pop(index, None)
 
     def put(self, index: int, reference_id: int, T_cam_submap: FloatArray) -> None:
         """Say where a frame stands, relative to a keyframe of the submap (which may be the frame itself)."""

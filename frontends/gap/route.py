@@ -24,13 +24,10 @@ class Route:
         Of the submap's own keyframes.
     ahead : sequence of View
         In the order in which they will be given.
-    overlap_id : int
-        The first frame on the way that an older submap holds: a gap lies before it.
     """
 
     own: Sequence[View]
     ahead: Sequence[View]
-    overlap_id: int
 
     def usable_after(self, view: View, min_features: int) -> Iterator[View]:
         """Yield the next frames after one in which features can be found."""

@@ -69,6 +69,7 @@ def refuse_look_alike(
     K: FloatArray,
     size_px: tuple[int, int],
     seed: int,
+    any_is_doubt: bool = False,
 ) -> Failure | None:
     """Return why a pose beyond a gap is not to be believed, if another one explains nearly as much.
 
@@ -85,9 +86,12 @@ def refuse_look_alike(
     K : (3, 3)
     size_px : (width, height)
     seed : int
+    any_is_doubt : bool
+        However few points another pose explains, the first is not believed; all points are compared.
     """
-    second = find_second_pose(frontend, descriptors, xyz, features, T_cam_w, K, size_px, seed)
-    if second is None or not second.makes_doubtful:
+    n_points = len(xyz) if any_is_doubt else N_POINTS
+    second = find_second_pose(frontend, descriptors, xyz, features, T_cam_w, K, size_px, seed, n_points)
+    if second is None or not (second.makes_doubtful or any_is_doubt):
         return None
     numbers = {"second_pose": float(second.support), "first_pose": float(second.first_support)}
     detail = f"another pose explains {second.support} points, this one {second.first_support}"
@@ -103,9 +107,10 @@ def find_second_pose(
     K: FloatArray,
     size_px: tuple[int, int],
     seed: int,
+    n_points: int = N_POINTS,
 ) -> SecondPose | None:
     """Look for another pose among the pairs that the first one leaves over; parameters as `refuse_look_alike`."""
-    chosen, seen = _spread(len(xyz), N_POINTS), _spread(len(features), N_FEATURES)
+    chosen, seen = _spread(len(xyz), n_points), _spread(len(features), N_FEATURES)
     xyz, features = xyz[chosen], features.take(seen)
     point, feature = _alike(frontend, descriptors[chosen], features.descriptors)
     explained = _explained(T_cam_w, xyz[point], features, feature, K)

@@ -162,6 +162,11 @@ class VisualFrontEnd:
         self._tracker.take(track)
         self._note_gap(track)
 
+    @property
+    def took_short_cut(self) -> bool:
+        """False: there are no other features."""
+        return False
+
     def confirmed(self) -> Track | None:
         """Return None: a frame has its pose at once, or none."""
         return None

@@ -13,6 +13,7 @@ from dualslam.config.settings import Config
 from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Track, View
 from dualslam.frontends.features.orb import OrbFrontend
+from dualslam.frontends.gap.auxiliary_features import Auxiliary
 from dualslam.frontends.gap.auxiliary_map import AuxiliaryMap, TrackViews, triangulate
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry
 from dualslam.frontends.gap.relocalisation import GapPose, relocalise_across_gap
@@ -60,13 +61,14 @@ def odometry(
     auxiliary: PointWorld | WorldFeatures,
     config: Config | None = None,
     tracks_live: bool = False,
-    overlap_id: int = 0,
+    own: WorldFeatures | None = None,
 ) -> PnpOdometry:
+    features = [] if own is None else [own]
+    features.append(WorldFeatures(auxiliary) if isinstance(auxiliary, PointWorld) else auxiliary)
     reverse_tracker = PnpOdometry(
         front_end(live, KEYFRAMES, 40),
-        OrbFrontend(),
-        WorldFeatures(auxiliary) if isinstance(auxiliary, PointWorld) else auxiliary,
-        Route([live.view(k) for k in KEYFRAMES], [live.view(i) for i in range(39, -1, -1)], overlap_id),
+        [Auxiliary(OrbFrontend(), each) for each in features],
+        Route([live.view(k) for k in KEYFRAMES], [live.view(i) for i in range(39, -1, -1)]),
         bundle_adjust_arrays,
         config or Config(),
         SIZE_PX,
@@ -214,19 +216,43 @@ class TestGapRelocalisation:
     def test_what_a_leap_needs_is_foreseen(self) -> None:
         live, auxiliary = worlds(range(25, 32))
         features = WorldFeatures(auxiliary)
-        reverse_tracker = odometry(live, features, tracks_live=True, overlap_id=24)
-        assert features.prefetched == KEYFRAMES[::-1]
+        reverse_tracker = odometry(live, features, tracks_live=True)
         walk(reverse_tracker, live, range(39, 31, -1))
-        assert set(features.prefetched) == {
-            *KEYFRAMES,
-            *reverse_tracker.submap.keyframes,
-        }  # and none of the other frames
+        assert not features.prefetched
         for i in range(31, 9, -1):
             before, features.asked = set(features.prefetched), []
             reverse_tracker.track(live.view(i))
             assert set(features.asked) <= set(features.prefetched)
-            if i < 30:  # with the first frame in the gap came those that it is matched with, and the next ones
+            if i < 24:  # with the first frame beyond the gap came those that it is matched with, and the next one
                 assert set(features.asked) <= before
+
+    def test_own_features_cross_first_and_no_others_are_asked(self) -> None:
+        live, auxiliary = worlds()
+        features = WorldFeatures(auxiliary)
+        reverse_tracker = odometry(live, features, tracks_live=True, own=WorldFeatures(live))
+        steps = walk(reverse_tracker, live, range(39, 31, -1))
+        assert not reverse_tracker.took_short_cut
+        steps |= walk(reverse_tracker, live, range(24, 9, -1))
+        assert all(steps[i] for i in range(23, 9, -1))
+        assert reverse_tracker.took_short_cut
+        assert not features.asked
+        assert np.linalg.norm(errors(steps, live)[:, 3:], axis=1).max() < POSITION_M * 2
+
+    def test_what_own_features_leave_in_doubt_the_others_decide(self) -> None:
+        """A sixth of what own features show stands elsewhere beyond the gap, and asks for another pose by itself."""
+        live, auxiliary = worlds(range(25, 32))
+        elsewhere = live.xyz.copy()
+        elsewhere[:200, 1] += 0.6
+        own, features = WorldFeatures(live), WorldFeatures(auxiliary)
+        beyond = replace(live, xyz=elsewhere)
+        np.testing.assert_array_equal(beyond.descriptors, live.descriptors)
+        own.find = lambda view: (beyond if view.index < 25 else live).features(view.index)
+        reverse_tracker = odometry(live, features, tracks_live=True, own=own)
+        steps = walk(reverse_tracker, live, range(39, 22, -1))
+        assert isinstance(steps[23], Track)
+        assert not reverse_tracker.took_short_cut
+        assert {24, 23} <= set(features.asked)
+        assert np.linalg.norm(errors(steps, live)[:, 3:], axis=1).max() < POSITION_M * 2
 
     def test_no_gap_no_features_of_the_guest(self) -> None:
         """The older submap ends where this one begins, and nothing lies between that the auxiliary front end would be
@@ -234,7 +260,7 @@ class TestGapRelocalisation:
         """
         live, auxiliary = worlds()
         features = WorldFeatures(auxiliary)
-        reverse_tracker = odometry(live, features, tracks_live=True, overlap_id=40)
+        reverse_tracker = odometry(live, features, tracks_live=True)
         assert all(walk(reverse_tracker, live, range(39, 20, -1)).values())
         assert not features.prefetched
         assert not features.asked

@@ -66,6 +66,9 @@ def test_what_does_not_repeat_has_one_pose(seed: int) -> None:
 def test_few_things_that_repeat_leave_the_pose_certain() -> None:
     xyz, descriptors, features, T = sight(5, 250, 4)
     assert refuse_look_alike(ORB, descriptors, xyz, features, T, K, SIZE_PX, 4) is None
+    refused = refuse_look_alike(ORB, descriptors, xyz, features, T, K, SIZE_PX, 4, any_is_doubt=True)
+    assert refused is not None  # where others can decide
+    assert refused.numbers["second_pose"] < 0.5 * refused.numbers["first_pose"]
 
 
 def test_nothing_to_compare_is_no_second_pose() -> None:

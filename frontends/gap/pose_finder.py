@@ -1,0 +1,306 @@
+"""Poses of frames by one front end's features: from frame to frame, and across a gap.
+
+Its features are matched by themselves; their points, triangulated from the frames before, give a frame's pose by PnP.
+Across a gap a frame is matched with several frames before it, and its pose is believed only once a second frame beyond
+the gap, posed by itself, sees the same points where they should be, and no other pose explains nearly as much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dualslam.config.settings import Config
+from dualslam.core.bundle import BundleAdjuster
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.projection import project_points, refine_pose
+from dualslam.core.support import find_lack_of_support
+from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray, Matches, Track, View
+from dualslam.frontends.gap.auxiliary_features import Auxiliary
+from dualslam.frontends.gap.auxiliary_map import AuxiliaryMap, triangulate
+from dualslam.frontends.gap.consensus import CONFIRMING_SHARE, BeyondGap, confirmed_share
+from dualslam.frontends.gap.relocalisation import GapPose, relocalise_across_gap
+from dualslam.frontends.gap.second_pose import refuse_look_alike
+from dualslam.frontends.gap.uncertainty import SMALL_STEP
+from dualslam.frontends.tracking.resection import resect
+from dualslam.frontends.tracking.tracker import GivenPose
+from dualslam.frontends.tracking.visual import VisualFrontEnd
+from dualslam.map.submap import NO_LANDMARK
+
+FOLLOW_FRAMES = 2  # frames that the next one is matched with
+POINT_FRAMES = 6  # frames that a point is triangulated from
+GAP_FRAMES = 5  # frames before a gap that those beyond it are matched with
+SEED_KEYFRAMES = 8  # the latest keyframes, that the walk starts from and that those before a gap are chosen from
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameBeyond(BeyondGap):
+    """A frame beyond a gap, with its view."""
+
+    view: View
+
+    def track(self, T_cam_submap: FloatArray) -> Track:
+        """Return the frame with a pose that it was given in the end, and no landmarks."""
+        wide, ids = self.pose, np.full(len(self.view.features), NO_LANDMARK, np.int64)
+        n, n_inliers = len(wide.inliers), int(wide.inliers.sum())
+        numbers = (n, n_inliers, wide.chi2)
+        none = np.zeros(0, np.int64)
+        return Track(self.view, T_cam_submap, T_cam_submap, ids, none, *numbers, wide=True, covariance=wide.covariance)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Crossing:
+    """A gap that is crossed.
+
+    Attributes
+    ----------
+    pose : GivenPose
+        Of the frame beyond it that confirms the first.
+    first : FrameBeyond
+    T_first_confirming : (4, 4)
+    """
+
+    pose: GivenPose
+    first: FrameBeyond
+    T_first_confirming: FloatArray
+
+
+class PoseFinder:
+    """Finds poses by a front end's features, in a submap of which it reads the keyframes' poses.
+
+    Parameters
+    ----------
+    live : VisualFrontEnd
+        Of the submap.
+    auxiliary : Auxiliary
+    adjuster : BundleAdjuster
+    config : Config
+    size_px : (width, height)
+    is_short_cut : bool
+        There are other features, better ones: what these leave in doubt beyond a gap is for those to decide. Binary
+        descriptors know a thing again only where they see it from about the same side. Past rows of parked cars, each
+        of which repeats the one before, 16 to 46 points of 186 to 294 were all that showed of the right pose, and in
+        scenes that do not repeat themselves no second pose has the 12 that it takes to be one (8 at most).
+    """
+
+    def __init__(
+        self,
+        live: VisualFrontEnd,
+        auxiliary: Auxiliary,
+        adjuster: BundleAdjuster,
+        config: Config,
+        size_px: tuple[int, int],
+        is_short_cut: bool,
+    ) -> None:
+        self._live = live
+        self._submap = live.submap
+        self._frontend = auxiliary.frontend
+        self._features_of = auxiliary.features
+        self._adjuster = adjuster
+        self._config = config
+        self._min_features = config.tracking.min_inliers
+        self._size_px = size_px
+        self._is_short_cut = is_short_cut
+        self._map = AuxiliaryMap(live.submap)
+        self._pending: dict[int, View] = {}  # posed, but without features of this front end as yet
+        self._doubt: Failure | None = None
+        self._beyond: FrameBeyond | None = None  # the last frame beyond a gap, until another confirms it
+
+    @property
+    def knows_last(self) -> bool:
+        """Whether it has features of the last frame that has a pose."""
+        return bool(self._map.posed) and self._map.has_features(self._map.posed[-1])
+
+    @property
+    def waits(self) -> bool:
+        """Whether a frame beyond a gap has a pose that the next one may confirm."""
+        return self._beyond is not None
+
+    @property
+    def doubt(self) -> Failure | None:
+        """What was found to look alike beyond the gap at hand: it is not crossed by these features any more."""
+        return self._doubt
+
+    def T_cam_submap(self, index: int) -> FloatArray:
+        """Return where a frame stands by the submap's poses of now."""
+        return self._map.T_cam_submap(index)
+
+    def note(self, view: View, reference_id: int, T_cam_submap: FloatArray) -> None:
+        """Take in where a frame stands; its features are found when they are needed."""
+        self._map.put(view.index, reference_id, T_cam_submap)
+        if not self._map.has_features(view.index):
+            self._pending[view.index] = view
+
+    def end_gap(self) -> None:
+        """Forget the gap that was crossed, and frames that no later one will be compared with."""
+        self._beyond, self._doubt = None, None
+        for index in self._map.frames[:-POINT_FRAMES]:
+            if index not in self._submap.keyframes:
+                self._map.drop(index)
+
+    def _look_at(self, view: View, needed: list[int], ahead: Iterable[View]) -> Features | Failure:
+        """Find the features of a frame, and of those that it will be matched with."""
+        pending = [self._pending.pop(index) for index in needed if index in self._pending]
+        self._features_of.prefetch([*pending, view, *ahead])
+        for other in pending:
+            features = self._features(other)
+            if isinstance(features, Failure):
+                self._map.drop(other.index)
+            else:
+                self._map.add(other.index, features, self._matches(features, self._map.frames[-GAP_FRAMES:]))
+        return self._features(view)
+
+    def _features(self, view: View) -> Features | Failure:
+        features = self._features_of.of(view)
+        if not isinstance(features, Failure) and len(features) < self._min_features:
+            return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features of {self._frontend.name} in the image")
+        return features
+
+    def _matches(self, features: Features, frames: list[int]) -> dict[int, Matches]:
+        return {k: self._frontend.match_wide(self._map.features(k), features) for k in reversed(frames)}
+
+    # --- from frame to frame
+
+    def follow(self, view: View, ahead: Iterable[View]) -> GivenPose | Failure:
+        """Pose a frame that is next to the last one: PnP against the points of the frames before.
+
+        `ahead`: the views that come after it.
+        """
+        posed = self._map.posed
+        keyframes = [k for k in posed if k in self._submap.keyframes][-SEED_KEYFRAMES:]
+        features = self._look_at(view, list(dict.fromkeys([*keyframes, *posed[-FOLLOW_FRAMES:]])), ahead)
+        if isinstance(features, Failure):
+            return features
+        frames = self._map.frames[-POINT_FRAMES:]
+        self._map.add(view.index, features, self._matches(features, frames[-FOLLOW_FRAMES:]))
+        rows = self._map.rows_with_track(view.index)
+        xyz, good = triangulate(self._map.views(view.index, rows, frames), self._submap.K)
+        pose = self._pnp(features, rows[good], xyz[good])
+        if isinstance(pose, Failure):
+            self._map.drop(view.index)
+        return pose
+
+    def _pnp(self, features: Features, rows: IntArray, xyz: FloatArray) -> GivenPose | Failure:
+        minimum = self._config.health.min_inliers
+        if len(rows) < minimum:
+            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(rows)} points of {self._frontend.name}")
+        uv, sigma = features.uv_rect_px[rows], features.sigma_px[rows]
+        T = resect(self._submap.K, self._size_px, uv, xyz, float(np.median(sigma)), self._config.seed)
+        found = refine_pose(self._submap.K, T, xyz, uv, sigma, min_inliers=minimum)
+        if isinstance(found, Failure):
+            return found
+        chi2 = float(found.chi2[found.inliers].mean() / 2)
+        return GivenPose(found.T_cam_w, len(rows), found.n_inliers, chi2, found.covariance, wide=False)
+
+    def _healthy(self, n_inliers: int, n_matches: int, chi2: float) -> bool:
+        return find_lack_of_support(n_inliers, n_matches, chi2, self._config.health) is None
+
+    # --- across a gap
+
+    def relocalise(self, view: View, ahead: Iterable[View]) -> Crossing | Track | Failure:
+        """Wide matching with several frames before the gap; believed when a second frame beyond it agrees."""
+        if self._doubt is not None:
+            return self._doubt
+        index, before = view.index, self._beyond
+        frames = self._frames_before_gap()
+        features = self._look_at(view, frames, ahead)
+        if isinstance(features, Failure):
+            return features
+        frames = [k for k in frames if self._map.has_features(k)]
+        self._map.add(index, features, self._matches(features, frames))
+        rows = self._map.rows_with_track(index)
+        found = relocalise_across_gap(
+            self._map.views(index, rows, frames),
+            features.uv_rect_px[rows],
+            features.sigma_px[rows],
+            self._submap.K,
+            self._size_px,
+            self._adjuster,
+            self._config.seed,
+        )
+        wide = self._judge(found)
+        if not isinstance(wide, Failure):
+            self._doubt = self._refuse_look_alike(wide, features, frames)
+            wide = wide if self._doubt is None else self._doubt
+        if isinstance(wide, Failure):
+            step = None
+            may_be_small = not self._is_short_cut and wide.reason is not FailureReason.LOOK_ALIKE
+            if isinstance(found, GapPose) and may_be_small:
+                step = self._small_step(view, found, frames[-1])
+            if step is None:
+                self._map.drop(index)
+            return wide if step is None else step
+        self._beyond = FrameBeyond(features, rows[wide.inliers], wide, view)
+        if before is None:
+            return Failure(FailureReason.UNCONFIRMED, "the first frame beyond a gap", wide.numbers)
+        matches = self._frontend.match_wide(before.features, features).index
+        share = confirmed_share(before, self._beyond, matches, self._submap.K)
+        if share < CONFIRMING_SHARE:
+            self._map.drop(before.view.index)
+            return Failure(
+                FailureReason.UNCONFIRMED, f"{share:.0%} of two frames confirm the gap relocalisation", wide.numbers
+            )
+        self._map.put(before.view.index, self._live.reference_id, before.pose.T_cam_submap)
+        n_inliers = int(wide.inliers.sum())
+        pose = GivenPose(wide.T_cam_submap, len(rows), n_inliers, wide.chi2, wide.covariance, wide=True)
+        return Crossing(pose, before, before.pose.T_cam_submap @ se3.inverse(wide.T_cam_submap))
+
+    def _frames_before_gap(self) -> list[int]:
+        """Return the last frame, and others spread over the keyframes before it: the wider these stand, the better is
+        depth known.
+        """
+        posed = self._map.posed
+        keyframes = [k for k in posed[:-1] if k in self._submap.keyframes][1 - SEED_KEYFRAMES :]
+        spread = np.linspace(0, len(keyframes) - 1, min(GAP_FRAMES - 1, len(keyframes))).astype(np.int64)
+        return [*(keyframes[i] for i in spread.tolist()), *posed[-1:]]
+
+    def _small_step(self, view: View, found: GapPose, last: int) -> Track | None:
+        """Let the submap's landmarks decide where the auxiliary front end's matches alone do not, if the camera has
+        hardly moved.
+
+        A camera in the hand turns fast and moves little: few of the auxiliary front end's points have parallax enough
+        to keep the scale, but the landmarks that it still sees have, and a step that is small against their depth
+        changes nothing in that. (Across a long one, landmarks of two or three views would carry their errors over as
+        scale.)
+        """
+        track = self._live.track_near(view, found.T_cam_submap)
+        if isinstance(track, Failure) or not self._healthy(track.n_inliers, track.n_matches, track.chi2):
+            return None
+        place = se3.inverse(self._map.T_cam_submap(last))[:3, 3]
+        step = float(np.linalg.norm(se3.inverse(track.T_cam_submap)[:3, 3] - place))
+        ids = track.landmark_ids[track.landmark_ids >= 0]
+        _, depth = project_points(self._submap.K, track.T_cam_submap, self._submap.landmarks["xyz_mu"][ids])
+        if not step < SMALL_STEP * float(np.median(depth)):
+            return None
+        self._live.take(track)
+        return track
+
+    def _refuse_look_alike(self, wide: GapPose, features: Features, frames: list[int]) -> Failure | None:
+        """Return why a gap relocalisation is not believed, if another pose explains nearly as much."""
+        last = frames[-1]
+        rows = self._map.rows_with_track(last)
+        xyz, good = triangulate(self._map.views(last, rows, frames), self._submap.K)
+        return refuse_look_alike(
+            self._frontend,
+            self._map.features(last).descriptors[rows[good]],
+            xyz[good],
+            features,
+            wide.T_cam_submap,
+            self._submap.K,
+            self._size_px,
+            self._config.seed,
+            any_is_doubt=self._is_short_cut,
+        )
+
+    def _judge(self, wide: GapPose | Failure) -> GapPose | Failure:
+        """Hold a gap relocalisation to what health asks of a track, and to the scale that it must not lose."""
+        if isinstance(wide, Failure):
+            return wide
+        lack = find_lack_of_support(int(wide.inliers.sum()), len(wide.inliers), wide.chi2, self._config.health)
+        if lack is not None:
+            return replace(lack, numbers=wide.numbers)
+        if wide.scale_sigma > self._config.linking.max_gap_scale_sigma:
+            return Failure(FailureReason.SCALE, f"the scale beyond is known to {wide.scale_sigma:.1%}", wide.numbers)
+        return wide
