@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -102,6 +104,30 @@ def test_no_start_without_a_baseline(turn_rad: FloatArray, seed: int) -> None:
         FailureReason.DOUBTFUL_INITIALISATION,
         FailureReason.CHI_SQUARE,
     }
+
+
+@pytest.mark.parametrize("step_m", [0.005, 0.01, 0.02])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_pairs_that_are_refused_early_start_no_map_otherwise(
+    step_m: float, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = PointWorld(cloud(seed=seed), path(30, [step_m, 0, 0], [0, 0.02, 0]), seed=seed)
+    is_hopeless, found = Initialiser._hopeless, []
+
+    def count(*args: Any) -> Failure | None:
+        found.append(is_hopeless(*args))
+        return found[-1]
+
+    monkeypatch.setattr(Initialiser, "_hopeless", count)
+    early, refused_early = feed(world.views())
+    assert any(failure is not None for failure in found)
+    monkeypatch.setattr(Initialiser, "_hopeless", lambda *args: None)
+    late, refused_late = feed(world.views())
+    assert len(refused_early) == len(refused_late)
+    assert (early is None) == (late is None)
+    if early is not None and late is not None:
+        assert np.array_equal(early.T_first_cam, late.T_first_cam)
+        assert np.array_equal(early.xyz, late.xyz)
 
 
 def test_a_plane_gives_the_right_start_or_none() -> None:
