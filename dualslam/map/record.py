@@ -37,6 +37,8 @@ class Record:
     rows : dict of int to FrameRow
         Every frame that was given to the system, by its index.
     poses : dict of int to FramePose
+    refound : set of int
+        Frames that were found by wide matching, beyond a gap: their poses do not follow from those before them.
     events : EventLog
     timer : StageTimer
     """
@@ -44,6 +46,7 @@ class Record:
     atlas: Atlas = field(default_factory=Atlas)
     rows: dict[int, FrameRow] = field(default_factory=dict)
     poses: dict[int, FramePose] = field(default_factory=dict)
+    refound: set[int] = field(default_factory=set)
     events: EventLog = field(default_factory=EventLog)
     timer: StageTimer = field(default_factory=StageTimer)
 

@@ -363,7 +363,11 @@ class Revisits:
         known = compose(record.poses.values(), record.atlas, {a: np.eye(4)}).in_time_order()
         both = compose(record.poses.values(), record.atlas, {a: np.eye(4), b: match.S_place_query}).in_time_order()
         refused = refuse_leaps(
-            both.timestamps_s, both.T_world_cam[:, :3, 3], known.timestamps_s, known.T_world_cam[:, :3, 3]
+            both.timestamps_s,
+            both.T_world_cam[:, :3, 3],
+            known.timestamps_s,
+            known.T_world_cam[:, :3, 3],
+            np.isin(known.index, list(record.refound)),
         )
         return match if refused is None else refused
 

@@ -2,7 +2,8 @@
 
 On either side the velocity is known, in the map itself. Between them the camera has moved by about their mean times the
 time that has passed; by how much it may differ from that, the run itself tells: the same question is asked wherever
-nothing is missing. So no unit is needed, and a hand is judged as a hand, a car as a car.
+nothing is missing and each frame's pose follows from those before it. So no unit is needed, and a hand is judged as a
+hand, a car as a car.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
+from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
 
@@ -58,7 +59,9 @@ class Leap:
         return {"leap_off": self.off_mu, "leap_usual": self.usual_mu, "leap_asked": float(self.n_asked)}
 
 
-def measure_leap(times_s: FloatArray, centres: FloatArray, last_before: int) -> Leap | None:
+def measure_leap(
+    times_s: FloatArray, centres: FloatArray, last_before: int, refound: BoolArray | None = None
+) -> Leap | None:
     """Compare a leap with the same stretch of time where nothing is missing.
 
     Parameters
@@ -69,6 +72,8 @@ def measure_leap(times_s: FloatArray, centres: FloatArray, last_before: int) -> 
         Of the camera, in one map.
     last_before : int
         Row of the last frame before the gap.
+    refound : (N,) bool or None
+        Frames that were found by wide matching, and not by those before them.
 
     Returns
     -------
@@ -85,11 +90,16 @@ def measure_leap(times_s: FloatArray, centres: FloatArray, last_before: int) -> 
     if off is None:
         return None
     before = slice(last_before + 1)  # beyond the leap the map may be wrong
-    return Leap(off, *usual_difference(times_s[before], centres[before], leap_s))
+    refound = None if refound is None else refound[before]
+    return Leap(off, *usual_difference(times_s[before], centres[before], leap_s, refound))
 
 
-def usual_difference(times_s: FloatArray, centres: FloatArray, leap_s: float) -> tuple[float, int]:
+def usual_difference(
+    times_s: FloatArray, centres: FloatArray, leap_s: float, refound: BoolArray | None = None
+) -> tuple[float, int]:
     """Return the usual distance between where velocities lead in a time and where the camera was, and of how many.
+
+    What a frame that was found again has jumped by is none of the camera's: a stretch with one in it is not asked.
 
     Parameters
     ----------
@@ -97,22 +107,32 @@ def usual_difference(times_s: FloatArray, centres: FloatArray, leap_s: float) ->
         Of posed frames, ascending.
     centres : (N, 3)
     leap_s : float
+    refound : (N,) bool or None
+        As for `measure_leap`.
     """
     if len(times_s) < 2 * WINDOW_FRAMES:
         return 0.0, 0
     usual_s = float(np.median(np.diff(times_s)))
     window_s = max(WINDOW_S, WINDOW_FRAMES * usual_s)
+    reach_s = window_s + 0.5 * usual_s
+    times_refound = times_s[:0] if refound is None else times_s[refound]
     asked = []
     for i in range(len(times_s)):
         j = int(np.searchsorted(times_s, times_s[i] + leap_s - 0.5 * usual_s))
-        if j < len(times_s):
+        if j == len(times_s):
+            break
+        if not ((times_refound > times_s[i] - reach_s) & (times_refound < times_s[j] + reach_s)).any():
             asked.append(_off(times_s, centres, i, j, window_s, usual_s))
     known = [value for value in asked if value is not None]
     return (float(np.quantile(known, USUAL)) if known else 0.0), len(known)
 
 
 def refuse_leaps(
-    times_s: FloatArray, centres: FloatArray, times_known_s: FloatArray, centres_known: FloatArray
+    times_s: FloatArray,
+    centres: FloatArray,
+    times_known_s: FloatArray,
+    centres_known: FloatArray,
+    refound_known: BoolArray | None = None,
 ) -> Failure | None:
     """Return why a walk's leaps are not to be believed, by what another map of the same run shows of its camera.
 
@@ -122,6 +142,8 @@ def refuse_leaps(
         Of the frames of the walk and those that it set out from, by ascending time.
     times_known_s : (M,), centres_known : (M, 3)
         Of the other map's, in the unit of the walk's.
+    refound_known : (M,) bool or None
+        Of these, the frames that were found by wide matching.
     """
     if len(times_s) < 2 * WINDOW_FRAMES:
         return None
@@ -132,7 +154,7 @@ def refuse_leaps(
         off = _off(times_s, centres, i, i + 1, window_s, usual_s) if leap_s <= MAX_LEAP_S else None
         if off is None:
             continue
-        leap = Leap(off, *usual_difference(times_known_s, centres_known, leap_s))
+        leap = Leap(off, *usual_difference(times_known_s, centres_known, leap_s, refound_known))
         if leap.is_refused:
             return _refusal(leap)
     return None
@@ -226,7 +248,8 @@ class LeapWatch:
         missing = np.flatnonzero(np.diff(times[: place + 1]) > MISSING * abs(usual_s))
         if not len(missing):
             return None
-        leap = measure_leap(times, centres, int(missing[-1]))
+        refound = np.array([pose.index in record.refound for pose in poses])
+        leap = measure_leap(times, centres, int(missing[-1]), refound)
         if leap is None or not leap.is_refused:
             return None
         return _refusal(leap)

@@ -35,7 +35,7 @@ from dualslam.recovery.leaps import refuse_leaps
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.merge import Merged, merge_recovery
 from dualslam.recovery.overlap_refinement import gauge_at_overlap
-from dualslam.recovery.schedule import RetrySchedule, way_to_gaps
+from dualslam.recovery.schedule import RetrySchedule, as_far_as_it_leads, way_to_gaps
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,14 +185,9 @@ class Recoveries:
         self._executor.submit(job)
 
     def _way_to_gaps(self, submap: Submap) -> list[View]:
-        """Return the buffered frames without a pose, and what leads to them from the submap; the latest first.
-
-        What another map has posed that is not linked with this one, and all that is older, is not this one's to pose.
-        """
+        """Return the buffered frames without a pose, and what leads to them from the submap; the latest first."""
         poses, own = self._record.poses, next(c for c in self._record.atlas.components() if submap.id in c)
-        views = takewhile(
-            lambda view: view.index not in poses or poses[view.index].submap_id in own, reversed(tuple(self._buffer))
-        )
+        views = as_far_as_it_leads(reversed(tuple(self._buffer)), poses, submap, own)
         return way_to_gaps(tuple(views), poses.keys(), submap.keyframes.keys())
 
     def collect(self, live: VisualOdometry | None, now: FrameStamp) -> None:
@@ -246,9 +241,12 @@ class Recoveries:
         ours = [p for p in self._record.poses.values() if p.submap_id == new.id and p.index not in walked]
         ours = [p for p in ours if p.keyframe_id in new.keyframes] + list(walked.values())
         theirs = [p for p in self._record.poses.values() if p.submap_id == old.id]
+        theirs.sort(key=lambda pose: pose.timestamp_s)
+        refound = np.array([pose.index in self._record.refound for pose in theirs], bool)
         t_new, centres = _path_of(ours, new)
         t_old, centres_old = _path_of(theirs, old)
-        return refuse_leaps(t_new, centres, t_old, centres_old / float(sim3.scale(result.link.estimate.S_old_new)))
+        scale = float(sim3.scale(result.link.estimate.S_old_new))
+        return refuse_leaps(t_new, centres, t_old, centres_old / scale, refound)
 
     def _poses_any(self, result: RecoveryResult | Failure) -> bool:
         """Whether a walk has found a pose for a frame that has none."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import takewhile
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.types import View
 from dualslam.map.submap import Submap
+from dualslam.map.trajectory import FramePose
 
 
 class RetrySchedule:
@@ -52,6 +54,32 @@ class RetrySchedule:
         if due:
             del self._tried[submap.id]
         return due
+
+
+def as_far_as_it_leads(
+    views: Iterable[View], poses: Mapping[int, FramePose], submap: Submap, linked: Collection[int]
+) -> Iterator[View]:
+    """Yield the views, latest first, up to where only a leap over another map's frames would lead on.
+
+    What another map has posed, and all that is older, is not this one's to pose. Not so where the two are linked, as
+    far as this one has keyframes there as well.
+
+    Parameters
+    ----------
+    views : iterable of View
+    poses : mapping of int to FramePose
+    submap : Submap
+        The one that the walk sets out from.
+    linked : collection of int
+        Submaps that are one map with it.
+    """
+    oldest = min(submap.keyframes)
+
+    def leads_on(view: View) -> bool:
+        posed_in = poses[view.index].submap_id if view.index in poses else submap.id
+        return posed_in == submap.id or (posed_in in linked and view.index >= oldest)
+
+    return takewhile(leads_on, views)
 
 
 def way_to_gaps(views: Sequence[View], posed: Collection[int], keyframe_ids: Collection[int]) -> list[View]:

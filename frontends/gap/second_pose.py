@@ -4,6 +4,9 @@ A match is made where the best candidate is clearly better than the second, whic
 a repetition; among the few that are left a wrong pose, one period off, may have all. So every point is paired with all
 features that look like it; what the first pose explains is taken out, and the rest is asked for another pose. (The
 same test for two maps: `dualslam/places/second_pose.py`.)
+
+What a pose explains is counted among the points that it has in view. A pose near the one of before the gap has nearly
+all of them, and of those that a camera which has moved on by a period still sees, it would win by number alone.
 """
 
 from __future__ import annotations
@@ -25,8 +28,8 @@ from dualslam.frontends.gates import MIN_CONSENSUS
 from dualslam.frontends.tracking.resection import resect
 
 NEARLY_AS_MUCH = 0.5
-"""Share of the first pose's support at which a second makes it doubtful, as for two maps: at a half, the better
-explanation no longer stands out."""
+"""Times what the first pose explains of its view at which a second makes it doubtful, as for two maps: at a half, the
+better explanation no longer stands out."""
 N_ALIKE = 4
 """Features that one point is paired with: copies of a thing that are told apart."""
 N_POINTS, N_FEATURES = 300, 1500
@@ -48,16 +51,20 @@ class SecondPose:
     ----------
     T_cam_w : (4, 4)
     support, first_support : int
+    in_view, first_in_view : int
+        Points that the poses have in the image.
     """
 
     T_cam_w: FloatArray
     support: int
     first_support: int
+    in_view: int
+    first_in_view: int
 
     @property
     def makes_doubtful(self) -> bool:
-        """Whether it explains nearly as much as the first."""
-        return self.support >= NEARLY_AS_MUCH * self.first_support
+        """Whether it explains nearly as much of its view as the first does."""
+        return self.support * self.first_in_view >= NEARLY_AS_MUCH * self.first_support * self.in_view
 
 
 def refuse_look_alike(
@@ -93,8 +100,16 @@ def refuse_look_alike(
     second = find_second_pose(frontend, descriptors, xyz, features, T_cam_w, K, size_px, seed, n_points)
     if second is None or not (second.makes_doubtful or any_is_doubt):
         return None
-    numbers = {"second_pose": float(second.support), "first_pose": float(second.first_support)}
-    detail = f"another pose explains {second.support} points, this one {second.first_support}"
+    numbers = {
+        "second_pose": float(second.support),
+        "second_in_view": float(second.in_view),
+        "first_pose": float(second.first_support),
+        "first_in_view": float(second.first_in_view),
+    }
+    detail = (
+        f"another pose explains {second.support} of {second.in_view} points in view,"
+        f" this one {second.first_support} of {second.first_in_view}"
+    )
     return Failure(FailureReason.LOOK_ALIKE, detail, numbers)
 
 
@@ -114,7 +129,7 @@ def find_second_pose(
     xyz, features = xyz[chosen], features.take(seen)
     point, feature = _alike(frontend, descriptors[chosen], features.descriptors)
     explained = _explained(T_cam_w, xyz[point], features, feature, K)
-    first_support = len(np.unique(point[explained]))
+    first_support, first_in_view = len(np.unique(point[explained])), _n_in_view(T_cam_w, xyz, K, size_px)
     rest = np.flatnonzero(~explained)
     if len(rest) < MIN_CONSENSUS:
         return None
@@ -134,8 +149,9 @@ def find_second_pose(
         held = np.unique(point[_explained(T, xyz[point], features, feature, K)])
         if len(held) < MIN_CONSENSUS or _are_one(T_cam_w, T, xyz[held], K, sigma_px):
             continue
-        if best is None or len(held) > best.support:
-            best = SecondPose(T, len(held), first_support)
+        second = SecondPose(T, len(held), first_support, _n_in_view(T, xyz, K, size_px), first_in_view)
+        if best is None or second.support * best.in_view > best.support * second.in_view:
+            best = second
     return best
 
 
@@ -190,6 +206,11 @@ def _explained(T_cam_w: FloatArray, xyz: FloatArray, features: Features, feature
 def _within(T_cam_w: FloatArray, xyz: FloatArray, uv_px: FloatArray, K: FloatArray, reach_px: FloatArray) -> BoolArray:
     uv, depth = project_points(K, T_cam_w, xyz)
     return np.asarray((depth > 0) & (np.linalg.norm(uv - uv_px, axis=1) < reach_px))
+
+
+def _n_in_view(T_cam_w: FloatArray, xyz: FloatArray, K: FloatArray, size_px: tuple[int, int]) -> int:
+    uv, depth = project_points(K, T_cam_w, xyz)
+    return int(np.count_nonzero((depth > 0) & ((uv > 0) & (uv < size_px)).all(axis=1)))
 
 
 def _are_one(T_a: FloatArray, T_b: FloatArray, xyz: FloatArray, K: FloatArray, sigma_px: float) -> bool:

@@ -23,9 +23,10 @@ class Motion:
     Attributes
     ----------
     xi : (6,) or None
-        The motion from one frame to the next; None: at rest.
+        The motion from one frame to the next; None: none is known, and the camera is taken to be at rest.
     interval_s : float
-        The time that it took; negative where frames come in reverse.
+        The time that it took; negative where frames come in reverse. At rest, the shortest time between two keyframes:
+        no frame of a slow sequence is a gap.
     """
 
     xi: FloatArray | None = None
@@ -52,8 +53,10 @@ class Motion:
         return se3.exp(self.xi * n_intervals) @ last.T_cam_submap
 
     def lies_beyond_gap(self, last: Track, view: View) -> bool:
-        """Whether so much time has passed since a track that the motion does not lead to a view."""
-        return self.xi is not None and self._n_intervals(last, view.timestamp_s) > self._max_extrapolation
+        """Whether so much time has passed since a track that the motion does not lead to a view; at rest, too."""
+        if self.xi is None:
+            return abs(view.timestamp_s - last.view.timestamp_s) > max(STEADY_S, self.interval_s)
+        return self._n_intervals(last, view.timestamp_s) > self._max_extrapolation
 
     @property
     def _max_extrapolation(self) -> float:

@@ -99,7 +99,9 @@ class Tracker:
 
     def start(self, track: Track) -> None:
         """Begin at a frame whose pose is known, at rest."""
-        self._last, self._motion, self._doubt = track, Motion(), None
+        times_s = np.sort([keyframe.timestamp_s for keyframe in self._submap.keyframes.values()])
+        at_rest = Motion(interval_s=float(np.diff(times_s).min(initial=np.inf)))
+        self._last, self._motion, self._doubt = track, at_rest, None
         self.refresh()
 
     def refresh(self) -> None:

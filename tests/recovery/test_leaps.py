@@ -47,6 +47,26 @@ def test_one_that_is_a_period_off_is_not(seed: int, off_m: float) -> None:
     assert leap.is_refused
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_what_a_map_itself_has_leapt_is_nothing_that_its_camera_does(seed: int) -> None:
+    """A start that was found again with a jump: it must not let a jump pass later."""
+    t, p = way(160, seed, sway_m=0.02)
+    p[:10, 0] -= 0.6
+    t, p = without(t, p, 90, 10)
+    refound = np.arange(len(t)) == 10
+    right = measure_leap(t, p, 89, refound)
+    assert right is not None
+    assert right.n_asked >= MIN_ASKED
+    assert not right.is_refused
+    p[90:, 0] += 0.6
+    wrong = measure_leap(t, p, 89, refound)
+    assert wrong is not None
+    assert wrong.is_refused
+    blind = measure_leap(t, p, 89)
+    assert blind is not None
+    assert not blind.is_refused, "the first jump is what shows the second to be none"
+
+
 def test_where_the_run_can_tell_nothing_nothing_is_refused() -> None:
     t, p = without(*way(40, 1), 12, 10)
     p[12:, 0] += 1.5

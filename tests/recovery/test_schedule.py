@@ -14,10 +14,11 @@ from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray, FrameStatus, Keyframe, View
 from dualslam.frontends.tracking.local_map import covering_keyframes
 from dualslam.map.submap import Submap
+from dualslam.map.trajectory import FramePose
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
-from dualslam.recovery.schedule import RetrySchedule, way_to_gaps
+from dualslam.recovery.schedule import RetrySchedule, as_far_as_it_leads, way_to_gaps
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
 from dualslam.testing.point_world import (
@@ -240,6 +241,23 @@ class TestWayToGaps:
         order = list(range(9, -1, -1))
         posed = set(order) - set(without_pose)
         assert [view.index for view in way_to_gaps(views(order), posed, keyframes)] == way
+
+    @pytest.mark.parametrize(
+        ("posed_in", "keyframes", "last"),
+        [
+            ({9: 0, 7: 0, 5: 0, 3: 0}, [9, 5], 0),  # its own
+            ({9: 0, 6: 1, 5: 1, 3: 1}, [9, 4], 4),  # linked, and older than all that it knows
+            ({9: 0, 6: 1, 5: 1, 3: 1}, [9, 6, 3], 0),
+            ({9: 0, 6: 2, 5: 2}, [9, 4], 7),  # of a map that is not linked
+        ],
+    )
+    def test_it_leads_over_no_stretch_that_is_only_another_map_s(
+        self, posed_in: dict[int, int], keyframes: list[int], last: int
+    ) -> None:
+        poses = {i: FramePose(i, float(i), m, i, np.eye(4)) for i, m in posed_in.items()}
+        order = views(range(9, -1, -1))
+        way = [view.index for view in as_far_as_it_leads(order, poses, submap_with(keyframes), {0, 1})]
+        assert way == list(range(9, last - 1, -1))
 
 
 def submap_with(keyframes: Iterable[int]) -> Submap:

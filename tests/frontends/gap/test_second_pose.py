@@ -58,6 +58,23 @@ def test_what_repeats_is_refused_whichever_pose_came_first(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
+def test_a_pose_that_has_little_of_what_was_seen_in_view_is_none_the_worse_for_it(seed: int) -> None:
+    """A period on, less than half of the points is in view: from where the camera was before it more of them fit."""
+    xyz, descriptors = row_of_things(60, 30, seed)
+    xyz *= [3.0, 1.0, 1.0]
+    _, before = seen_from(np.eye(4), xyz, descriptors, seed)
+    T = np.eye(4)
+    T[0, 3] = -3.0 * PERIOD_M
+    features, _ = seen_from(T, xyz, descriptors, seed)
+    second = find_second_pose(ORB, descriptors[before], xyz[before], features, np.eye(4), K, SIZE_PX, seed)
+    assert second is not None
+    assert np.linalg.norm(second.T_cam_w[:3, 3] - T[:3, 3]) < 0.1
+    assert second.support < 0.5 * second.first_support
+    assert second.support > 0.9 * second.in_view
+    assert second.makes_doubtful
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_what_does_not_repeat_has_one_pose(seed: int) -> None:
     xyz, descriptors, features, T = sight(0, 250, seed)
     assert find_second_pose(ORB, descriptors, xyz, features, T, K, SIZE_PX, seed) is None

@@ -138,6 +138,14 @@ class TestTracker:
         assert track.wide
         assert np.linalg.norm(se3.log(track.T_cam_submap @ world.T_world_cam[19])[3:]) < POSITION_M
 
+    def test_a_front_end_at_rest_knows_of_no_motion_that_leads_beyond_a_gap(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8, 12, 16], start_at=8)
+        assert not live.lies_beyond_gap(world.view(12))  # as far as from one keyframe to the next
+        assert live.lies_beyond_gap(world.view(13))
+        assert live.lies_beyond_gap(world.view(3))
+        assert tracked(live, world.view(14)).wide
+        assert not front_end(world, [0, 8, 16], start_at=8).lies_beyond_gap(world.view(15))
+
     @pytest.mark.parametrize(("keyframes", "holds"), [([0, 1], False), ([0, 4, 8, 12], True)])
     def test_a_leap_that_loses_the_scale_is_refused(self, keyframes: list[int], holds: bool) -> None:
         """Two keyframes side by side hardly know depths; the same gap crossed from a wide map holds the scale."""
