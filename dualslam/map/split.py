@@ -72,6 +72,18 @@ def take_out(submap: Submap, keyframe_ids: Iterable[int], anchor: int) -> None:
     submap.gauge = _widest_pair(submap, sorted(submap.keyframes))
 
 
+def sound_copy(submap: Submap) -> Submap:
+    """Return a copy without the keyframes that are condemned, as long as others are left.
+
+    What these have seen of the others' landmarks would pair them with the wrong ones of another map.
+    """
+    twin = submap.copy()
+    sound = twin.keyframes.keys() - twin.condemned
+    if len(sound) >= 2 and twin.condemned:
+        take_out(twin, sorted(twin.condemned), max(sound))
+    return twin
+
+
 def _widest_pair(submap: Submap, keyframe_ids: list[int]) -> tuple[int, int]:
     """Return the two keyframes that are farthest apart: a distance that is known the better the longer it is.
 

@@ -22,6 +22,7 @@ from dualslam.map.connections import Connections
 from dualslam.map.propagation import propagate_poses
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.solving import solve
+from dualslam.map.split import sound_copy
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 from dualslam.map.trajectory import FramePose
@@ -171,7 +172,7 @@ class Recoveries:
         job = RecoveryJob(
             submap=submap.copy(),
             newest_id=newest.index,
-            lost={m: self._record.atlas.submaps[m].copy() for m in onsets},
+            lost={m: sound_copy(self._record.atlas.submaps[m]) for m in onsets},
             onsets=onsets,
             views=tuple(views),
             own=tuple(view for view in self._buffer if view.index in submap.keyframes),

@@ -9,6 +9,7 @@ from dualslam.core.events import EventKind
 from dualslam.core.types import FailureReason, FloatArray
 from dualslam.recovery.leaps import MIN_ASKED, measure_leap, refuse_leaps
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
+from tests.recovery.test_schedule import Watched
 
 RATE_HZ = 20.0
 
@@ -105,3 +106,24 @@ def test_a_map_that_has_leapt_as_its_camera_never_moves_ends_there() -> None:
     assert [event.data["reason"] for event in failed] == ["leap"]
     assert failed[0].data["suspected_since"] >= 90
     assert not any(pose.submap_id == 0 and pose.index >= 90 for pose in system.poses.values())
+
+
+def test_what_a_map_saw_beyond_its_leap_takes_no_part_in_a_link() -> None:
+    T = hand_held(150)
+    T[90:, 0, 3] += 2.5
+    world = PointWorld(cloud(), T)
+    system = system_in(world, recovery={"attempts": ["live"]})
+    system._recoveries._executor = watched = Watched(system._recoveries._executor)
+    for frame in world.frames():
+        if not 80 <= frame.index < 90:
+            system.step(frame)
+    old = system.atlas.submaps[0]
+    assert min(old.condemned) >= 90, "the map itself stays whole"
+    jobs = [job for job in watched.jobs if 0 in job.lost]
+    assert jobs
+    for job in jobs:
+        lost = job.lost[0]
+        assert lost.keyframes.keys() == old.keyframes.keys() - old.condemned
+        assert not lost.condemned
+        alive = np.flatnonzero(lost.landmarks["alive"])
+        assert lost.n_observations(alive).min() >= 2
