@@ -220,7 +220,7 @@ class PoseFinder:
             self._adjuster,
             self._config.seed,
         )
-        wide = self._judge(found)
+        wide = self._judge(view, found)
         if not isinstance(wide, Failure):
             self._doubt = self._refuse_look_alike(wide, features, frames)
             wide = wide if self._doubt is None else self._doubt
@@ -243,9 +243,7 @@ class PoseFinder:
                 FailureReason.UNCONFIRMED, f"{share:.0%} of two frames confirm the gap relocalisation", wide.numbers
             )
         self._map.put(before.view.index, self._live.reference_id, before.pose.T_cam_submap)
-        n_inliers = int(wide.inliers.sum())
-        pose = GivenPose(wide.T_cam_submap, len(rows), n_inliers, wide.chi2, wide.covariance, wide=True)
-        return Crossing(pose, before, before.pose.T_cam_submap @ se3.inverse(wide.T_cam_submap))
+        return Crossing(_given(wide), before, before.pose.T_cam_submap @ se3.inverse(wide.T_cam_submap))
 
     def _frames_before_gap(self) -> list[int]:
         """Return the last frame, and others spread over the keyframes before it: the wider these stand, the better is
@@ -294,13 +292,28 @@ class PoseFinder:
             any_is_doubt=self._is_short_cut,
         )
 
-    def _judge(self, wide: GapPose | Failure) -> GapPose | Failure:
+    def _judge(self, view: View, wide: GapPose | Failure) -> GapPose | Failure:
         """Hold a gap relocalisation to what health asks of a track, and to the scale that it must not lose."""
         if isinstance(wide, Failure):
             return wide
         lack = find_lack_of_support(int(wide.inliers.sum()), len(wide.inliers), wide.chi2, self._config.health)
         if lack is not None:
             return replace(lack, numbers=wide.numbers)
-        if wide.scale_sigma > self._config.linking.max_gap_scale_sigma:
+        if wide.scale_sigma > self._config.linking.max_gap_scale_sigma and not self._holds_scale(view, wide):
             return Failure(FailureReason.SCALE, f"the scale beyond is known to {wide.scale_sigma:.1%}", wide.numbers)
         return wide
+
+    def _holds_scale(self, view: View, wide: GapPose) -> bool:
+        """Whether the landmarks that are found again in the image hold the scale where the wide matches leave it open.
+
+        They are what carries it on beyond the gap. Where they turn out to be too few, the walk comes to no link and
+        other features make it again; after the last ones there is no other try.
+        """
+        if not self._is_short_cut:
+            return False
+        return self._live.scale_sigma_at(view, _given(wide)) < self._config.linking.max_gap_scale_sigma
+
+
+def _given(wide: GapPose) -> GivenPose:
+    n_inliers = int(wide.inliers.sum())
+    return GivenPose(wide.T_cam_submap, len(wide.inliers), n_inliers, wide.chi2, wide.covariance, wide=True)

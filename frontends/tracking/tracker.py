@@ -164,7 +164,13 @@ class Tracker:
         return self._last is not None and self._motion.lies_beyond_gap(self._last, view)
 
     def track_at(self, view: View, pose: GivenPose) -> Track:
-        """Take a pose as it is, and look for the landmarks of the keyframes nearest in time under it."""
+        """Take a pose as it is, look for the landmarks of the keyframes nearest in time under it, and go on there."""
+        track = self.look_at(view, pose)
+        self._accept(track)
+        return track
+
+    def look_at(self, view: View, pose: GivenPose) -> Track:
+        """Take a pose as `track_at` does; the tracker goes on from there only after `take`."""
         keyframe_ids = self._submap.keyframes_near(view.index)[:LOCAL_KEYFRAMES]
         self._local = LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(keyframe_ids))
         landmark_ids = np.full(len(view.features), NO_LANDMARK, np.int64)
@@ -178,7 +184,7 @@ class Tracker:
         fits = error2 < GIVEN_POSE_CHI2 * view.features.sigma_px[feature] ** 2
         landmark_ids[feature[~fits]] = NO_LANDMARK
         T = pose.T_cam_submap
-        track = Track(
+        return Track(
             view,
             T,
             T,
@@ -190,8 +196,6 @@ class Tracker:
             pose.wide,
             pose.covariance,
         )
-        self._accept(track)
-        return track
 
     def track_near(self, view: View, T_cam_submap: FloatArray) -> Track | Failure:
         """Pose a frame by the landmarks of the keyframes nearest in time, from a pose that is near its own.

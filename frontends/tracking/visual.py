@@ -16,6 +16,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend, SubmapGraph, WindowSolver
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from dualslam.frontends.gap.refinding import Refinder
+from dualslam.frontends.gap.uncertainty import pose_uncertainty
 from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like
 from dualslam.frontends.tracking.mapper import Mapper
 from dualslam.frontends.tracking.tracker import GivenPose, Tracker
@@ -137,6 +138,21 @@ class VisualFrontEnd:
         if view.index in self.submap.keyframes:
             self._meet(view.index)
         return track
+
+    def scale_sigma_at(self, view: View, pose: GivenPose) -> float:
+        """Return how well a frame beyond a gap would hold the scale under a given pose (standard deviation of its log).
+
+        By the submap's landmarks that it would see as a keyframe, those among them that are found again in its image.
+        `track_at` goes on from there.
+        """
+        track = self._tracker.look_at(view, pose)
+        if self._refinder is not None:
+            self._refinder.begin(view.index)
+            track = self._refinder.extend(track, pose_is_given=True)
+        row = np.flatnonzero(track.landmark_ids >= 0)
+        sigma_px = track.view.features.sigma_px[row]
+        found = pose_uncertainty(self.submap, track.T_cam_submap, track.landmark_ids[row], sigma_px)
+        return np.inf if found is None else found[1]
 
     def track_near(self, view: View, T_cam_submap: FloatArray) -> Track | Failure:
         """Pose a frame by the submap's landmarks, from a pose that is near its own; `take` goes on from there."""

@@ -254,6 +254,27 @@ class TestGapRelocalisation:
         assert {24, 23} <= set(features.asked)
         assert np.linalg.norm(errors(steps, live)[:, 3:], axis=1).max() < POSITION_M * 2
 
+    @pytest.mark.parametrize(("limit", "others_are_asked"), [(0.002, False), (0.001, True)])
+    def test_landmarks_may_hold_the_scale_that_own_features_leave_open(
+        self, limit: float, others_are_asked: bool
+    ) -> None:
+        """Own features leave it open by 0.3 %; the landmarks beyond hold it to 0.12 %, the others to 0.08 %."""
+        live, auxiliary = worlds(range(25, 32))
+        own, features = WorldFeatures(live), WorldFeatures(auxiliary)
+
+        def find(view: View) -> Features:
+            found = live.features(view.index)
+            return replace(found, sigma_px=4 * found.sigma_px)
+
+        own.find = find
+        config = Config.model_validate({"linking": {"wrong_scale": limit}})
+        reverse_tracker = odometry(live, features, config, tracks_live=True, own=own)
+        steps = walk(reverse_tracker, live, range(39, 31, -1)) | walk(reverse_tracker, live, range(24, 9, -1))
+        assert all(steps[i] for i in range(23, 9, -1))
+        assert bool(features.asked) is others_are_asked
+        assert reverse_tracker.took_short_cut is not others_are_asked
+        assert np.linalg.norm(errors(steps, live)[:, 3:], axis=1).max() < POSITION_M * 2
+
     def test_no_gap_no_features_of_the_guest(self) -> None:
         """The older submap ends where this one begins, and nothing lies between that the auxiliary front end would be
         needed for.
