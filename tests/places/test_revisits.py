@@ -10,6 +10,7 @@ import pytest
 from dualslam.core.events import EventKind
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
 from dualslam.map.atlas import LinkKind
+from dualslam.places.revisits import can_have_drifted
 from dualslam.places.search import PlaceSearch
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
@@ -77,6 +78,27 @@ def test_the_same_run_twice_is_the_same_to_the_bit() -> None:
 
 
 @cache
+def drifted(scale_rate: float, turn_rate: float) -> tuple[float, float, float]:
+    """Walk 100 steps whose scale and heading drift by a rate each step; return what `can_have_drifted` takes."""
+    steps = np.arange(100)
+    headings, scales = np.radians(turn_rate * steps), np.exp(scale_rate * steps)
+    walked = (scales[:, None] * np.stack([np.cos(headings), np.sin(headings)], axis=1)).sum(axis=0)
+    apart = float(np.linalg.norm(walked - [100.0, 0.0]))
+    return apart / float(scales.sum()), turn_rate * 100, scale_rate * 100
+
+
+@pytest.mark.parametrize(("scale_rate", "turn_rate"), [(0, 0), (0.004, 0), (-0.004, 0), (0, 0.3), (0.002, 0.2)])
+def test_what_turn_and_scale_have_lost_is_drift(scale_rate: float, turn_rate: float) -> None:
+    share, turn_deg, log_scale = drifted(scale_rate, turn_rate)
+    assert can_have_drifted(share, turn_deg, log_scale)
+
+
+def test_a_copy_of_the_place_is_no_drift() -> None:
+    assert not can_have_drifted(0.4, 0.2, 0.003)  # displaced by a period, and nothing else
+    assert not can_have_drifted(0.6, 10.0, np.log(1.5))
+    assert not can_have_drifted(0.1, 90.0, 0.0)
+
+
 def two_maps() -> System:
     """Lost for so long that nothing of the first map is buffered; the second comes to where the first began."""
     world = lap(N + 12, covered=frozenset(range(60, 80)))
