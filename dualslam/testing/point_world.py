@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -110,10 +111,10 @@ def hand_held(n: int) -> FloatArray:
 
 
 def system_in(world: PointWorld, **settings: object) -> System:
-    """Build the real system, with the world's features instead of those of an image."""
-    config = Config.model_validate(
-        {"camera": {"model_sigma_px": 0.0}, "calibration": {"refine": False}, "recovery": {"enabled": False}} | settings
-    )
+    """Build the real system, with the world's features instead of those of an image; no other ones are to be had."""
+    recovery: Any = settings.get("recovery", {"enabled": False})
+    fixed = {"camera": {"model_sigma_px": 0.0}, "calibration": {"refine": False}}
+    config = Config.model_validate(fixed | settings | {"recovery": {"attempts": ["live"]} | recovery})
     system = build_system(config, CAMERA)
 
     def view_of(frame: Frame) -> View | Failure:
