@@ -84,11 +84,12 @@ def _copy_trajectory(args: argparse.Namespace) -> int:
     source = args.run / TRAJECTORIES[args.to]
     if not source.is_file():
         raise InputError(f"{args.run} has no {source.name}; give a run folder.")
-    if not read_text(source).strip():
+    text = read_text(source)
+    if not text.strip():
         raise InputError(f"{args.run} has no trajectory to export: no frame was posed.")
     metres = read_scale(args.run)
     if metres is None:
-        write_text(args.out, read_text(source))
+        write_text(args.out, text)
     elif args.to == "tum":
         trajectory = read_tum(source)
         write_tum(args.out, replace(trajectory, T_world_cam=_in_metres(trajectory.T_world_cam, metres)))

@@ -63,15 +63,17 @@ _FILES = (
 _RESULTS = (CONFIG, EVENTS, FRAMES, TRAJECTORY, f"{SUBMAPS}/", SUMMARY, GROUND_TRUTH, f"{MAP}/", MAP_PAGE, REPORT)
 """In the order in which a person is told of them."""
 _NOT_OF_EVERY_RUN = frozenset({f"{SUBMAPS}/", GROUND_TRUTH, MAP_PAGE})
-_SUMMARY_KINDS: Mapping[str, tuple[tuple[type, ...], str]] = {
+_Kinds = Mapping[str, tuple[tuple[type, ...], str]]
+"""Of values by their names: the types that one may have, and what they are called."""
+_SUMMARY_KINDS: _Kinds = {
     **dict.fromkeys(("frames", "posed", "failures", "recoveries", "submaps", "first_id"), ((int,), "a whole number")),
-    **dict.fromkeys(("coverage",), ((int, float), "a number")),
+    "coverage": ((int, float), "a number"),
     **dict.fromkeys(("camera", "versions", "latency_ms", "stages_cpu_s"), ((dict,), "a mapping")),
     "first_index": ((int, type(None)), "a whole number"),
     "sequence": ((str,), "a word"),
 }
 """Of what others build on in a summary: an earlier version may have written less."""
-_EVENT_KINDS: Mapping[str, tuple[tuple[type, ...], str]] = {
+_EVENT_KINDS: _Kinds = {
     "event": ((str,), "a word"),
     "frame": ((int,), "a whole number"),
     "timestamp_s": ((int, float), "a number"),
@@ -357,10 +359,17 @@ def read_summary(run: Path) -> dict[str, Any]:
         raise InputError(f"{path} is no valid JSON: {error}.") from None
     if not isinstance(summary, dict):
         raise InputError(f"{path} is no summary of a run.")
-    for name, (kinds, what) in _SUMMARY_KINDS.items():
-        if name in summary and not isinstance(summary[name], kinds):
-            raise InputError(f"{path} is damaged: {name} is not {what}. Give another run, or run it again.")
+    if (misfit := _misfit(summary, _SUMMARY_KINDS)) is not None:
+        raise InputError(f"{path} is damaged: {misfit}. Give another run, or run it again.")
     return summary
+
+
+def _misfit(values: Mapping[str, Any], kinds: _Kinds) -> str | None:
+    """Return which value is of another type than a run writes, if one is."""
+    for name, (types, what) in kinds.items():
+        if name in values and not isinstance(values[name], types):
+            return f"{name} is not {what}"
+    return None
 
 
 def read_events(path: str | Path) -> list[dict[str, Any]]:
@@ -377,9 +386,8 @@ def read_events(path: str | Path) -> list[dict[str, Any]]:
             break
         if not isinstance(event, dict) or "event" not in event:
             raise InputError(f"{path}, line {number} is not an event.")
-        for name, (kinds, what) in _EVENT_KINDS.items():
-            if name in event and not isinstance(event[name], kinds):
-                raise InputError(f"{path}, line {number}: {name} is not {what}.")
+        if (misfit := _misfit(event, _EVENT_KINDS)) is not None:
+            raise InputError(f"{path}, line {number}: {misfit}.")
         events.append(event)
     return events
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -122,7 +122,8 @@ def read_run(path: str | Path) -> RunData:
         raise InputError(f"{path} is not the folder of a finished run: {missing}.")
     rows = read_frames(path / run_folder.FRAMES)
     times = np.array([row.timestamp_s for row in rows])
-    config_text = read_text(path / run_folder.CONFIG)
+    config_file = path / run_folder.CONFIG
+    config_text = read_text(config_file)
     truth_file = path / run_folder.GROUND_TRUTH
     events = read_events(path / run_folder.EVENTS)
     if not all("timestamp_s" in event and "frame" in event for event in events):
@@ -132,7 +133,7 @@ def read_run(path: str | Path) -> RunData:
         rows=rows,
         events=events,
         summary=run_folder.read_summary(path),
-        config=_mapping(path / run_folder.CONFIG, strict_yaml.loads),
+        config=_settings(config_file, config_text),
         config_text=config_text,
         main=_on_rows(path / run_folder.TRAJECTORY, times),
         unlinked={m: _on_rows(file, times) for m, file in unlinked_submaps(path).items()},
@@ -142,11 +143,10 @@ def read_run(path: str | Path) -> RunData:
     )
 
 
-def _mapping(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
-    """Read a file that holds names and their values."""
-    text = read_text(path)
+def _settings(path: Path, text: str) -> dict[str, Any]:
+    """Return what a configuration's text says."""
     try:
-        found = parse(text)
+        found = strict_yaml.loads(text)
     except ValueError as error:
         raise InputError(f"{path} is damaged: {error}.") from None
     if not isinstance(found, dict):
