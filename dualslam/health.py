@@ -18,7 +18,7 @@ from dualslam.core.chi_square import CHI2_90, CHI2_9999
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.quantiles import quantile
-from dualslam.core.support import find_lack_of_support
+from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track
 
 MAJORITY = 0.5
@@ -45,22 +45,6 @@ TAIL, TAIL_SIGMAS = 0.9, 1.645
 """A quantile, and where it lies for the size of a Gaussian (in sigmas)."""
 MIN_INNOVATIONS = 8
 """Frames before which the motion model's error is not known."""
-
-
-def judge_track(track: Track | Failure, config: HealthConfig) -> Track | Failure:
-    """Return the track if the map explains it, else why not.
-
-    Parameters
-    ----------
-    track : Track or Failure
-        What the tracker made of a frame.
-    config : HealthConfig
-        Thresholds, each with its meaning.
-    """
-    if isinstance(track, Failure):
-        return track
-    lack = find_lack_of_support(track.n_inliers, track.n_matches, track.chi2, config)
-    return track if lack is None else lack
 
 
 @dataclass(frozen=True, slots=True)

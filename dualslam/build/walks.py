@@ -16,6 +16,7 @@ from dualslam.config.settings import AttemptConfig, Config
 from dualslam.core.camera.base import Camera
 from dualslam.core.estimates import PreferredCamera
 from dualslam.core.interfaces import Frontend, SubmapGraph
+from dualslam.core.support import judge_track
 from dualslam.core.types import IntArray
 from dualslam.frontends.features.image_features import ImageFeatures
 from dualslam.frontends.gap.auxiliary_features import Auxiliary, BufferedFeatures, OwnFeatures
@@ -24,7 +25,6 @@ from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.gap.route import Route
 from dualslam.frontends.registry import FOR_WALKS, create_frontend
 from dualslam.frontends.tracking.visual import VisualFrontEnd
-from dualslam.health import judge_track
 from dualslam.map.submap import Submap
 from dualslam.recovery.job import RecoveryJob
 from dualslam.recovery.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
@@ -109,19 +109,21 @@ def _attempts(
         if key not in auxiliaries:
             with naming_attempt(number):
                 auxiliaries[key] = ImageFeatures(create_frontend(wanted, FOR_WALKS), n_threads)
-        other = partial(_buffered, auxiliaries[key], config)
-        thorough = _attempt_by(partial(_after, (), other), attempt, config, live, size_px)
-        short = _attempt_by(partial(_after, (own,), other), attempt, config, live, size_px)
-        attempts.append(replace(short, thorough=thorough) if attempt.tracking == "live" else thorough)
+        by_images = partial(_after, (), auxiliaries[key], config.camera.model_sigma_px)
+        thorough = _attempt_by(by_images, attempt, config, live, size_px)
+        if attempt.tracking == "live":
+            own_first = partial(_after, (own,), auxiliaries[key], config.camera.model_sigma_px)
+            short = _attempt_by(own_first, attempt, config, live, size_px)
+            attempts.append(replace(short, thorough=thorough))
+        else:
+            attempts.append(thorough)
     return tuple(attempts)
 
 
-def _buffered(images: ImageFeatures, config: Config, camera: Camera) -> Auxiliary:
-    return Auxiliary(images.frontend, BufferedFeatures(images, config.camera.model_sigma_px, camera))
-
-
-def _after(first: tuple[Auxiliary, ...], other: Callable[[Camera], Auxiliary], camera: Camera) -> tuple[Auxiliary, ...]:
-    return (*first, other(camera))
+def _after(
+    first: tuple[Auxiliary, ...], images: ImageFeatures, model_sigma_px: float, camera: Camera
+) -> tuple[Auxiliary, ...]:
+    return (*first, Auxiliary(images.frontend, BufferedFeatures(images, model_sigma_px, camera)))
 
 
 def _attempt_by(

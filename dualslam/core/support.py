@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from dualslam.core.types import Failure, FailureReason
+from dualslam.core.types import Failure, FailureReason, Track
 
 if TYPE_CHECKING:
     from dualslam.config.settings import HealthConfig
@@ -30,3 +30,19 @@ def find_lack_of_support(n_inliers: int, n_matches: int, chi2: float, config: He
     if chi2 > config.max_chi2:
         return Failure(FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {chi2:.1f}", numbers)
     return None
+
+
+def judge_track(track: Track | Failure, config: HealthConfig) -> Track | Failure:
+    """Return the track if the map explains it, else why not.
+
+    Parameters
+    ----------
+    track : Track or Failure
+        What the tracker made of a frame.
+    config : HealthConfig
+        Thresholds, each with its meaning.
+    """
+    if isinstance(track, Failure):
+        return track
+    lack = find_lack_of_support(track.n_inliers, track.n_matches, track.chi2, config)
+    return track if lack is None else lack

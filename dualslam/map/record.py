@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+import numpy as np
+
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.stage_timer import StageTimer
-from dualslam.core.types import FrameStatus
+from dualslam.core.types import BoolArray, FrameStatus
 from dualslam.map.atlas import Atlas
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.trajectory import FramePose
@@ -37,8 +40,6 @@ class Record:
     rows : dict of int to FrameRow
         Every frame that was given to the system, by its index.
     poses : dict of int to FramePose
-    refound : set of int
-        Frames that were found by wide matching, beyond a gap: their poses do not follow from those before them.
     events : EventLog
     timer : StageTimer
     """
@@ -46,7 +47,6 @@ class Record:
     atlas: Atlas = field(default_factory=Atlas)
     rows: dict[int, FrameRow] = field(default_factory=dict)
     poses: dict[int, FramePose] = field(default_factory=dict)
-    refound: set[int] = field(default_factory=set)
     events: EventLog = field(default_factory=EventLog)
     timer: StageTimer = field(default_factory=StageTimer)
 
@@ -57,6 +57,11 @@ class Record:
         row.status, row.submap = FrameStatus.TRACKED, pose.submap_id
         if n_matches is not None:
             row.n_matches, row.n_inliers = n_matches, n_inliers
+
+    def are_refound(self, indices: Iterable[int]) -> BoolArray:
+        """Return which frames (N,) were found by wide matching, beyond a gap: not by those before them."""
+        refound = {event.frame for event in self.events.of_kind(EventKind.GAP_RELOCALISED)}
+        return np.array([index in refound for index in indices], bool)
 
     def event(self, kind: EventKind, at: FrameStamp, submap_id: int | None = None, **data: Any) -> None:
         """Enter what happened at a frame."""

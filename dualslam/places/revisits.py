@@ -390,7 +390,7 @@ class Revisits:
             both.T_world_cam[:, :3, 3],
             known.timestamps_s,
             known.T_world_cam[:, :3, 3],
-            np.isin(known.index, list(record.refound)),
+            record.are_refound(known.index.tolist()),
         )
         return match if refused is None else refused
 

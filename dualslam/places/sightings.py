@@ -11,8 +11,8 @@ from dualslam.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Seeker, SubmapGraph
+from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
-from dualslam.health import judge_track
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
 from dualslam.places.recogniser import PlaceCandidate, PlaceRecogniser

@@ -248,7 +248,7 @@ class LeapWatch:
         missing = np.flatnonzero(np.diff(times[: place + 1]) > MISSING * abs(usual_s))
         if not len(missing):
             return None
-        refound = np.array([pose.index in record.refound for pose in poses])
+        refound = record.are_refound(pose.index for pose in poses)
         leap = measure_leap(times, centres, int(missing[-1]), refound)
         if leap is None or not leap.is_refused:
             return None

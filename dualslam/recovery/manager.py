@@ -242,12 +242,10 @@ class Recoveries:
         ours = [p for p in self._record.poses.values() if p.submap_id == new.id and p.index not in walked]
         ours = [p for p in ours if p.keyframe_id in new.keyframes] + list(walked.values())
         theirs = [p for p in self._record.poses.values() if p.submap_id == old.id]
-        theirs.sort(key=lambda pose: pose.timestamp_s)
-        refound = np.array([pose.index in self._record.refound for pose in theirs], bool)
-        t_new, centres = _path_of(ours, new)
-        t_old, centres_old = _path_of(theirs, old)
+        _, t_new, centres = _path_of(ours, new)
+        index_old, t_old, centres_old = _path_of(theirs, old)
         scale = float(sim3.scale(result.link.estimate.S_old_new))
-        return refuse_leaps(t_new, centres, t_old, centres_old / scale, refound)
+        return refuse_leaps(t_new, centres, t_old, centres_old / scale, self._record.are_refound(index_old))
 
     def _poses_any(self, result: RecoveryResult | Failure) -> bool:
         """Whether a walk has found a pose for a frame that has none."""
@@ -368,11 +366,12 @@ class Recoveries:
         self._lost = {m: loss for m, loss in self._lost.items() if m not in settled}
 
 
-def _path_of(poses: list[FramePose], submap: Submap) -> tuple[FloatArray, FloatArray]:
-    """Return times (N,), ascending, and centres (N, 3) of frames posed in a map."""
+def _path_of(poses: list[FramePose], submap: Submap) -> tuple[list[int], FloatArray, FloatArray]:
+    """Return indices, times (N,), ascending, and centres (N, 3) of frames posed in a map."""
     poses = sorted(poses, key=lambda pose: pose.timestamp_s)
     centres = [submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)[:3, 3] for pose in poses]
-    return np.array([pose.timestamp_s for pose in poses]), np.array(centres).reshape(-1, 3)
+    times_s = np.array([pose.timestamp_s for pose in poses])
+    return [pose.index for pose in poses], times_s, np.array(centres).reshape(-1, 3)
 
 
 def _same_camera(job: RecoveryJob, submap: Submap) -> bool:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 from dualslam.config.settings import Config
 from dualslam.core.interfaces import Seeker, SubmapGraph, VisualOdometry
+from dualslam.core.support import judge_track
 from dualslam.core.types import View
-from dualslam.health import judge_track
 from dualslam.map.submap import Submap
 
 

@@ -47,7 +47,6 @@ class Tracking:
         if not state.localises:
             submap.count_sightings(track)
         if track.wide:
-            state.record.refound.add(view.index)
             state.record.event(EventKind.GAP_RELOCALISED, view, submap.id, n_inliers=track.n_inliers)
         if state.localises:
             cast(Seeker, odometry).look_about()

@@ -24,7 +24,7 @@ from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import SubmapGraph
-from dualslam.core.support import find_lack_of_support
+from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
 from dualslam.frontends.gap.auxiliary_features import Auxiliary
 from dualslam.frontends.gap.pose_finder import SEED_KEYFRAMES, Crossing, PoseFinder
@@ -149,8 +149,8 @@ class PnpOdometry:
         if self._live.lies_beyond_gap(view):
             self._following = False
         if self._tracks_live and self._following:
-            track = self._live.follow(view)
-            if not isinstance(track, Failure) and self._healthy(track):
+            track = judge_track(self._live.follow(view), self._config.health)
+            if not isinstance(track, Failure):
                 self._note(view, self.reference_id, track.T_cam_submap)
                 return track
         lack = find_lack(view, self._min_features)
@@ -215,6 +215,3 @@ class PnpOdometry:
     def _note(self, view: View, reference_id: int, T_cam_submap: FloatArray) -> None:
         for finder in self._finders:
             finder.note(view, reference_id, T_cam_submap)
-
-    def _healthy(self, track: Track) -> bool:
-        return find_lack_of_support(track.n_inliers, track.n_matches, track.chi2, self._config.health) is None

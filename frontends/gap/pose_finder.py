@@ -16,7 +16,7 @@ from dualslam.config.settings import Config
 from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, refine_pose
-from dualslam.core.support import find_lack_of_support
+from dualslam.core.support import find_lack_of_support, judge_track
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray, Matches, Track, View
 from dualslam.frontends.gap.auxiliary_features import Auxiliary
 from dualslam.frontends.gap.auxiliary_map import AuxiliaryMap, triangulate
@@ -194,9 +194,6 @@ class PoseFinder:
         chi2 = float(found.chi2[found.inliers].mean() / 2)
         return GivenPose(found.T_cam_w, len(rows), found.n_inliers, chi2, found.covariance, wide=False)
 
-    def _healthy(self, n_inliers: int, n_matches: int, chi2: float) -> bool:
-        return find_lack_of_support(n_inliers, n_matches, chi2, self._config.health) is None
-
     # --- across a gap
 
     def relocalise(self, view: View, ahead: Iterable[View]) -> Crossing | Track | Failure:
@@ -263,8 +260,8 @@ class PoseFinder:
         changes nothing in that. (Across a long one, landmarks of two or three views would carry their errors over as
         scale.)
         """
-        track = self._live.track_near(view, found.T_cam_submap)
-        if isinstance(track, Failure) or not self._healthy(track.n_inliers, track.n_matches, track.chi2):
+        track = judge_track(self._live.track_near(view, found.T_cam_submap), self._config.health)
+        if isinstance(track, Failure):
             return None
         place = se3.inverse(self._map.T_cam_submap(last))[:3, 3]
         step = float(np.linalg.norm(se3.inverse(track.T_cam_submap)[:3, 3] - place))

@@ -28,7 +28,7 @@ from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Failure, Features, FloatArray, IntArray, Track, View
 from dualslam.frontends.gap.patches import HALF_PX, Pyramid, build_pyramid, match_patches
-from dualslam.frontends.gap.uncertainty import pose_uncertainty
+from dualslam.frontends.gap.uncertainty import track_uncertainty
 from dualslam.frontends.tracking.row_shifts import find_as_read, straighten
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
@@ -187,9 +187,7 @@ class Refinder:
         """Return how well the frame's pose is known (6, 6), by the gap relocalisation and by the landmarks that it
         sees.
         """
-        row = np.flatnonzero(track.landmark_ids >= 0)
-        sigma = track.view.features.sigma_px[row]
-        by_landmarks = pose_uncertainty(self._submap, track.T_cam_submap, track.landmark_ids[row], sigma)
+        by_landmarks = track_uncertainty(self._submap, track)
         if by_landmarks is None:
             return _inverse(pose_prior.information)
         return _inverse(_inverse(by_landmarks[0]) + pose_prior.information)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.core.geometry.projection import projection_jacobians
-from dualslam.core.types import FloatArray, IntArray
+from dualslam.core.types import FloatArray, IntArray, Track
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 
@@ -81,3 +81,10 @@ def pose_uncertainty(
     xyz = submap.landmarks["xyz_mu"][landmark_ids[known]]
     information = np.asarray(np.linalg.inv(covariances[known]), np.float64)
     return gap_uncertainty(submap.K, T_cam_submap, xyz, sigma_px[known], information)
+
+
+def track_uncertainty(submap: Submap, track: Track) -> tuple[FloatArray, float] | None:
+    """Return the same of a track by the landmarks that it sees; None where these are too few to tell."""
+    row = np.flatnonzero(track.landmark_ids >= 0)
+    sigma_px = track.view.features.sigma_px[row]
+    return pose_uncertainty(submap, track.T_cam_submap, track.landmark_ids[row], sigma_px)

@@ -10,7 +10,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Failure, FailureReason, Track
 from dualslam.frontends.gap.second_pose import refuse_look_alike
-from dualslam.frontends.gap.uncertainty import SMALL_STEP, pose_uncertainty
+from dualslam.frontends.gap.uncertainty import SMALL_STEP, track_uncertainty
 from dualslam.map.submap import Submap
 
 
@@ -19,12 +19,11 @@ def refuse_lost_scale(submap: Submap, track: Track, last: Track, max_scale_sigma
 
     A step from the last track that is small against the depth of what is seen leaves the scale where it is.
     """
-    row = np.flatnonzero(track.landmark_ids >= 0)
-    ids = track.landmark_ids[row]
+    ids = track.landmark_ids[track.landmark_ids >= 0]
     step = se3.inverse(track.T_cam_submap)[:3, 3] - se3.inverse(last.T_cam_submap)[:3, 3]
     if np.linalg.norm(step) < SMALL_STEP * np.median(submap.depths(ids, track.T_cam_submap)):
         return None
-    known = pose_uncertainty(submap, track.T_cam_submap, ids, track.view.features.sigma_px[row])
+    known = track_uncertainty(submap, track)
     scale_sigma = np.inf if known is None else known[1]
     if scale_sigma <= max_scale_sigma:
         return None

@@ -16,7 +16,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend, SubmapGraph, WindowSolver
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from dualslam.frontends.gap.refinding import Refinder
-from dualslam.frontends.gap.uncertainty import pose_uncertainty
+from dualslam.frontends.gap.uncertainty import track_uncertainty
 from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like
 from dualslam.frontends.tracking.mapper import Mapper
 from dualslam.frontends.tracking.tracker import GivenPose, Tracker
@@ -149,9 +149,7 @@ class VisualFrontEnd:
         if self._refinder is not None:
             self._refinder.begin(view.index)
             track = self._refinder.extend(track, pose_is_given=True)
-        row = np.flatnonzero(track.landmark_ids >= 0)
-        sigma_px = track.view.features.sigma_px[row]
-        found = pose_uncertainty(self.submap, track.T_cam_submap, track.landmark_ids[row], sigma_px)
+        found = track_uncertainty(self.submap, track)
         return np.inf if found is None else found[1]
 
     def track_near(self, view: View, T_cam_submap: FloatArray) -> Track | Failure:

@@ -9,8 +9,8 @@ import pytest
 
 from dualslam.config.settings import HealthConfig
 from dualslam.core.geometry import se3, sim3, so3
+from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Keyframe, Track, View
-from dualslam.health import judge_track
 from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose, compose
