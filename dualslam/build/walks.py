@@ -139,6 +139,16 @@ def _attempt_by(
     def new_odometry(job: RecoveryJob, submap: Submap, graph: SubmapGraph) -> PnpOdometry:
         reverse_tracker, route = live(job, submap, graph), Route(job.own, job.views)
         adjuster = bundle_adjuster(config)
-        return PnpOdometry(reverse_tracker, auxiliaries(job.camera), route, adjuster, config, size_px, tracks_live)
+        return PnpOdometry(
+            reverse_tracker,
+            auxiliaries(job.camera),
+            route,
+            adjuster,
+            config,
+            size_px,
+            tracks_live,
+            notes_rivals=job.notes_rivals,
+            expected=job.expected,
+        )
 
     return Attempt(attempt.name, new_odometry)

@@ -15,7 +15,7 @@ from dualslam.core.estimates import (
     GraphEstimate,
     KeyframeReport,
 )
-from dualslam.core.types import Failure, Features, FloatArray, Frame, IntArray, Matches, Start, Track, View
+from dualslam.core.types import Failure, Features, FloatArray, Frame, IntArray, Matches, Rival, Start, Track, View
 
 if TYPE_CHECKING:
     from dualslam.core.camera.base import Camera
@@ -259,6 +259,11 @@ class VisualOdometry(Protocol):
     @property
     def took_short_cut(self) -> bool:
         """Whether features at hand have crossed a gap where others, that give more matches, were not asked."""
+        ...
+
+    @property
+    def rivals(self) -> tuple[Rival, ...]:
+        """Other answers to where the camera is beyond the gaps that were crossed, and the one at hand."""
         ...
 
     def confirmed(self) -> Track | None:

@@ -243,6 +243,30 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Rival:
+    """Another answer to where a frame beyond a gap is, where what is seen there repeats itself.
+
+    Attributes
+    ----------
+    index : int
+    timestamp_s : float
+        Of the frame.
+    T_cam_rival, T_cam_walked : (4, 4) float64
+        ``T_cam_submap`` by the other answer, and by the one that was gone by.
+    """
+
+    index: int
+    timestamp_s: float
+    T_cam_rival: FloatArray
+    T_cam_walked: FloatArray
+
+    @property
+    def T_rival_walked(self) -> FloatArray:
+        """What moves all that lies beyond the gap from where it is by the one to where it is by the other."""
+        return np.asarray(np.linalg.inv(self.T_cam_rival) @ self.T_cam_walked, np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Start:
     """A verified start of a submap.
 

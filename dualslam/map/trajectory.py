@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dualslam.core.geometry import sim3
 from dualslam.core.trajectory import Trajectory
-from dualslam.core.types import FloatArray
+from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.atlas import Atlas
+from dualslam.map.submap import Submap
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,6 +23,75 @@ class FramePose:
     submap_id: int
     keyframe_id: int
     T_kf_cam: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Path:
+    """The way of a camera in a submap, by ascending time.
+
+    Attributes
+    ----------
+    index : (N,) int64
+        Of the frames.
+    times_s : (N,) float64
+    T_map_cam : (N, 4, 4) float64
+    refound : (N,) bool
+        Frames that were found again by wide matching, and not by those before them.
+    """
+
+    index: IntArray
+    times_s: FloatArray
+    T_map_cam: FloatArray
+    refound: BoolArray
+
+    @classmethod
+    def of(cls, poses: Iterable[FramePose], submap: Submap) -> Path:
+        """Return the path of frames that are posed in a submap, as if none had been found again."""
+        ordered = sorted(poses, key=lambda pose: pose.timestamp_s)
+        T = [submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam) for pose in ordered]
+        return cls(
+            np.array([pose.index for pose in ordered], np.int64),
+            np.array([pose.timestamp_s for pose in ordered], np.float64),
+            np.array(T, np.float64).reshape(-1, 4, 4),
+            np.zeros(len(ordered), bool),
+        )
+
+    @property
+    def centres(self) -> FloatArray:
+        """Where the camera was, (N, 3)."""
+        return self.T_map_cam[:, :3, 3]
+
+    def take(self, rows: BoolArray) -> Path:
+        """Return the path of some of the frames."""
+        return Path(self.index[rows], self.times_s[rows], self.T_map_cam[rows], self.refound[rows])
+
+    def moved(self, S: FloatArray) -> Path:
+        """Return the path in other coordinates, by a Sim(3) (4, 4)."""
+        return replace(self, T_map_cam=sim3.act_on_pose(S, self.T_map_cam))
+
+    def then(self, later: Path) -> Path:
+        """Return the path that goes on with those frames of another that are later than all of its own."""
+        rest = later if not len(self.times_s) else later.take(later.times_s > self.times_s[-1])
+        both = zip(*((path.index, path.times_s, path.T_map_cam, path.refound) for path in (self, rest)), strict=True)
+        return Path(*(np.concatenate(arrays) for arrays in both))
+
+    def similarity_to(self, other: Path, min_frames: int) -> FloatArray | None:
+        """Return the Sim(3) (4, 4) that takes this path to another by the frames in both; None where these are few.
+
+        The turn is that of the cameras: of a straight way the places leave it open.
+        """
+        _, mine, theirs = np.intersect1d(self.index, other.index, return_indices=True)
+        if len(mine) < min_frames:
+            return None
+        a, b = other.T_map_cam[theirs], self.T_map_cam[mine]
+        U, _, Vt = np.linalg.svd((a[:, :3, :3] @ b[:, :3, :3].swapaxes(1, 2)).sum(axis=0))
+        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        mean_a, mean_b = a[:, :3, 3].mean(axis=0), b[:, :3, 3].mean(axis=0)
+        spread_a, spread_b = np.linalg.norm(a[:, :3, 3] - mean_a), np.linalg.norm(b[:, :3, 3] - mean_b)
+        if not spread_a * spread_b > 0:
+            return None
+        s = spread_a / spread_b
+        return sim3.from_parts(s, R, mean_a - s * R @ mean_b)
 
 
 def compose(poses: Iterable[FramePose], atlas: Atlas, S_world_submap: dict[int, FloatArray]) -> Trajectory:

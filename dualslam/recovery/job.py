@@ -8,7 +8,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.events import Event
 from dualslam.core.types import Failure, FloatArray, View
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose
+from dualslam.map.trajectory import FramePose, Path
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.linking import LinkEstimate
 from dualslam.recovery.overlap_refinement import OverlapReport
@@ -41,6 +41,14 @@ class RecoveryJob:
         Whether the submap is one without its start, which the walk is to be compared with (`recovery/audit.py`).
     tries : LinkTries
         What earlier walks have tried in vain.
+    poses : tuple of FramePose
+        Of the frames that the new submap has posed.
+    paths : dict of int to Path
+        For each lost submap the camera's path in it.
+    notes_rivals : bool
+        Whether a pose beyond a gap that has rivals is gone by; the velocities must tell them apart.
+    expected : dict of int to (4, 4)
+        ``T_cam_submap`` of frames beyond a gap, where the velocities have told.
     """
 
     submap: Submap
@@ -53,6 +61,10 @@ class RecoveryJob:
     camera_covariance: FloatArray | None
     is_audit: bool = False
     tries: LinkTries = field(default_factory=LinkTries)
+    poses: tuple[FramePose, ...] = ()
+    paths: dict[int, Path] = field(default_factory=dict)
+    notes_rivals: bool = False
+    expected: dict[int, FloatArray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

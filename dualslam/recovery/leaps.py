@@ -147,20 +147,38 @@ def refuse_leaps(
     """
     if len(times_s) < 2 * WINDOW_FRAMES:
         return None
-    usual_s = float(np.median(np.diff(times_s)))
-    window_s = max(WINDOW_S, WINDOW_FRAMES * usual_s)
-    for i in np.flatnonzero(np.diff(times_s) > MISSING * usual_s).tolist():
-        leap_s = float(times_s[i + 1] - times_s[i])
-        off = _off(times_s, centres, i, i + 1, window_s, usual_s) if leap_s <= MAX_LEAP_S else None
-        if off is None:
-            continue
-        leap = Leap(off, *usual_difference(times_known_s, centres_known, leap_s, refound_known))
-        if leap.is_refused:
-            return _refusal(leap)
+    for i in gaps_of(times_s).tolist():
+        leap = leap_by_other(times_s, centres, i, times_known_s, centres_known, refound_known)
+        if leap is not None and leap.is_refused:
+            return leap_refusal(leap)
     return None
 
 
-def _refusal(leap: Leap) -> Failure:
+def gaps_of(times_s: FloatArray) -> IntArray:
+    """Return the last rows before frames are missing."""
+    apart_s = np.diff(times_s)
+    return np.flatnonzero(apart_s > MISSING * np.median(apart_s)) if len(apart_s) else np.zeros(0, np.int64)
+
+
+def leap_by_other(
+    times_s: FloatArray,
+    centres: FloatArray,
+    last_before: int,
+    times_known_s: FloatArray,
+    centres_known: FloatArray,
+    refound_known: BoolArray | None = None,
+) -> Leap | None:
+    """Measure a leap as `measure_leap` does, by what another map shows of the camera (`refuse_leaps`)."""
+    leap_s, usual_s = float(times_s[last_before + 1] - times_s[last_before]), float(np.median(np.diff(times_s)))
+    if leap_s > MAX_LEAP_S:
+        return None
+    window_s = max(WINDOW_S, WINDOW_FRAMES * usual_s)
+    off = _off(times_s, centres, last_before, last_before + 1, window_s, usual_s)
+    return None if off is None else Leap(off, *usual_difference(times_known_s, centres_known, leap_s, refound_known))
+
+
+def leap_refusal(leap: Leap) -> Failure:
+    """Return why a leap is not to be believed."""
     times = leap.off_mu / max(leap.usual_mu, 1e-12)
     detail = f"a leap {times:.0f} times further off than velocities lead elsewhere"
     return Failure(FailureReason.LEAP, detail, leap.numbers)
@@ -252,4 +270,4 @@ class LeapWatch:
         leap = measure_leap(times, centres, int(missing[-1]), refound)
         if leap is None or not leap.is_refused:
             return None
-        return _refusal(leap)
+        return leap_refusal(leap)

@@ -37,6 +37,10 @@ class LinkTries:
         copied._held = set(self._held)
         return copied
 
+    def restore(self, other: LinkTries) -> None:
+        """Know what `other` does, and no more."""
+        self.refused, self._held = Counter(other.refused), set(other._held)
+
     def take_over(self, old_id: int, other: LinkTries) -> None:
         """Replace what is known of one lost map by what `other` knows."""
         self.refused[old_id] = other.refused[old_id]

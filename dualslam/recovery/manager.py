@@ -9,8 +9,6 @@ from functools import partial
 from itertools import takewhile
 from typing import Any
 
-import numpy as np
-
 from dualslam.calibration.lens import Calibration
 from dualslam.config.settings import RecoveryConfig
 from dualslam.core.errors import SolverError
@@ -25,7 +23,7 @@ from dualslam.map.solving import solve
 from dualslam.map.split import sound_copy
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
-from dualslam.map.trajectory import FramePose
+from dualslam.map.trajectory import Path
 from dualslam.recovery.audits import Audits
 from dualslam.recovery.bypass import absorb
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
@@ -179,11 +177,19 @@ class Recoveries:
             camera=self._calibration.camera,
             camera_covariance=self._calibration.covariance,
             tries=self._tries.copy(),
+            poses=tuple(p for p in self._record.poses.values() if p.submap_id == submap.id),
+            paths={m: self._path_in(m) for m in onsets},
+            notes_rivals=bool(onsets),
         )
         self._retries.start_of(submap, newest.index)
         n_live = self._retries.n_live(submap, (now or newest).index)
         self._under_way[submap.id] = _UnderWay(time.perf_counter(), n_live, again=now is not None)
         self._executor.submit(job)
+
+    def _path_in(self, submap_id: int) -> Path:
+        poses = [pose for pose in self._record.poses.values() if pose.submap_id == submap_id]
+        path = Path.of(poses, self._record.atlas.submaps[submap_id])
+        return replace(path, refound=self._record.are_refound(path.index.tolist()))
 
     def _way_to_gaps(self, submap: Submap) -> list[View]:
         """Return the buffered frames without a pose, and what leads to them from the submap; the latest first."""
@@ -237,15 +243,12 @@ class Recoveries:
         """Return why a link is not to be believed whose walk has leapt as the lost map's camera never moved."""
         if result.link is None:
             return None
-        old, new = self._record.atlas.submaps[result.link.old_id], result.submap
+        new, known = result.submap, self._path_in(result.link.old_id)
         walked = {frame.pose.index: frame.pose for frame in result.frames}
-        ours = [p for p in self._record.poses.values() if p.submap_id == new.id and p.index not in walked]
-        ours = [p for p in ours if p.keyframe_id in new.keyframes] + list(walked.values())
-        theirs = [p for p in self._record.poses.values() if p.submap_id == old.id]
-        _, t_new, centres = _path_of(ours, new)
-        index_old, t_old, centres_old = _path_of(theirs, old)
+        own = [p for p in self._record.poses.values() if p.submap_id == new.id and p.index not in walked]
+        path = Path.of([*(p for p in own if p.keyframe_id in new.keyframes), *walked.values()], new)
         scale = float(sim3.scale(result.link.estimate.S_old_new))
-        return refuse_leaps(t_new, centres, t_old, centres_old / scale, self._record.are_refound(index_old))
+        return refuse_leaps(path.times_s, path.centres, known.times_s, known.centres / scale, known.refound)
 
     def _poses_any(self, result: RecoveryResult | Failure) -> bool:
         """Whether a walk has found a pose for a frame that has none."""
@@ -364,14 +367,6 @@ class Recoveries:
         if live is not None:
             settled.update(next(c for c in self._record.atlas.components() if live.submap.id in c))
         self._lost = {m: loss for m, loss in self._lost.items() if m not in settled}
-
-
-def _path_of(poses: list[FramePose], submap: Submap) -> tuple[list[int], FloatArray, FloatArray]:
-    """Return indices, times (N,), ascending, and centres (N, 3) of frames posed in a map."""
-    poses = sorted(poses, key=lambda pose: pose.timestamp_s)
-    centres = [submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)[:3, 3] for pose in poses]
-    times_s = np.array([pose.timestamp_s for pose in poses])
-    return [pose.index for pose in poses], times_s, np.array(centres).reshape(-1, 3)
 
 
 def _same_camera(job: RecoveryJob, submap: Submap) -> bool:

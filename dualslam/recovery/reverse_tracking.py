@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,15 +22,19 @@ from dualslam.config.settings import FusionConfig, RecoveryConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.events import Event, EventKind
+from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
-from dualslam.core.types import Failure, FailureReason, Track, View
+from dualslam.core.types import Failure, FailureReason, Rival, Track, View
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose
+from dualslam.map.trajectory import FramePose, Path
 from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult
+from dualslam.recovery.leaps import WINDOW_FRAMES
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.linking import NO_BEND, Bend, LinkEstimate
 from dualslam.recovery.overlap_refinement import OverlapReport, refine_overlap
+from dualslam.recovery.progress import Progress
 from dualslam.recovery.relinker import Linker, LinkTry, Relinker
+from dualslam.recovery.rivals import choose_by_velocity
 from dualslam.recovery.schedule import way_to_gaps
 from dualslam.recovery.walk_news import WalkNews, WalkTrace
 from dualslam.workers.jobs import result_of
@@ -88,7 +92,7 @@ def run_recovery(
 def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNews, None, RecoveryResult | Failure]:
     """Do what `run_recovery` does; yields how far it has come, and nothing depends on who takes notice."""
     started, cpu_started = time.perf_counter(), time.process_time()
-    best: _Progress | None = None
+    best: Progress | None = None
     problem = Failure(FailureReason.SOLVER)
     events: list[Event] = []
     looks_alike, tries = False, job.tries.copy()
@@ -99,7 +103,7 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
         attempt = ways.pop(0)
         if best is not None and time.perf_counter() > until:
             break
-        progress = yield from _make_attempt(job, parts, attempt, until, tries)
+        progress = yield from _make_told_apart(job, parts, attempt, until, tries)
         if isinstance(progress, Failure):
             problem = progress
             continue
@@ -120,55 +124,34 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
     return RecoveryResult(best.submap, frames, best.link, tuple(events), seconds, cpu_s, looks_alike, tries)
 
 
-@dataclass(slots=True, eq=False)
-class _Progress:
-    """The state of one attempt."""
+def _make_told_apart(
+    job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float, tries: LinkTries
+) -> Generator[WalkNews, None, Progress | Failure]:
+    """Make one attempt; where a pose beyond a gap has rivals, again by the one that the velocities tell to be right.
 
-    submap: Submap
-    frames: dict[int, RecoveredFrame] = field(default_factory=dict)  # in the order in which they were posed first
-    events: list[Event] = field(default_factory=list)
-    link: FoundLink | None = None
-    n_keyframes: int = 0
-    n_gaps: int = 0
-    n_skipped: int = 0  # frames without a pose between some that have one
-    n_unusable: int = 0  # the last frames
-    took_short_cut: bool = False
-    out_of_time: bool = False
-    given_up: bool = False
-    needs_camera: bool = False  # no other walk would do better, before the camera is calibrated
-    needs_live_end: bool = False  # nor before the live end has grown, from which all of them set out
-    looks_alike: bool = False  # beyond a gap: what one front end cannot tell apart another may not even notice
-    why_unusable: str = ""
-    why_not_linked: str = ""
-
-    @property
-    def verdict(self) -> str:
-        if self.link is not None:
-            return "linked"
-        ended = "out of time" if self.out_of_time else self.why_unusable if self.n_unusable else "the buffer ends"
-        ended = "given up" if self.given_up else ended
-        return f"{ended}; no link: {self.why_not_linked}" if self.why_not_linked else ended
-
-    def note_unusable(self, failure: Failure) -> None:
-        self.n_unusable += 1
-        self.looks_alike |= failure.reason is FailureReason.LOOK_ALIKE
-        self.why_unusable = failure.detail or str(failure.reason)
-
-    def note_posed(self, frame: RecoveredFrame, new_keyframe: bool) -> None:
-        self.frames.setdefault(frame.pose.index, frame)
-        self.n_keyframes += new_keyframe
-        self.n_gaps += self.n_unusable > 0
-        self.n_skipped += self.n_unusable
-        self.n_unusable = 0
-
-    def note_confirmed(self, frame: RecoveredFrame) -> None:
-        self.frames.setdefault(frame.pose.index, frame)
-        self.n_skipped -= 1
+    Where they tell none, again as far as the gap: what lies beyond it is not to be believed.
+    """
+    progress = yield from _make_attempt(job, parts, attempt, until, walked := tries.copy())
+    events: list[Event] = []
+    has_rivals = not isinstance(progress, Failure) and bool(progress.rivals)
+    if not isinstance(progress, Failure) and (better := _find_better(job, progress)):
+        events += progress.events
+        expected = {rival.index: rival.T_cam_rival for rival in better}
+        by_better = replace(job, expected=expected)
+        progress = yield from _make_attempt(by_better, parts, attempt, until, walked := tries.copy())
+    if not isinstance(progress, Failure) and progress.link is None and has_rivals:
+        events += progress.events
+        as_far = replace(job, notes_rivals=False)
+        progress = yield from _make_attempt(as_far, parts, attempt, until, walked := tries.copy())
+    tries.restore(walked)
+    if not isinstance(progress, Failure):
+        progress.events[:0] = events
+    return progress
 
 
 def _make_attempt(
     job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float, tries: LinkTries
-) -> Generator[WalkNews, None, _Progress | Failure]:
+) -> Generator[WalkNews, None, Progress | Failure]:
     """Make one attempt, from a copy of the job's submap; it stops at the time `until`."""
     started = time.perf_counter()
     submap, graph = job.submap.copy(), parts.new_graph()
@@ -181,7 +164,7 @@ def _make_attempt(
     reverse_tracker.start_at(job.newest_id)
     relinker = Relinker(submap, job.lost, job.onsets, parts.link)
     reverse_tracker.keep(relinker.keyframe_ids)  # redundant or not: linking stands on keyframes that both maps hold
-    progress = _Progress(submap)
+    progress = Progress(submap)
     # Frames before a start are worth a look each, however many show nothing; no map waits for the end of that walk.
     max_gap_frames = parts.config.max_gap_frames if job.lost else len(job.views)
     views = job.views if job.lost else _there_and_back(job.views, progress)
@@ -193,6 +176,7 @@ def _make_attempt(
         trace.note(step.view, step.track)
         if (news := trace.news()) is not None:
             yield news
+        progress.rivals = reverse_tracker.rivals
         if isinstance(step.track, Failure):
             progress.note_unusable(step.track)
             continue
@@ -204,7 +188,7 @@ def _make_attempt(
         if step.view.index not in submap.keyframes:
             continue
         for tried in relinker.attempts(step.view.index):
-            found = _fused(tried, job, submap, attempt.name, parts, tries)
+            found = _fused(tried, job, submap, attempt.name, parts, tries, progress)
             if not isinstance(found, Failure):
                 progress.link = found
                 break
@@ -216,6 +200,8 @@ def _make_attempt(
             was_lost = found.reason is FailureReason.SCALE_LOST and progress.n_gaps > 0
             progress.needs_live_end |= was_lost and not progress.took_short_cut
             progress.given_up |= progress.needs_camera or found.reason is FailureReason.SCALE_LOST
+            # As long as the walk is not far enough beyond the gap nothing is measured, and more may tell.
+            progress.given_up |= found.reason in (FailureReason.LEAP, FailureReason.LOOK_ALIKE) and bool(found.numbers)
             progress.events.append(_refusal(tried, found, attempt.name, step.view, submap.id))
         progress.given_up |= relinker.has_seen_enough
         if progress.link is not None or progress.given_up:
@@ -225,7 +211,7 @@ def _make_attempt(
     return progress
 
 
-def _there_and_back(views: tuple[View, ...], progress: _Progress) -> Iterator[View]:
+def _there_and_back(views: tuple[View, ...], progress: Progress) -> Iterator[View]:
     """Yield the views, and then, the other way round, those that the walk has found no pose for.
 
     A camera that turns away slowly and comes back at once is lost in reverse, and followed forwards.
@@ -235,7 +221,13 @@ def _there_and_back(views: tuple[View, ...], progress: _Progress) -> Iterator[Vi
 
 
 def _fused(
-    tried: LinkTry, job: RecoveryJob, submap: Submap, attempt: str, parts: RecoveryParts, tries: LinkTries
+    tried: LinkTry,
+    job: RecoveryJob,
+    submap: Submap,
+    attempt: str,
+    parts: RecoveryParts,
+    tries: LinkTries,
+    progress: Progress,
 ) -> FoundLink | Failure:
     """Refine the overlap and with it the link, which must hold as far as where the walk set out, and beyond."""
     found = tried.result
@@ -263,10 +255,51 @@ def _fused(
     again = tries.judge(tried.old_id, link.numbers["sigma_scale"], parts.max_scale_sigma)
     if again is not None:
         return again
+    refused = _refuse_rivalled(job, refined, progress, tried.old_id, link)
+    if refused is not None:
+        return refused
     if refined is not submap:
         submap.take_over(refined)
-    link = replace(link, numbers=link.numbers | {"tries": tries.refused[tried.old_id] + 1.0})
-    return FoundLink(tried.old_id, link, report, attempt)
+    told = {"tries": tries.refused[tried.old_id] + 1.0, "rivals": float(len(progress.rivals))}
+    return FoundLink(tried.old_id, replace(link, numbers=link.numbers | told), report, attempt)
+
+
+def _refuse_rivalled(
+    job: RecoveryJob, submap: Submap, progress: Progress, old_id: int, link: LinkEstimate
+) -> Failure | None:
+    """Return why a link over a gap is not to be believed beyond which several poses are alike."""
+    if not progress.rivals:
+        return None
+    sound = np.inf if link.suspected_onset is None else link.suspected_onset
+    known = job.paths[old_id].moved(sim3.inverse(link.S_old_new))
+    choice = choose_by_velocity(_walked(job, submap, progress), known.take(known.index < sound), progress.rivals)
+    progress.choice = choice
+    return choice.refusal
+
+
+def _find_better(job: RecoveryJob, progress: Progress) -> tuple[Rival, ...]:
+    """Return what a walk that came to no link should have gone by beyond a gap, if the velocities tell.
+
+    Under a wrong pose it need not come to where a link is judged: a copy is not quite like the other. Then the ways in
+    the two maps say how these lie.
+    """
+    if progress.link is not None or not progress.rivals:
+        return ()
+    if progress.choice is not None and progress.choice.is_measured:
+        return progress.choice.better
+    walked = _walked(job, progress.submap, progress)
+    for old_id in sorted(job.paths, reverse=True):
+        known = job.paths[old_id].take(job.paths[old_id].index < job.onsets[old_id])
+        S_new_old = known.similarity_to(walked, WINDOW_FRAMES)
+        if S_new_old is not None:
+            return choose_by_velocity(walked, known.moved(S_new_old), progress.rivals).better
+    return ()
+
+
+def _walked(job: RecoveryJob, submap: Submap, progress: Progress) -> Path:
+    """Return the path of the walk, and of the frames that it set out from."""
+    own = [pose for pose in job.poses if pose.index not in progress.frames and pose.keyframe_id in submap.keyframes]
+    return Path.of([*own, *(frame.pose for frame in progress.frames.values())], submap)
 
 
 def _recovered_frame(reverse_tracker: VisualOdometry, view: View, track: Track) -> RecoveredFrame:
@@ -287,7 +320,7 @@ def _refusal(tried: LinkTry, failure: Failure, attempt: str, view: View, submap_
     return Event(EventKind.LINK_REFUSED, view.index, view.timestamp_s, submap_id, data)
 
 
-def _event_of(job: RecoveryJob, progress: _Progress, attempt: str, seconds: float) -> Event:
+def _event_of(job: RecoveryJob, progress: Progress, attempt: str, seconds: float) -> Event:
     """One attempt in one line, at the frame where it ended."""
     by_index = {view.index: view for view in (*job.own, *job.views)}
     frames = list(progress.frames.values())

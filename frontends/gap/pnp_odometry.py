@@ -15,7 +15,8 @@ Where the next frame cannot be posed so (blur, black-out, frames that are missin
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
+from types import MappingProxyType
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import SubmapGraph
 from dualslam.core.support import judge_track
-from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
+from dualslam.core.types import Failure, FailureReason, FloatArray, Rival, Track, View
 from dualslam.frontends.gap.auxiliary_features import Auxiliary
 from dualslam.frontends.gap.pose_finder import SEED_KEYFRAMES, Crossing, PoseFinder
 from dualslam.frontends.gap.route import Route, find_lack
@@ -51,6 +52,8 @@ class PnpOdometry:
     size_px : (width, height)
     tracks_live : bool
         The live front end poses the frames as long as it can by itself, and the others where it cannot.
+    notes_rivals, expected
+        As for `PoseFinder`.
     """
 
     def __init__(
@@ -62,6 +65,8 @@ class PnpOdometry:
         config: Config,
         size_px: tuple[int, int],
         tracks_live: bool = False,
+        notes_rivals: bool = False,
+        expected: Mapping[int, FloatArray] = MappingProxyType({}),
     ) -> None:
         self.submap = live.submap
         self.graph = live.graph
@@ -69,7 +74,7 @@ class PnpOdometry:
         self._route = route
         self._config = config
         self._finders = [
-            PoseFinder(live, auxiliary, adjuster, config, size_px, is_short_cut=n < len(auxiliaries))
+            PoseFinder(live, auxiliary, adjuster, config, size_px, n < len(auxiliaries), notes_rivals, expected)
             for n, auxiliary in enumerate(auxiliaries, 1)
         ]
         self._min_features = config.tracking.min_inliers
@@ -78,6 +83,7 @@ class PnpOdometry:
         self._relocalised: int | None = None  # the last frame that a gap relocalisation has posed
         self._crossing: Crossing | None = None  # of the frame that was given last
         self._took_short_cut = False
+        self._rivals: tuple[Rival, ...] = ()
 
     # --- the VisualOdometry protocol, as far as the live front end does it
 
@@ -99,6 +105,11 @@ class PnpOdometry:
     def took_short_cut(self) -> bool:
         """Whether any but the last of the front ends has crossed a gap."""
         return self._took_short_cut
+
+    @property
+    def rivals(self) -> tuple[Rival, ...]:
+        """Other answers to where the camera is beyond the gaps that were crossed, and the one at hand."""
+        return self._rivals + self._finders[-1].rivals
 
     def confirmed(self) -> Track | None:
         """Return the first frame beyond a gap, when the one just given has confirmed it: where that one stands now."""
@@ -167,6 +178,7 @@ class PnpOdometry:
         track = found if isinstance(found, Track) else self._live.track_at(view, found)
         self._following = True
         self._note(view, self.reference_id, track.T_cam_submap)
+        self._rivals = self.rivals
         for finder in self._finders:
             finder.end_gap()
         return track
@@ -193,7 +205,8 @@ class PnpOdometry:
             found = finder.follow(view, self._ahead(view, finder))
             if not isinstance(found, Failure):
                 return found
-        for finder in self._finders:
+        # Once the last has seen several poses, the others, which hardly see them, might go by another than it does.
+        for finder in self._finders[-1:] if self._finders[-1].rivals else self._finders:
             has_waited, ahead = finder.waits, self._ahead(view, finder)
             if self._following and finder not in ready:
                 found = finder.follow(view, ahead)

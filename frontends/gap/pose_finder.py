@@ -7,7 +7,7 @@ the gap, posed by itself, sees the same points where they should be, and no othe
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,12 +17,23 @@ from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.support import find_lack_of_support, judge_track
-from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray, Matches, Track, View
+from dualslam.core.types import (
+    BoolArray,
+    Failure,
+    FailureReason,
+    Features,
+    FloatArray,
+    IntArray,
+    Matches,
+    Rival,
+    Track,
+    View,
+)
 from dualslam.frontends.gap.auxiliary_features import Auxiliary
 from dualslam.frontends.gap.auxiliary_map import AuxiliaryMap, triangulate
 from dualslam.frontends.gap.consensus import CONFIRMING_SHARE, BeyondGap, confirmed_share
 from dualslam.frontends.gap.relocalisation import GapPose, relocalise_across_gap
-from dualslam.frontends.gap.second_pose import refuse_look_alike
+from dualslam.frontends.gap.second_pose import find_other_poses, match_under, refuse_look_alike
 from dualslam.frontends.gap.uncertainty import SMALL_STEP
 from dualslam.frontends.tracking.resection import resect
 from dualslam.frontends.tracking.tracker import GivenPose
@@ -83,6 +94,10 @@ class PoseFinder:
         descriptors know a thing again only where they see it from about the same side. Past rows of parked cars, each
         of which repeats the one before, 16 to 46 points of 186 to 294 were all that showed of the right pose, and in
         scenes that do not repeat themselves no second pose has the 12 that it takes to be one (8 at most).
+    notes_rivals : bool
+        A pose beyond a gap that has rivals is gone by, and who goes on has to tell them apart; else it is refused.
+    expected : mapping of int to (4, 4)
+        ``T_cam_submap`` of frames beyond the gap, where it is known which of several like places they show.
     """
 
     def __init__(
@@ -93,6 +108,8 @@ class PoseFinder:
         config: Config,
         size_px: tuple[int, int],
         is_short_cut: bool,
+        notes_rivals: bool,
+        expected: Mapping[int, FloatArray],
     ) -> None:
         self._live = live
         self._submap = live.submap
@@ -103,6 +120,9 @@ class PoseFinder:
         self._min_features = config.tracking.min_inliers
         self._size_px = size_px
         self._is_short_cut = is_short_cut
+        self._notes_rivals = notes_rivals and not is_short_cut
+        self._expected = expected
+        self._rivals: list[Rival] = []  # beyond the gap at hand
         self._map = AuxiliaryMap(live.submap)
         self._pending: dict[int, View] = {}  # posed, but without features of this front end as yet
         self._doubt: Failure | None = None
@@ -123,6 +143,11 @@ class PoseFinder:
         """What was found to look alike beyond the gap at hand: it is not crossed by these features any more."""
         return self._doubt
 
+    @property
+    def rivals(self) -> tuple[Rival, ...]:
+        """Other answers for frames beyond the gap at hand: they stay for as long as it does."""
+        return tuple(self._rivals)
+
     def T_cam_submap(self, index: int) -> FloatArray:
         """Return where a frame stands by the submap's poses of now."""
         return self._map.T_cam_submap(index)
@@ -136,6 +161,7 @@ class PoseFinder:
     def end_gap(self) -> None:
         """Forget the gap that was crossed, and frames that no later one will be compared with."""
         self._beyond, self._doubt = None, None
+        self._rivals = []
         for index in self._map.frames[:-POINT_FRAMES]:
             if index not in self._submap.keyframes:
                 self._map.drop(index)
@@ -198,6 +224,8 @@ class PoseFinder:
 
     def relocalise(self, view: View, ahead: Iterable[View]) -> Crossing | Track | Failure:
         """Wide matching with several frames before the gap; believed when a second frame beyond it agrees."""
+        if self._doubt is None and self._is_short_cut and self._expected:
+            self._doubt = Failure(FailureReason.LOOK_ALIKE, "it took other features to tell several poses apart")
         if self._doubt is not None:
             return self._doubt
         index, before = view.index, self._beyond
@@ -206,7 +234,13 @@ class PoseFinder:
         if isinstance(features, Failure):
             return features
         frames = [k for k in frames if self._map.has_features(k)]
-        self._map.add(index, features, self._matches(features, frames))
+        T_expected = self._expected.get(index)
+        if T_expected is None and self._rivals and before is not None:
+            T_expected = before.pose.T_cam_submap  # of several like places the one that waits to be confirmed
+        if T_expected is None:
+            self._map.add(index, features, self._matches(features, frames))
+        else:
+            self._map.add(index, features, self._matches_under(T_expected, features, frames))
         rows = self._map.rows_with_track(index)
         found = relocalise_across_gap(
             self._map.views(index, rows, frames),
@@ -219,11 +253,11 @@ class PoseFinder:
         )
         wide = self._judge(view, found)
         if not isinstance(wide, Failure):
-            self._doubt = self._refuse_look_alike(wide, features, frames)
+            self._doubt = self._refuse_look_alike(view, wide, features, frames)
             wide = wide if self._doubt is None else self._doubt
         if isinstance(wide, Failure):
             step = None
-            may_be_small = not self._is_short_cut and wide.reason is not FailureReason.LOOK_ALIKE
+            may_be_small = not (self._is_short_cut or self._rivals or wide.reason is FailureReason.LOOK_ALIKE)
             if isinstance(found, GapPose) and may_be_small:
                 step = self._small_step(view, found, frames[-1])
             if step is None:
@@ -233,9 +267,15 @@ class PoseFinder:
         if before is None:
             return Failure(FailureReason.UNCONFIRMED, "the first frame beyond a gap", wide.numbers)
         matches = self._frontend.match_wide(before.features, features).index
+        if self._rivals:
+            matches = matches[self._are_no_copies(before, self._beyond, matches)]
         share = confirmed_share(before, self._beyond, matches, self._submap.K)
         if share < CONFIRMING_SHARE:
             self._map.drop(before.view.index)
+            if self._rivals:
+                detail = "beyond the gap several poses are alike, and two frames do not confirm one of them"
+                self._doubt = Failure(FailureReason.LOOK_ALIKE, detail, wide.numbers)
+                return self._doubt
             return Failure(
                 FailureReason.UNCONFIRMED, f"{share:.0%} of two frames confirm the gap relocalisation", wide.numbers
             )
@@ -272,22 +312,51 @@ class PoseFinder:
         self._live.take(track)
         return track
 
-    def _refuse_look_alike(self, wide: GapPose, features: Features, frames: list[int]) -> Failure | None:
-        """Return why a gap relocalisation is not believed, if another pose explains nearly as much."""
-        last = frames[-1]
-        rows = self._map.rows_with_track(last)
-        xyz, good = triangulate(self._map.views(last, rows, frames), self._submap.K)
-        return refuse_look_alike(
-            self._frontend,
-            self._map.features(last).descriptors[rows[good]],
-            xyz[good],
-            features,
-            wide.T_cam_submap,
-            self._submap.K,
-            self._size_px,
-            self._config.seed,
-            any_is_doubt=self._is_short_cut,
-        )
+    def _refuse_look_alike(self, view: View, wide: GapPose, features: Features, frames: list[int]) -> Failure | None:
+        """Return why a gap relocalisation is not believed, if another pose explains nearly as much and is not noted."""
+        rows, xyz = self._points(frames[-1], frames)
+        descriptors = self._map.features(frames[-1]).descriptors[rows]
+        seen = self._frontend, descriptors, xyz, features, wide.T_cam_submap
+        settings = self._submap.K, self._size_px, self._config.seed
+        if not self._notes_rivals:
+            return refuse_look_alike(*seen, *settings, any_is_doubt=self._is_short_cut)
+        others = find_other_poses(*seen, *settings)
+        if others and others[0].makes_doubtful:
+            self._rivals += [Rival(view.index, view.timestamp_s, other.T_cam_w, wide.T_cam_submap) for other in others]
+        return None
+
+    def _are_no_copies(self, first: FrameBeyond, second: FrameBeyond, matches: IntArray) -> BoolArray:
+        """Return which matches (M,) of two frames are of one thing: of what repeats itself a copy may look more alike.
+
+        Those nearer to where the poses show what lies at the median depth than half way to where a rival does.
+        """
+        K, T_first, T_second = self._submap.K, first.pose.T_cam_submap, second.pose.T_cam_submap
+        xyz = first.pose.xyz_mu[first.pose.inliers]
+        uv, _ = project_points(K, T_second, xyz)
+        by_rivals = [project_points(K, T_second @ rival.T_rival_walked, xyz)[0] for rival in self._rivals]
+        period_px = min(float(np.median(np.linalg.norm(uv_rival - uv, axis=1))) for uv_rival in by_rivals)
+        _, depth = project_points(K, T_first, xyz)
+        uv_first = first.features.uv_rect_px[matches[:, 0]]
+        rays = np.column_stack([(uv_first - K[:2, 2]) / (K[0, 0], K[1, 1]), np.ones(len(matches))])
+        shown, _ = project_points(K, T_second @ se3.inverse(T_first), rays * float(np.median(depth)))
+        apart = np.linalg.norm(second.features.uv_rect_px[matches[:, 1]] - shown, axis=1)
+        return np.asarray(apart < 0.5 * period_px)
+
+    def _points(self, index: int, frames: list[int]) -> tuple[IntArray, FloatArray]:
+        """Return features of a frame (N,) whose points are known from several, and the points (N, 3)."""
+        rows = self._map.rows_with_track(index)
+        xyz, good = triangulate(self._map.views(index, rows, frames), self._submap.K)
+        return rows[good], xyz[good]
+
+    def _matches_under(self, T_cam_submap: FloatArray, features: Features, frames: list[int]) -> dict[int, Matches]:
+        """Match a frame with others where the points that these see should be."""
+        matches = {}
+        for k in reversed(frames):
+            rows, xyz = self._points(k, frames)
+            of = self._map.features(k).descriptors[rows]
+            found = match_under(self._frontend, of, xyz, features, T_cam_submap, self._submap.K)
+            matches[k] = Matches(np.column_stack([rows[found.index[:, 0]], found.index[:, 1]]), found.distance)
+        return matches
 
     def _judge(self, view: View, wide: GapPose | Failure) -> GapPose | Failure:
         """Hold a gap relocalisation to what health asks of a track, and to the scale that it must not lose."""

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from dualslam.core.chi_square import CHI2_99
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
-from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray
+from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray, Matches
 from dualslam.frontends.features.all_pairs import all_distances
 from dualslam.frontends.features.groups import rank_in_runs
 from dualslam.frontends.gates import MIN_CONSENSUS
@@ -124,7 +124,26 @@ def find_second_pose(
     seed: int,
     n_points: int = N_POINTS,
 ) -> SecondPose | None:
-    """Look for another pose among the pairs that the first one leaves over; parameters as `refuse_look_alike`."""
+    """Return the other pose that explains most of its view; parameters as `refuse_look_alike`."""
+    others = find_other_poses(frontend, descriptors, xyz, features, T_cam_w, K, size_px, seed, n_points)
+    return others[0] if others else None
+
+
+def find_other_poses(
+    frontend: Frontend,
+    descriptors: NDArray[np.generic],
+    xyz: FloatArray,
+    features: Features,
+    T_cam_w: FloatArray,
+    K: FloatArray,
+    size_px: tuple[int, int],
+    seed: int,
+    n_points: int = N_POINTS,
+) -> list[SecondPose]:
+    """Look for other poses among the pairs that the first one leaves over, each of which shows the points elsewhere.
+
+    Parameters as `refuse_look_alike`. The one that explains most of its view comes first.
+    """
     chosen, seen = _spread(len(xyz), n_points), _spread(len(features), N_FEATURES)
     xyz, features = xyz[chosen], features.take(seen)
     point, feature = _alike(frontend, descriptors[chosen], features.descriptors)
@@ -132,12 +151,12 @@ def find_second_pose(
     first_support, first_in_view = len(np.unique(point[explained])), _n_in_view(T_cam_w, xyz, K, size_px)
     rest = np.flatnonzero(~explained)
     if len(rest) < MIN_CONSENSUS:
-        return None
+        return []
     uv, sigma = features.uv_rect_px[feature[rest]], features.sigma_px[feature[rest]]
     sigma_px = float(np.median(sigma))
     starts = [*_shifted(T_cam_w, xyz[point[rest]], uv, K, sigma_px)]
     starts.append(resect(K, size_px, uv, xyz[point[rest]], sigma_px, seed, max_iterations=HYPOTHESES))
-    best: SecondPose | None = None
+    found: list[SecondPose] = []
     for T_start in starts:
         near = _within(T_start, xyz[point[rest]], uv, K, SAME_PX * sigma)
         if np.count_nonzero(near) < MIN_CONSENSUS:
@@ -149,10 +168,12 @@ def find_second_pose(
         held = np.unique(point[_explained(T, xyz[point], features, feature, K)])
         if len(held) < MIN_CONSENSUS or _are_one(T_cam_w, T, xyz[held], K, sigma_px):
             continue
-        second = SecondPose(T, len(held), first_support, _n_in_view(T, xyz, K, size_px), first_in_view)
-        if best is None or second.support * best.in_view > best.support * second.in_view:
-            best = second
-    return best
+        found.append(SecondPose(T, len(held), first_support, _n_in_view(T, xyz, K, size_px), first_in_view))
+    others: list[SecondPose] = []
+    for second in sorted(found, key=lambda second: second.support / second.in_view, reverse=True):
+        if not any(_are_one(second.T_cam_w, other.T_cam_w, xyz, K, sigma_px) for other in others):
+            others.append(second)
+    return others
 
 
 def _shifted(
@@ -180,6 +201,32 @@ def _shifted(
         T_shifted[:2, 3] += votes[top]
         yield T_shifted
         left &= np.linalg.norm(votes - votes[top], axis=1) > radius
+
+
+def match_under(
+    frontend: Frontend,
+    descriptors: NDArray[np.generic],
+    xyz: FloatArray,
+    features: Features,
+    T_cam_w: FloatArray,
+    K: FloatArray,
+) -> Matches:
+    """Match what is known with what looks like it and lies where a pose shows it; parameters as `refuse_look_alike`.
+
+    Of what repeats itself the copy that the pose has in view is not the one that looks most alike.
+    """
+    distance = all_distances(frontend, descriptors, features.descriptors)
+    i, j = np.nonzero(distance <= frontend.max_distance_strict)
+    near = _within(T_cam_w, xyz[i], features.uv_rect_px[j], K, SAME_PX * features.sigma_px[j])
+    i, j = i[near], j[near]
+    order = np.lexsort((j, i, distance[i, j]))
+    i, j = i[order], j[order]
+    first = np.zeros(len(i), bool)
+    first[np.unique(i, return_index=True)[1]] = True
+    is_best_of_j = np.zeros(len(j), bool)
+    is_best_of_j[np.unique(j, return_index=True)[1]] = True
+    kept = first & is_best_of_j
+    return Matches(np.column_stack([i[kept], j[kept]]), np.asarray(distance[i[kept], j[kept]], np.float64))
 
 
 def _spread(n: int, at_most: int) -> IntArray:

@@ -14,7 +14,7 @@ from dualslam.config.settings import Config
 from dualslam.core.estimates import GraphEstimate, KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend, SubmapGraph, WindowSolver
-from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Rival, Track, View
 from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.gap.uncertainty import track_uncertainty
 from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like
@@ -180,6 +180,11 @@ class VisualFrontEnd:
     def took_short_cut(self) -> bool:
         """False: there are no other features."""
         return False
+
+    @property
+    def rivals(self) -> tuple[Rival, ...]:
+        """None: a pose that has one is not believed."""
+        return ()
 
     def confirmed(self) -> Track | None:
         """Return None: a frame has its pose at once, or none."""

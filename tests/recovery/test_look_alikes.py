@@ -2,29 +2,63 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
+
 import numpy as np
 import pytest
 
 from dualslam.build import build_system
 from dualslam.config.settings import Config
+from dualslam.core.events import EventKind
+from dualslam.core.types import FailureReason, FloatArray, IntArray
 from dualslam.lab.metrics.alignment import align_points
 from dualslam.lab.synthetic import make_sequence
-from dualslam.lab.synthetic.traps import CAR_PERIOD_M
+from dualslam.lab.synthetic.traps import BOARD_PERIOD_M, CAR_PERIOD_M
 from dualslam.run.results import trajectories_of
+from dualslam.system import System
 
-GAP = range(75, 92)
 
-
-@pytest.mark.slow
-def test_a_frame_lost_long_before_a_gap_is_not_posed_by_a_leap_over_the_map_that_lost_it() -> None:
-    """Of parked cars: the map beyond the gap is linked, and its way to the frame is a leap of a second."""
-    sequence = make_sequence("parked", n_frames=130, seed=37, width=480, height=360, supersampling=1.0)
-    system = build_system(Config.model_validate({"seed": 37}), sequence.camera)
+def past_a_gap(world: str, seed: int, missing: Container[int]) -> tuple[System, IntArray, FloatArray]:
+    """Run a world without some frames; the frames of the main map and how far (N,) each is off, in metres."""
+    sequence = make_sequence(world, n_frames=130, seed=seed, width=480, height=360, supersampling=1.0)
+    system = build_system(Config.model_validate({"seed": seed}), sequence.camera)
     for frame in sequence:
-        if frame.index not in GAP:
+        if frame.index not in missing:
             system.step(frame)
     system.finish()
     main = trajectories_of(system).main
     p, q = main.T_world_cam[:, :3, 3], sequence.ground_truth_T_world_cam[main.index][:, :3, 3]
     s, R, t = align_points(p, q)
-    assert np.linalg.norm(s * p @ R.T + t - q, axis=1).max() < 0.1 * CAR_PERIOD_M
+    return system, main.index, np.linalg.norm(s * p @ R.T + t - q, axis=1)
+
+
+@pytest.mark.slow
+def test_a_frame_lost_long_before_a_gap_is_not_posed_by_a_leap_over_the_map_that_lost_it() -> None:
+    """Of parked cars: the map beyond the gap is linked, and its way to the frame is a leap of a second."""
+    _, _, off_m = past_a_gap("parked", 37, range(75, 92))
+    assert off_m.max() < 0.1 * CAR_PERIOD_M
+
+
+@pytest.mark.slow
+def test_of_the_poses_beyond_a_gap_the_one_is_gone_by_that_the_camera_can_have_come_to() -> None:
+    """The board is the same a third of a metre on, and the images show the wrong one first."""
+    system, frames, off_m = past_a_gap("board", 1, range(75, 92))
+    (linked,) = system.events.of_kind(EventKind.LINKED)
+    assert linked.data["rivals"] > 0
+    refused = [event.data["reason"] for event in system.events.of_kind(EventKind.LINK_REFUSED)]
+    assert FailureReason.LEAP in refused
+    assert len(frames) == 130 - 17
+    assert off_m.max() < 0.1 * BOARD_PERIOD_M
+
+
+@pytest.mark.slow
+def test_where_the_camera_may_have_come_to_two_the_maps_stay_apart() -> None:
+    """The hand sways by as much as the velocities would have to tell apart."""
+    system, frames, off_m = past_a_gap("board", 2, range(75, 99))
+    assert not system.events.of_kind(EventKind.LINKED)
+    refused = [event.data["reason"] for event in system.events.of_kind(EventKind.LINK_REFUSED)]
+    assert FailureReason.LOOK_ALIKE in refused
+    assert frames.max() < 75
+    assert off_m.max() < 0.1 * BOARD_PERIOD_M
+    later = list(trajectories_of(system).unlinked.values())
+    assert [int(component.index.min()) >= 99 for component in later] == [True]

@@ -9,7 +9,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
 from dualslam.core.types import FailureReason, Features, FloatArray
 from dualslam.frontends.features.orb import OrbFrontend
-from dualslam.frontends.gap.second_pose import find_second_pose, refuse_look_alike
+from dualslam.frontends.gap.second_pose import find_other_poses, find_second_pose, match_under, refuse_look_alike
 
 SIZE_PX = (640, 480)
 K = np.array([[400.0, 0.0, 320.0], [0.0, 400.0, 240.0], [0.0, 0.0, 1.0]])
@@ -55,6 +55,23 @@ def test_what_repeats_is_refused_whichever_pose_came_first(seed: int) -> None:
         assert refused is not None
         assert refused.reason is FailureReason.LOOK_ALIKE
         assert refused.numbers["second_pose"] >= 12
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_all_poses_that_are_a_period_off_are_told_and_each_has_its_own_matches(seed: int) -> None:
+    xyz, descriptors, features, T = sight(60, 0, seed)
+    others = find_other_poses(ORB, descriptors, xyz, features, T, K, SIZE_PX, seed)
+    places = np.array([np.linalg.inv(other.T_cam_w)[0, 3] - np.linalg.inv(T)[0, 3] for other in others])
+    assert len(others) >= 2
+    assert np.abs(places / PERIOD_M - np.round(places / PERIOD_M)).max() < 0.05
+    assert {-1.0, 1.0} <= set(np.round(places / PERIOD_M).tolist())
+    assert len(set(np.round(places / PERIOD_M).tolist())) == len(places), "no place twice"
+    for T_cam_w in (T, *(other.T_cam_w for other in others)):
+        found = match_under(ORB, descriptors, xyz, features, T_cam_w, K)
+        uv, _ = project_points(K, T_cam_w, xyz[found.index[:, 0]])
+        assert len(found) >= 12
+        assert np.unique(found.index[:, 0]).size == np.unique(found.index[:, 1]).size == len(found)
+        assert np.linalg.norm(uv - features.uv_px[found.index[:, 1]], axis=1).max() < 12.0 * SIGMA_PX
 
 
 @pytest.mark.parametrize("seed", range(3))
