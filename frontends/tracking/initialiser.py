@@ -33,7 +33,7 @@ from dualslam.core.types import (
 )
 from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
 from dualslam.frontends.tracking.direction import direction_angle_deg, direction_sigma_deg
-from dualslam.frontends.tracking.near_points import N_PROOF, nearer_than_proven
+from dualslam.frontends.tracking.near_points import N_PROOF, nearer_than_proven, stands_before
 from dualslam.frontends.tracking.resection import resect
 from dualslam.frontends.tracking.two_view_hypotheses import MIN_NOISE2, RelativePoses
 
@@ -269,14 +269,20 @@ class Initialiser:
         return self._adjust(views, T_first_cam[keep_views], xyz, feature[keep_views], numbers)
 
     def _confirm(self, witness: View, first: View, feature: IntArray, xyz: FloatArray) -> _Witness | Failure:
-        """Pose a witness from the points alone, without a guess, and count how many of its matches agree."""
+        """Pose a witness from the points alone, without a guess, and count how many of its matches agree.
+
+        Two views do not prove a few that stand far before all others: these have no say in the pose that is to prove
+        them. Of what repeats itself they are copies, and would turn the witness until it agreed with them.
+        """
         matches = self._frontend.match_wide(first.features.take(feature), witness.features)
         if len(matches) < self._config.min_points // 2:
             return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(matches)} of {len(xyz)} points found")
         point, seen = matches.index[:, 0], matches.index[:, 1]
         uv_px, sigma_px = witness.features.uv_rect_px[seen], witness.features.sigma_px[seen]
-        T_guess = resect(self._K, self._size_px, uv_px, xyz[point], float(np.median(sigma_px)), self._seed)
-        estimate = refine_pose(self._K, T_guess, xyz[point], uv_px, sigma_px)
+        leads = ~stands_before(xyz[point, 2], xyz[:, 2])
+        sigma = float(np.median(sigma_px))
+        T_guess = resect(self._K, self._size_px, uv_px[leads], xyz[point[leads]], sigma, self._seed)
+        estimate = refine_pose(self._K, T_guess, xyz[point], uv_px, sigma_px, counted=leads)
         if isinstance(estimate, Failure):
             return estimate
         features = np.full(len(xyz), -1, np.int64)

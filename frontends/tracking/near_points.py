@@ -33,4 +33,9 @@ def nearer_than_proven(depth: FloatArray, proven: BoolArray) -> BoolArray:
     """
     if not proven.any():
         return np.zeros(len(depth), np.bool_)
-    return np.asarray(~proven & (depth <= NEARER * quantile(depth[proven], NEAREST)))
+    return ~proven & stands_before(depth, depth[proven])
+
+
+def stands_before(depth: FloatArray, others: FloatArray) -> BoolArray:
+    """Return which points (N,) stand far before all but a few others (M,)."""
+    return np.asarray(depth <= NEARER * quantile(others, NEAREST))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dualslam.frontends.tracking.near_points import nearer_than_proven
+from dualslam.frontends.tracking.near_points import nearer_than_proven, stands_before
 
 
 def test_only_what_is_unproven_and_nearer_than_any_proof_is_left_out() -> None:
@@ -25,3 +25,8 @@ def test_a_single_near_one_does_not() -> None:
 
 def test_where_nothing_is_proven_nothing_is_left_out() -> None:
     assert not nearer_than_proven(np.array([0.1, 5.0]), np.zeros(2, bool)).any()
+
+
+def test_a_few_stand_before_all_others_and_many_do_not() -> None:
+    assert np.flatnonzero(stands_before(depth := np.r_[np.full(97, 5.0), 0.3, 2.4, 2.6], depth)).tolist() == [97, 98]
+    assert not stands_before(depth := np.r_[np.full(90, 5.0), np.full(10, 0.3)], depth).any()
