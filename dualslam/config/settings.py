@@ -47,7 +47,8 @@ class InitialiserConfig(StrictModel):
     """Angle under which the two cameras must see half as many points as `min_points`, after the rotation is taken out.
     However many more are far away: on a road most are, and the near ones fix the motion."""
     max_direction_sigma_deg: float = Field(1.5, gt=0)
-    """Largest standard deviation (from the bundle adjustment's Hessian) of the direction of translation."""
+    """Largest standard deviation (from the bundle adjustment's Hessian) of the direction of translation: by the pixels'
+    sigmas, or less in proportion, down to two thirds, where residuals are smaller than 0.3 of these."""
 
     @property
     def min_matches(self) -> int:
@@ -77,7 +78,8 @@ class KeyframeConfig(StrictModel):
     max_frames: int = Field(30, ge=1)
     """Frames after which a keyframe is due if the camera moved at all."""
     weak_landmarks: int = Field(60, ge=10)
-    """Tracked landmarks below which tracking is weak and a keyframe is due at once."""
+    """Tracked landmarks below which tracking is weak and a keyframe is due at once. Where so few near ones hold the
+    camera's position, `max_tracked_ratio` counts each landmark by its hold, one over its depth squared."""
 
 
 class MappingConfig(StrictModel):

@@ -7,7 +7,7 @@ import numpy as np
 from dualslam.config.settings import KeyframeConfig
 from dualslam.core.geometry import se3
 from dualslam.core.quantiles import median
-from dualslam.core.types import IntArray, Track
+from dualslam.core.types import FloatArray, IntArray, Track
 from dualslam.map.submap import Submap
 
 MIN_PARALLAX_DEG = 0.5
@@ -21,6 +21,7 @@ N_LIKE = 5
 """Keyframes of earlier runs, those that see most of what a frame sees, that are asked whether one shows the same."""
 
 ESTABLISHED = 3  # views of a landmark from which on its loss says that the scene has changed
+NEAREST = 1e-6  # of a submap's unit, its first median depth
 
 
 def keyframe_due(track: Track, submap: Submap, reference_id: int, config: KeyframeConfig, first_id: int = 0) -> bool:
@@ -42,7 +43,12 @@ def keyframe_due(track: Track, submap: Submap, reference_id: int, config: Keyfra
         return True
     n_frames = abs(track.view.index - reference_id) if reference_id >= first_id else 0
     share = _share_in(track.landmark_ids, submap, reference_id)
-    return _shows_other(share, parallax_deg(track, submap, reference_id), n_frames, config)
+    parallax = parallax_deg(track, submap, reference_id)
+    if parallax >= MIN_PARALLAX_DEG and _n_holding(track, submap) < config.weak_landmarks:
+        # A few near ones hold the position, like a bench that a camera takes off from: while they leave, the many far
+        # ones are still in view, and a keyframe that came when these change would find the scale already lost.
+        share = min(share, _share_in(track.landmark_ids, submap, reference_id, by_hold=True))
+    return _shows_other(share, parallax, n_frames, config)
 
 
 def keyframe_like(track: Track, submap: Submap, first_id: int, config: KeyframeConfig) -> int | None:
@@ -83,15 +89,31 @@ def _shows_other(share: float, parallax: float, n_frames: int, config: KeyframeC
     return share < worth * config.max_tracked_ratio or n_frames >= config.max_frames
 
 
-def _share_in(landmark_ids: IntArray, submap: Submap, keyframe_id: int) -> float:
-    """Return the share of a keyframe's established landmarks that are among some."""
+def _share_in(landmark_ids: IntArray, submap: Submap, keyframe_id: int, by_hold: bool = False) -> float:
+    """Return the share of a keyframe's established landmarks that are among some; `by_hold`: of their hold on it."""
     reference = submap.landmark_of[keyframe_id]
     reference = reference[reference >= 0]
     established = submap.n_observations(reference) >= min(ESTABLISHED, len(submap.keyframes))
     reference = reference[established]
     shown = np.zeros(len(submap.landmarks), np.bool_)
     shown[landmark_ids[landmark_ids >= 0]] = True
-    return float(shown[reference].mean()) if len(reference) else 0.0
+    if not len(reference):
+        return 0.0
+    if not by_hold:
+        return float(shown[reference].mean())
+    hold = _hold(reference, submap, se3.inverse(submap.T_submap_kf[keyframe_id]))
+    return float(hold @ shown[reference] / hold.sum())
+
+
+def _hold(landmark_ids: IntArray, submap: Submap, T_cam_submap: FloatArray) -> FloatArray:
+    """Return by how much each landmark holds a camera's position: a pixel's information on it falls as depth squared."""
+    return np.maximum(submap.depths(landmark_ids, T_cam_submap), NEAREST) ** -2.0
+
+
+def _n_holding(track: Track, submap: Submap) -> float:
+    """Return how many landmarks, all as near as each other, would hold the position as evenly as those tracked do."""
+    hold = _hold(track.landmark_ids[track.landmark_ids >= 0], submap, track.T_cam_submap)
+    return float(hold.sum() ** 2 / (hold @ hold)) if len(hold) else 0.0
 
 
 def parallax_deg(track: Track, submap: Submap, reference_id: int) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -191,6 +192,27 @@ def test_direction_is_known_as_well_as_is_said() -> None:
     refusal = strict.try_pair(0, 8)
     assert isinstance(refusal, Failure)
     assert "direction of translation" in refusal.detail
+
+
+@pytest.mark.parametrize(("noise_of_sigma", "worth"), [(1.0, 1.0), (0.6, 1.0), (0.02, 2 / 3)])
+def test_direction_is_known_better_where_pixels_are_calmer_than_usual(noise_of_sigma: float, worth: float) -> None:
+    """A bound of 1.5 degrees is for residuals of 0.3 sigmas; what is calmer is taken as it is, drawn pictures' aside."""
+    at_usual, at_this = [
+        _direction_sigma_deg(PointWorld(cloud(), path(9, [0.06, 0, 0.02], [0, 0, 0]), noise_px=noise), 1.0 / noise)
+        for noise in (1.0, noise_of_sigma)
+    ]
+    assert at_this == pytest.approx(worth * at_usual, rel=0.15)
+
+
+def _direction_sigma_deg(world: PointWorld, claim: float) -> float:
+    """Return how well the first and the last view say to know their direction, of sigmas `claim` times the noise."""
+    starter = initialiser()
+    for view in world.views():
+        features = replace(view.features, sigma_px=claim * view.features.sigma_px)
+        starter.collect(replace(view, features=features))
+    start = starter.try_pair(0, 8)
+    assert isinstance(start, Start)
+    return start.numbers["direction_sigma_deg"]
 
 
 def test_collected_views_can_be_first_views() -> None:
