@@ -274,7 +274,7 @@ class Submap:
 
     def rows_of_landmarks(self, landmark_ids: IntArray) -> IntArray:
         """Return the live observation rows of a set of landmarks."""
-        wanted = self._mask(landmark_ids)
+        wanted = self.mask_of(landmark_ids)
         return np.flatnonzero(self.observations["alive"] & wanted[self.observations["landmark"]])
 
     def _views_by_landmark(self, landmark_ids: list[int]) -> dict[int, list[tuple[int, int, int]]]:
@@ -339,9 +339,10 @@ class Submap:
             sigma[here] = features.sigma_px[feature[here]]
         return uv, sigma
 
-    def _mask(self, landmark_ids: IntArray) -> BoolArray:
+    def mask_of(self, landmark_ids: IntArray) -> BoolArray:
+        """Return a mask over all landmarks, dead ones too, that is true at those named (`NO_LANDMARK` names none)."""
         mask = np.zeros(len(self.landmarks), bool)
-        mask[landmark_ids] = True
+        mask[landmark_ids[landmark_ids >= 0]] = True
         return mask
 
     # --- whole map

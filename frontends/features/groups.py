@@ -139,7 +139,8 @@ def consistent_rotation(turn_rad: FloatArray, tolerance_rad: float = np.radians(
         return np.ones(len(turn_rad), np.bool_)
     bin_rad = 2 * np.pi / 30
     histogram = np.bincount((turn_rad % (2 * np.pi) / bin_rad).astype(np.int64) % 30, minlength=30)
-    peak = int(np.argmax(2 * histogram + np.roll(histogram, 1) + np.roll(histogram, -1)))
+    around = np.concatenate([histogram[-1:], histogram, histogram[:1]])
+    peak = int(np.argmax(2 * histogram + around[:-2] + around[2:]))
     # The mean around the peak, so that the window does not depend on where the bins happen to lie.
     from_peak = _wrapped(turn_rad - (peak + 0.5) * bin_rad)
     centre = from_peak[np.abs(from_peak) <= 1.5 * bin_rad].mean()

@@ -151,7 +151,7 @@ class Mapper:
         """Look for neighbours' landmarks that tracking missed: new observations, or duplicates to merge."""
         submap = self._submap
         others = submap.landmarks_of_keyframes(neighbours)
-        local = LocalMap.of_landmarks(submap, others[~np.isin(others, tracked)])
+        local = LocalMap.of_landmarks(submap, others[~submap.mask_of(tracked)[others]])
         return self._observe_in(k, local)
 
     def _observe_in(self, k: int, local: LocalMap) -> tuple[int, int]:
@@ -269,7 +269,7 @@ class Mapper:
         submap = self._submap
         for other in neighbours:
             alive = new[submap.landmarks["alive"][new]]
-            unseen = alive[~np.isin(alive, submap.landmark_of[other])]
+            unseen = alive[~submap.mask_of(submap.landmark_of[other])[alive]]
             if len(unseen) == 0:
                 continue
             self._observe_in(other, LocalMap.of_landmarks(submap, unseen))

@@ -373,7 +373,7 @@ class Tracker:
         assert self._local is not None
         features, local = view.features, self._local
         prediction = self._predict_local(local, T_cam_submap)
-        new = ~np.isin(local.landmark_ids[prediction.rows], landmark_ids)
+        new = ~self._submap.mask_of(landmark_ids)[local.landmark_ids[prediction.rows]]
         matches = match_projected(
             self._frontend,
             grid,

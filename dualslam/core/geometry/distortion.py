@@ -15,11 +15,7 @@ TOLERANCE = 1e-12
 
 def radial(r: FloatArray, k: tuple[float, ...]) -> FloatArray:
     """Return ``r (1 + k[0] r^2 + k[1] r^4 + ...)``."""
-    s = r * r
-    total = np.zeros_like(s)
-    for c in reversed(k):
-        total = (total + c) * s
-    return r * (1.0 + total)
+    return r * _factor(r * r, k)
 
 
 def radial_derivative(r: FloatArray, k: tuple[float, ...]) -> FloatArray:
@@ -59,10 +55,14 @@ def invert_radial(r_distorted: FloatArray, k: tuple[float, ...], limit: float) -
     r = np.minimum(r_distorted, high)
     for _ in range(N_ITERATIONS):
         error = radial(r, k) - r_distorted
-        high, low = np.where(error > 0, r, high), np.where(error < 0, r, low)
+        np.copyto(high, r, where=error > 0)
+        np.copyto(low, r, where=error < 0)
         slope = radial_derivative(r, k)
-        new = r - error / np.where(slope > 1e-12, slope, np.inf)
-        new = np.where((new > low) & (new < high) & (slope > 1e-12), new, np.where(error == 0, r, 0.5 * (low + high)))
+        rises = slope > 1e-12
+        new = r - error / np.where(rises, slope, np.inf)
+        odd = ~((new > low) & (new < high) & rises)
+        if odd.any():
+            new = np.where(odd, np.where(error == 0, r, 0.5 * (low + high)), new)
         moved, r = np.abs(new - r), new
         if not (inside & (moved > TOLERANCE * (1.0 + r))).any():
             break
