@@ -70,7 +70,6 @@ class _Pair:
     n_explained: int  # matches that fit the pose, wherever their points are: at infinity, too
     parallax_deg: float  # median
     n_near: int  # points with at least the parallax that is asked for
-    noise2: float  # variance of the points' residuals, in that of their sigmas
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -213,7 +212,7 @@ class Initialiser:
 
     def _direction_sigma_deg(self, pair: _Pair) -> float:
         """Return how well two views alone know the direction, before any bundle adjustment."""
-        sigma_px = pair.b.features.sigma_px[pair.matches.index[pair.good, 1]] * _calmer(pair.noise2)
+        sigma_px = pair.b.features.sigma_px[pair.matches.index[pair.good, 1]]
         return direction_sigma_deg(self._K, np.eye(4), se3.inverse(pair.T_b_a), pair.xyz[pair.good], sigma_px)
 
     def _evaluate(self, a: View, b: View, matches: Matches, T_b_a: FloatArray) -> _Pair:
@@ -233,9 +232,7 @@ class Initialiser:
         good[good] = angle > 0.5 * self._config.min_parallax_deg
         parallax = float(np.median(angle)) if len(angle) else 0.0
         n_near = int((angle >= self._config.min_parallax_deg).sum())
-        residual2 = (points.error2_a[good] + points.error2_b[good]) / sigma_b[good] ** 2
-        noise2 = float(np.median(residual2)) / MEDIAN_CHI2[1] if len(residual2) else 1.0
-        return _Pair(a, b, matches, T_b_a, points.xyz, good, n_explained, parallax, n_near, noise2)
+        return _Pair(a, b, matches, T_b_a, points.xyz, good, n_explained, parallax, n_near)
 
     # --- witnesses and bundle adjustment
 

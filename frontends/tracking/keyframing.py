@@ -106,7 +106,7 @@ def _share_in(landmark_ids: IntArray, submap: Submap, keyframe_id: int, by_hold:
 
 
 def _hold(landmark_ids: IntArray, submap: Submap, T_cam_submap: FloatArray) -> FloatArray:
-    """Return by how much each landmark holds a camera's position: a pixel's information on it falls as depth squared."""
+    """Return by how much each landmark holds a camera: what a pixel tells of its position falls as depth squared."""
     return np.maximum(submap.depths(landmark_ids, T_cam_submap), NEAREST) ** -2.0
 
 

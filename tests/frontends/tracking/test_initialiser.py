@@ -196,7 +196,7 @@ def test_direction_is_known_as_well_as_is_said() -> None:
 
 @pytest.mark.parametrize(("noise_of_sigma", "worth"), [(1.0, 1.0), (0.6, 1.0), (0.02, 2 / 3)])
 def test_direction_is_known_better_where_pixels_are_calmer_than_usual(noise_of_sigma: float, worth: float) -> None:
-    """A bound of 1.5 degrees is for residuals of 0.3 sigmas; what is calmer is taken as it is, drawn pictures' aside."""
+    """The bound is for residuals of 0.3 sigmas; what is calmer is taken as it is, down to what drawn pictures have."""
     at_usual, at_this = [
         _direction_sigma_deg(PointWorld(cloud(), path(9, [0.06, 0, 0.02], [0, 0, 0]), noise_px=noise), 1.0 / noise)
         for noise in (1.0, noise_of_sigma)
