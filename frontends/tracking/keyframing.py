@@ -21,6 +21,9 @@ N_LIKE = 5
 """Keyframes of earlier runs, those that see most of what a frame sees, that are asked whether one shows the same."""
 
 ESTABLISHED = 3  # views of a landmark from which on its loss says that the scene has changed
+LEAST_HOLD = 0.5
+"""Share of the hold that must be left, of the share of the number: on roads near landmarks leave all the time, and with
+more than half keyframes come a tenth more often there."""
 NEAREST = 1e-6  # of a submap's unit, its first median depth
 
 
@@ -47,7 +50,7 @@ def keyframe_due(track: Track, submap: Submap, reference_id: int, config: Keyfra
     if parallax >= MIN_PARALLAX_DEG and _n_holding(track, submap) < config.weak_landmarks:
         # A few near ones hold the position, like a bench that a camera takes off from: while they leave, the many far
         # ones are still in view, and a keyframe that came when these change would find the scale already lost.
-        share = min(share, _share_in(track.landmark_ids, submap, reference_id, by_hold=True))
+        share = min(share, _share_in(track.landmark_ids, submap, reference_id, by_hold=True) / LEAST_HOLD)
     return _shows_other(share, parallax, n_frames, config)
 
 
