@@ -46,6 +46,7 @@ MAX_VIEWS = 120
 
 LAGS = (2, 4, 8, 16, 32, START_REACH)  # frames back that are tried as the first view
 MAX_PAIRS = 2  # tried with each view, in turn: what two views farther apart lack, the next two lack most often as well
+N_POSING = 3  # points that fix a pose
 N_WITNESSES = 3  # frames between the two views that must agree
 PROVEN = 1 / 3  # share of the points, and of those that a start needs, that are proven; it is made of these alone
 NEAR = 0.5  # share of the points that a start needs at least which must be near: on a road these fix the motion
@@ -272,8 +273,9 @@ class Initialiser:
     def _confirm(self, witness: View, first: View, feature: IntArray, xyz: FloatArray) -> _Witness | Failure:
         """Pose a witness from the points alone, without a guess, and count how many of its matches agree.
 
-        Two views do not prove a few that stand far before all others: these have no say in the pose that is to prove
-        them. Of what repeats itself they are copies, and would turn the witness until it agreed with them.
+        Two views do not prove a few that stand far before all others: where they are enough to fix a pose, they have no
+        say in the one that is to prove them. Of what repeats itself they are copies, and would turn the witness until
+        it agreed with them.
         """
         matches = self._frontend.match_wide(first.features.take(feature), witness.features)
         if len(matches) < self._config.min_points // 2:
@@ -281,6 +283,8 @@ class Initialiser:
         point, seen = matches.index[:, 0], matches.index[:, 1]
         uv_px, sigma_px = witness.features.uv_rect_px[seen], witness.features.sigma_px[seen]
         leads = ~stands_before(xyz[point, 2], xyz[:, 2])
+        if np.count_nonzero(~leads) < N_POSING:
+            leads[:] = True
         sigma = float(np.median(sigma_px))
         T_guess = resect(self._K, self._size_px, uv_px[leads], xyz[point[leads]], sigma, self._seed)
         estimate = refine_pose(self._K, T_guess, xyz[point], uv_px, sigma_px, counted=leads)
