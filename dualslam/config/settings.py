@@ -79,7 +79,8 @@ class KeyframeConfig(StrictModel):
     """Frames after which a keyframe is due if the camera moved at all."""
     weak_landmarks: int = Field(60, ge=10)
     """Tracked landmarks below which tracking is weak and a keyframe is due at once. Where so few near ones hold the
-    camera's position, `max_tracked_ratio` counts each landmark by its hold, one over its depth squared."""
+    camera's position, one is due as well when of their hold, one over the depth squared, less than half of what
+    `max_tracked_ratio` asks of their number is left."""
 
 
 class MappingConfig(StrictModel):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dualslam.core.geometry import sim3
+from dualslam.core.geometry import sim3, so3
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.atlas import Atlas
@@ -84,8 +84,7 @@ class Path:
         if len(mine) < min_frames:
             return None
         a, b = other.T_map_cam[theirs], self.T_map_cam[mine]
-        U, _, Vt = np.linalg.svd((a[:, :3, :3] @ b[:, :3, :3].swapaxes(1, 2)).sum(axis=0))
-        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        R = so3.orthonormalise((a[:, :3, :3] @ b[:, :3, :3].swapaxes(1, 2)).sum(axis=0))
         mean_a, mean_b = a[:, :3, 3].mean(axis=0), b[:, :3, 3].mean(axis=0)
         spread_a, spread_b = np.linalg.norm(a[:, :3, 3] - mean_a), np.linalg.norm(b[:, :3, 3] - mean_b)
         if not spread_a * spread_b > 0:

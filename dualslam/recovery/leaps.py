@@ -83,15 +83,11 @@ def measure_leap(
     if len(times_s) < 2 * WINDOW_FRAMES:
         return None
     leap_s, usual_s = float(times_s[last_before + 1] - times_s[last_before]), float(np.median(np.diff(times_s)))
-    if not MISSING * usual_s < leap_s <= MAX_LEAP_S:
-        return None
-    window_s = max(WINDOW_S, WINDOW_FRAMES * usual_s)
-    off = _off(times_s, centres, last_before, last_before + 1, window_s, usual_s)
-    if off is None:
+    if not MISSING * usual_s < leap_s:
         return None
     before = slice(last_before + 1)  # beyond the leap the map may be wrong
     refound = None if refound is None else refound[before]
-    return Leap(off, *usual_difference(times_s[before], centres[before], leap_s, refound))
+    return leap_by_other(times_s, centres, last_before, times_s[before], centres[before], refound)
 
 
 def usual_difference(

@@ -33,8 +33,8 @@ class LinkTries:
 
     def copy(self) -> LinkTries:
         """Return tries that go on by themselves."""
-        copied = LinkTries(self.refused)
-        copied._held = set(self._held)
+        copied = LinkTries()
+        copied.restore(self)
         return copied
 
     def restore(self, other: LinkTries) -> None:

@@ -23,7 +23,7 @@ from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray, Matches
 from dualslam.frontends.features.all_pairs import all_distances
-from dualslam.frontends.features.groups import rank_in_runs
+from dualslam.frontends.features.groups import best_per_group, rank_in_runs
 from dualslam.frontends.gates import MIN_CONSENSUS
 from dualslam.frontends.tracking.resection import resect
 
@@ -97,9 +97,10 @@ def refuse_look_alike(
         However few points another pose explains, the first is not believed; all points are compared.
     """
     n_points = len(xyz) if any_is_doubt else N_POINTS
-    second = find_second_pose(frontend, descriptors, xyz, features, T_cam_w, K, size_px, seed, n_points)
-    if second is None or not (second.makes_doubtful or any_is_doubt):
+    others = find_other_poses(frontend, descriptors, xyz, features, T_cam_w, K, size_px, seed, n_points)
+    if not others or not (others[0].makes_doubtful or any_is_doubt):
         return None
+    second = others[0]
     numbers = {
         "second_pose": float(second.support),
         "second_in_view": float(second.in_view),
@@ -111,22 +112,6 @@ def refuse_look_alike(
         f" this one {second.first_support} of {second.first_in_view}"
     )
     return Failure(FailureReason.LOOK_ALIKE, detail, numbers)
-
-
-def find_second_pose(
-    frontend: Frontend,
-    descriptors: NDArray[np.generic],
-    xyz: FloatArray,
-    features: Features,
-    T_cam_w: FloatArray,
-    K: FloatArray,
-    size_px: tuple[int, int],
-    seed: int,
-    n_points: int = N_POINTS,
-) -> SecondPose | None:
-    """Return the other pose that explains most of its view; parameters as `refuse_look_alike`."""
-    others = find_other_poses(frontend, descriptors, xyz, features, T_cam_w, K, size_px, seed, n_points)
-    return others[0] if others else None
 
 
 def find_other_poses(
@@ -219,14 +204,12 @@ def match_under(
     i, j = np.nonzero(distance <= frontend.max_distance_strict)
     near = _within(T_cam_w, xyz[i], features.uv_rect_px[j], K, SAME_PX * features.sigma_px[j])
     i, j = i[near], j[near]
-    order = np.lexsort((j, i, distance[i, j]))
-    i, j = i[order], j[order]
-    first = np.zeros(len(i), bool)
-    first[np.unique(i, return_index=True)[1]] = True
-    is_best_of_j = np.zeros(len(j), bool)
-    is_best_of_j[np.unique(j, return_index=True)[1]] = True
-    kept = first & is_best_of_j
-    return Matches(np.column_stack([i[kept], j[kept]]), np.asarray(distance[i[kept], j[kept]], np.float64))
+    cost = np.asarray(distance[i, j], np.float64)
+    best_of_both = np.intersect1d(
+        best_per_group(i, cost, len(descriptors)), best_per_group(j, cost, len(features)), assume_unique=True
+    )
+    best_of_both = best_of_both[np.argsort(cost[best_of_both], kind="stable")]
+    return Matches(np.column_stack([i[best_of_both], j[best_of_both]]), cost[best_of_both])
 
 
 def _spread(n: int, at_most: int) -> IntArray:

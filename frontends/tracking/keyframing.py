@@ -98,14 +98,13 @@ def _share_in(landmark_ids: IntArray, submap: Submap, keyframe_id: int, by_hold:
     reference = reference[reference >= 0]
     established = submap.n_observations(reference) >= min(ESTABLISHED, len(submap.keyframes))
     reference = reference[established]
-    shown = np.zeros(len(submap.landmarks), np.bool_)
-    shown[landmark_ids[landmark_ids >= 0]] = True
     if not len(reference):
         return 0.0
+    shown = submap.mask_of(landmark_ids)[reference]
     if not by_hold:
-        return float(shown[reference].mean())
+        return float(shown.mean())
     hold = _hold(reference, submap, se3.inverse(submap.T_submap_kf[keyframe_id]))
-    return float(hold @ shown[reference] / hold.sum())
+    return float(hold @ shown / hold.sum())
 
 
 def _hold(landmark_ids: IntArray, submap: Submap, T_cam_submap: FloatArray) -> FloatArray:
