@@ -20,6 +20,8 @@ DICTIONARIES = (
     *("aruco_4x4", "aruco_5x5", "aruco_6x6", "aruco_original"),
 )
 MAX_PORT = 65535
+SHORTEST_M, LONGEST_M = 1e-6, 1e9
+"""Of a known length: a mistyped exponent, and nothing that a camera could see, lies outside."""
 SOURCE_HELP = (
     "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours), a folder of images or a video file with --camera or "
     "--fov, a webcam's number, or an embedded world: synthetic:street, room, circuit, eight, terrace, "
@@ -201,8 +203,8 @@ class _Distance(argparse.Action):
 
     def __call__(self, parser, namespace, values, option_string=None) -> None:  # type: ignore[no-untyped-def]
         try:
-            setattr(namespace, self.dest, (int(values[0]), int(values[1]), float(values[2])))
-        except ValueError:
+            setattr(namespace, self.dest, (int(values[0]), int(values[1]), _length(values[2])))
+        except (ValueError, argparse.ArgumentTypeError):
             parser.error(f"argument {option_string}: give two frames and a distance in metres, as 10 250 3.2")
 
 
@@ -313,8 +315,10 @@ def _length(text: str) -> float:
         value = float(text)
     except ValueError:
         value = 0.0
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be a length in metres above 0, not {text!r}")
+    if not SHORTEST_M <= value <= LONGEST_M:
+        raise argparse.ArgumentTypeError(
+            f"must be a length in metres above 0, {SHORTEST_M:g} to {LONGEST_M:g}, not {text!r}"
+        )
     return value
 
 

@@ -78,7 +78,22 @@ _EVENT_KINDS: _Kinds = {
     "frame": ((int,), "a whole number"),
     "timestamp_s": ((int, float), "a number"),
     "submap": ((int, type(None)), "a whole number"),
+    **dict.fromkeys(
+        ("first_view", "keyframe", "lost_since", "old_submap", "other_frame", "other_submap", "suspected_since"),
+        ((int, type(None)), "a whole number"),
+    ),
+    **dict.fromkeys(
+        ("cost_after", "cost_before", "drift_log_scale", "frames", "inliers", "largest_bend", "largest_move", "matches")
+        + ("n_agreeing_keyframes", "n_inliers", "n_matches", "n_pairs", "n_shared_keyframes", "scale", "seconds")
+        + ("shared_keyframes", "sigma_rot_deg", "sigma_scale", "sigma_trans_mu", "skipped_frames", "tries"),
+        ((int, float, type(None)), "a number"),
+    ),
+    **dict.fromkeys(
+        ("agreeing_keyframes", "left", "lost", "old_submaps", "rejected", "submaps"), ((list, type(None)), "a list")
+    ),
+    "factors": ((dict,), "a mapping"),
 }
+"""Of what pages are made of; what else belongs to an event is shown as it is."""
 _SUBMAP_NAME = re.compile(r"\d+\.txt")
 _SAMPLE_NAME = re.compile(r"\d+\.jpg")
 _MAP_NAME = re.compile(r"[\w.-]+\.(npz|json)")
@@ -339,7 +354,12 @@ def _finite(cell: str) -> float:
 
 
 def _sigma(cell: str | None) -> float | None:
-    return float(cell) if cell else None
+    if not cell:
+        return None
+    value = float(cell)
+    if not value >= 0:
+        raise ValueError(f"{cell} is no standard deviation")
+    return value
 
 
 def read_summary(run: Path) -> dict[str, Any]:

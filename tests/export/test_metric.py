@@ -189,6 +189,8 @@ def test_trajectories_come_in_metres_too(tmp_path: Path) -> None:
     ("arguments", "expected"),
     [
         (["--height", "-1"], "above 0"),
+        (["--height", "1e300"], "1e-06 to 1e+09"),
+        (["--distance", "1", "2", "inf"], "a distance in metres"),
         (["--height", "1.6", "--marker", "0.2"], "not allowed with"),
         ([], "required"),
     ],

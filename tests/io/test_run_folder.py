@@ -224,6 +224,30 @@ def test_events_cut_off_by_a_crash(tmp_path: Path) -> None:
         read_events(path)
 
 
+@pytest.mark.parametrize(
+    ("detail", "words"),
+    [
+        ('"lost_since": "x"', "lost_since is not a whole number"),
+        ('"sigma_scale": [1]', "sigma_scale is not a number"),
+        ('"old_submaps": 3', "old_submaps is not a list"),
+        ('"factors": 3', "factors is not a mapping"),
+    ],
+)
+def test_what_pages_are_made_of_is_checked_as_it_is_read(tmp_path: Path, detail: str, words: str) -> None:
+    path = tmp_path / "events.jsonl"
+    path.write_text(f'{{"event": "failed", "frame": 3}}\n{{"event": "failed", "frame": 4, {detail}}}\n')
+    with pytest.raises(InputError, match=f"line 2: {words}"):
+        read_events(path)
+
+
+def test_a_standard_deviation_below_zero_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "frames.csv"
+    header = "index,timestamp_s,status,submap,in_main_map,n_matches,n_inliers,latency_ms,sigma_position_rel,sigma_scale"
+    path.write_text(f"{header}\n1,0.1,tracked,0,1,9,9,1,0.1,-1\n")
+    with pytest.raises(InputError, match=r"line 2: .*-1 is no standard deviation"):
+        read_frames(path)
+
+
 def test_bad_frames_csv(tmp_path: Path) -> None:
     path = tmp_path / "frames.csv"
     path.write_text("a,b\n1,2\n")
