@@ -30,6 +30,8 @@ class Progress:
     needs_camera: bool = False  # no other walk would do better, before the camera is calibrated
     needs_live_end: bool = False  # nor before the live end has grown, from which all of them set out
     looks_alike: bool = False  # beyond a gap: what one front end cannot tell apart another may not even notice
+    before_gap: int | None = None  # the frame from which the first gap was crossed
+    walk_sigma: float = 0.0  # of the scale that the walk hands on, as the last link that was tried says
     rivals: Sequence[Rival] = ()  # of poses beyond gaps
     choice: Choice | None = None  # what the velocities say of these
     why_unusable: str = ""
@@ -43,6 +45,10 @@ class Progress:
         ended = "out of time" if self.out_of_time else self.why_unusable if self.n_unusable else "the buffer ends"
         ended = "given up" if self.given_up else ended
         return f"{ended}; no link: {self.why_not_linked}" if self.why_not_linked else ended
+
+    def lost_scale_from(self, max_sigma: float) -> int | None:
+        """Return from which frame it crossed a gap, where it came to no link as it hands the scale on more loosely."""
+        return self.before_gap if self.link is None and self.walk_sigma > max_sigma else None
 
     def note_unusable(self, failure: Failure) -> None:
         """Count a frame that was not posed."""

@@ -111,7 +111,7 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
         looks_alike |= progress.looks_alike
         came_as_far = best is not None and len(progress.frames) >= len(best.frames)
         if best is None or progress.link is not None or (attempt is thorough and came_as_far):
-            best = progress
+            best, way = progress, attempt
         if progress.link is not None or progress.needs_camera or progress.needs_live_end or progress.looks_alike:
             break
         if progress.took_short_cut and attempt.thorough is not None:
@@ -119,9 +119,24 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
             ways.insert(0, thorough)
     if best is None:
         return problem
+    if (gap := best.lost_scale_from(parts.max_scale_sigma)) is not None:
+        best = yield from _as_far_as(gap, job, parts, way, until)
     seconds, cpu_s = time.perf_counter() - started, time.process_time() - cpu_started
     frames = tuple(best.frames.values())
     return RecoveryResult(best.submap, frames, best.link, tuple(events), seconds, cpu_s, looks_alike, tries)
+
+
+def _as_far_as(
+    gap: int, job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float
+) -> Generator[WalkNews, None, Progress]:
+    """Walk again, no farther than to the frame before a gap.
+
+    Later walks go by the keyframes that an earlier one has left. From beyond a gap they would be tied to a crossing
+    that a young map has made, and the grown one can make it more firmly.
+    """
+    near = replace(job, views=tuple(view for view in job.views if view.index >= gap))
+    kept = yield from _make_attempt(near, parts, attempt, until, job.tries.copy())
+    return Progress(job.submap) if isinstance(kept, Failure) else kept
 
 
 def _make_told_apart(
@@ -181,6 +196,8 @@ def _make_attempt(
             progress.note_unusable(step.track)
             continue
         progress.took_short_cut = reverse_tracker.took_short_cut
+        if step.track.wide and progress.before_gap is None:
+            progress.before_gap = min(progress.frames, default=job.newest_id)
         progress.note_posed(_recovered_frame(reverse_tracker, step.view, step.track), step.report is not None)
         if (earlier := reverse_tracker.confirmed()) is not None:
             progress.note_confirmed(_recovered_frame(reverse_tracker, earlier.view, earlier))
@@ -194,6 +211,7 @@ def _make_attempt(
                 break
             tries.note_try(tried.old_id, found.reason)
             progress.why_not_linked = found.detail
+            progress.walk_sigma = found.numbers.get("sigma_scale_reverse", 0.0)
             progress.needs_camera |= found.reason is FailureReason.CAMERA
             # What was lost across a gap the others lose as well: they cross it by the same matches, or by fewer. Only
             # where a short cut was taken there are more.

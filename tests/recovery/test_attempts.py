@@ -10,7 +10,7 @@ import pytest
 from dualslam.build import build_system, recovery_parts
 from dualslam.config.corruption import Corruption
 from dualslam.config.corruption import CorruptionKind as SpoilKind
-from dualslam.config.settings import AttemptConfig, Config, RecoveryConfig
+from dualslam.config.settings import AttemptConfig, Config, LinkingConfig, RecoveryConfig
 from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.errors import ConfigError
 from dualslam.core.events import Event, EventKind
@@ -106,6 +106,22 @@ class TestOrder:
         assert [attempt.data["attempt"] for attempt in attempts] == ["gap (sift)"] * (1 if links else 2)
         if not links:
             assert attempts[1].data["gaps"] == 0
+
+    def test_nothing_is_kept_from_beyond_a_gap_across_which_the_scale_was_lost(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """By a bound that no walk can hold: what lies before the gap stays, and the next walk crosses it anew."""
+        monkeypatch.setattr(LinkingConfig, "max_live_scale_sigma", 1e-6)
+        world = PointWorld(cloud(), hand_held(60), covered=COVERED)
+        recovery = {"attempts": ["live"], "retry_keyframes": [2]}
+        system = system_in(world, recovery=recovery)
+        for frame in world.frames():
+            system.step(frame)
+        first, *later = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)
+        assert first.data["gaps"] == 1
+        assert "by the walk" in first.data["verdict"]
+        assert min(system.live.submap.keyframes) > max(COVERED)
+        assert any(attempt.data["gaps"] == 1 and attempt.data["new_keyframes"] >= 4 for attempt in later)
 
     def test_all_may_fail(self) -> None:
         events = events_of(["live", "sift"], max_gap_frames=3)
