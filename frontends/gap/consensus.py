@@ -8,6 +8,7 @@ though both hang by the same points on the gap's other side: of a right pair rat
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, projection_jacobians
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_distance
-from dualslam.core.types import Features, FloatArray, IntArray
+from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Rival
 from dualslam.frontends.gap.relocalisation import GapPose
 from dualslam.frontends.gates import MIN_CONSENSUS
 
@@ -81,6 +82,43 @@ def confirmed_share(first: BeyondGap, second: BeyondGap, matches: IntArray, K: F
     if (~tracked).sum() < MIN_CONSENSUS:
         return share
     return min(share, _static_share(uv_a[~tracked], uv_b[~tracked], variance[~tracked] / 2.0, K, T_b_a, within))
+
+
+def are_no_copies(
+    first: BeyondGap, second: BeyondGap, matches: IntArray, rivals: Iterable[Rival], K: FloatArray
+) -> BoolArray:
+    """Return which matches of two frames are of one thing: of what repeats itself a copy may look more alike.
+
+    Those nearer to where the poses show what lies at the median depth than half way to where a rival does.
+
+    Parameters
+    ----------
+    first, second : BeyondGap
+    matches : (M, 2) int64
+        Rows of their features.
+    rivals : iterable of Rival
+        Other poses beyond the gap, of either frame.
+    K : (3, 3)
+
+    Returns
+    -------
+    (M,) bool
+    """
+    T_first, T_second = first.pose.T_cam_submap, second.pose.T_cam_submap
+    xyz = first.pose.xyz_mu[first.pose.inliers]
+    uv, _ = project_points(K, T_second, xyz)
+    period_px = np.inf
+    for rival in rivals:
+        uv_rival, _ = project_points(K, T_second @ se3.inverse(rival.T_rival_walked), xyz)
+        apart_px = np.linalg.norm(uv_rival - uv, axis=1)
+        apart_px[np.isnan(apart_px)] = np.inf  # behind one of the cameras: it shows no copy of that
+        period_px = min(period_px, float(np.median(apart_px)))
+    _, depth = project_points(K, T_first, xyz)
+    uv_first = first.features.uv_rect_px[matches[:, 0]]
+    rays = np.column_stack([(uv_first - K[:2, 2]) / (K[0, 0], K[1, 1]), np.ones(len(matches))])
+    shown, _ = project_points(K, T_second @ se3.inverse(T_first), rays * float(np.median(depth)))
+    apart_px = np.linalg.norm(second.features.uv_rect_px[matches[:, 1]] - shown, axis=1)
+    return np.asarray(apart_px < 0.5 * period_px)
 
 
 def _share_in_place(

@@ -18,7 +18,6 @@ from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.support import find_lack_of_support, judge_track
 from dualslam.core.types import (
-    BoolArray,
     Failure,
     FailureReason,
     Features,
@@ -31,7 +30,7 @@ from dualslam.core.types import (
 )
 from dualslam.frontends.gap.auxiliary_features import Auxiliary
 from dualslam.frontends.gap.auxiliary_map import AuxiliaryMap, triangulate
-from dualslam.frontends.gap.consensus import CONFIRMING_SHARE, BeyondGap, confirmed_share
+from dualslam.frontends.gap.consensus import CONFIRMING_SHARE, BeyondGap, are_no_copies, confirmed_share
 from dualslam.frontends.gap.relocalisation import GapPose, relocalise_across_gap
 from dualslam.frontends.gap.second_pose import find_other_poses, match_under, refuse_look_alike
 from dualslam.frontends.gap.uncertainty import SMALL_STEP
@@ -268,7 +267,7 @@ class PoseFinder:
             return Failure(FailureReason.UNCONFIRMED, "the first frame beyond a gap", wide.numbers)
         matches = self._frontend.match_wide(before.features, features).index
         if self._rivals:
-            matches = matches[self._are_no_copies(before, self._beyond, matches)]
+            matches = matches[are_no_copies(before, self._beyond, matches, self._rivals, self._submap.K)]
         share = confirmed_share(before, self._beyond, matches, self._submap.K)
         if share < CONFIRMING_SHARE:
             self._map.drop(before.view.index)
@@ -324,23 +323,6 @@ class PoseFinder:
         if others and others[0].makes_doubtful:
             self._rivals += [Rival(view.index, view.timestamp_s, other.T_cam_w, wide.T_cam_submap) for other in others]
         return None
-
-    def _are_no_copies(self, first: FrameBeyond, second: FrameBeyond, matches: IntArray) -> BoolArray:
-        """Return which matches (M,) of two frames are of one thing: of what repeats itself a copy may look more alike.
-
-        Those nearer to where the poses show what lies at the median depth than half way to where a rival does.
-        """
-        K, T_first, T_second = self._submap.K, first.pose.T_cam_submap, second.pose.T_cam_submap
-        xyz = first.pose.xyz_mu[first.pose.inliers]
-        uv, _ = project_points(K, T_second, xyz)
-        by_rivals = [project_points(K, T_second @ rival.T_rival_walked, xyz)[0] for rival in self._rivals]
-        period_px = min(float(np.median(np.linalg.norm(uv_rival - uv, axis=1))) for uv_rival in by_rivals)
-        _, depth = project_points(K, T_first, xyz)
-        uv_first = first.features.uv_rect_px[matches[:, 0]]
-        rays = np.column_stack([(uv_first - K[:2, 2]) / (K[0, 0], K[1, 1]), np.ones(len(matches))])
-        shown, _ = project_points(K, T_second @ se3.inverse(T_first), rays * float(np.median(depth)))
-        apart = np.linalg.norm(second.features.uv_rect_px[matches[:, 1]] - shown, axis=1)
-        return np.asarray(apart < 0.5 * period_px)
 
     def _points(self, index: int, frames: list[int]) -> tuple[IntArray, FloatArray]:
         """Return features of a frame (N,) whose points are known from several, and the points (N, 3)."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
-from dualslam.core.types import Features, FloatArray
-from dualslam.frontends.gap.consensus import CONFIRMING_SHARE, BeyondGap, confirmed_share
+from dualslam.core.types import Features, FloatArray, Rival
+from dualslam.frontends.gap.consensus import CONFIRMING_SHARE, BeyondGap, are_no_copies, confirmed_share
 from dualslam.frontends.gap.relocalisation import GapPose
 
 K = np.array([[400.0, 0.0, 320.0], [0.0, 400.0, 240.0], [0.0, 0.0, 1.0]])
@@ -81,3 +83,33 @@ def test_frames_that_share_too_little_tell_nothing() -> None:
     first, second = (beyond(xyz, T, np.zeros(6), SIGMAS, 0) for T in (T_FIRST, T_SECOND))
     few = np.column_stack([np.arange(N_TRACKED - 8, N)] * 2)
     assert confirmed_share(first, second, few, K) == 0.0
+
+
+def along_the_view(way: float) -> FloatArray:
+    return se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, -way]))
+
+
+@pytest.mark.parametrize("ways", [[1.5], [-1.5], [1.5, -1.5], [-1.5, 1.5], [12.0], [12.0, -1.5]])
+def test_rivals_along_the_view_let_right_matches_pass(ways: list[float]) -> None:
+    """Rivals ahead (positive) and behind, in any order, also where some or all points lie behind their cameras."""
+    xyz = np.random.default_rng(0).uniform([-2, -1, 1], [2, 1, 8], (N, 3))
+    T_first, T_second = np.eye(4), along_the_view(0.1)
+    first, second = (beyond(xyz, T, np.zeros(6), SIGMAS, n) for n, T in enumerate((T_first, T_second)))
+    rivals = [Rival(0, 0.0, along_the_view(way) @ T_first, T_first) for way in ways]
+    same = np.column_stack([np.arange(N)] * 2)
+    assert are_no_copies(first, second, same, rivals, K).mean() > 0.85
+
+
+@pytest.mark.parametrize(("way", "seen_from", "passes"), [(2.0, 1.2, True), (2.0, 1.6, False), (-2.0, 1.2, False)])
+def test_copies_lie_where_the_rival_shows_them(way: float, seen_from: float, passes: bool) -> None:
+    """From 2 ahead a ring at depth 4 is shown a whole radius off, from 2 behind a third of one.
+
+    It is seen 0.43 or 0.67 off. A third of what is known is so near that it lies behind the rival ahead.
+    """
+    angle, near = np.linspace(0.0, 2 * np.pi, N), np.arange(N) < N_TRACKED // 3
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.where(near, 1.0, 4.0)])
+    first, second = (beyond(ring, along_the_view(ahead), np.zeros(6), SIGMAS, 0) for ahead in (0.0, seen_from))
+    second = replace(second, pose=first.pose)
+    rival = Rival(0, 0.0, along_the_view(way), np.eye(4))
+    matches = np.column_stack([np.flatnonzero(~near)] * 2)
+    assert (are_no_copies(first, second, matches, [rival], K) == passes).all()
