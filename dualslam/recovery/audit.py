@@ -45,6 +45,7 @@ MIN_SUPPORT = 0.8
 MIN_PARTED = 5
 """Frames in a row, up to the first one, in which they must part."""
 PIXEL_CHI2 = 9.210
+CHANGED = "the map has changed meanwhile"
 
 
 class Verdict(StrEnum):
@@ -114,6 +115,8 @@ def judge_start(
         The walk.
     """
     first = min(job.submap.keyframes)
+    if first not in live.keyframes:
+        return AuditReport(Verdict.UNDECIDED, CHANGED, None, {})
     start = [i for i, pose in poses.items() if pose.submap_id == live.id and i < first]
     walked = {frame.pose.index: frame for frame in result.frames if frame.pose.index < first}
     both = np.array(sorted(set(start) & walked.keys()), np.int64)

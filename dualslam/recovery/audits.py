@@ -14,6 +14,7 @@ from dualslam.map.submap import Submap
 from dualslam.recovery.audit import (
     AUDIT_KEYFRAMES,
     BUFFER_SHARE,
+    CHANGED,
     MIN_KEYFRAMES,
     Verdict,
     cut_start,
@@ -88,7 +89,7 @@ class Audits:
         report = judge_start(submap, record.poses, n_inliers, job, result)
         verdict, detail = report.verdict, report.detail
         if verdict is Verdict.CUT and not self._cut(job, result, now, take_in):
-            verdict, detail = Verdict.UNDECIDED, "the map has changed meanwhile"
+            verdict, detail = Verdict.UNDECIDED, CHANGED
         told = {"verdict": str(verdict), "detail": detail, "parted_until": report.parted_until}
         record.event(EventKind.AUDITED, now, submap.id, **told, seconds=result.cpu_s, **report.numbers)
 
@@ -99,7 +100,7 @@ class Audits:
         """Make the start a submap of its own, and give its frames the poses of the walk; return whether it was done."""
         record, submap, first = self._record, self._record.atlas.submaps[job.submap.id], min(job.submap.keyframes)
         same_camera = bool((submap.K == job.submap.K).all())
-        if first not in submap.keyframes or self._is_linked(submap.id) or not same_camera:
+        if self._is_linked(submap.id) or not same_camera:
             return False
         before, frames = submap.copy(), frames_before(record.poses.values(), submap.id, first)
         rows = {i: (record.poses[i], record.rows[i].status) for i in frames}

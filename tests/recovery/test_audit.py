@@ -106,3 +106,20 @@ def test_the_half_that_asks_holds_nothing_of_the_start() -> None:
     assert (rest.n_observations(alive) >= 2).all()
     for k in whole.keyframes:  # what stood where it stood still does
         assert np.allclose(rest.resolve_anchor(k, np.eye(4)), whole.T_submap_kf[k])
+
+
+def test_a_map_that_has_lost_the_keyframe_it_is_split_at_is_left_as_it_is(way: PointWorld) -> None:
+    """The walk is made beside the run, which goes on culling."""
+    system = system_in(way, **ON)
+    for frame in way.frames():
+        before = len(system._recoveries._audits.asked)
+        system.step(frame)
+        if len(system._recoveries._audits.asked) > before:
+            break
+    assert system.live is not None
+    submap = system.live.submap
+    submap.remove_keyframe(split_for_audit(submap), max(submap.keyframes))
+    system.finish()
+    (event,) = system.events.of_kind(EventKind.AUDITED)
+    assert (event.data["verdict"], event.data["detail"]) == ("undecided", "the map has changed meanwhile")
+    assert not system.events.of_kind(EventKind.CUT)
