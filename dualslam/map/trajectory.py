@@ -27,13 +27,14 @@ class FramePose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Path:
-    """The way of a camera in a submap, by ascending time.
+    """The way of a camera in a submap, from frame to frame as they came.
 
     Attributes
     ----------
     index : (N,) int64
         Of the frames.
     times_s : (N,) float64
+        Ascending: negative timestamps where a source is read from its end.
     T_map_cam : (N, 4, 4) float64
     refound : (N,) bool
         Frames that were found again by wide matching, and not by those before them.
@@ -47,11 +48,14 @@ class Path:
     @classmethod
     def of(cls, poses: Iterable[FramePose], submap: Submap) -> Path:
         """Return the path of frames that are posed in a submap, as if none had been found again."""
-        ordered = sorted(poses, key=lambda pose: pose.timestamp_s)
+        by_index = sorted(poses, key=lambda pose: pose.index)
+        falls = len(by_index) > 1 and by_index[-1].timestamp_s < by_index[-2].timestamp_s
+        sign = -1.0 if falls else 1.0
+        ordered = sorted(by_index, key=lambda pose: sign * pose.timestamp_s)
         T = [submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam) for pose in ordered]
         return cls(
             np.array([pose.index for pose in ordered], np.int64),
-            np.array([pose.timestamp_s for pose in ordered], np.float64),
+            np.array([sign * pose.timestamp_s for pose in ordered], np.float64),
             np.array(T, np.float64).reshape(-1, 4, 4),
             np.zeros(len(ordered), bool),
         )

@@ -91,7 +91,7 @@ def _measure(walked: Path, known: Path, rivals: Sequence[Rival]) -> tuple[list[L
 
     Returns these leaps, and where the last frame before the gap is by each (N, 3); None where nothing can be measured.
     """
-    gaps = [i for i in gaps_of(walked.times_s).tolist() if walked.times_s[i] >= rivals[0].timestamp_s]
+    gaps = [i for i in gaps_of(walked.times_s).tolist() if walked.index[i] >= rivals[0].index]
     if not gaps:
         return None
     after_s = walked.times_s[gaps[0] + 1]

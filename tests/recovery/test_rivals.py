@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dualslam.core.types import FailureReason, FloatArray, Rival
-from dualslam.map.trajectory import Path
+from dualslam.map.submap import Submap
+from dualslam.map.trajectory import FramePose, Path
 from dualslam.recovery.rivals import choose_by_velocity
 from tests.recovery.test_leaps import RATE_HZ, way, without
 
@@ -99,3 +102,26 @@ def test_nothing_is_told_where_nothing_can_be_measured(case: str) -> None:
     assert choice.refusal is not None
     assert choice.refusal.reason is FailureReason.LOOK_ALIKE
     assert not choice.better
+
+
+def read_from_its_end(way: Path) -> Path:
+    """The same frames in the same order, by falling timestamps, in a map of one keyframe."""
+    submap = Submap(0, np.eye(3), np.zeros(32, np.uint8))
+    submap.T_submap_kf[0] = np.eye(4)
+    frames = zip(way.index.tolist(), way.times_s.tolist(), way.T_map_cam, strict=True)
+    return Path.of([FramePose(i, 100.0 - t, 0, 0, T) for i, t, T in frames], submap)
+
+
+@pytest.mark.parametrize("off_m", [0.0, PERIOD_M])
+def test_a_source_that_is_read_from_its_end_tells_the_same(off_m: float) -> None:
+    for seed in range(6):
+        t, p = way(200, seed)
+        walked, known = walk(t, p, 109, off_m), path(t[KNOWN], p[KNOWN] + [off_m, 0.0, 0.0])
+        rivals = [rival(109, each) for each in (-PERIOD_M, PERIOD_M)]
+        choice = choose_by_velocity(walked, known, rivals)
+        falling = [replace(each, timestamp_s=100.0 - each.timestamp_s) for each in rivals]
+        other = choose_by_velocity(read_from_its_end(walked), read_from_its_end(known), falling)
+        assert (choice.refusal is None) == (off_m == 0.0)
+        assert (other.refusal is None) == (off_m == 0.0)
+        assert [each.T_cam_rival[0, 3] for each in other.better] == [each.T_cam_rival[0, 3] for each in choice.better]
+        assert len(other.better) == (off_m != 0.0)
