@@ -176,20 +176,23 @@ class PnpOdometry:
             self._relocalised, self._crossing = view.index, found
             found = found.pose
         track = found if isinstance(found, Track) else self._live.track_at(view, found)
-        self._following = True
         self._note(view, self.reference_id, track.T_cam_submap)
         self._rivals = self.rivals
-        for finder in self._finders:
-            finder.end_gap()
+        self._end_gap()
         return track
 
     def _meet(self, view: View) -> Track:
         """Come to a frame that is a keyframe of the submap already."""
         T_cam_submap = se3.inverse(self.submap.T_submap_kf[view.index])
         self._note(view, view.index, T_cam_submap)
-        self._following = True
+        self._end_gap()  # not by a pose that had rivals
         n = int((self.submap.landmark_of[view.index] >= 0).sum())
         return self._live.track_at(view, GivenPose(T_cam_submap, n, n, 1.0, np.zeros((6, 6)), wide=False))
+
+    def _end_gap(self) -> None:
+        self._following = True
+        for finder in self._finders:
+            finder.end_gap()
 
     def _find(self, view: View) -> Pose | Failure:
         """Have the front ends pose a frame, one after the other until one can.

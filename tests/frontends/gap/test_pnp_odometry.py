@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -62,11 +62,12 @@ def odometry(
     config: Config | None = None,
     tracks_live: bool = False,
     own: WorldFeatures | None = None,
+    keyframes: Sequence[int] = KEYFRAMES,
 ) -> PnpOdometry:
     features = [] if own is None else [own]
     features.append(WorldFeatures(auxiliary) if isinstance(auxiliary, PointWorld) else auxiliary)
     reverse_tracker = PnpOdometry(
-        front_end(live, KEYFRAMES, 40),
+        front_end(live, list(keyframes), 40),
         [Auxiliary(OrbFrontend(), each) for each in features],
         Route([live.view(k) for k in KEYFRAMES], [live.view(i) for i in range(39, -1, -1)]),
         bundle_adjust_arrays,
@@ -202,6 +203,22 @@ class TestGapRelocalisation:
         assert np.linalg.norm(off[3:]) < POSITION_M * 2
         error = errors(steps, live)
         assert np.linalg.norm(error[:, 3:], axis=1).max() < POSITION_M * 2
+
+    def test_a_keyframe_of_an_earlier_walk_ends_the_gap(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Beyond it nothing is in doubt any more, another gap is crossed, and no rival of the old one stays."""
+        live, auxiliary = worlds(range(27, 34))
+        reverse_tracker = odometry(live, auxiliary, tracks_live=True, keyframes=[14, 17, 20, *KEYFRAMES])
+        doubt = Failure(FailureReason.LOOK_ALIKE, "")
+        monkeypatch.setattr("dualslam.frontends.gap.pose_finder.refuse_look_alike", lambda *_, **__: doubt)
+        steps = walk(reverse_tracker, live, range(39, 20, -1))
+        assert steps[26] is steps[21] is doubt
+        monkeypatch.undo()
+        steps = walk(reverse_tracker, live, range(20, 11, -1)) | walk(reverse_tracker, live, range(2, -1, -1))
+        assert all(steps[i] for i in range(20, 11, -1))
+        assert isinstance(steps[2], Failure)
+        assert steps[2].reason is FailureReason.UNCONFIRMED
+        assert isinstance(steps[1], Track)
+        assert np.linalg.norm(errors(steps, live)[:, 3:], axis=1).max() < POSITION_M * 2
 
     def test_the_scale_beyond_is_that_before(self) -> None:
         live, auxiliary = worlds(self.covered)
