@@ -64,6 +64,11 @@ class LocalMap:
     descriptors: NDArray[np.generic]
 
     @classmethod
+    def of_keyframes(cls, submap: Submap, keyframe_ids: IntArray | list[int]) -> LocalMap:
+        """Take a snapshot of the landmarks that any of the keyframes sees."""
+        return cls.of_landmarks(submap, submap.landmarks_of_keyframes(keyframe_ids))
+
+    @classmethod
     def of_landmarks(cls, submap: Submap, landmark_ids: IntArray) -> LocalMap:
         """Take a snapshot of the given landmarks."""
         lm = submap.landmarks

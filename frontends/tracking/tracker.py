@@ -141,13 +141,14 @@ class Tracker:
             found = self._pose_from_last(view, grid, T_predicted, radius_px)
             if found:
                 break
-        wide = not found or self.lies_beyond_gap(view)
+        wide, local = not found or self.lies_beyond_gap(view), self._local
+        assert local is not None
         if isinstance(found, Failure):
             found = self._pose_from_wide_matches(view) if may_relocalise else found
             if isinstance(found, Failure):
                 return found
-            self._local = self._local_map(found[1][found[1] >= 0])
-        track = self._pose_from_local_map(view, grid, *found, T_predicted, wide)
+            local = self._local_map(found[1][found[1] >= 0])
+        track = self._pose_from_local_map(local, view, grid, *found, T_predicted, wide)
         if isinstance(track, Failure):
             return track
         if wide:
@@ -156,7 +157,7 @@ class Tracker:
                 refused = self._refuse_look_alike(track)
             if refused is not None:
                 return refused
-        self._accept(track)
+        self._accept(track, local)
         return track
 
     def lies_beyond_gap(self, view: View) -> bool:
@@ -166,16 +167,14 @@ class Tracker:
     def track_at(self, view: View, pose: GivenPose) -> Track:
         """Take a pose as it is, look for the landmarks of the keyframes nearest in time under it, and go on there."""
         track = self.look_at(view, pose)
-        self._accept(track)
+        self.take(track)
         return track
 
     def look_at(self, view: View, pose: GivenPose) -> Track:
         """Take a pose as `track_at` does; the tracker goes on from there only after `take`."""
-        keyframe_ids = self._submap.keyframes_near(view.index)[:LOCAL_KEYFRAMES]
-        self._local = LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(keyframe_ids))
         landmark_ids = np.full(len(view.features), NO_LANDMARK, np.int64)
-        grid = FeatureGrid.build(view.features.uv_rect_px)
-        landmark_ids, _ = self._search_local_map(view, grid, pose.T_cam_submap, landmark_ids)
+        local, grid = self._near_map(view.index), FeatureGrid.build(view.features.uv_rect_px)
+        landmark_ids, _ = self._search(local, view, grid, pose.T_cam_submap, landmark_ids)
         feature = np.flatnonzero(landmark_ids >= 0)
         uv, _ = project_points(
             self._submap.K, pose.T_cam_submap, self._submap.landmarks["xyz_mu"][landmark_ids[feature]]
@@ -202,11 +201,9 @@ class Tracker:
 
         The tracker continues from there only after `take`.
         """
-        keyframe_ids = self._submap.keyframes_near(view.index)[:LOCAL_KEYFRAMES]
-        self._local = LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(keyframe_ids))
-        grid = FeatureGrid.build(view.features.uv_rect_px)
+        local, grid = self._near_map(view.index), FeatureGrid.build(view.features.uv_rect_px)
         nothing = np.full(len(view.features), NO_LANDMARK, np.int64)
-        return self._pose_from_local_map(view, grid, T_cam_submap, nothing, T_cam_submap, wide=True)
+        return self._pose_from_local_map(local, view, grid, T_cam_submap, nothing, T_cam_submap, wide=True)
 
     def relocalise(self, view: View, keyframe_id: int) -> Track | Failure:
         """Pose a frame by a keyframe of the submap and those that see the same; continue from there, at rest."""
@@ -219,9 +216,8 @@ class Tracker:
         found = self._pose_from_wide_matches(view, about[:WIDE_KEYFRAMES])
         if isinstance(found, Failure):
             return found
-        self._local = self._local_map(found[1][found[1] >= 0])
-        grid = FeatureGrid.build(features.uv_rect_px)
-        track = self._pose_from_local_map(view, grid, *found, found[0], wide=True)
+        local, grid = self._local_map(found[1][found[1] >= 0]), FeatureGrid.build(features.uv_rect_px)
+        track = self._pose_from_local_map(local, view, grid, *found, found[0], wide=True)
         if isinstance(track, Failure):
             return track
         refused = self._refuse_second_pose(track, about[:BEFORE_GAP])
@@ -231,8 +227,8 @@ class Tracker:
         return track
 
     def take(self, track: Track) -> None:
-        """Continue from a track."""
-        self._accept(track)
+        """Continue from a track of `look_at` or `track_near`."""
+        self._accept(track, self._near_map(track.view.index))
 
     # --- steps
 
@@ -327,6 +323,7 @@ class Tracker:
 
     def _pose_from_local_map(
         self,
+        local: LocalMap,
         view: View,
         grid: FeatureGrid,
         T_cam_submap: FloatArray,
@@ -336,7 +333,7 @@ class Tracker:
     ) -> Track | Failure:
         """Add the local map's other landmarks about their pixels under the first pose, and refine with all of them."""
         features, submap = view.features, self._submap
-        landmark_ids, visible = self._search_local_map(view, grid, T_cam_submap, landmark_ids)
+        landmark_ids, visible = self._search(local, view, grid, T_cam_submap, landmark_ids)
         feature = np.flatnonzero(landmark_ids >= 0)
         ids = landmark_ids[feature]
         estimate = refine_pose(
@@ -366,12 +363,11 @@ class Tracker:
             covariance=estimate.covariance,
         )
 
-    def _search_local_map(
-        self, view: View, grid: FeatureGrid, T_cam_submap: FloatArray, landmark_ids: IntArray
+    def _search(
+        self, local: LocalMap, view: View, grid: FeatureGrid, T_cam_submap: FloatArray, landmark_ids: IntArray
     ) -> tuple[IntArray, IntArray]:
         """Return the features' landmarks, those of the local map added that were not among them, and all in view."""
-        assert self._local is not None
-        features, local = view.features, self._local
+        features = view.features
         prediction = self._predict_local(local, T_cam_submap)
         new = ~self._submap.mask_of(landmark_ids)[local.landmark_ids[prediction.rows]]
         matches = match_projected(
@@ -388,10 +384,10 @@ class Tracker:
         landmark_ids[matches.index[:, 1]] = local.landmark_ids[prediction.rows[new][matches.index[:, 0]]]
         return landmark_ids, local.landmark_ids[prediction.rows]
 
-    def _accept(self, track: Track) -> None:
+    def _accept(self, track: Track, local: LocalMap) -> None:
         assert self._last is not None
         self._motion = Motion.between(self._last, track)
-        self._last, self._doubt = track, None
+        self._last, self._local, self._doubt = track, local, None
 
     # --- the local map
 
@@ -401,5 +397,7 @@ class Tracker:
 
     def _local_map(self, landmark_ids: IntArray) -> LocalMap:
         keyframe_ids, _ = self._submap.covisible(landmark_ids)
-        nearest = keyframe_ids[:LOCAL_KEYFRAMES]
-        return LocalMap.of_landmarks(self._submap, self._submap.landmarks_of_keyframes(nearest))
+        return LocalMap.of_keyframes(self._submap, keyframe_ids[:LOCAL_KEYFRAMES])
+
+    def _near_map(self, index: int) -> LocalMap:
+        return LocalMap.of_keyframes(self._submap, self._submap.keyframes_near(index)[:LOCAL_KEYFRAMES])

@@ -18,6 +18,7 @@ from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like, 
 from dualslam.frontends.tracking.local_map import LocalMap
 from dualslam.frontends.tracking.mapper import Mapper, spread_choice
 from dualslam.frontends.tracking.resection import resect
+from dualslam.frontends.tracking.tracker import GivenPose
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.map.submap import NO_LANDMARK, Submap
 from dualslam.testing.point_world import (
@@ -190,6 +191,27 @@ class TestTracker:
             assert isinstance(live.track(View(i, i / 20, features)), Failure)
         a, b = tracked(live, world.view(11)), tracked(untouched, world.view(11))
         assert np.array_equal(a.T_cam_submap, b.T_cam_submap)
+
+    def test_a_look_elsewhere_leaves_the_tracker_as_it_was(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The frame shows another part of the map, which has nothing in common with the one that is tracked."""
+        drive = PointWorld(cloud(length_m=24.0), path(90, np.array([0.25, 0.0, 0.02]), np.zeros(3)))
+        live, untouched = (front_end(drive, list(range(0, 90, 2)), start_at=8) for _ in range(2))
+        far, T_cam_submap = drive.view(75), se3.inverse(drive.T_world_cam[75])
+
+        def refused() -> Track | Failure:
+            refusal = Failure(FailureReason.SCALE, "refused")
+            with monkeypatch.context() as patched:
+                patched.setattr("dualslam.frontends.tracking.tracker.refuse_lost_scale", lambda *_: refusal)
+                return live.track(far)
+
+        def posed() -> float:
+            return live.scale_sigma_at(far, GivenPose(T_cam_submap, 50, 50, 1.0, 1e-6 * np.eye(6), wide=True))
+
+        for i, look in enumerate((None, refused, posed, lambda: live.track_near(far, T_cam_submap)), 9):
+            assert look is None or isinstance(look(), Failure) == (look is refused)
+            a, b = tracked(live, drive.view(i)), tracked(untouched, drive.view(i))
+            assert np.array_equal(a.T_cam_submap, b.T_cam_submap)
+            assert np.array_equal(a.landmark_ids, b.landmark_ids)
 
     def test_no_texture_is_said(self, world: PointWorld) -> None:
         live = front_end(world, [0, 4, 8], start_at=8)
