@@ -393,6 +393,7 @@ def track_in_reverse(
             step = _track_one(reverse_tracker, view, judge(reverse_tracker.track(view)), view.index in keyframe_ids)
         except SolverError as error:
             log.warning("reverse tracking ends: %s", error)
+            yield ReverseStep(view, Failure(FailureReason.SOLVER, str(error)), None)
             return
         yield step
         n_failed = 0 if step.track else n_failed + 1

@@ -12,9 +12,10 @@ from dualslam.config.corruption import Corruption
 from dualslam.config.corruption import CorruptionKind as SpoilKind
 from dualslam.config.settings import AttemptConfig, Config, LinkingConfig, RecoveryConfig
 from dualslam.core.camera.models import PinholeCamera
-from dualslam.core.errors import ConfigError
+from dualslam.core.errors import ConfigError, SolverError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import se3, sim3
+from dualslam.frontends.gap.pnp_odometry import PnpOdometry
 from dualslam.lab.audits.link_audit import LinkAudit, audit_links
 from dualslam.lab.synthetic import make_sequence
 from dualslam.recovery.executor import InlineExecutor, Outcome
@@ -128,6 +129,15 @@ class TestOrder:
         assert [event.event for event in events[:2]] == [EventKind.RECOVERY_ATTEMPT] * 2
         assert not events[-1].data["linked"]
         assert events[0].data["unusable_at_end"] == 4
+
+
+def test_a_solver_that_fails_ends_an_attempt_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise SolverError("no solution")
+
+    monkeypatch.setattr(PnpOdometry, "insert_keyframe", fail)
+    attempt = events_of(["live"])[0]
+    assert attempt.data["verdict"] == "no solution"
 
 
 def test_frames_before_a_start_are_posed_by_live_features_whatever_the_attempts() -> None:
