@@ -18,6 +18,7 @@ from dualslam.frontends.gap.auxiliary_map import AuxiliaryMap, TrackViews, trian
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry
 from dualslam.frontends.gap.relocalisation import GapPose, relocalise_across_gap
 from dualslam.frontends.gap.route import Route
+from dualslam.frontends.gap.second_pose import SecondPose
 from dualslam.map.submap import NO_LANDMARK
 from dualslam.testing.point_world import CAMERA, SIZE_PX, PointWorld, cloud, path, random_features
 from tests.frontends.tracking.test_tracking import front_end
@@ -63,6 +64,7 @@ def odometry(
     tracks_live: bool = False,
     own: WorldFeatures | None = None,
     keyframes: Sequence[int] = KEYFRAMES,
+    notes_rivals: bool = False,
 ) -> PnpOdometry:
     features = [] if own is None else [own]
     features.append(WorldFeatures(auxiliary) if isinstance(auxiliary, PointWorld) else auxiliary)
@@ -74,6 +76,7 @@ def odometry(
         config or Config(),
         SIZE_PX,
         tracks_live,
+        notes_rivals,
     )
     reverse_tracker.start_at(40)
     return reverse_tracker
@@ -205,7 +208,7 @@ class TestGapRelocalisation:
         assert np.linalg.norm(error[:, 3:], axis=1).max() < POSITION_M * 2
 
     def test_a_keyframe_of_an_earlier_walk_ends_the_gap(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Beyond it nothing is in doubt any more, another gap is crossed, and no rival of the old one stays."""
+        """Beyond it nothing is in doubt any more, and another gap is crossed."""
         live, auxiliary = worlds(range(27, 34))
         reverse_tracker = odometry(live, auxiliary, tracks_live=True, keyframes=[14, 17, 20, *KEYFRAMES])
         doubt = Failure(FailureReason.LOOK_ALIKE, "")
@@ -219,6 +222,17 @@ class TestGapRelocalisation:
         assert steps[2].reason is FailureReason.UNCONFIRMED
         assert isinstance(steps[1], Track)
         assert np.linalg.norm(errors(steps, live)[:, 3:], axis=1).max() < POSITION_M * 2
+
+    def test_a_keyframe_of_an_earlier_walk_leaves_no_rivals(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """They are of a frame that nothing has confirmed: the keyframe is where the earlier walk has put it."""
+        live, auxiliary = worlds(range(27, 34))
+        reverse_tracker = odometry(live, auxiliary, keyframes=[20, *KEYFRAMES], notes_rivals=True)
+        other = SecondPose(np.eye(4), 100, 100, 200, 200)
+        monkeypatch.setattr("dualslam.frontends.gap.pose_finder.find_other_poses", lambda *_, **__: [other])
+        walk(reverse_tracker, live, range(39, 25, -1))
+        assert [rival.index for rival in reverse_tracker.rivals] == [26]
+        walk(reverse_tracker, live, range(20, 19, -1))
+        assert not reverse_tracker.rivals
 
     def test_the_scale_beyond_is_that_before(self) -> None:
         live, auxiliary = worlds(self.covered)
