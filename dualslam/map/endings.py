@@ -22,9 +22,10 @@ def archive(record: Record, submap: Submap, graph: SubmapGraph, why: str) -> Non
         submap.apply_estimate(*final.values)
     except SolverError:
         log.warning("submap %d is archived as it stands: its graph gives no estimate", submap.id)
-    # A submap that rolled over and was lost at once has no frame of its own: its newest keyframe stands for it.
-    posed = [p.index for p in record.poses.values() if p.submap_id == submap.id and p.index in record.rows]
-    last = max(posed, default=max(submap.keyframes))
+    # A submap that rolled over and was lost at once has no frame of its own: its newest keyframe stands for it, and the
+    # newest frame where all its keyframes are of earlier runs.
+    posed = {pose.index for pose in record.own_poses() if pose.submap_id == submap.id}
+    last = max(posed or submap.keyframes.keys() & record.rows.keys() or record.rows)
     record.event(
         EventKind.ARCHIVED,
         record.rows[last],

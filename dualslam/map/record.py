@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -57,6 +57,10 @@ class Record:
         row.status, row.submap = FrameStatus.TRACKED, pose.submap_id
         if n_matches is not None:
             row.n_matches, row.n_inliers = n_matches, n_inliers
+
+    def own_poses(self) -> Iterator[FramePose]:
+        """Yield the poses of this run's frames: those of earlier runs, in a saved map, go by another clock."""
+        return (pose for i, pose in self.poses.items() if i in self.rows)
 
     def are_refound(self, indices: Iterable[int]) -> BoolArray:
         """Return which frames (N,) were found by wide matching, beyond a gap: not by those before them."""

@@ -383,8 +383,8 @@ class Revisits:
         """Refuse to join two maps of this run where the camera cannot have come from the one to the other meanwhile."""
         a, b = match.place[0], match.query[0]
         record = self._record
-        known = compose(record.poses.values(), record.atlas, {a: np.eye(4)}).in_time_order()
-        both = compose(record.poses.values(), record.atlas, {a: np.eye(4), b: match.S_place_query}).in_time_order()
+        known = compose(record.own_poses(), record.atlas, {a: np.eye(4)}).in_time_order()
+        both = compose(record.own_poses(), record.atlas, {a: np.eye(4), b: match.S_place_query}).in_time_order()
         refused = refuse_leaps(
             both.timestamps_s,
             both.T_world_cam[:, :3, 3],

@@ -242,14 +242,14 @@ class LeapWatch:
             return None
         poses = [
             pose
-            for pose in record.poses.values()
+            for pose in record.own_poses()
             if pose.submap_id == submap.id and abs(pose.timestamp_s - at.timestamp_s) <= HISTORY_S
         ]
         poses.sort(key=lambda pose: pose.index)
         place = next((n for n, pose in enumerate(poses) if pose.index >= first.index), len(poses))
         times = np.array([pose.timestamp_s for pose in poses])
         if place == 0:
-            self.end()  # nothing of the moment before: too long ago, or another run's
+            self.end()  # nothing of the moment before: too long ago, or in another run
         if place == 0 or place >= len(poses):
             return None
         usual_s = float(np.median(np.diff(times)))

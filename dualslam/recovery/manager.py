@@ -177,7 +177,7 @@ class Recoveries:
             camera=self._calibration.camera,
             camera_covariance=self._calibration.covariance,
             tries=self._tries.copy(),
-            poses=tuple(p for p in self._record.poses.values() if p.submap_id == submap.id),
+            poses=tuple(p for p in self._record.own_poses() if p.submap_id == submap.id),
             paths={m: self._path_in(m) for m in onsets},
             notes_rivals=bool(onsets),
         )
@@ -187,7 +187,7 @@ class Recoveries:
         self._executor.submit(job)
 
     def _path_in(self, submap_id: int) -> Path:
-        poses = [pose for pose in self._record.poses.values() if pose.submap_id == submap_id]
+        poses = [pose for pose in self._record.own_poses() if pose.submap_id == submap_id]
         path = Path.of(poses, self._record.atlas.submaps[submap_id])
         return replace(path, refound=self._record.are_refound(path.index.tolist()))
 
@@ -245,7 +245,7 @@ class Recoveries:
             return None
         new, known = result.submap, self._path_in(result.link.old_id)
         walked = {frame.pose.index: frame.pose for frame in result.frames}
-        own = [p for p in self._record.poses.values() if p.submap_id == new.id and p.index not in walked]
+        own = [p for p in self._record.own_poses() if p.submap_id == new.id and p.index not in walked]
         path = Path.of([*(p for p in own if p.keyframe_id in new.keyframes), *walked.values()], new)
         scale = float(sim3.scale(result.link.estimate.S_old_new))
         return refuse_leaps(path.times_s, path.centres, known.times_s, known.centres / scale, known.refound)
