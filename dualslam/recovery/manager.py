@@ -225,6 +225,8 @@ class Recoveries:
                 self._record.timer.add("walk back", result.cpu_s)
                 for lost in job.onsets:
                     self._tries.take_over(lost, result.tries)
+                if result.link is not None and not self._still_lost(job, result.link.old_id):
+                    result = replace(result, link=None)
             if walk.again and not job.onsets and not self._poses_any(result):
                 continue  # the last one for these frames; what it would add to the map is not worth a solution
             if not isinstance(result, Failure) and (refused := self._refuse_leaps(result)) is not None:
@@ -238,6 +240,11 @@ class Recoveries:
                 continue
             if unlinked or self._way_to_gaps(self._record.atlas.submaps[job.submap.id]):
                 self._retries.leave_open(job.submap.id, walk.n_live, job.camera)
+
+    def _still_lost(self, job: RecoveryJob, old_id: int) -> bool:
+        """Whether a map waits for a link as when the walk began: it may have been found and lost anew."""
+        loss = self._lost.get(old_id)
+        return loss is not None and loss.onset == job.onsets[old_id]
 
     def _refuse_leaps(self, result: RecoveryResult) -> Failure | None:
         """Return why a link is not to be believed whose walk has leapt as the lost map's camera never moved."""

@@ -247,6 +247,26 @@ def test_the_run_ends_meanwhile(world: PointWorld) -> None:
     assert_one_right_map(system, world, COVERED)
 
 
+@pytest.mark.parametrize("again", [False, True])
+def test_the_lost_map_has_been_found_again_meanwhile(world: PointWorld, again: bool) -> None:
+    """What it has posed since is its own, whether or not it has been lost anew."""
+    system, frames = late_system(world, 12), iter(world.frames())
+    while not system.events.of_kind(EventKind.REINITIALISED):
+        system.step(next(frames))
+    old, poses = system.atlas.submaps[0], {i: p for i, p in system.poses.items() if p.submap_id == 0}
+    system._recoveries.found_again(old)
+    if again:
+        system._recoveries.declare_lost(0, 45, "inliers", 45)
+    while not system.events.of_kind(EventKind.RECOVERY_ENDED):
+        system.step(next(frames))
+    (ended,) = system.events.of_kind(EventKind.RECOVERY_ENDED)
+    assert not ended.data["linked"]
+    assert not system.atlas.links
+    assert not old.condemned
+    assert {i: p for i, p in system.poses.items() if p.submap_id == 0} == poses
+    assert system._recoveries.waiting == ([0] if again else [])
+
+
 def test_a_recovery_that_fails_costs_its_link_only(world: PointWorld) -> None:
     system = system_in(world, recovery={"enabled": True})
     system._recoveries._executor = FailingExecutor(system._recoveries._executor, 5)
