@@ -287,12 +287,11 @@ class System:
             return track
         state.lost = []
         self.buffer.thaw()
-        first = state.leaps.first_beyond
-        contradicted = state.leaps.judge(view, track.wide, state.record, live.submap)
-        if contradicted is not None and first is not None:
-            self._endings.break_at(live, view, first.index, contradicted)
+        broken = state.leaps.judge(view, track.wide, state.record, live.submap)
+        if broken is not None:
+            self._endings.break_at(live, view, broken.first, broken.failure)
             self._begin_anew()
-            return contradicted
+            return broken.failure
         if (found := self._places.seen_from(live, track)) is not None:
             return self._go_over(found, live, view)
         if live.reference_id == view.index:

@@ -59,6 +59,14 @@ class Leap:
         return {"leap_off": self.off_mu, "leap_usual": self.usual_mu, "leap_asked": float(self.n_asked)}
 
 
+@dataclass(frozen=True, slots=True)
+class Break:
+    """Where a map has leapt: its first posed frame beyond, and why the camera cannot have moved so."""
+
+    first: int
+    failure: Failure
+
+
 def measure_leap(
     times_s: FloatArray, centres: FloatArray, last_before: int, refound: BoolArray | None = None
 ) -> Leap | None:
@@ -223,8 +231,8 @@ class LeapWatch:
         """Forget the gap."""
         self._first_beyond = None
 
-    def judge(self, at: FrameStamp, wide: bool, record: Record, submap: Submap) -> Failure | None:
-        """Note a posed frame, and return why the last leap was none, once that can be told.
+    def judge(self, at: FrameStamp, wide: bool, record: Record, submap: Submap) -> Break | None:
+        """Note a posed frame, and return where the map has leapt as no camera moves, once that can be told.
 
         Parameters
         ----------
@@ -262,8 +270,9 @@ class LeapWatch:
         missing = np.flatnonzero(np.diff(times[: place + 1]) > MISSING * abs(usual_s))
         if not len(missing):
             return None
+        last_before = int(missing[-1])
         refound = record.are_refound(pose.index for pose in poses)
-        leap = measure_leap(times, centres, int(missing[-1]), refound)
+        leap = measure_leap(times, centres, last_before, refound)
         if leap is None or not leap.is_refused:
             return None
-        return leap_refusal(leap)
+        return Break(poses[last_before + 1].index, leap_refusal(leap))

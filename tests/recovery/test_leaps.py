@@ -92,19 +92,26 @@ def test_a_walk_that_has_leapt_is_judged_by_the_lost_map(seed: int) -> None:
     assert refuse_leaps(t_new, p_new, t[old][:5], p[old][:5]) is None
 
 
-def test_a_map_that_has_leapt_as_its_camera_never_moves_ends_there() -> None:
+@pytest.mark.parametrize("walked_from", [None, 95])
+def test_a_map_that_has_leapt_as_its_camera_never_moves_ends_there(walked_from: int | None) -> None:
+    """Also where a walk from the frame that was found has posed those back to the leap."""
     T = hand_held(130)
     T[90:, 0, 3] += 2.5  # what a period would do
     missing = range(80, 90)
     world = PointWorld(cloud(), T)
     system = system_in(world)
     for frame in world.frames():
+        if frame.index == walked_from:
+            system._state.leaps.begin(frame)
         if frame.index not in missing:
             system.step(frame)
     system.finish()
     failed = system.events.of_kind(EventKind.FAILED)
     assert [event.data["reason"] for event in failed] == ["leap"]
+    assert failed[0].data["lost_since"] == 90
     assert failed[0].data["suspected_since"] >= 90
+    assert min(system.atlas.submaps[0].condemned) >= 90
+    assert all(k < 90 or k in system.atlas.submaps[0].condemned for k in system.atlas.submaps[0].keyframes)
     assert not any(pose.submap_id == 0 and pose.index >= 90 for pose in system.poses.values())
 
 
