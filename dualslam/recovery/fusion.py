@@ -23,8 +23,10 @@ def fuse(
     recovered_frames: list[RecoveredFrame],
     now: FrameStamp,
     seconds: float,
-) -> None:
-    """Join the two submaps by the link; frames of the old map's end take their pose from the new one.
+) -> bool:
+    """Join the two submaps by the link, unless the atlas refuses it; return whether they are joined.
+
+    Frames of the old map's end take their pose from the new one.
 
     The link was measured between a copy of the old submap and the new one at the end of the walk. Both may have
     moved since, and the link with them.
@@ -37,9 +39,9 @@ def fuse(
     covariance = Ad @ link.covariance @ Ad.T
     joined = Link(found.old_id, new_id, S_old_new, covariance, LinkKind.RECOVERY, tuple(agreeing))
     report = connections.connect([joined], now)
-    if not report or report.newly_rejected:
+    if not report or any(link.attached_as(joined) for link in report.newly_rejected):
         _refused(record, found, new_id, report, now)
-        return
+        return False
     record.event(
         EventKind.LINKED,
         now,
@@ -55,6 +57,7 @@ def fuse(
         **(link.numbers | {"scale": float(sim3.scale(S_old_new))}),
     )
     _hand_over(record, job, found, recovered_frames, now)
+    return True
 
 
 def _hand_over(

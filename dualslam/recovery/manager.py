@@ -235,7 +235,8 @@ class Recoveries:
             if not isinstance(result, Failure):
                 with self._record.timer.measure("merging"):
                     self._take_in(job, result, live, now, walk.began_s)
-            unlinked = bool(job.onsets) and (isinstance(result, Failure) or result.link is None)
+            link = None if isinstance(result, Failure) else result.link
+            unlinked = bool(job.onsets) and (link is None or link.old_id in self._lost)
             if not isinstance(result, Failure) and result.looks_alike:
                 continue
             if unlinked or self._way_to_gaps(self._record.atlas.submaps[job.submap.id]):
@@ -325,22 +326,24 @@ class Recoveries:
             self._record.events.add(event.event, event.frame, event.timestamp_s, event.submap, **data)
         recovered_frames = self._pose_frames(result, merged, submap)
         seconds = time.perf_counter() - started_s
+        linked = False
+        if result.link is not None:
+            estimate = result.link.estimate
+            S_now_then = change_of_frame(unsolved, submap, estimate.agreeing_keyframes.tolist()) @ merged.S_live_grown
+            linked = fuse(self._record, self._connections, job, result.link, S_now_then, recovered_frames, now, seconds)
+            if linked:
+                self._settle(result.link.old_id, live)
         if job.onsets:
             self._record.event(
                 EventKind.RECOVERY_ENDED,
                 now,
                 submap.id,
-                linked=result.link is not None,
+                linked=linked,
                 frames=len(recovered_frames),
                 keyframes=len(result.submap.keyframes.keys() - job.submap.keyframes.keys()),
                 recovery_s=result.seconds,
                 seconds=seconds,
             )
-        if result.link is not None:
-            estimate = result.link.estimate
-            S_now_then = change_of_frame(unsolved, submap, estimate.agreeing_keyframes.tolist()) @ merged.S_live_grown
-            fuse(self._record, self._connections, job, result.link, S_now_then, recovered_frames, now, seconds)
-            self._settle(result.link.old_id, live)
         for gone in absorb(self._record, recovered_frames, submap.id, self._lost.keys(), now):
             self._lost.pop(gone, None)
         return True

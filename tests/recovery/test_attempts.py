@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +16,14 @@ from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.errors import ConfigError, SolverError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import se3, sim3
+from dualslam.core.types import Failure, FailureReason
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry
 from dualslam.lab.audits.link_audit import LinkAudit, audit_links
 from dualslam.lab.synthetic import make_sequence
+from dualslam.map.atlas import Link, LinkKind
+from dualslam.map.atlas_report import AtlasReport
+from dualslam.map.connections import Connections
+from dualslam.map.record import FrameStamp
 from dualslam.recovery.executor import InlineExecutor, Outcome
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
@@ -74,7 +80,7 @@ def events_of(attempts: list[str], **settings: object) -> list[Event]:
 
 class TestOrder:
     def test_the_first_that_links_is_the_last_that_is_made(self) -> None:
-        attempt, ended, linked = events_of(["live", "sift"])
+        attempt, linked, ended = events_of(["live", "sift"])
         assert attempt.data["attempt"] == linked.data["attempt"] == "live"
         assert attempt.data["verdict"] == "linked"
         assert attempt.data["frames"] >= attempt.data["new_keyframes"] >= 4
@@ -83,15 +89,15 @@ class TestOrder:
         assert ended.data["linked"]
 
     def test_one_that_fails_is_followed_by_the_next(self) -> None:
-        first, second, _, linked = events_of(["sift", "live"])
+        first, second, linked, _ = events_of(["sift", "live"])
         assert [first.data["attempt"], second.data["attempt"]] == ["sift", "live"]
         assert first.data["verdict"] == "its image is no longer buffered"
         assert linked.data["attempt"] == "live"
 
     @pytest.mark.slow
     def test_the_next_starts_where_the_first_did(self) -> None:
-        alone = events_of(["live"])[-1].data
-        second = events_of(["sift", "live"])[-1].data
+        alone = events_of(["live"])[-2].data
+        second = events_of(["sift", "live"])[-2].data
         assert {k: v for k, v in alone.items() if k != "seconds"} == {k: v for k, v in second.items() if k != "seconds"}
 
     @pytest.mark.parametrize("links", [True, False])
@@ -192,6 +198,39 @@ class TestRetry:
         assert link.keyframes
         main = trajectories_of(system).main
         assert set(main.index.tolist()) == set(range(90)) - COVERED
+
+    @pytest.mark.parametrize("failure", [None, Failure(FailureReason.SOLVER, "singular")])
+    def test_so_it_is_where_the_atlas_refuses_the_link(
+        self, monkeypatch: pytest.MonkeyPatch, failure: Failure | None
+    ) -> None:
+        asked, connect = [], Connections.connect
+
+        def refuse_first(self: Connections, links: Sequence[Link], now: FrameStamp) -> AtlasReport:
+            asked.append(links)
+            if len(asked) > 1:
+                return connect(self, links, now)
+            return AtlasReport(failure=failure, newly_rejected=() if failure else (replace(links[0], rejected=True),))
+
+        monkeypatch.setattr(Connections, "connect", refuse_first)
+        system = self.run(n_failing=0)
+        first, second = system.events.of_kind(EventKind.RECOVERY_ENDED)
+        assert [event.data["linked"] for event in (first, second)] == [False, True]
+        refused = system.events.of_kind(EventKind.LINK_REFUSED)[-1]
+        assert (refused.frame, refused.data["reason"]) == (first.frame, "solver" if failure else "contradiction")
+        assert [event.frame for event in system.events.of_kind(EventKind.LINKED)] == [second.frame]
+
+    def test_that_an_older_link_falls_refuses_no_new_one(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        connect = Connections.connect
+
+        def with_another_rejected(self: Connections, links: Sequence[Link], now: FrameStamp) -> AtlasReport:
+            older = replace(links[0], kind=LinkKind.LOOP, rejected=True)
+            return replace(connect(self, links, now), newly_rejected=(older,))
+
+        monkeypatch.setattr(Connections, "connect", with_another_rejected)
+        system = self.run(n_failing=0)
+        assert system.events.of_kind(EventKind.LINKED)
+        assert system.events.of_kind(EventKind.FUSED)
+        assert not system._recoveries.waiting
 
     def test_it_ends_with_the_last_of_the_sizes_and_once_more_with_the_run(self) -> None:
         system = self.run(n_failing=9, n_frames=110)  # so many that the new map grows beyond the size
