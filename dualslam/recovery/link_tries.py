@@ -41,10 +41,13 @@ class LinkTries:
         """Know what `other` does, and no more."""
         self.refused, self._held = Counter(other.refused), set(other._held)
 
-    def take_over(self, old_id: int, other: LinkTries) -> None:
-        """Replace what is known of one lost map by what `other` knows."""
-        self.refused[old_id] = other.refused[old_id]
-        self._held = (self._held - {old_id}) | (other._held & {old_id})
+    def take_in(self, old_id: int, before: LinkTries, after: LinkTries) -> None:
+        """Add what a walk has tried at one lost map: it knew `before`, and knows `after` now."""
+        self.refused[old_id] += after.refused[old_id] - before.refused[old_id]
+        if old_id not in after._held:
+            self._held.discard(old_id)
+        elif old_id not in before._held:
+            self._held.add(old_id)
 
     def note_try(self, old_id: int, reason: FailureReason) -> None:
         """Count a try that came to nothing."""

@@ -224,13 +224,15 @@ class Recoveries:
             else:
                 self._record.timer.add("walk back", result.cpu_s)
                 for lost in job.onsets:
-                    self._tries.take_over(lost, result.tries)
+                    self._tries.take_in(lost, job.tries, result.tries)
                 if result.link is not None and not self._still_lost(job, result.link.old_id):
                     result = replace(result, link=None)
             if walk.again and not job.onsets and not self._poses_any(result):
                 continue  # the last one for these frames; what it would add to the map is not worth a solution
             if not isinstance(result, Failure) and (refused := self._refuse_leaps(result)) is not None:
                 self._failed(job, now, refused, time.perf_counter() - walk.began_s)
+                if result.link is not None:
+                    self._tries.note_try(result.link.old_id, refused.reason)
                 continue
             if not isinstance(result, Failure):
                 with self._record.timer.measure("merging"):

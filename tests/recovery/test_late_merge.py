@@ -267,6 +267,19 @@ def test_the_lost_map_has_been_found_again_meanwhile(world: PointWorld, again: b
     assert system._recoveries.waiting == ([0] if again else [])
 
 
+def test_a_link_that_leaps_must_hold_anew(world: PointWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    leap = Failure(FailureReason.LEAP, "a leap 9 times further off than velocities lead elsewhere")
+    monkeypatch.setattr("dualslam.recovery.manager.refuse_leaps", lambda *_: leap)
+    monkeypatch.setattr("dualslam.recovery.link_tries.tightened", lambda *_: 0.0)  # sure as it may be, it holds twice
+    system, frames = late_system(world, 12), iter(world.frames())
+    tries = system._recoveries._tries
+    tries.refused[0] = 1
+    while not any(event.data["reason"] == "leap" for event in system.events.of_kind(EventKind.RECOVERY_FAILED)):
+        system.step(next(frames))
+    assert not system.atlas.links
+    assert tries.judge(0, 0.024, 0.025) is not None
+
+
 def test_a_recovery_that_fails_costs_its_link_only(world: PointWorld) -> None:
     system = system_in(world, recovery={"enabled": True})
     system._recoveries._executor = FailingExecutor(system._recoveries._executor, 5)

@@ -48,12 +48,36 @@ def test_what_fails_in_between_begins_anew_and_what_is_far_surer_passes_at_once(
 
 
 def test_what_held_in_one_walk_may_hold_again_in_the_next() -> None:
-    known, walk = LinkTries({0: 2, 1: 3}), LinkTries({0: 4})
+    known = LinkTries({0: 2, 1: 3})
+    before, walk = known.copy(), known.copy()
+    for _ in range(2):
+        walk.note_try(0, FailureReason.SCALE)
     assert walk.judge(0, 0.024, MAX_SIGMA) is not None
-    known.take_over(0, walk)
+    known.take_in(0, before, walk)
     assert known.refused == {0: 4, 1: 3}
     next_walk = known.copy()
     next_walk.note_try(1, FailureReason.SCALE)
     assert next_walk.judge(0, 0.024, MAX_SIGMA) is None
     assert next_walk.judge(1, 0.024, MAX_SIGMA) is not None
     assert known.refused[1] == 3
+
+
+def test_the_tries_of_walks_that_were_under_way_at_once_add_up() -> None:
+    known = LinkTries({0: 1})
+    before, one, other = (known.copy() for _ in range(3))
+    for _ in range(4):
+        one.note_try(0, FailureReason.SCALE)
+    other.note_try(0, FailureReason.SCALE_LOST)
+    known.take_in(0, before, one)
+    known.take_in(0, before, other)
+    assert known.refused[0] == 6
+
+
+def test_what_held_before_two_walks_and_failed_in_one_of_them_holds_no_more() -> None:
+    known = LinkTries({0: 1})
+    known.judge(0, 0.024, MAX_SIGMA)
+    before, one, other = (known.copy() for _ in range(3))
+    one.note_try(0, FailureReason.LEAP)
+    known.take_in(0, before, one)
+    known.take_in(0, before, other)  # it came to no try
+    assert known.judge(0, 0.024, MAX_SIGMA) is not None
