@@ -7,8 +7,9 @@ import pytest
 
 from dualslam.config.settings import RecoveryConfig
 from dualslam.core.events import EventKind
-from dualslam.core.types import FloatArray, FrameStatus, Track
+from dualslam.core.types import FloatArray, FrameStatus, Track, View
 from dualslam.lab.bench.measure import breakages
+from dualslam.places.sightings import Relocalised, Sightings
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, path, pose_errors, system_in
@@ -180,6 +181,23 @@ def test_it_may_be_lost_again() -> None:
     assert kinds(system).count(EventKind.RELOCALISED) == 1
     losses = breakages(tuple(system.events))
     assert [(loss.submap, loss.relocalised, loss.recovered) for loss in losses] == [(0, True, True), (0, False, False)]
+
+
+def test_a_new_map_has_its_chance_after_each_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lost, seen again, and lost once more: only after so many frames anew is it asked which submap shows them."""
+    asked, sighted = [], Sightings.sighted
+
+    def watched(self: Sightings, view: View, K: FloatArray) -> Relocalised | None:
+        asked.append(view.index)
+        return sighted(self, view, K)
+
+    monkeypatch.setattr(Sightings, "sighted", watched)
+    once, T = turning_back(25), turning_back(25).T_world_cam
+    system = run(PointWorld(once.xyz, np.concatenate([T, np.repeat(T[30:31], 12, 0)])), recovery={"enabled": True})
+    first, second = (event.frame for event in system.events.of_kind(EventKind.FAILED))
+    assert second > len(T)
+    assert min(asked) == first + 16
+    assert max(asked) < len(T)
 
 
 @pytest.mark.slow

@@ -66,6 +66,7 @@ class Starting:
             return None
         state.live = relocaliser
         state.relocaliser.end()
+        self._n_without_map = 0
         state.record.event(EventKind.RELOCALISED, view, relocaliser.submap.id, n_inliers=track.n_inliers)
         self._go_on(relocaliser.submap, view)
         return track
