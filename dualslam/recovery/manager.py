@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import takewhile
 from typing import Any
@@ -48,11 +48,15 @@ class Loss:
 
 @dataclass(frozen=True, slots=True)
 class _UnderWay:
-    """A walk that has begun: when, with how many live keyframes, and whether it is not the submap's first."""
+    """A walk that has begun: when, with how many live keyframes, and whether it is not the submap's first.
+
+    `gone_on`: the submaps that were found again since, and are no more as the walk knows them.
+    """
 
     began_s: float
     n_live: int
     again: bool
+    gone_on: set[int] = field(default_factory=set)
 
 
 class Recoveries:
@@ -113,6 +117,8 @@ class Recoveries:
     def found_again(self, submap: Submap) -> None:
         """Let no walk look for a submap that is live again; from its next keyframe one poses the frames of the gap."""
         self._lost.pop(submap.id, None)
+        for walk in self._under_way.values():
+            walk.gone_on.add(submap.id)
         self._retries.start_of(submap, min(submap.keyframes))
         self._retries.leave_open(submap.id, 0, self._calibration.camera)
 
@@ -225,7 +231,7 @@ class Recoveries:
                 self._record.timer.add("walk back", result.cpu_s)
                 for lost in job.onsets:
                     self._tries.take_in(lost, job.tries, result.tries)
-                if result.link is not None and not self._still_lost(job, result.link.old_id):
+                if result.link is not None and result.link.old_id in walk.gone_on:
                     result = replace(result, link=None)
             if walk.again and not job.onsets and not self._poses_any(result):
                 continue  # the last one for these frames; what it would add to the map is not worth a solution
@@ -243,11 +249,6 @@ class Recoveries:
                 continue
             if unlinked or self._way_to_gaps(self._record.atlas.submaps[job.submap.id]):
                 self._retries.leave_open(job.submap.id, walk.n_live, job.camera)
-
-    def _still_lost(self, job: RecoveryJob, old_id: int) -> bool:
-        """Whether a map waits for a link as when the walk began: it may have been found and lost anew."""
-        loss = self._lost.get(old_id)
-        return loss is not None and loss.onset == job.onsets[old_id]
 
     def _refuse_leaps(self, result: RecoveryResult) -> Failure | None:
         """Return why a link is not to be believed whose walk has leapt as the lost map's camera never moved."""
