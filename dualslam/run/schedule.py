@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from dualslam.core.errors import InputError
 from dualslam.core.types import Frame
 from dualslam.io.read_ahead import read_ahead
 
@@ -35,24 +34,28 @@ class Schedule:
         return now - self._began - abs(frame.timestamp_s - self._first_s)
 
     def hand_out(self, frames: Iterator[Frame], dropped: list[tuple[int, float]]) -> Iterator[Frame]:
-        """Yield each frame when its time has come, and note as dropped those that came too late."""
+        """Yield each frame when its time has come, and note as dropped those that came too late.
+
+        The next frame is asked for only where the one in hand may be dropped for it: a camera gives it when it is due,
+        and no sooner. A frame that had to be waited for is the newest, and who waits is in time.
+        """
         frame = next(frames, None)
         if frame is None:
             return
         self._first_s, self._began = frame.timestamp_s, self._clock()
         self._in_time_at = self._began
         while frame is not None:
-            broken: InputError | None = None
-            try:
-                upcoming = next(frames, None)
-            except InputError as error:  # after the frame in hand
-                upcoming, broken = None, error
             now = self._clock()
-            late_s = self.late_s(frame, now)
+            late_s, upcoming, broken = self.late_s(frame, now), None, None
             if late_s <= LATE_S:
                 self._in_time_at = now
-            may_be_late_s = MAX_LATE_S if now - self._in_time_at < CATCH_UP_S else 0.0
-            if upcoming is not None and late_s > may_be_late_s and self.late_s(upcoming, now) >= 0:
+            is_late = late_s > (MAX_LATE_S if now - self._in_time_at < CATCH_UP_S else 0.0)
+            if is_late:
+                try:
+                    upcoming = self._fetched(frames)
+                except Exception as error:  # after the frame in hand
+                    broken = error
+            if upcoming is not None and self.late_s(upcoming, self._clock()) >= 0:
                 dropped.append((frame.index, frame.timestamp_s))
             else:
                 if late_s < 0:
@@ -61,7 +64,15 @@ class Schedule:
                 yield frame
             if broken is not None:
                 raise broken
-            frame = upcoming
+            frame = upcoming if is_late else self._fetched(frames)
+
+    def _fetched(self, frames: Iterator[Frame]) -> Frame | None:
+        """Return the next frame; None at the end."""
+        asked = self._clock()
+        frame, came = next(frames, None), self._clock()
+        if came - asked > LATE_S:
+            self._in_time_at = came
+        return frame
 
 
 def prepared(

@@ -119,6 +119,30 @@ def test_who_is_never_in_time_gets_the_newest_frame() -> None:
     assert len(seen) == pytest.approx(120 * (1 / 30) / 0.050, abs=3)
 
 
+@pytest.mark.parametrize(("delivery_s", "step_s"), [(0.0, 0.010), (0.012, 0.010), (0.012, 0.050)])
+def test_a_camera_gives_a_frame_no_sooner_than_it_is_due_and_none_that_is_the_newest_is_dropped(
+    delivery_s: float, step_s: float
+) -> None:
+    clock, began_s, period_s, n = Clock(), 100.0, 1 / 30, 120
+
+    class Camera(Frames):
+        """Waits for each frame; the first few come at once, later ones after some time."""
+
+        def __iter__(self) -> Iterator[Frame]:
+            for i in self.indices:
+                clock.now_s = max(clock.now_s, began_s + i * period_s + (delivery_s if i >= 5 else 0.0))
+                yield Frame(i, i * period_s, None)
+
+    system = FakeSystem(EVERYWHERE, before_step=lambda frame: clock.sleep(step_s))
+    report = run_sequence(system, Camera(list(range(n))), realtime=True, clock=clock, sleep=clock.sleep)  # type: ignore[arg-type]
+    if step_s < period_s:
+        assert report.dropped == ()
+        assert report.latencies_ms[5:] == pytest.approx([1e3 * (delivery_s + step_s)] * (n - 5))
+    else:
+        assert len(report.latencies_ms) == pytest.approx(n * period_s / step_s, abs=3)
+        assert report.dropped[-1][0] - report.dropped[0][0] > n / 2, "the rest is spread over the run"
+
+
 def test_late_frames_are_prepared_on_another_thread_and_timely_ones_are_not() -> None:
     class AtOnce(Frames):
         def __iter__(self) -> Iterator[Frame]:
