@@ -233,7 +233,7 @@ class BesideGraphs:
         yield from self.collect(submaps)
 
     def finish(self, submaps: Mapping[int, Submap]) -> Iterator[Moved]:
-        """Let all graphs take in what they lack, as long as that ends soon."""
+        """Let all graphs take in what they lack, as long as that ends soon; one that fails is left behind."""
         while True:
             for graph in self._graphs.values():
                 graph.is_behind |= graph.holds_refused
@@ -241,13 +241,16 @@ class BesideGraphs:
             if self._under_way is None:
                 return
             answers = self._desk.drain(JobKind.GRAPH)
-            if not answers:
-                return  # the desk has lost what it was given
+            if not answers:  # the desk has lost what it was given
+                self._forget()
+                return
             for ended in answers:
                 if isinstance(ended.result, Failure):
                     log.log(_level(ended.result), "a graph was left behind at the end: %s", ended.result.detail)
-                    return
-                if (moved := self._take(ended.result, submaps)) is not None:
+                    self._forget()
+                    if ended.result.reason not in (FailureReason.DISABLED, FailureReason.SOLVER):
+                        return  # the process is lost, or takes too long: no graph is sent after it
+                elif (moved := self._take(ended.result, submaps)) is not None:
                     yield moved
 
     def _note(self, submap: Submap, graph: BesideGraph) -> None:
@@ -269,13 +272,14 @@ class BesideGraphs:
 
     def _take(self, result: GraphAnswer | Failure, submaps: Mapping[int, Submap]) -> Moved | None:
         assert self._under_way is not None
-        (submap_id, graph, K), self._under_way = self._under_way, None
+        submap_id, graph, K = self._under_way
         if isinstance(result, Failure):
             log.log(_level(result), "graph of submap %d: %s; it is made anew", submap_id, result.detail)
-            graph.mirror, graph.rebuild_asked = SubmapMirror(), False
+            self._forget()
             # A solver that has failed on these arrays would fail again: it waits for the next keyframe.
             graph.is_behind = graph.is_behind or result.reason is not FailureReason.SOLVER
             return None
+        self._under_way = None
         if self._graphs.get(submap_id) is not graph or graph.rebuild_asked is not None:
             return None  # the submap has another graph by now, or is to be made anew from what it has become
         submap, estimate = submaps[submap_id], result.estimate
@@ -289,6 +293,12 @@ class BesideGraphs:
         submap.remove_outliers(rows)
         graph.holds_refused = len(rows) > 0
         return Moved(submap, before, estimate.rebuilt)
+
+    def _forget(self) -> None:
+        """Give up what is under way: the process has that graph no more, and the next job makes it anew."""
+        assert self._under_way is not None
+        (_, graph, _), self._under_way = self._under_way, None
+        graph.mirror, graph.rebuild_asked = SubmapMirror(), False
 
 
 def _level(failure: Failure) -> int:

@@ -10,15 +10,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.build import build_system, graph_handlers, window_solver
 from dualslam.calibration.lens import change_camera
 from dualslam.config.settings import Config
-from dualslam.core.types import FailureReason, FrameStatus
-from dualslam.map.graph_beside import BesideGraph, BesideGraphs, GraphServer
+from dualslam.core.types import Failure, FailureReason, FrameStatus
+from dualslam.map.graph_beside import BesideGraph, BesideGraphs, GraphAnswer, GraphJob, GraphServer
 from dualslam.map.submap import Submap
 from dualslam.map.submap_delta import SubmapMirror
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
+from dualslam.testing.graph_scene import guessed_submap, make_scene
+from dualslam.testing.graph_scene import pose_errors as scene_errors
 from dualslam.testing.late_desk import LateDesk
 from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, pose_errors, system_in
 from dualslam.workers.desk import WorkerDesk
@@ -130,9 +133,6 @@ def test_two_maps_are_linked_whose_graphs_answer_late() -> None:
 def test_a_server_that_does_not_know_a_graph_says_so() -> None:
     world = PointWorld(cloud(), hand_held(20))
     system = run(system_in(world), world)
-    from dualslam.backend.submap_graph import ISam2SubmapGraph
-    from dualslam.map.graph_beside import GraphJob
-
     mirror = SubmapMirror()
     first, second = (mirror.delta(system.atlas.submaps[0]) for _ in range(2))
     server = GraphServer(lambda: ISam2SubmapGraph(Config().graph))
@@ -141,6 +141,33 @@ def test_a_server_that_does_not_know_a_graph_says_so() -> None:
     assert lost.reason is FailureReason.DISABLED  # type: ignore[union-attr]
     assert server(GraphJob(7, first, False, False))
     assert server(GraphJob(7, second, False, False))
+
+
+@pytest.mark.parametrize("reason", [FailureReason.DISABLED, FailureReason.SOLVER, FailureReason.TIMEOUT])
+def test_a_graph_that_fails_at_the_end_keeps_no_other_from_being_solved(reason: FailureReason) -> None:
+    """The newer submap's job fails; then a merge changes the older one, which the end asks for once more."""
+    server, failing = GraphServer(lambda: ISam2SubmapGraph(Config().graph)), {1}
+    scenes = [make_scene(6, noise_px=0.5, seed=m) for m in range(2)]
+
+    def solve(job: GraphJob) -> GraphAnswer | Failure:
+        return Failure(reason, "as it was told") if job.graph_id in failing else server(job)
+
+    graphs = BesideGraphs(
+        InlineDesk({JobKind.GRAPH: solve}), lambda submap, k: Failure(FailureReason.SOLVER, "no window")
+    )
+    submaps = {m: guessed_submap(scene, pose_noise=0.02) for m, scene in enumerate(scenes)}
+    for m, submap in submaps.items():
+        submap.id = m
+        graphs.new_graph().update(submap)
+    moved = [each.submap.id for each in graphs.finish(submaps)]
+    assert moved[:1] == ([] if reason is FailureReason.TIMEOUT else [0])  # a process that hangs is not asked again
+    graphs.new_graph().rebuild(submaps[0])
+    failing.clear()
+    moved = [each.submap.id for each in graphs.finish(submaps)]
+    assert 0 in moved
+    assert graphs.lag(submaps[0]) == 0
+    translation, _ = scene_errors(submaps[0].keyframe_poses(range(6)), scenes[0].T_true)
+    assert translation.max() < 0.01
 
 
 def test_a_process_that_is_killed_costs_the_map_nothing(world: PointWorld) -> None:
