@@ -62,7 +62,7 @@ class RunReport:
     error : InputError, OutputError or None
         What ended the source early, or kept its results from being written.
     bug : Exception or None
-        What the system raised, which ended the run: its maker's mistake, no property of the input.
+        What else was raised and ended the run: by the system, the source or `on_frame`, no property of the input.
     """
 
     n_frames: int
@@ -100,8 +100,8 @@ def run_sequence(
 
     The first SIGINT, SIGTERM or SIGHUP ends the run after the frame in hand, so that what there is can be saved; the
     second one leaves this frame, or the end of the run, too; the third one acts as ever. A source that breaks after its
-    first frame ends the run in the same way, and so do a system that raises and a disk that is full; what was raised is
-    in the report, for the caller to raise again once the rest is saved.
+    first frame, by whatever it raises, ends the run in the same way, and so do a system or an `on_frame` that raises
+    and a disk that is full; what was raised is in the report, for the caller to raise again once the rest is saved.
 
     Parameters
     ----------
@@ -133,6 +133,8 @@ def run_sequence(
     ------
     InputError
         If the source gives no frame at all.
+    Exception
+        Whatever the source raises before its first frame.
     """
     dropped: list[tuple[int, float]] = []
     began, cpu_began = clock(), _cpu_s()
@@ -203,17 +205,17 @@ class _Steps:
 
         Raises
         ------
-        InputError
+        Exception
             The source breaks before its first frame.
         """
         try:
             frame, spent_s = next(frames)
         except StopIteration:
             return False
-        except InputError as problem:
+        except Exception as problem:
             if not self.latencies_ms:
                 raise
-            self.error = problem
+            self._end(problem)
             return False
         result = self._step(frame, spent_s)
         if result is None:
@@ -221,9 +223,17 @@ class _Steps:
         try:
             if self._on_frame is not None:
                 self._on_frame(replace(result, latency_ms=self.latencies_ms[-1]))
-        except OutputError as problem:
+        except Exception as problem:
+            self._end(problem)
+            return False
+        return True
+
+    def _end(self, problem: Exception) -> None:
+        """Note what has ended the frames."""
+        if isinstance(problem, InputError | OutputError):
             self.error = problem
-        return self.error is None
+        else:
+            self.bug = problem
 
     def _step(self, frame: Frame, spent_s: float) -> FrameResult | None:
         """Return the result of one step, None if it raised; `spent_s`: how long the frame was prepared."""

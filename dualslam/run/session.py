@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -159,7 +160,8 @@ def run_to_folder(
     ------
     ConfigError, InputError, OutputError
     Exception
-        Whatever the system raised, once what it had found until then is written; a note on it says where.
+        Whatever the system, `on_frame` or, after its first frame, the sequence raised, once what was found until then
+        is written; a note on it says where.
     KeyboardInterrupt
         If results were being written; a note on it says which are there.
     """
@@ -175,7 +177,7 @@ def run_to_folder(
         system = build_system(config, sequence.camera, saved=saved, localise=localise)
     else:
         system = (build or build_system)(config, sequence.camera)
-    with RunFolder(out, overwrite=overwrite) as folder:
+    with closing(system.desk), RunFolder(out, overwrite=overwrite) as folder:
         folder.write_config(dump_config(config))
 
         refusals = StartRefusals()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
+from dualslam.core.errors import ConfigError
 from dualslam.core.types import Failure, Frame
 from dualslam.workers.desk import WorkerDesk
 from dualslam.workers.jobs import JobKind
@@ -16,7 +17,7 @@ class FeaturesBeside:
     """Has the features of one frame after the other found in another process.
 
     Called on one thread that is not the tracking's. A process that has died or hangs costs nothing but time: the frame
-    comes back without features, and the tracking process finds them.
+    comes back without features, and the tracking process finds them. So do all that follow where no process starts.
 
     Parameters
     ----------
@@ -26,12 +27,18 @@ class FeaturesBeside:
 
     def __init__(self, desk: WorkerDesk) -> None:
         self._desk = desk
+        self._gave_up = False
 
     def __call__(self, frame: Frame) -> Frame:
         """Return the frame with its features."""
-        if frame.image is None:
+        if frame.image is None or self._gave_up:
             return frame
-        found = self._desk.ask(JobKind.FEATURES, frame.image).result
+        try:
+            found = self._desk.ask(JobKind.FEATURES, frame.image).result
+        except ConfigError as error:
+            log.warning("no more features are found beside the tracking: %s", error)
+            self._gave_up = True
+            return frame
         if isinstance(found, Failure):
             log.warning("frame %d: %s; its features are found beside nothing", frame.index, found.detail)
             return frame

@@ -282,6 +282,30 @@ def test_a_system_that_breaks_is_finished_and_what_it_raised_first_is_reported()
     assert isinstance(run_sequence(Broken(EVERYWHERE), Frames([0])).bug, ValueError)  # type: ignore[arg-type]
 
 
+def test_whatever_a_source_or_a_callback_raises_ends_the_run_as_a_system_that_breaks_does() -> None:
+    class Unplugged(Frames):
+        def __iter__(self) -> Iterator[Frame]:
+            yield from super().__iter__()
+            raise OSError("unplugged")
+
+    clock = Clock()
+    for realtime in (False, True):
+        system = FakeSystem(EVERYWHERE)
+        report = run_sequence(system, Unplugged([0, 1]), realtime=realtime, clock=clock, sleep=clock.sleep)  # type: ignore[arg-type]
+        assert isinstance(report.bug, OSError)
+        assert (list(system.rows), system.n_finished) == ([0, 1], 1)
+    with pytest.raises(OSError, match="unplugged"):
+        run_sequence(FakeSystem(EVERYWHERE), Unplugged([]))  # type: ignore[arg-type]
+
+    def stop(result: FrameResult) -> None:
+        raise ZeroDivisionError
+
+    system = FakeSystem(EVERYWHERE)
+    report = run_sequence(system, Frames([0, 1]), on_frame=stop)  # type: ignore[arg-type]
+    assert isinstance(report.bug, ZeroDivisionError)
+    assert (list(system.rows), system.n_finished) == ([0], 1)
+
+
 @pytest.mark.parametrize("stops", [False, True])
 def test_who_interrupts_a_run_does_not_wait_for_a_last_walk(stops: bool) -> None:
     def interrupt(frame: Frame) -> None:

@@ -9,8 +9,10 @@ from dualslam.config.settings import FrontendConfig
 from dualslam.core.types import Failure, Frame
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.testing.desk_work import lane, working
+from dualslam.workers.desk import MAX_STILLBORN, Lane
 from dualslam.workers.features_beside import FeaturesBeside
 from dualslam.workers.jobs import JobKind
+from tests.workers.test_stillborn import end_at_once
 
 
 def frame(index: int, brightness: int) -> Frame:
@@ -33,6 +35,14 @@ def test_a_process_that_dies_costs_no_frame() -> None:
     assert dead.image is not None
     assert after.features is not None
     assert desk.statistics[JobKind.FEATURES].n_failed == 1
+
+
+def test_processes_that_end_as_they_start_cost_no_frame_and_are_asked_no_more() -> None:
+    with working(Lane("features", (JobKind.FEATURES,), end_at_once, 1, 60.0)) as desk:
+        find, n = FeaturesBeside(desk), MAX_STILLBORN + 3
+        frames = [find(frame(i, 9)) for i in range(n)]
+    assert [f.index for f in frames if f.features is None and f.image is not None] == list(range(n))
+    assert desk.statistics[JobKind.FEATURES].n_done == MAX_STILLBORN + 1
 
 
 def test_a_frame_without_an_image_stays_as_it_is() -> None:

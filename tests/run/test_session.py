@@ -1,0 +1,90 @@
+"""What becomes of a run's results and its processes where something beside the system breaks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dualslam.config.settings import Config
+from dualslam.core.camera.base import Camera
+from dualslam.core.errors import OutputError
+from dualslam.core.types import Frame
+from dualslam.io.run_folder import read_frames
+from dualslam.map.frame_records import FrameResult
+from dualslam.run.session import run_to_folder
+from dualslam.testing.point_world import CAMERA
+from dualslam.workers.jobs import InlineDesk
+from tests.cli.fakes import FakeSystem
+
+
+class Unplugged:
+    """Frames of a camera that is unplugged, which is no `InputError` in somebody's own sequence."""
+
+    name, rate_hz, camera = "mine", 30.0, CAMERA
+
+    def __init__(self, after: int) -> None:
+        self.after = after
+
+    def __iter__(self) -> Iterator[Frame]:
+        for i in range(self.after):
+            yield Frame(i, i / 30, np.zeros((4, 4), np.uint8))
+        raise OSError("unplugged")
+
+
+class ClosedDesk(InlineDesk):
+    is_closed = False
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+@pytest.fixture
+def system() -> FakeSystem:
+    system = FakeSystem({i: np.eye(4) for i in range(100)})
+    system.desk = ClosedDesk({})
+    return system
+
+
+@pytest.fixture
+def build(system: FakeSystem) -> Callable[[Config, Camera], FakeSystem]:
+    return lambda config, camera: system
+
+
+def raise_at_the_third(result: FrameResult) -> None:
+    if result.index == 2:
+        raise OSError("mine")
+
+
+@pytest.mark.parametrize(
+    ("after", "on_frame", "n_frames"), [(5, None, 5), (5, raise_at_the_third, 3)], ids=["sequence", "on_frame"]
+)
+def test_what_a_sequence_or_a_callback_raises_costs_no_results(
+    system: FakeSystem,
+    build: Callable[[Config, Camera], FakeSystem],
+    tmp_path: Path,
+    after: int,
+    on_frame: Callable[[FrameResult], None] | None,
+    n_frames: int,
+) -> None:
+    with pytest.raises(OSError, match="unplugged" if on_frame is None else "mine") as raised:
+        run_to_folder(Config(), Unplugged(after), tmp_path / "run", build=build, on_frame=on_frame)  # type: ignore[arg-type]
+    assert raised.value.__notes__ == [f"What was found until then is in {tmp_path / 'run'}."]
+    assert system.n_finished == 1
+    assert len(read_frames(tmp_path / "run" / "frames.csv")) == n_frames
+    assert (tmp_path / "run" / "report.html").exists()
+
+
+def test_no_process_outlives_a_run_that_ends_before_its_first_frame_or_has_no_folder(
+    system: FakeSystem, build: Callable[[Config, Camera], FakeSystem], tmp_path: Path
+) -> None:
+    with pytest.raises(OSError, match="unplugged"):
+        run_to_folder(Config(), Unplugged(0), tmp_path / "run", build=build)  # type: ignore[arg-type]
+    assert system.desk.is_closed  # type: ignore[attr-defined]
+    system.desk = ClosedDesk({})
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError):
+        run_to_folder(Config(), Unplugged(5), tmp_path / "file" / "run", build=build)  # type: ignore[arg-type]
+    assert system.desk.is_closed
