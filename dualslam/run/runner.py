@@ -6,7 +6,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -275,7 +275,9 @@ def _closing(frames: Iterator[Any]) -> Iterator[None]:
     finally:
         close = getattr(frames, "close", None)
         if close is not None:
-            close()
+            # A generator that another thread is in, which was not waited for, says so; it ends with that thread.
+            with suppress(ValueError):
+                close()
 
 
 def _cpu_s() -> float:

@@ -317,6 +317,30 @@ def test_who_interrupts_a_run_does_not_wait_for_a_last_walk(stops: bool) -> None
     assert (report.interrupted, system.was_interrupted, system.n_finished) == (stops, stops, 1)
 
 
+def test_who_is_impatient_with_a_source_that_stalls_keeps_what_there_is() -> None:
+    stalled, go_on = threading.Event(), threading.Event()
+
+    class Stalls(Frames):
+        def __iter__(self) -> Iterator[Frame]:
+            yield from super().__iter__()
+            stalled.set()
+            go_on.wait(30)
+
+    def interrupt_twice(frame: Frame) -> None:
+        if frame.index == 1:
+            assert stalled.wait(30)  # another thread is in the source from here on
+            signal.raise_signal(signal.SIGINT)
+            threading.Timer(0.2, signal.pthread_kill, [threading.main_thread().ident, signal.SIGINT]).start()
+
+    system = FakeSystem(EVERYWHERE, before_step=interrupt_twice)
+    try:
+        report = run_sequence(system, Stalls([0, 1]), realtime=True, prepare=lambda frame: frame)  # type: ignore[arg-type]
+    finally:
+        go_on.set()
+    assert report.interrupted
+    assert (list(system.rows), system.n_finished) == ([0, 1], 1)
+
+
 def test_a_source_without_frames_is_bad_input() -> None:
     with pytest.raises(InputError, match="gave no frame"):
         run_sequence(FakeSystem(EVERYWHERE), Frames([]))  # type: ignore[arg-type]
