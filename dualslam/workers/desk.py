@@ -223,9 +223,12 @@ class WorkerDesk:
         return sum(job.kind is kind for job in [*queue.waiting, *(task.job for task in queue.busy)])
 
     def drain(self, kind: JobKind) -> list[Ended]:
-        """Wait, for a limited time, for what is under way; what has not ended by then ends as a `Failure`."""
+        """Wait, for a limited time, for what is under way; what has not ended by then ends as a `Failure`.
+
+        Other workers take the places of those that were busy with it, for what else waits or is still to come.
+        """
         queue, ended, began_s = self._by_kind[kind], self.poll(kind), time.monotonic()
-        while self.n_open(kind) and time.monotonic() - began_s < self._finish_wait_s:
+        while self.n_open(kind) and (queue.busy or queue.idle) and time.monotonic() - began_s < self._finish_wait_s:
             time.sleep(PAUSE_S)
             ended += self.poll(kind)
         late = Failure(FailureReason.TIMEOUT, f"the run ended, and {self._finish_wait_s:g} s later its {kind} had not")
@@ -234,7 +237,8 @@ class WorkerDesk:
         queue.waiting = [job for job in queue.waiting if job.kind is not kind]
         for task in [task for task in queue.busy if task.job.kind is kind]:
             queue.busy.remove(task)
-            task.worker.stop()
+            queue.idle.append(queue.replaced(task.worker))
+        self._hand_out(queue)
         return ended
 
     def close(self) -> None:

@@ -167,6 +167,18 @@ def test_one_job_too_many_ends_at_once() -> None:
         assert desk.statistics[WALK].max_waiting == 2
 
 
+def test_what_is_not_waited_for_any_longer_leaves_its_place_to_others() -> None:
+    with working(lane(WALK, CALIBRATION), finish_wait_s=0.5) as desk:
+        assert desk.wait_until_ready()
+        desk.submit(WALK, ("sleep", 600.0))
+        desk.submit(CALIBRATION, np.arange(3.0))
+        assert reasons(desk.drain(WALK)) == [FailureReason.TIMEOUT]
+        (ended,) = collect(desk, CALIBRATION)
+        np.testing.assert_array_equal(ended.result, [0, 2, 4])
+        desk.submit(CALIBRATION, np.ones(1))
+        assert collect(desk, CALIBRATION)[0].result == 2
+
+
 def kill(desk: WorkerDesk) -> None:
     os.kill(desk.pids[0] or 0, signal.SIGKILL)
 

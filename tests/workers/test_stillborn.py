@@ -25,10 +25,14 @@ def submit_until(desk: WorkerDesk, until_s: float, ended: list[Ended]) -> None:
 
 
 def test_workers_that_end_as_they_start_are_told_of_and_cost_their_jobs() -> None:
-    desk = WorkerDesk([Lane("walks", (JobKind.WALK,), end_at_once, 1, 60.0)], 0.0)
+    desk = WorkerDesk([Lane("walks", (JobKind.WALK,), end_at_once, 1, 60.0)], 60.0)
     ended: list[Ended] = []
     with pytest.raises(ConfigError, match=r'walks process ends as it starts.*if __name__ == "__main__"'):
         submit_until(desk, time.monotonic() + 120, ended)
     assert len(ended) <= MAX_STILLBORN
     assert all(isinstance(each.result, Failure) for each in ended)
+    desk.submit(JobKind.WALK, "there is no worker left")
+    began_s = time.monotonic()
+    assert not desk.drain(JobKind.WALK)[0].result
+    assert time.monotonic() - began_s < 30  # of 60: nobody is waited for
     desk.close()
