@@ -16,16 +16,20 @@ from dualslam.core.types import Frame
 
 FRAMES_IN_EVENTS = (
     "agreeing_keyframes",
+    "before",
     "change_point",
     "first_view",
     "keyframe",
+    "left",
     "lost_since",
     "onset",
     "other_frame",
+    "other_keyframe",
+    "parted_until",
     "suspected_since",
     "torn",
 )
-"""What belongs to events and is frames: one or a list."""
+"""What belongs to events, or to a part of one, and is frames: one or a list. One below 0 is none, but a mark."""
 
 
 class FrameNumbers:
@@ -97,6 +101,11 @@ class FrameNumbers:
         def told(value: Any) -> Any:
             if isinstance(value, list | tuple):
                 return [told(each) for each in value]
-            return value if value is None else type(value)(self.index_of(int(value)))
+            return value if value is None or value < 0 else type(value)(self.index_of(int(value)))
 
-        return {name: told(value) if name in FRAMES_IN_EVENTS else value for name, value in data.items()}
+        def within(value: Any) -> Any:
+            if isinstance(value, list | tuple):
+                return [within(each) for each in value]
+            return self.in_source(value) if isinstance(value, Mapping) else value
+
+        return {name: told(value) if name in FRAMES_IN_EVENTS else within(value) for name, value in data.items()}
