@@ -339,8 +339,9 @@ class System:
         return failure
 
     def _begin_anew(self) -> None:
-        """Look for the next map's start from the frames since the loss on."""
-        self._starting.begin_anew(self._state.lost)
+        """Look for the next map's start from the frames since the loss on, rectified by the camera of now."""
+        lost = {view.index for view in self._state.lost}
+        self._starting.begin_anew([view for view in self.buffer if view.index in lost])
         self._state.lost = []
 
     # --- records

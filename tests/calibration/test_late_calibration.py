@@ -13,18 +13,19 @@ from dualslam.calibration.lens import CalibrationAnswer, change_camera
 from dualslam.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
-from dualslam.core.types import FloatArray, Frame
+from dualslam.core.types import FloatArray, Frame, View
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
 from dualslam.testing.late_desk import LateDesk
 from dualslam.testing.point_world import pose_errors
+from dualslam.workers.jobs import JobKind
 from tests.backend.test_self_calibration import TRUE, make_submap, wrong_camera
 from tests.calibration.test_lens import WRONG, CalibrationWorld
 
 N_FRAMES = 60
 
 
-def run(polls: int, n_frames: int = N_FRAMES, blind: range = range(0)) -> System:
+def late_system(polls: int) -> tuple[System, CalibrationWorld]:
     settings = {
         "calibration": {"first_keyframes": 12, "max_observations": 6000},
         "keyframes": {"max_parallax_deg": 1.0},
@@ -32,8 +33,13 @@ def run(polls: int, n_frames: int = N_FRAMES, blind: range = range(0)) -> System
         "recovery": {"enabled": False},
     }
     system, world = build_system(Config.model_validate(settings), wrong_camera(WRONG)), CalibrationWorld()
-    calibration = system._state.parts.calibration
     system._calibrations._desk = LateDesk(system._state.parts.desk, polls)
+    return system, world
+
+
+def run(polls: int, n_frames: int = N_FRAMES, blind: range = range(0)) -> System:
+    system, world = late_system(polls)
+    calibration = system._state.parts.calibration
 
     def view_of(frame: Frame) -> object:
         view = world.view(frame, calibration)
@@ -84,6 +90,31 @@ def test_an_answer_for_a_map_that_was_lost_meanwhile_changes_nothing(in_time: Sy
     assert "live no more" in kept.data["reason"]
     np.testing.assert_array_equal(system._state.parts.calibration.camera.K, wrong_camera(WRONG).K)
     assert all((submap.K == wrong_camera(WRONG).K).all() for submap in system.atlas.submaps.values())
+
+
+def test_a_next_start_has_the_pixels_of_a_camera_that_was_found_while_the_map_was_about_to_be_lost() -> None:
+    """From the question on, all that is seen looks like nothing in the map; the answer comes after five such frames."""
+    system, world = late_system(polls=5)
+    calibration, unlike, begun = system._state.parts.calibration, np.random.default_rng(5), list[View]()
+
+    def view_of(frame: Frame) -> View:
+        view = world.view(frame, calibration)
+        if not system._calibrations._desk.n_open(JobKind.CALIBRATION) and not system._state.lost:
+            return view
+        descriptors = unlike.integers(0, 256, view.features.descriptors.shape, np.uint8)
+        return replace(view, features=replace(view.features, descriptors=descriptors))
+
+    system._state.parts = replace(system._state.parts, view_of=view_of)
+    system._starting.begin_anew = begun.extend  # type: ignore[assignment, method-assign]
+    for i in range(N_FRAMES):
+        system.step(Frame(i, i / 30, None))
+        if begun:
+            break
+    (found,) = system.events.of_kind(EventKind.CALIBRATED)
+    assert [view.index for view in begun] == list(range(begun[0].index, begun[-1].index + 1))
+    assert begun[0].index < found.frame < begun[-1].index
+    for view in begun:
+        np.testing.assert_allclose(view.features.uv_rect_px, calibration.camera.rectify(view.features.uv_px)[0])
 
 
 def test_what_has_come_since_follows() -> None:
