@@ -222,17 +222,6 @@ class Connections:
             moved=moved,
         )
 
-    def open_graph(self, submap_id: int) -> SubmapGraph:
-        """Return the graph of any submap, made from its arrays, which stay as they are: to ask it for covariances.
-
-        Raises
-        ------
-        SolverError
-        """
-        graph = self._new_graph()
-        graph.rebuild(self._atlas.submaps[submap_id].copy())
-        return graph
-
     # --- solving
 
     def _skeleton(self, touched: set[int], new: Sequence[Link], covariances: Covariances | None = None) -> Skeleton:

@@ -432,16 +432,6 @@ def test_a_seam_within_one_submap() -> None:
     assert gap() < 0.3 * before
 
 
-def test_an_archived_submaps_graph_can_be_opened() -> None:
-    world = lap_in_submaps(seed=1)
-    before = state(world)
-    graph = world.connections.open_graph(0)
-    near, far = (np.trace(graph.pose_covariance(k)) for k in (5, 45))
-    assert 0 < near < far
-    for was, now in zip(before, state(world), strict=True):
-        np.testing.assert_array_equal(was, now)
-
-
 # --- on the disk
 
 
