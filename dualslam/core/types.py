@@ -249,14 +249,12 @@ class Rival:
     Attributes
     ----------
     index : int
-    timestamp_s : float
         Of the frame.
     T_cam_rival, T_cam_walked : (4, 4) float64
         ``T_cam_submap`` by the other answer, and by the one that was gone by.
     """
 
     index: int
-    timestamp_s: float
     T_cam_rival: FloatArray
     T_cam_walked: FloatArray
 

@@ -321,7 +321,7 @@ class PoseFinder:
             return refuse_look_alike(*seen, *settings, any_is_doubt=self._is_short_cut)
         others = find_other_poses(*seen, *settings)
         if others and others[0].makes_doubtful:
-            self._rivals += [Rival(view.index, view.timestamp_s, other.T_cam_w, wide.T_cam_submap) for other in others]
+            self._rivals += [Rival(view.index, other.T_cam_w, wide.T_cam_submap) for other in others]
         return None
 
     def _points(self, index: int, frames: list[int]) -> tuple[IntArray, FloatArray]:

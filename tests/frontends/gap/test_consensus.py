@@ -95,7 +95,7 @@ def test_rivals_along_the_view_let_right_matches_pass(ways: list[float]) -> None
     xyz = np.random.default_rng(0).uniform([-2, -1, 1], [2, 1, 8], (N, 3))
     T_first, T_second = np.eye(4), along_the_view(0.1)
     first, second = (beyond(xyz, T, np.zeros(6), SIGMAS, n) for n, T in enumerate((T_first, T_second)))
-    rivals = [Rival(0, 0.0, along_the_view(way) @ T_first, T_first) for way in ways]
+    rivals = [Rival(0, along_the_view(way) @ T_first, T_first) for way in ways]
     same = np.column_stack([np.arange(N)] * 2)
     assert are_no_copies(first, second, same, rivals, K).mean() > 0.85
 
@@ -110,6 +110,6 @@ def test_copies_lie_where_the_rival_shows_them(way: float, seen_from: float, pas
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.where(near, 1.0, 4.0)])
     first, second = (beyond(ring, along_the_view(ahead), np.zeros(6), SIGMAS, 0) for ahead in (0.0, seen_from))
     second = replace(second, pose=first.pose)
-    rival = Rival(0, 0.0, along_the_view(way), np.eye(4))
+    rival = Rival(0, along_the_view(way), np.eye(4))
     matches = np.column_stack([np.flatnonzero(~near)] * 2)
     assert (are_no_copies(first, second, matches, [rival], K) == passes).all()
