@@ -166,35 +166,14 @@ class Tracker:
 
     def track_at(self, view: View, pose: GivenPose) -> Track:
         """Take a pose as it is, look for the landmarks of the keyframes nearest in time under it, and go on there."""
-        track = self.look_at(view, pose)
-        self.take(track)
+        local = self._near_map(view.index)
+        track = self._look_for(local, view, pose)
+        self._accept(track, local)
         return track
 
     def look_at(self, view: View, pose: GivenPose) -> Track:
         """Take a pose as `track_at` does; the tracker goes on from there only after `take`."""
-        landmark_ids = np.full(len(view.features), NO_LANDMARK, np.int64)
-        local, grid = self._near_map(view.index), FeatureGrid.build(view.features.uv_rect_px)
-        landmark_ids, _ = self._search(local, view, grid, pose.T_cam_submap, landmark_ids)
-        feature = np.flatnonzero(landmark_ids >= 0)
-        uv, _ = project_points(
-            self._submap.K, pose.T_cam_submap, self._submap.landmarks["xyz_mu"][landmark_ids[feature]]
-        )
-        error2 = ((uv - view.features.uv_rect_px[feature]) ** 2).sum(axis=1)
-        fits = error2 < GIVEN_POSE_CHI2 * view.features.sigma_px[feature] ** 2
-        landmark_ids[feature[~fits]] = NO_LANDMARK
-        T = pose.T_cam_submap
-        return Track(
-            view,
-            T,
-            T,
-            landmark_ids,
-            np.zeros(0, np.int64),
-            pose.n_matches,
-            pose.n_inliers,
-            pose.chi2,
-            pose.wide,
-            pose.covariance,
-        )
+        return self._look_for(self._near_map(view.index), view, pose)
 
     def track_near(self, view: View, T_cam_submap: FloatArray) -> Track | Failure:
         """Pose a frame by the landmarks of the keyframes nearest in time, from a pose that is near its own.
@@ -231,6 +210,32 @@ class Tracker:
         self._accept(track, self._near_map(track.view.index))
 
     # --- steps
+
+    def _look_for(self, local: LocalMap, view: View, pose: GivenPose) -> Track:
+        """Return the track of a given pose: which of the local map's landmarks are where it shows them."""
+        landmark_ids = np.full(len(view.features), NO_LANDMARK, np.int64)
+        grid = FeatureGrid.build(view.features.uv_rect_px)
+        landmark_ids, _ = self._search(local, view, grid, pose.T_cam_submap, landmark_ids)
+        feature = np.flatnonzero(landmark_ids >= 0)
+        uv, _ = project_points(
+            self._submap.K, pose.T_cam_submap, self._submap.landmarks["xyz_mu"][landmark_ids[feature]]
+        )
+        error2 = ((uv - view.features.uv_rect_px[feature]) ** 2).sum(axis=1)
+        fits = error2 < GIVEN_POSE_CHI2 * view.features.sigma_px[feature] ** 2
+        landmark_ids[feature[~fits]] = NO_LANDMARK
+        T = pose.T_cam_submap
+        return Track(
+            view,
+            T,
+            T,
+            landmark_ids,
+            np.zeros(0, np.int64),
+            pose.n_matches,
+            pose.n_inliers,
+            pose.chi2,
+            pose.wide,
+            pose.covariance,
+        )
 
     def _pose_from_last(
         self, view: View, grid: FeatureGrid, T_predicted: FloatArray, radius_px: float
