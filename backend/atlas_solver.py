@@ -37,6 +37,8 @@ ODOMETRY = ("within", "rollover")
 """Kinds of edges that say how a camera went, and not where it has been before."""
 REJECTION_CHI2 = CHI2_99[7]
 """The price of a rejection: an edge has 7 degrees of freedom."""
+MAX_ASKED = 20
+"""Newest sure connections that are asked how much the odometry has drifted: their median needs no more."""
 LEAST_REDUNDANCY = 1e-6
 """Share of an edge's variance below which the rest of the graph has no say in it."""
 
@@ -66,10 +68,11 @@ class GtsamAtlasSolver:
         graph = _Graph(problem)
         all_edges = np.ones(len(problem.edges), bool)
         doubtful = np.array([e.doubtful for e in problem.edges], bool)
-        drift = graph.take_in_drift(doubtful)
-        believed, chi2 = all_edges, np.full(len(problem.edges), np.nan)
+        drift, chi2 = graph.take_in_drift(doubtful)
+        believed = all_edges
         if self._robust and doubtful.any():
-            believed, chi2 = graph.choose(doubtful)
+            believed, of_doubtful = graph.choose(doubtful)
+            chi2 = np.where(doubtful, of_doubtful, chi2)
         solution = graph.optimise(believed)
         found = np.array([solution.S_world_node[i] for i in range(len(problem.S_world_node))])
         return AtlasSolution(found, believed, chi2, solution.cost_before, solution.cost_after, drift)
@@ -146,8 +149,10 @@ class _Graph:
 
     # --- how far odometry is to be believed
 
-    def take_in_drift(self, doubtful: BoolArray) -> float:
-        """Inflate what submaps say of themselves by what sure connections show of it; return the ratio of sigmas.
+    def take_in_drift(self, doubtful: BoolArray) -> tuple[float, FloatArray]:
+        """Inflate what submaps say of themselves by what sure connections show of it.
+
+        Returns the ratio of sigmas, and the chi-square of those that were asked against all others (NaN: the rest).
 
         Where a connection that is beyond doubt closes a cycle, the way round has drifted by its innovation. The chain
         that contradicts it was surer of itself than it had a right to be, there and elsewhere: with a lens that is not
@@ -157,15 +162,16 @@ class _Graph:
         odometry = np.array([e.kind in ODOMETRY for e in self.problem.edges], bool)
         sure = ~odometry & ~doubtful
         believed = ~doubtful | self._base(doubtful)
-        tested = np.flatnonzero(sure & ~self._bridges(believed, sure)) if sure.any() else np.zeros(0, np.int64)
+        chi2 = np.full(len(doubtful), np.nan)
+        tested = np.flatnonzero(sure & ~self._bridges(believed, sure))[-MAX_ASKED:]
         if not len(tested):
-            return 1.0
+            return 1.0, chi2
         C, r = self._innovations(self.optimise(believed), believed, tested)
-        chi2 = np.sort(np.einsum("ei,ei->e", r, np.linalg.solve(C, r[..., None])[..., 0]))
-        ratio2 = max(1.0, float(chi2[(len(chi2) - 1) // 2]) / MEDIAN_CHI2[7])
+        chi2[tested] = np.einsum("ei,ei->e", r, np.linalg.solve(C, r[..., None])[..., 0])
+        ratio2 = max(1.0, float(np.sort(chi2[tested])[(len(tested) - 1) // 2]) / MEDIAN_CHI2[7])
         for i in np.flatnonzero(odometry).tolist():
             self.edges[i] = replace(self.edges[i], covariance=ratio2 * self.edges[i].covariance)
-        return float(np.sqrt(ratio2))
+        return float(np.sqrt(ratio2)), chi2
 
     # --- what to believe
 

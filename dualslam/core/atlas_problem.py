@@ -71,8 +71,8 @@ class AtlasSolution:
     believed : (E,) bool
         False for doubtful edges that were rejected.
     chi2 : (E,) float64
-        Of each doubtful edge against all others that are believed (7 degrees of freedom); NaN where nothing else ties
-        its ends, or it is not doubtful.
+        Of connections against all others that are believed (7 degrees of freedom); NaN where nothing else ties the
+        ends, for what is no connection, and for all but the newest of many that are not doubtful.
     cost_before, cost_after : float
         Half the sum of squared whitened residuals of the believed edges.
     drift : float

@@ -15,9 +15,9 @@ from dualslam.map.bending import Move
 from dualslam.map.skeleton import Skeleton
 from dualslam.map.warp import Warp
 
-STILL = 1e-6
-"""Bends up to this (radians, share of scale, submap units: a thousandth of a pixel) are none: the arrays stay as they
-are, to the bit."""
+STILL = 1e-4
+"""Bends up to this (radians, share of scale, submap units: less than a tenth of a pixel) are none: the arrays stay as
+they are, to the bit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +35,9 @@ class AtlasReport:
         Half the sum of squared whitened residuals.
     drift : float
         Errors within submaps over what they claim, as sure connections show (the largest of the linked sets).
+    newest_chi2 : float, optional
+        Of the connection that came last, against all others (7 degrees of freedom); None where nothing else ties its
+        ends.
     bent : dict of int to float
         By submap: farthest move of a keyframe within its submap's frame, in the submap's unit; those that moved.
     placed : dict of int to float
@@ -51,6 +54,7 @@ class AtlasReport:
     cost_before: float = 0.0
     cost_after: float = 0.0
     drift: float = 1.0
+    newest_chi2: float | None = None
     bent: dict[int, float] = field(default_factory=dict)
     placed: dict[int, float] = field(default_factory=dict)
     seconds: float = 0.0
@@ -59,24 +63,6 @@ class AtlasReport:
     def __bool__(self) -> bool:
         """Whether there is a solution."""
         return self.failure is None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LinkVerdict:
-    """What the atlas would say of a connection.
-
-    Attributes
-    ----------
-    accepted : bool
-    redundant : bool
-        Whether anything else ties its ends; else nothing can contradict it.
-    chi2 : float
-        Against all others (7 degrees of freedom); NaN where it is not redundant.
-    """
-
-    accepted: bool
-    redundant: bool
-    chi2: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,6 +84,12 @@ class Solved:
         """Of the connections, which are the last edges."""
         n = len(self.skeleton.links)
         return [bool(kept) for kept in self.solution.believed[len(self.edges) - n :]]
+
+    @property
+    def newest_chi2(self) -> float | None:
+        """Of the last connection against all others; None where nothing else ties its ends."""
+        chi2 = self.solution.chi2[-1] if self.skeleton.links else float("nan")
+        return float(chi2) if np.isfinite(chi2) else None
 
 
 def changes_nothing(skeleton: Skeleton, solution: AtlasSolution, new: Sequence[Link]) -> bool:
@@ -148,6 +140,7 @@ def together(reports: Sequence[AtlasReport]) -> AtlasReport:
         cost_before=sum(r.cost_before for r in reports),
         cost_after=sum(r.cost_after for r in reports),
         drift=max((r.drift for r in reports), default=1.0),
+        newest_chi2=next((r.newest_chi2 for r in reports if r.newest_chi2 is not None), None),
         bent={m: bend for r in reports for m, bend in r.bent.items()},
         placed={m: gone for r in reports for m, gone in r.placed.items()},
     )

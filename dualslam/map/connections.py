@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
-import numpy as np
-
 from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.errors import SolverError
@@ -24,7 +22,6 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.atlas import Atlas, Link, LinkKind, joined
 from dualslam.map.atlas_report import (
     AtlasReport,
-    LinkVerdict,
     Solved,
     changes_nothing,
     count_kinds,
@@ -142,18 +139,6 @@ class Connections:
         for component in self._atlas.components():
             if component[0] in self._atlas.placement:
                 self._solve(set(component), (), now)
-
-    def judge(self, link: Link) -> LinkVerdict | Failure:
-        """Return what `connect` would say of a connection if it were doubtful; nothing is changed."""
-        try:
-            skeleton = self._skeleton({link.a, link.b}, (replace(link, doubtful=True),))
-            if skeleton.is_tree:
-                return LinkVerdict(True, False, float("nan"))
-            solution = self._solver.solve(skeleton.problem)
-        except SolverError as error:
-            return Failure(FailureReason.SOLVER, str(error))
-        chi2 = float(solution.chi2[-1])
-        return LinkVerdict(bool(solution.believed[-1]), bool(np.isfinite(chi2)), chi2)
 
     def relative(self, a: tuple[int, int], b: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
         """Return ``S_ka_kb`` between two keyframes, each a submap and an id there, and its (7, 7) covariance.
@@ -315,6 +300,7 @@ class Connections:
             cost_before=solved.solution.cost_before,
             cost_after=solved.solution.cost_after,
             drift=solved.solution.drift,
+            newest_chi2=solved.newest_chi2,
             bent={move.submap_id: move.bend_mu for move in moves if move.bent},
             placed=placed_by(skeleton, solved.solution) if solved.moves is not None else {},
         )

@@ -18,7 +18,7 @@ from dualslam.core.atlas_problem import AtlasEdge, AtlasProblem
 from dualslam.core.chi_square import CHI2_999
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, sim3, so3
-from dualslam.core.types import Failure, FailureReason, FloatArray
+from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 from dualslam.map.atlas import Atlas, Link, joined
 from dualslam.map.submap import Submap
 from dualslam.map.warp import Warp
@@ -293,40 +293,43 @@ def _within(
         C = np.broadcast_to(np.eye(7), (len(pairs), 7, 7))
     else:
         C = _inflated(submap, pairs, covariances(submap, pairs, atlas.held.get(submap.id, frozenset())))
-    S = submap.keyframe_poses(knots)
-    if submap.id in atlas.warps:
-        S = sim3.inverse(atlas.warps[submap.id].at(knots)) @ S
+    i, j = np.array(places, np.int64).reshape(-1, 2).T
     T = submap.keyframe_poses(knots)
-    edges = []
-    for (i, j), covariance in zip(places, C, strict=True):
-        S_i_j = sim3.inverse(S[i]) @ S[j]
-        if j > i + 1 and _is_torn(S_i_j, sim3.inverse(T[i]) @ T[j], covariance):
-            continue
-        edges.append(AtlasEdge(first + i, first + j, S_i_j, covariance, WITHIN))
-    return edges
+    S = sim3.inverse(atlas.warps[submap.id].at(knots)) @ T if submap.id in atlas.warps else T
+    own, now = (sim3.inverse(at[i]) @ at[j] for at in (S, T))
+    kept = (j == i + 1) | ~_are_torn(own, now, C)
+    return [
+        AtlasEdge(first + int(i[n]), first + int(j[n]), own[n], C[n], WITHIN) for n in np.flatnonzero(kept).tolist()
+    ]
 
 
-def _is_torn(own: FloatArray, now: FloatArray, covariance: FloatArray) -> bool:
-    """Whether two places were bent together that nothing tied at the time.
+def _are_torn(own: FloatArray, now: FloatArray, covariances: FloatArray) -> BoolArray:
+    """Whether two places of each pair were bent together that nothing tied at the time.
 
     What they share now came of that: landmarks of a loop that became one. The loop's own factor says it, and a tie
     that had the bend taken out of it would deny it.
     """
     off = sim3.log(sim3.inverse(own) @ now)
-    return bool(off @ np.linalg.solve(covariance, off) > CHI2_999[7])
+    chi2: FloatArray = np.einsum("ei,ei->e", off, np.linalg.solve(covariances, off[..., None])[..., 0])
+    return chi2 > CHI2_999[7]
 
 
 def _inflated(submap: Submap, pairs: list[tuple[int, int]], covariances: FloatArray) -> FloatArray:
     """Return the covariances of edges with what the factors do not know."""
-    C = DRIFT**2 * covariances
-    for i, (first, second) in enumerate(pairs):
-        T = se3.inverse(submap.T_submap_kf[first]) @ submap.T_submap_kf[second]
-        ids = submap.landmark_of[second]
-        depth = float(np.median(submap.landmarks["distance_mu"][ids[ids >= 0]])) if (ids >= 0).any() else 1.0
-        motion = float(np.linalg.norm(so3.log(T[:3, :3])) + np.linalg.norm(T[:3, 3]) / depth)
-        units = np.array([1, 1, 1, depth, depth, depth, 1])
-        C[i] += np.diag((MODEL_SHARE * motion * units) ** 2)
-    return C
+    if not pairs:
+        return covariances
+    first, second = np.array(pairs).T.tolist()
+    T = se3.inverse(submap.keyframe_poses(first)) @ submap.keyframe_poses(second)
+    depth_of = {}
+    for k in set(second):
+        ids = submap.landmark_of[k]
+        depth_of[k] = float(np.median(submap.landmarks["distance_mu"][ids[ids >= 0]])) if (ids >= 0).any() else 1.0
+    depth = np.array([depth_of[k] for k in second])
+    motion = np.linalg.norm(so3.log(T[:, :3, :3]), axis=1) + np.linalg.norm(T[:, :3, 3], axis=1) / depth
+    units = np.ones((len(pairs), 7))
+    units[:, 3:6] = depth[:, None]
+    model: FloatArray = (MODEL_SHARE * motion[:, None] * units) ** 2
+    return DRIFT**2 * covariances + model[:, :, None] * np.eye(7)
 
 
 def _across_knots(submap: Submap, knots: list[int]) -> list[tuple[int, int]]:

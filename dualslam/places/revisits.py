@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.config.settings import Config
+from dualslam.core.chi_square import MEDIAN_CHI2
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.interfaces import Seeker, SubmapGraph, VisualOdometry
@@ -42,8 +43,10 @@ RECENT = 20
 """Keyframes before and after that are no revisit: what is seen there is tracked, or was a moment ago."""
 MAX_MISSES = 3
 """Keyframes that may not second before the provisional pair is dropped."""
-REST = 10
-"""Keyframes after a link between two submaps before another is looked for between them."""
+REST, MAX_REST = 10, 40
+"""Keyframes after a loop before the map that it lies in is searched again. Each loop that finds no more drift than the
+map claims doubles them: beside one that was closed a moment ago it tells next to nothing, and costs more the larger the
+map is. At most so many that each submap still comes by a few."""
 MAX_DRIFT, MAX_DRIFT_DEG, MAX_DRIFT_LOG_SCALE = 0.5, 60.0, float(np.log(3.0))
 """What a map that was never lost between two places can have drifted at most: a share of the way, a turn, a scale. Half
 the way is what lies between two copies of a thing that stand next to each other; the largest drift that was seen on a
@@ -135,7 +138,8 @@ class Revisits:
         self._provisional: _Provisional | None = None
         self._believed: _Believed | None = None
         self._n_asked = 0
-        self._linked_at: dict[tuple[int, int], int] = {}  # counted in `_n_asked`, by pairs of submaps
+        self._rest = REST
+        self._rests_until = 0  # counted in `_n_asked`; other maps may be found all the same
 
     # --- keyframes of the live map
 
@@ -157,6 +161,8 @@ class Revisits:
         self.sightings.end()
         self._n_asked += 1
         if (self._provisional is None and self._n_asked % ASK_EVERY) or self._desk.n_open(JobKind.LOOP):
+            return
+        if self._believed is not None:  # another could take its place before it is linked
             return
         submap, keyframe_id = live.submap, live.reference_id
         self.take_in(submap, at_most)
@@ -228,14 +234,11 @@ class Revisits:
         arrived = sorted({k for m in self._record.atlas.submaps.values() for k in m.keyframes})
         at = arrived.index(keyframe_id)
         recent = {*arrived[max(at - RECENT, 0) : at + RECENT + 1], *seen_now}
-        resting = {
-            other for (one, other), n in self._linked_at.items() if one == submap.id and self._n_asked - n < REST
-        }
-
         joined = set(self._component(submap.id))
+        rests = self._n_asked < self._rests_until
 
         def may_be(m: int, k: int) -> bool:
-            if m in resting or k in recent or (m not in joined and not self._merges):
+            if k in recent or (rests if m in joined else not self._merges):
                 return False
             return m == submap.id or k not in submap.keyframes
 
@@ -265,11 +268,10 @@ class Revisits:
         self._believe(match, waiting.seconds)
 
     def _believe(self, match: PlaceMatch, seconds: int) -> None:
-        """Ask for what the atlas needs to be solved with a place; between its submaps no other is looked for now."""
+        """Ask for what the atlas needs to be solved with a place."""
         then = poses_of(match, self._record.atlas.submaps)
         assert then is not None, "it was followed to the submaps as they are"
         self._believed = _Believed(match, seconds, then)
-        self._linked_at[match.query[0], match.place[0]] = self._n_asked
         self._connections.foresee(self._link_of(match))
 
     def _link_believed(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
@@ -291,8 +293,8 @@ class Revisits:
         atlas = self._record.atlas
         (a, keyframe_a), (b, keyframe_b) = match.place, match.query
         link = self._link_of(match)
-        verdict = self._connections.judge(link)
         report = self._connections.connect([link], now)
+        self._rest_after(report)
         if not report:
             assert report.failure is not None
             record_refusal(self._record, now, b, a, keyframe_a, report.failure)
@@ -300,7 +302,6 @@ class Revisits:
         if a == b:
             self._merge_duplicates(atlas.submaps[a], match)
             live.adopt(live.graph, live.submap)  # its last frame holds ids that are no more
-        chi2 = None if isinstance(verdict, Failure) or not verdict.redundant else verdict.chi2
         self._record.event(
             EventKind.LOOP_CLOSED if link.kind is LinkKind.LOOP else EventKind.MERGED,
             now,
@@ -311,11 +312,18 @@ class Revisits:
             seconds=seconds,
             matches=match.n_matches,
             inliers=match.n_inliers,
-            chi2_drift=chi2,
+            chi2_drift=report.newest_chi2,
             moved=max([*report.placed.values(), *report.bent.values()], default=0.0),
             **{name: value for name, value in match.numbers.items() if name not in ("n_matches", "n_inliers")},
         )
         return report
+
+    def _rest_after(self, report: AtlasReport) -> None:
+        """Set when the map is searched again: the later, the less it had drifted."""
+        chi2 = report.newest_chi2
+        as_claimed = chi2 is not None and chi2 < MEDIAN_CHI2[7]
+        self._rest = min(2 * self._rest, MAX_REST) if as_claimed else REST
+        self._rests_until = self._n_asked + self._rest
 
     def _merge_duplicates(self, submap: Submap, match: PlaceMatch) -> None:
         """Merge duplicate landmarks of the loop, so that the observations hold it too."""

@@ -194,3 +194,31 @@ def test_a_loop_that_still_waits_when_the_run_ends_is_closed_then() -> None:
     assert not system.atlas.links
     system.finish()
     assert [link.kind for link in system.atlas.believed] == [LinkKind.LOOP]
+
+
+def test_while_a_believed_place_waits_no_other_takes_its_place() -> None:
+    world = lap()
+    system = system_in(world)
+    system._connections._covariances._desk = LateDesk(system._state.parts.desk, 100_000)
+    waits = None
+    for frame in world.frames():
+        system.step(frame)
+        believed = system._revisits._believed
+        if waits is not None:
+            assert believed is waits
+        waits = believed
+    assert waits is not None
+
+
+@pytest.mark.slow
+def test_a_lap_that_is_driven_again_and_again_closes_ever_fewer_loops() -> None:
+    n = 4 * N_LAP
+    system = run(PointWorld(wall(), ring(n)), **ROLLING)
+    n_keyframes = sum(len(submap.keyframes) for submap in system.atlas.submaps.values())
+    loops = [e.frame for e in system.events.of_kind(EventKind.LOOP_CLOSED)]
+    assert loops
+    assert loops[-1] > n - N_LAP, "the last lap is held as well"
+    assert len(loops) < n_keyframes / 30, "what was told a moment ago is not told again"
+    main = trajectories_of(system).main
+    size = np.linalg.norm(np.ptp(ring(n)[:, :3, 3], axis=0))
+    assert pose_errors(main.T_world_cam, ring(n)[main.index])[0].max() < 0.05 * size
