@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from dualslam.io.map_files import (
     submap_to_arrays,
 )
 from dualslam.io.run_folder import MAP
-from dualslam.map.atlas import ROLLOVER_SIGMAS, Atlas, Link, LinkKind
+from dualslam.map.atlas import Atlas, Link, LinkKind, rollover_covariance
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
 from dualslam.map.warp import Warp
@@ -134,6 +134,7 @@ def load_atlas(folder: str | Path) -> StoredMap:
         for name in sorted(groups.keys() - set(_OTHER)):
             atlas.add(submap_from_arrays(groups[name]))
         _join(atlas, atlas.submaps, groups[LINKS], groups.get(SOLUTION), metadata)
+        atlas.links = [_not_exact(link, atlas) for link in atlas.links]
         frames = groups[FRAMES]
         check_rows(frames, FRAME_ROWS)
         columns = (frames[name].tolist() for name in ("index", "timestamp_s", "submap", "keyframe"))
@@ -230,10 +231,15 @@ def _links(arrays: Arrays, metadata: Mapping[str, Any]) -> list[Link]:
     rows = zip(ab, S_a_b, covariance, kinds, metadata["link_keyframes"], ends, doubtful, rejected, strict=True)
     links = []
     for (a, b), S, C, kind, shared, (k_a, k_b), may_doubt, refused in rows:
-        if kind is LinkKind.ROLLOVER and not C.any():  # an earlier version took these links as exact
-            C = np.diag(ROLLOVER_SIGMAS**2)
         links.append(Link(a, b, S, C, kind, tuple(map(int, shared)), k_a, k_b, may_doubt, refused))
     return links
+
+
+def _not_exact(link: Link, atlas: Atlas) -> Link:
+    """Return a rollover's link that an earlier version took as exact as stiff as it is now."""
+    if link.kind is not LinkKind.ROLLOVER or link.covariance.any():
+        return link
+    return replace(link, covariance=rollover_covariance(atlas.submaps[link.b], link.attached(atlas)[1]))
 
 
 def _check_frames(frames: Arrays, atlas: Atlas) -> None:

@@ -66,7 +66,7 @@ class Link:
         """Join a full submap and the next, which starts in its frame: stiff, but not rigid."""
         shared = tuple(sorted(full.keyframes.keys() & following.keyframes.keys()))
         middle = shared[len(shared) // 2]
-        covariance = np.diag(ROLLOVER_SIGMAS**2)
+        covariance = rollover_covariance(following, middle)
         return cls(
             full.id, following.id, np.eye(4), covariance, LinkKind.ROLLOVER, shared, middle, middle, doubtful=False
         )
@@ -182,6 +182,15 @@ class Atlas:
                     found[link.a] = found[link.b] @ sim3.inverse(link.S_a_b)
                     grown = True
         return found
+
+
+def rollover_covariance(following: Submap, keyframe_id: int) -> FloatArray:
+    """Return the (7, 7) covariance of a rollover's link: `ROLLOVER_SIGMAS` at a keyframe that both submaps share.
+
+    Taken for sigmas at the origin of the coordinates, which lies far behind, they would let the seam turn about that.
+    """
+    Ad = sim3.adjoint(following.T_submap_kf[keyframe_id])
+    return np.asarray(Ad @ np.diag(ROLLOVER_SIGMAS**2) @ Ad.T)
 
 
 def joined(submap_ids: Iterable[int], links: Iterable[Link]) -> list[list[int]]:

@@ -20,7 +20,7 @@ from dualslam.core.types import Failure, FailureReason
 from dualslam.io.map_files import load_arrays, save_arrays
 from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.map.anchors import Anchor
-from dualslam.map.atlas import Link, LinkKind
+from dualslam.map.atlas import ROLLOVER_SIGMAS, Link, LinkKind
 from dualslam.map.bending import bend_submap
 from dualslam.map.submap import Submap
 from dualslam.map.warp import Warp
@@ -216,6 +216,33 @@ def test_what_is_beyond_doubt_shows_how_far_odometry_is_to_be_believed() -> None
     late = world.loop((0, 9), (2, 128))
     far, wrong = (world.loop((0, 40), (2, 100), off=off) for off in (None, 3 * WRONG))
     assert [would_accept(world, link) for link in (late, far, wrong)] == [True, True, False]
+
+
+@pytest.mark.parametrize("way", [0.0, 300.0])
+def test_a_seam_holds_at_its_keyframes_however_far_from_the_origin_they_are(way: float) -> None:
+    far = np.eye(4)
+    far[2, 3] = way
+    world = DriftingMap(130)
+    for k in range(130):
+        world.add(k, far)
+        if len(world.submap.keyframes) >= 50 and k < 120:
+            world.roll_over()
+    for link in world.atlas.links:
+        assert within_sigmas(world, link, ROLLOVER_SIGMAS)
+    world.connections.connect([replace(world.loop((0, 2), (2, 124)), doubtful=False)], world.now)
+    S = world.atlas.S_world_submap([0, 1, 2])
+    for link in world.atlas.links[:2]:
+        k = link.keyframe_a
+        ends = [S[m] @ world.atlas.submaps[m].T_submap_kf[k] for m in (link.a, link.b)]
+        apart = sim3.log(sim3.inverse(ends[0]) @ ends[1])
+        assert np.linalg.norm(apart[3:6]) < 5 * ROLLOVER_SIGMAS[3]
+
+
+def within_sigmas(world: DriftingMap, link: Link, sigmas: np.ndarray) -> bool:
+    """Whether a link's covariance is these sigmas at its second keyframe."""
+    k = link.attached(world.atlas)[1]
+    Ad = sim3.adjoint(sim3.inverse(world.atlas.submaps[link.b].T_submap_kf[k]))
+    return bool(np.allclose(Ad @ link.covariance @ Ad.T, np.diag(sigmas**2), rtol=1e-3, atol=1e-9))
 
 
 # --- the transaction
@@ -483,6 +510,8 @@ def test_a_map_of_the_version_before_is_read_and_one_of_the_next_refused(
     assert not stored.submaps[0].landmarks["condemned"].any()
     assert [link.doubtful for link in stored.links] == [False, False, True, True]
     assert all((np.linalg.eigvalsh(link.covariance) > 0).all() for link in stored.links)
+    closed_world.atlas.submaps = stored.submaps
+    assert all(within_sigmas(closed_world, link, ROLLOVER_SIGMAS) for link in stored.links[:2])
     (folder / "map.json").write_text(json.dumps(document | {"format": 9}))
     with pytest.raises(InputError, match=r"format 9, newer than"):
         load_atlas(folder)
