@@ -131,8 +131,10 @@ class Connections:
             self._record.poses[pose.index] = pose
         propagate_anchors(before, after)
         propagate_links(self._atlas, before, after)
-        if held := self._atlas.held.get(after.id):  # a calibration forgets relative poses
+        if held := self._atlas.held.get(after.id):
             self._atlas.held[after.id] = frozenset(k for k in held if k in after.relative_poses)
+            if not self._atlas.held[after.id]:  # another camera forgets them all: its graph has taken the bend out
+                self._atlas.warps.pop(after.id, None)
 
     def settle(self, now: FrameStamp) -> None:
         """Solve all sets with cycles once more, as their submaps are by now."""
