@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dualslam.backend.atlas_solver import GtsamAtlasSolver
 from dualslam.config.settings import RecoveryConfig
+from dualslam.core.atlas_problem import AtlasProblem, AtlasSolution
+from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, FrameStatus, Track, View
 from dualslam.lab.bench.measure import breakages
@@ -261,13 +264,16 @@ def test_the_main_map_is_the_one_with_most_frames(world: PointWorld) -> None:
     assert list(found.unlinked) == [0]
 
 
-def test_rolling_over_loses_nothing(world: PointWorld) -> None:
+@pytest.mark.parametrize("fails", [False, True])
+def test_rolling_over_loses_nothing(world: PointWorld, monkeypatch: pytest.MonkeyPatch, fails: bool) -> None:
     settings = {
         "graph": {"max_keyframes": 20, "rollover_keyframes": 6},
         "keyframes": {"max_parallax_deg": 1.0},
         "mapping": {"redundant_ratio": 1.0},
         "loops": {"enabled": False},
     }
+    if fails:
+        monkeypatch.setattr(GtsamAtlasSolver, "solve", no_solution)
     system = run(world, **settings)
     assert len(system.atlas.submaps) > 1
     assert not system.events.of_kind(EventKind.FAILED)
@@ -277,6 +283,10 @@ def test_rolling_over_loses_nothing(world: PointWorld) -> None:
     assert not found.unlinked
     assert found.main.index.tolist() == list(range(70))
     assert_right(found.main.index.tolist(), found.main.T_world_cam, world)
+
+
+def no_solution(solver: GtsamAtlasSolver, problem: AtlasProblem) -> AtlasSolution:
+    raise SolverError("no")
 
 
 def test_frames_may_come_in_reverse(world: PointWorld) -> None:
