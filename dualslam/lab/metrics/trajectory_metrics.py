@@ -12,7 +12,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from dualslam.core.errors import InputError
-from dualslam.core.types import FloatArray
+from dualslam.core.types import FloatArray, IntArray
 from dualslam.io.run_folder import TRAJECTORY, unlinked_submaps
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate, nearest_in_time, read_tum
 from dualslam.lab.audits.silent_breaks import find_silent_breaks
@@ -186,19 +186,20 @@ def relative_error(
     """Return the fields of the relative pose error of paired trajectories over `interval_s`, where it can be had."""
     times = est.timestamps_s
     later = nearest_in_time(times, times + interval_s)
-    i = np.flatnonzero(np.abs(times[later] - times - interval_s) <= frame_dt_s)
+    near = np.abs(times[later] - times - interval_s) <= frame_dt_s
+    i = np.flatnonzero(near & (later != np.arange(len(times))))  # a frame has no error against itself
     j = later[i]
     if len(i) == 0:
         return {}
-    T_est, T_ref = _relative(est.T_world_cam, i, j), _relative(ref.T_world_cam, i, j)
-    trace = np.einsum("nij,nij->n", T_ref[:, :3, :3], T_est[:, :3, :3])
+    (R_est, t_est), (R_ref, t_ref) = (_relative(each.T_world_cam, i, j) for each in (est, ref))
+    trace = np.einsum("nij,nij->n", R_ref, R_est)
     angle_deg = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
     fields: dict[str, Any] = {"rpe_1s_rot_deg_median": float(np.median(angle_deg))}
-    moved = np.linalg.norm(T_ref[:, :3, 3], axis=1)
+    moved = np.linalg.norm(t_ref, axis=1)
     typical = np.median(moved)
     enough = (moved > _MIN_MOTION * typical) & (typical > 0)
     if enough.any():
-        off = np.linalg.norm(scale * T_est[:, :3, 3] - T_ref[:, :3, 3], axis=1)
+        off = np.linalg.norm(scale * t_est - t_ref, axis=1)
         fields["rpe_1s_trans_pct_median"] = float(np.median(100 * off[enough] / moved[enough]))
     return fields
 
@@ -216,8 +217,8 @@ def evaluate_run(
     Raises
     ------
     InputError
-        If the run has no trajectory or the sequence no ground truth, or no pose is at the time of any frame; if either
-        is something else, such as a list of poses.
+        If the run has no trajectory or the sequence no ground truth, or no pose is at the time of any frame; if a
+        trajectory that is given by itself is empty; if either is something else, such as a list of poses.
     """
     if not isinstance(run, str | Path):
         raise InputError(f"the run is a {type(run).__name__}; give the path of its folder or of its trajectory.")
@@ -226,10 +227,11 @@ def evaluate_run(
     truth = sequence.ground_truth
     if truth is None:
         raise InputError(f"{sequence.name} has no ground truth; a run is evaluated against one.")
-    path = Path(run) / TRAJECTORY if Path(run).is_dir() else Path(run)
+    is_run = Path(run).is_dir()
+    path = Path(run) / TRAJECTORY if is_run else Path(run)
 
     def scored(file: Path) -> dict[str, Any]:
-        estimate = read_tum(file, allow_empty=True)
+        estimate = read_tum(file, allow_empty=is_run)  # a run that could not pose a frame has a coverage all the same
         return score_trajectory(
             estimate, truth, sequence.frame_timestamps, alignment=alignment, max_dt_s=max_dt_s
         ).as_dict()
@@ -248,5 +250,8 @@ def _positions(trajectory: Trajectory) -> FloatArray:
     return trajectory.T_world_cam[:, :3, 3]
 
 
-def _relative(T_world_cam: FloatArray, i: Any, j: Any) -> FloatArray:
-    return np.asarray(np.linalg.inv(T_world_cam[i]) @ T_world_cam[j], np.float64)
+def _relative(T_world_cam: FloatArray, i: IntArray, j: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return ``R_i_j`` (N, 3, 3) and ``t_i_j`` (N, 3): exactly zero where nothing moves, which `inv(T) @ T` is not."""
+    R_i = T_world_cam[i, :3, :3].transpose(0, 2, 1)
+    t_i_j = np.einsum("nij,nj->ni", R_i, T_world_cam[j, :3, 3] - T_world_cam[i, :3, 3])
+    return R_i @ T_world_cam[j, :3, :3], t_i_j

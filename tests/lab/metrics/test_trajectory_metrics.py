@@ -108,6 +108,24 @@ def test_rotation_error_over_one_second() -> None:
     assert score.rpe_1s_rot_deg_median == pytest.approx(2.0, rel=1e-6)
 
 
+def test_where_the_true_camera_stands_still_rounding_is_no_motion() -> None:
+    truth, rng = curve(), np.random.default_rng(0)
+    still = Trajectory(truth.timestamps_s, poses(np.full((120, 3), [10.1, -20.3, 1e3]), truth.T_world_cam[:, :3, :3]))
+    moving = Trajectory(truth.timestamps_s, poses(rng.normal(size=(120, 3)), truth.T_world_cam[:, :3, :3]))
+    score = score_trajectory(moving, still, truth.timestamps_s)
+    assert score.rpe_1s_rot_deg_median == pytest.approx(0, abs=1e-5)
+    assert score.rpe_1s_trans_pct_median is None
+
+
+@pytest.mark.parametrize("rate_hz", [0.5, 0.9, 1.0])
+def test_no_frame_is_held_against_itself(rate_hz: float) -> None:
+    truth = curve(40, rate_hz)
+    off = so3.exp(np.radians(3.0) * np.arange(40)[:, None] * [0.0, 1.0, 0.0])
+    estimate = Trajectory(truth.timestamps_s, poses(truth.T_world_cam[:, :3, 3], truth.T_world_cam[:, :3, :3] @ off))
+    found = score_trajectory(estimate, truth, truth.timestamps_s).rpe_1s_rot_deg_median
+    assert found is None if rate_hz == 0.5 else found is not None and found > 1.0
+
+
 # --- completeness
 
 
@@ -227,6 +245,9 @@ def test_evaluate_run_needs_its_inputs(tmp_path: Path) -> None:
         evaluate_run(tmp_path, KnownSequence("curve", truth.timestamps_s, None))
     with pytest.raises(InputError, match=r"trajectory\.txt does not exist"):
         evaluate_run(tmp_path, KnownSequence("curve", truth.timestamps_s, truth))
+    (tmp_path / "bare.txt").write_text("")
+    with pytest.raises(InputError, match=r"bare\.txt is empty"):
+        evaluate_run(tmp_path / "bare.txt", KnownSequence("curve", truth.timestamps_s, truth))
 
 
 @pytest.mark.skipif("DUALSLAM_SCORE" not in os.environ, reason="DUALSLAM_SCORE does not name an independent scorer")
