@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import ToldFocal
-from dualslam.io.images import ImageReader, ImageStore
+from dualslam.io.images import ImageReader, ImageStore, UnreadableImageError
 
 MAX_SIDE_PX = 2048
 """Longer side of images that are read as they are. A frame has a thousand features whatever its size: an image of
@@ -71,6 +71,10 @@ class _ReducedReader:
     def read(self, index: int) -> NDArray[np.uint8]:
         image, n = self._reader.read(index), self._factor
         height, width = image.shape[0] // n, image.shape[1] // n
+        if not height or not width:
+            raise UnreadableImageError(
+                f"image {index} is {image.shape[1]} x {image.shape[0]} pixels: none is left where {n} x {n} become one."
+            )
         whole = image[: height * n, : width * n]
         return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 

@@ -61,6 +61,13 @@ def test_a_sequence_of_large_images_is_read_smaller_and_says_so(folder: Path, ca
     np.testing.assert_allclose(image[0], np.arange(21) * 2 + 0.5, atol=0.51)
 
 
+def test_an_image_that_reducing_leaves_nothing_of_is_unreadable(folder: Path) -> None:
+    cv2.imwrite(str(folder / "images" / "1.png"), np.zeros((31, 1), np.uint8))
+    frames = list(open_sequence(folder, max_side_px=21))
+    assert [frame.image is None for frame in frames] == [False, True, False]
+    assert "image 1 is 1 x 31 pixels" in frames[1].error
+
+
 def test_small_images_and_those_that_are_wanted_whole_stay_as_they_are(
     folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
