@@ -16,6 +16,7 @@ from dualslam.io import dataset_folder, euroc, folder, kitti, tum_mono, tum_rgbd
 from dualslam.io.camera_files import make_camera, read_camera_file
 from dualslam.io.reduced import MAX_SIDE_PX, ReducedImages, reduced_camera, reduction
 from dualslam.io.sequence import Given, RecordedSequence, Recording, Selection, check_image_size, image_size
+from dualslam.io.trajectory_files import MAX_BEGIN_GAP_S
 from dualslam.io.video import WebcamSequence
 
 log = logging.getLogger(__name__)
@@ -95,6 +96,7 @@ def open_sequence(
         device = int(name) if name.isdigit() else name
         return video.open_webcam(device, given_camera, fov_degrees, selection, given, grey)
     recording = _open_recording(Path(str(source)), given)
+    _check_clock(recording)
     camera = given_camera or recording.camera
     if camera is None:
         camera = _camera_from_fov(recording, fov_degrees)
@@ -127,6 +129,18 @@ def _open_recording(source: Path, given: Given) -> Recording:
         f"{source} is no sequence that can be read: it holds neither images nor a layout of ours, KITTI odometry, "
         "TUM RGB-D, TUM-Mono or EuRoC; check the path."
     )
+
+
+def _check_clock(recording: Recording) -> None:
+    """Refuse ground truth that no frame could be held against at the end of a run."""
+    if recording.ground_truth is None:
+        return
+    begin_s, truth_s = recording.timestamps_s[0], recording.ground_truth.timestamps_s[0]
+    if abs(truth_s - begin_s) > MAX_BEGIN_GAP_S:
+        raise InputError(
+            f"{recording.name}: its frames begin at {begin_s:.1f} s and its ground truth at {truth_s:.1f} s, "
+            "which are different clocks; give both in the same seconds, or take the ground truth away."
+        )
 
 
 def _reduced(recording: Recording, camera: Camera, max_side_px: int | None) -> tuple[Recording, Camera]:

@@ -15,6 +15,8 @@ from dualslam.io.atomic import write_text
 
 MAX_DT_S = 0.02
 """Largest gap in time between a frame and its true pose."""
+MAX_BEGIN_GAP_S = 1e6
+"""Frames and true poses that begin farther apart, eleven days, are on different clocks."""
 
 
 # --- TUM

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,9 @@ from dualslam.io.camera_files import read_tum_mono_camera
 from dualslam.io.images import ImageFiles, ImageStore, ZippedImages, list_images
 from dualslam.io.sequence import Given, Recording
 from dualslam.io.times import check_count, checked_times, resolve_times
-from dualslam.io.trajectory_files import read_text, read_tum
+from dualslam.io.trajectory_files import Trajectory, read_text, read_tum
+
+log = logging.getLogger(__name__)
 
 
 def recognises(folder: Path) -> bool:
@@ -44,11 +47,21 @@ def open_recording(folder: Path, given: Given) -> Recording:
         images=images,
         timestamps_s=timestamps_s,
         camera=None if given.camera else read_tum_mono_camera(camera_path),
-        # Motion capture saw only the start and the end of each sequence; the frames between are NaN.
-        ground_truth=read_tum(truth_path, skip_nan=True) if truth_path.exists() else None,
+        ground_truth=_ground_truth(truth_path),
         exposure_s=exposure_s,
         calibration=str(camera_path),
     )
+
+
+def _ground_truth(path: Path) -> Trajectory | None:
+    """Read what motion capture saw: the start and the end of each sequence; the frames between are NaN."""
+    if not path.exists():
+        return None
+    truth = read_tum(path, skip_nan=True)
+    if not len(truth):  # a piece from the middle
+        log.warning("%s knows the pose of no frame: there is no ground truth", path)
+        return None
+    return truth
 
 
 def read_times_with_exposure(path: Path) -> tuple[FloatArray, FloatArray | None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -27,6 +28,8 @@ from dualslam.run.claims import Claim, claims_of
 from dualslam.run.runner import RunReport
 from dualslam.system import System
 from dualslam.workers.desk import WorkerDesk
+
+log = logging.getLogger(__name__)
 
 PACKAGES = ("dualslam", "numpy", "scipy", "opencv-python-headless", "gtsam", "poselib", "pydantic")
 PACKAGES_OF_EXTRAS = ("torch", "kornia")
@@ -222,12 +225,15 @@ def _latency(latencies_ms: tuple[float, ...]) -> dict[str, float]:
 
 
 def _errors(system: System, main: Trajectory, truth: Trajectory, report: RunReport) -> dict[str, Any]:
+    """Return the errors; ``no_errors`` with the reason where the truth, which others made, cannot be used."""
     times = [row.timestamp_s for row in system.rows.values()] + [t for _, t in report.dropped]
     if len(times) < 2 or not len(main):
         return {}
-    ordered = main.in_time_order()
-    estimate = ordered
-    score = asdict(score_trajectory(estimate, truth, np.array(times)))
+    try:
+        score = asdict(score_trajectory(main.in_time_order(), truth, np.array(times)))
+    except (InputError, ValueError, ArithmeticError) as error:  # what the run has found is written all the same
+        log.warning("the run is not held against its ground truth: %s", error)
+        return {"no_errors": str(error)}
     return {
         "ate_rmse_m": score["ate_rmse_m"],
         "rpe": {

@@ -279,7 +279,7 @@ def _write_results(
     )
     rows = frame_rows(system, trajectories.main, report.dropped, report.latencies_ms)
     folder.write(RunRecord(rows, trajectories.main, trajectories.unlinked, summary))
-    if truth is not None:
+    if truth is not None and "no_errors" not in summary:
         folder.write_truth(truth_of_frames(truth, rows))
     save_atlas(folder.map_path, system.atlas, system.poses, system.camera)
     run = read_run(folder.path)

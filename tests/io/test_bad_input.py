@@ -214,6 +214,15 @@ def test_bad_tum_rgbd(make, tmp_path: Path) -> None:
     raises_sentence(folder, "rgb.txt: time 2", "not later")
 
 
+def test_a_piece_of_tum_mono_that_motion_capture_did_not_see_has_no_truth(
+    make, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = make["tum_mono"](tmp_path / "mono")
+    (folder / "groundtruthSync.txt").write_text("".join(f"{i} {' '.join(['NaN'] * 7)}\n" for i in range(6)))
+    assert open_sequence(folder).ground_truth is None
+    assert "groundtruthSync.txt knows the pose of no frame" in caplog.text
+
+
 def test_bad_tum_mono(make, tmp_path: Path) -> None:
     folder = make["tum_mono"](tmp_path / "mono")
     (folder / "camera.txt").write_text("0.5 0.6\n32 24\n")
@@ -252,6 +261,8 @@ def test_bad_ground_truth(dataset: Path) -> None:
     raises_sentence(dataset, "groundtruth_tum.txt, line 2", "7 numbers where 8")
     (dataset / "groundtruth_tum.txt").write_text("100 0 0 0 0 0 0 0\n")
     raises_sentence(dataset, "groundtruth_tum.txt", "quaternion of pose 1")
+    (dataset / "groundtruth_tum.txt").write_text("1600000100 0 0 0 0 0 0 1\n")
+    raises_sentence(dataset, "frames begin at 100.0 s and its ground truth at 1600000100.0 s", "different clocks")
 
 
 # --- options

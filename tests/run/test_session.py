@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -11,7 +12,9 @@ import pytest
 from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
 from dualslam.core.errors import OutputError
-from dualslam.core.types import Frame
+from dualslam.core.trajectory import Trajectory
+from dualslam.core.types import FloatArray, Frame
+from dualslam.io.map_store import load_atlas
 from dualslam.io.run_folder import read_frames
 from dualslam.map.frame_records import FrameResult
 from dualslam.run.session import run_to_folder
@@ -75,6 +78,52 @@ def test_what_a_sequence_or_a_callback_raises_costs_no_results(
     assert system.n_finished == 1
     assert len(read_frames(tmp_path / "run" / "frames.csv")) == n_frames
     assert (tmp_path / "run" / "report.html").exists()
+
+
+class WithTruth:
+    """Somebody's own frames, whose ground truth or times are not what they should be."""
+
+    name, rate_hz, camera = "mine", 30.0, CAMERA
+
+    def __init__(self, truth_s: FloatArray, T_world_cam: FloatArray, step_s: float) -> None:
+        self.ground_truth = Trajectory(truth_s, T_world_cam)
+        self._step_s = step_s
+
+    def __iter__(self) -> Iterator[Frame]:
+        for i in range(12):
+            yield Frame(i, i * self._step_s, np.zeros((4, 4), np.uint8))
+
+
+TIMES_S, STILL = np.arange(12) / 30, np.tile(np.eye(4), (12, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("truth_s", "T_world_cam", "step_s"),
+    [
+        (TIMES_S + 1.6e9, STILL, 1 / 30),
+        (np.zeros(0), np.zeros((0, 4, 4)), 1 / 30),
+        (TIMES_S, np.full((12, 4, 4), np.nan), 1 / 30),
+        (TIMES_S, STILL, 0.0),
+    ],
+    ids=["another clock", "empty", "not a number", "frames of one time"],
+)
+def test_a_truth_that_is_of_no_use_costs_its_errors_alone(
+    build: Callable[[Config, Camera], FakeSystem],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    truth_s: FloatArray,
+    T_world_cam: FloatArray,
+    step_s: float,
+) -> None:
+    sequence = WithTruth(truth_s, T_world_cam, step_s)
+    outcome = run_to_folder(Config(), sequence, tmp_path / "run", build=build)  # type: ignore[arg-type]
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["posed"] == 12
+    assert summary["no_errors"] in caplog.text
+    assert "ate_rmse_m" not in summary
+    assert load_atlas(outcome.out).poses.keys() == set(range(12))
+    assert (outcome.out / "report.html").exists()
+    assert not (outcome.out / "groundtruth.txt").exists()
 
 
 def test_no_process_outlives_a_run_that_ends_before_its_first_frame_or_has_no_folder(

@@ -14,7 +14,7 @@ import numpy as np
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.io.run_folder import TRAJECTORY, unlinked_submaps
-from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate, nearest_in_time, read_tum
+from dualslam.io.trajectory_files import MAX_BEGIN_GAP_S, MAX_DT_S, Trajectory, associate, nearest_in_time, read_tum
 from dualslam.lab.audits.silent_breaks import find_silent_breaks
 from dualslam.lab.metrics.alignment import align_points
 
@@ -123,14 +123,16 @@ def score_trajectory(
     Raises
     ------
     InputError
-        If the estimate is on another clock than the truth, or there are fewer than two frames.
+        If the frames are on another clock than the truth, are fewer than two, or have no times of their own.
     """
     times = np.sort(np.asarray(frame_times_s, float))
     if len(times) < 2 or len(truth) == 0:
         raise InputError("A trajectory is scored against two frames or more, and at least one true pose.")
-    if abs(truth.timestamps_s[0] - times[0]) > 1e6:
+    if abs(truth.timestamps_s[0] - times[0]) > MAX_BEGIN_GAP_S:
         raise InputError("The frames and the ground truth are on different clocks; give both in the same seconds.")
     frame_dt_s = float(np.median(np.diff(times)))
+    if not frame_dt_s > 0:
+        raise InputError("Half of the frames or more have the time of the one before; give each frame its own.")
     frame, on_frame = associate(times, estimate.timestamps_s, 0.5 * frame_dt_s)
     posed = len(np.unique(frame[on_frame]))
     row, near = associate(truth.timestamps_s, estimate.timestamps_s, max_dt_s)

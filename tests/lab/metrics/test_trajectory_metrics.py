@@ -153,6 +153,8 @@ def test_different_clocks_are_refused() -> None:
     truth = curve()
     with pytest.raises(InputError, match="different clocks"):
         score_trajectory(truth, truth, truth.timestamps_s + 1.4e9)
+    with pytest.raises(InputError, match="the time of the one before"):
+        score_trajectory(truth, truth, np.repeat(truth.timestamps_s[::4], 4))
     with pytest.raises(InputError, match="two frames"):
         score_trajectory(truth, truth, truth.timestamps_s[:1])
 
