@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.camera.base import Camera
 from dualslam.core.interfaces import Frontend
 from dualslam.core.place_matcher import CELLS, Sighting
 from dualslam.core.types import Features, FloatArray, IntArray, Matches
@@ -19,12 +20,13 @@ class FrontendPlaceMatcher:
     Parameters
     ----------
     frontend : Frontend
-    size_px : (width, height)
+    camera : Camera
+        As it was given.
     """
 
-    def __init__(self, frontend: Frontend, size_px: tuple[int, int]) -> None:
+    def __init__(self, frontend: Frontend, camera: Camera) -> None:
         self._frontend = frontend
-        self._size_px = size_px
+        self._camera = camera
         self.max_distance = frontend.max_distance
         self.max_distance_strict = frontend.max_distance_strict
 
@@ -48,7 +50,7 @@ class FrontendPlaceMatcher:
         """Look for landmarks of a submap in an image, about where they should be under a pose."""
         frontend = self._frontend
         local = LocalMap.of_landmarks(submap, landmark_ids)
-        seen = local.predict(T_cam_submap, K, self._size_px, frontend.scale_factor, frontend.n_octaves)
+        seen = local.predict(T_cam_submap, K, self._camera, frontend.scale_factor, frontend.n_octaves)
         feature = np.full(len(seen.rows), -1, np.int64)
         if len(features) and len(seen.rows):
             matches = match_projected(
@@ -61,5 +63,5 @@ class FrontendPlaceMatcher:
                 octave=seen.octave,
             )
             feature[matches.index[:, 0]] = matches.index[:, 1]
-        part = np.clip(seen.uv_px / self._size_px * CELLS, 0, CELLS - 1).astype(np.int64)
+        part = np.clip(self._camera.unrectify(seen.uv_px) / self._camera.size_px * CELLS, 0, CELLS - 1).astype(np.int64)
         return Sighting(local.landmark_ids[seen.rows], feature, CELLS * part[:, 1] + part[:, 0])

@@ -31,9 +31,9 @@ def new_initialiser(config: Config, frontend: Frontend, size_px: tuple[int, int]
     return Initialiser(frontend, bundle_adjuster(config), config.initialiser, K, size_px, config.seed)
 
 
-def place_parts(config: Config, frontend: Frontend, size_px: tuple[int, int]) -> PlaceParts:
-    """Build what recognises places and verifies them."""
-    matcher = FrontendPlaceMatcher(frontend, size_px)
+def place_parts(config: Config, frontend: Frontend, camera: Camera) -> PlaceParts:
+    """Build what recognises places and verifies them; `camera`: as it was given."""
+    matcher = FrontendPlaceMatcher(frontend, camera)
     return PlaceParts(
         FaissRecogniser(frontend.max_distance_strict), PlaceVerifier(matcher, config.linking, config.seed)
     )

@@ -81,7 +81,6 @@ def build_system(
     check_config(config)
     check_given(camera, saved)
     frontend = create_frontend(config.frontend)
-    size_px = (camera.width, camera.height)
     known = camera if saved is None else _camera_of(saved, camera)
     is_known = saved is not None and known is saved.camera
     if is_known:  # its camera is its own: to change it would part what is there from what comes
@@ -92,17 +91,17 @@ def build_system(
 
     if saved is not None and not localise:
         saved = replace(saved, poses=tidy(saved.atlas, saved.poses))
-    live = LiveParts(config, frontend, calibration, size_px, 0 if saved is None else saved.next_id)
+    live = LiveParts(config, frontend, calibration, camera, 0 if saved is None else saved.next_id)
     reader = FrameReader(frontend, live.camera, config.camera.model_sigma_px, shutter)
 
     workers = config.recovery.workers
     if recovery is None:
         # Built here in any case: a mistake in the config is told at once, not by a worker.
-        parts = recovery_parts(config, size_px, frontend=frontend)
-    places = place_parts(config, frontend, size_px)
+        parts = recovery_parts(config, camera, frontend=frontend)
+    places = place_parts(config, frontend, camera)
     watch = WalkWatch()
     desk = (
-        worker_desk(config, size_px, faults, watch) if workers else InlineDesk(inline_handlers(config, places.verifier))
+        worker_desk(config, camera, faults, watch) if workers else InlineDesk(inline_handlers(config, places.verifier))
     )
     graphs = BesideGraphs(desk, window_solver(config)) if workers else None
     if recovery is None:
@@ -143,7 +142,7 @@ class LiveParts:
     config: Config
     frontend: Frontend
     calibration: Calibration
-    size_px: tuple[int, int]
+    given: Camera
     first_id: int = 0
     """Number of the first frame: those before it are of the runs that have left the saved map."""
 
@@ -153,7 +152,7 @@ class LiveParts:
 
     def new_starter(self) -> Initialiser:
         """Make what collects views until two of them start a map."""
-        return new_initialiser(self.config, self.frontend, self.size_px, self.camera().K)
+        return new_initialiser(self.config, self.frontend, self.given.size_px, self.camera().K)
 
     def new_graph(self) -> ISam2SubmapGraph:
         """Make the factor graph of a submap, solved in this process."""
@@ -171,9 +170,7 @@ class LiveParts:
         config, frontend = self.config, self.frontend
         refinder = Refinder(submap, frontend, self.camera, config.camera.model_sigma_px)
         window = window_solver(config)
-        return VisualFrontEnd(
-            frontend, config, submap, graph, self.size_px, refinder, n_covering, window, self.first_id
-        )
+        return VisualFrontEnd(frontend, config, submap, graph, self.given, refinder, n_covering, window, self.first_id)
 
 
 def _camera_of(saved: StoredMap, camera: Camera) -> Camera:

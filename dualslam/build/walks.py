@@ -45,12 +45,12 @@ def _preferred_camera(
 
 def recovery_parts(
     config: Config,
-    size_px: tuple[int, int],
+    camera: Camera,
     budget_s: float | None = None,
     frontend: Frontend | None = None,
     n_threads: int = FEATURE_THREADS,
 ) -> RecoveryParts:
-    """Build what reverse tracking is made of, for images of this width and height; see `RecoveryParts.budget_s`.
+    """Build what reverse tracking is made of, for a camera as it was given; see `RecoveryParts.budget_s`.
 
     `frontend`: the live one, where this process has it already: it may hold networks. `n_threads`: that find other
     front ends' features beside the walk; the results do not depend on it.
@@ -67,11 +67,11 @@ def recovery_parts(
         for view in sorted(job.own, key=lambda view: view.index, reverse=True):  # those next to the walk stay
             refinder.remember(view)
         n_covering = 0 if job.lost else config.recovery.covering_keyframes
-        return VisualFrontEnd(frontend, config, submap, graph, size_px, refinder, n_covering, window_solver(config))
+        return VisualFrontEnd(frontend, config, submap, graph, camera, refinder, n_covering, window_solver(config))
 
     matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, DESCRIPTOR_RADIUS_PX)
     return RecoveryParts(
-        attempts=_attempts(config, frontend, live, size_px, n_threads),
+        attempts=_attempts(config, frontend, live, camera, n_threads),
         posing=Attempt("live", live),
         new_graph=lambda: ISam2SubmapGraph(config.graph),
         link=lambda old, new, onset: estimate_link(
@@ -93,7 +93,7 @@ def _attempts(
     config: Config,
     frontend: Frontend,
     live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
-    size_px: tuple[int, int],
+    camera: Camera,
     n_threads: int,
 ) -> tuple[Attempt, ...]:
     """Build the attempts; those with the same auxiliary front end share what it finds in the images."""
@@ -102,7 +102,7 @@ def _attempts(
     attempts = []
     for number, attempt in enumerate(config.recovery.attempts):
         if attempt.is_live:
-            attempts.append(_attempt_by(lambda camera: (own,), attempt, config, live, size_px))
+            attempts.append(_attempt_by(lambda camera: (own,), attempt, config, live, camera))
             continue
         wanted = auxiliary_config(attempt)
         key = wanted.model_dump_json()
@@ -110,10 +110,10 @@ def _attempts(
             with naming_attempt(number):
                 auxiliaries[key] = ImageFeatures(create_frontend(wanted, FOR_WALKS), n_threads)
         by_images = partial(_after, (), auxiliaries[key], config.camera.model_sigma_px)
-        thorough = _attempt_by(by_images, attempt, config, live, size_px)
+        thorough = _attempt_by(by_images, attempt, config, live, camera)
         if attempt.tracking == "live":
             own_first = partial(_after, (own,), auxiliaries[key], config.camera.model_sigma_px)
-            short = _attempt_by(own_first, attempt, config, live, size_px)
+            short = _attempt_by(own_first, attempt, config, live, camera)
             attempts.append(replace(short, thorough=thorough))
         else:
             attempts.append(thorough)
@@ -131,7 +131,7 @@ def _attempt_by(
     attempt: AttemptConfig,
     config: Config,
     live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
-    size_px: tuple[int, int],
+    camera: Camera,
 ) -> Attempt:
     """Build an attempt in which front ends, of which the live one may be one, give the live one its poses."""
     tracks_live = attempt.is_live or attempt.tracking == "live"
@@ -145,7 +145,7 @@ def _attempt_by(
             route,
             adjuster,
             config,
-            size_px,
+            camera,
             tracks_live,
             notes_rivals=job.notes_rivals,
             expected=job.expected,

@@ -9,6 +9,7 @@ from dualslam.build.parts import atlas_solver, new_calibration, new_initialiser,
 from dualslam.build.walks import FEATURE_THREADS, recovery_parts
 from dualslam.calibration.lens import CalibrationAnswer, CalibrationJob, answer
 from dualslam.config.settings import Config, FrontendConfig
+from dualslam.core.camera.base import Camera
 from dualslam.core.threads import spare_cores
 from dualslam.core.types import Failure
 from dualslam.frontends.registry import create_frontend
@@ -87,12 +88,12 @@ def map_handlers(config: Config, size_px: tuple[int, int]) -> Handlers:
     }
 
 
-def walk_handlers(config: Config, size_px: tuple[int, int], n_threads: int) -> Handlers:
+def walk_handlers(config: Config, camera: Camera, n_threads: int) -> Handlers:
     """Build what a worker for long work does: reverse tracking, calibrations, the search for places, the atlas."""
     budget_s = WORKER_BUDGET * config.recovery.time_limit_s
     frontend = create_frontend(config.frontend)
-    parts = recovery_parts(config, size_px, budget_s, frontend, n_threads)
-    verifier = place_parts(config, frontend, size_px).verifier
+    parts = recovery_parts(config, camera, budget_s, frontend, n_threads)
+    verifier = place_parts(config, frontend, camera).verifier
     return {
         JobKind.WALK: lambda job: recover_in_steps(job, parts),
         **edge_handlers(config),
@@ -108,7 +109,7 @@ def feature_handlers(config: FrontendConfig) -> Handlers:
     return {JobKind.FEATURES: create_frontend(config).extract}
 
 
-def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript, watch: WalkWatch) -> WorkerDesk:
+def worker_desk(config: Config, camera: Camera, faults: FaultScript, watch: WalkWatch) -> WorkerDesk:
     """Build the desk whose work is done in processes, which are started at once."""
     recovery = config.recovery
     # Live frames come first: threads beside the walk only where a core is left beside the tracking and the workers.
@@ -116,7 +117,7 @@ def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript, w
     walks = Lane(
         "walks",
         (JobKind.EDGES, JobKind.SCALE, JobKind.READOUT, JobKind.CALIBRATION, JobKind.LOOP, JobKind.WALK),
-        partial(walk_handlers, config, size_px, n_threads),
+        partial(walk_handlers, config, camera, n_threads),
         recovery.workers,
         recovery.time_limit_s,
         niceness=WALK_NICENESS,
@@ -124,7 +125,7 @@ def worker_desk(config: Config, size_px: tuple[int, int], faults: FaultScript, w
     live_map = Lane(
         "map",
         (JobKind.START, JobKind.GRAPH),
-        partial(map_handlers, config, size_px),
+        partial(map_handlers, config, camera.size_px),
         1,
         GRAPH_LIMIT_S,
         niceness=GRAPH_NICENESS,

@@ -22,6 +22,7 @@ import numpy as np
 
 from dualslam.config.settings import Config
 from dualslam.core.bundle import BundleAdjuster
+from dualslam.core.camera.base import Camera
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import SubmapGraph
@@ -49,7 +50,8 @@ class PnpOdometry:
     route : Route
     adjuster : BundleAdjuster
     config : Config
-    size_px : (width, height)
+    camera : Camera
+        As it was given.
     tracks_live : bool
         The live front end poses the frames as long as it can by itself, and the others where it cannot.
     notes_rivals, expected
@@ -63,7 +65,7 @@ class PnpOdometry:
         route: Route,
         adjuster: BundleAdjuster,
         config: Config,
-        size_px: tuple[int, int],
+        camera: Camera,
         tracks_live: bool = False,
         notes_rivals: bool = False,
         expected: Mapping[int, FloatArray] = MappingProxyType({}),
@@ -74,7 +76,7 @@ class PnpOdometry:
         self._route = route
         self._config = config
         self._finders = [
-            PoseFinder(live, auxiliary, adjuster, config, size_px, n < len(auxiliaries), notes_rivals, expected)
+            PoseFinder(live, auxiliary, adjuster, config, camera, n < len(auxiliaries), notes_rivals, expected)
             for n, auxiliary in enumerate(auxiliaries, 1)
         ]
         self._min_features = config.tracking.min_inliers

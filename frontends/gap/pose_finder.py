@@ -14,6 +14,7 @@ import numpy as np
 
 from dualslam.config.settings import Config
 from dualslam.core.bundle import BundleAdjuster
+from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.support import find_lack_of_support, judge_track
@@ -87,7 +88,8 @@ class PoseFinder:
     auxiliary : Auxiliary
     adjuster : BundleAdjuster
     config : Config
-    size_px : (width, height)
+    camera : Camera
+        As it was given.
     is_short_cut : bool
         There are other features, better ones: what these leave in doubt beyond a gap is for those to decide. Binary
         descriptors know a thing again only where they see it from about the same side. Past rows of parked cars, each
@@ -105,7 +107,7 @@ class PoseFinder:
         auxiliary: Auxiliary,
         adjuster: BundleAdjuster,
         config: Config,
-        size_px: tuple[int, int],
+        camera: Camera,
         is_short_cut: bool,
         notes_rivals: bool,
         expected: Mapping[int, FloatArray],
@@ -117,7 +119,7 @@ class PoseFinder:
         self._adjuster = adjuster
         self._config = config
         self._min_features = config.tracking.min_inliers
-        self._size_px = size_px
+        self._camera = camera
         self._is_short_cut = is_short_cut
         self._notes_rivals = notes_rivals and not is_short_cut
         self._expected = expected
@@ -212,7 +214,7 @@ class PoseFinder:
         if len(rows) < minimum:
             return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(rows)} points of {self._frontend.name}")
         uv, sigma = features.uv_rect_px[rows], features.sigma_px[rows]
-        T = resect(self._submap.K, self._size_px, uv, xyz, float(np.median(sigma)), self._config.seed)
+        T = resect(self._submap.K, self._camera.size_px, uv, xyz, float(np.median(sigma)), self._config.seed)
         found = refine_pose(self._submap.K, T, xyz, uv, sigma, min_inliers=minimum)
         if isinstance(found, Failure):
             return found
@@ -246,7 +248,7 @@ class PoseFinder:
             features.uv_rect_px[rows],
             features.sigma_px[rows],
             self._submap.K,
-            self._size_px,
+            self._camera.size_px,
             self._adjuster,
             self._config.seed,
         )
@@ -316,7 +318,7 @@ class PoseFinder:
         rows, xyz = self._points(frames[-1], frames)
         descriptors = self._map.features(frames[-1]).descriptors[rows]
         seen = self._frontend, descriptors, xyz, features, wide.T_cam_submap
-        settings = self._submap.K, self._size_px, self._config.seed
+        settings = self._submap.K, self._camera, self._config.seed
         if not self._notes_rivals:
             return refuse_look_alike(*seen, *settings, any_is_doubt=self._is_short_cut)
         others = find_other_poses(*seen, *settings)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_99
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
@@ -74,7 +75,7 @@ def refuse_look_alike(
     features: Features,
     T_cam_w: FloatArray,
     K: FloatArray,
-    size_px: tuple[int, int],
+    camera: Camera,
     seed: int,
     any_is_doubt: bool = False,
 ) -> Failure | None:
@@ -91,13 +92,14 @@ def refuse_look_alike(
     T_cam_w : (4, 4)
         The first pose.
     K : (3, 3)
-    size_px : (width, height)
+    camera : Camera
+        As it was given: what self-calibration corrects moves the rim of its image by little.
     seed : int
     any_is_doubt : bool
         However few points another pose explains, the first is not believed; all points are compared.
     """
     n_points = len(xyz) if any_is_doubt else N_POINTS
-    others = find_other_poses(frontend, descriptors, xyz, features, T_cam_w, K, size_px, seed, n_points)
+    others = find_other_poses(frontend, descriptors, xyz, features, T_cam_w, K, camera, seed, n_points)
     if not others or not (others[0].makes_doubtful or any_is_doubt):
         return None
     second = others[0]
@@ -121,7 +123,7 @@ def find_other_poses(
     features: Features,
     T_cam_w: FloatArray,
     K: FloatArray,
-    size_px: tuple[int, int],
+    camera: Camera,
     seed: int,
     n_points: int = N_POINTS,
 ) -> list[SecondPose]:
@@ -133,14 +135,14 @@ def find_other_poses(
     xyz, features = xyz[chosen], features.take(seen)
     point, feature = _alike(frontend, descriptors[chosen], features.descriptors)
     explained = _explained(T_cam_w, xyz[point], features, feature, K)
-    first_support, first_in_view = len(np.unique(point[explained])), _n_in_view(T_cam_w, xyz, K, size_px)
+    first_support, first_in_view = len(np.unique(point[explained])), _n_in_view(T_cam_w, xyz, K, camera)
     rest = np.flatnonzero(~explained)
     if len(rest) < MIN_CONSENSUS:
         return []
     uv, sigma = features.uv_rect_px[feature[rest]], features.sigma_px[feature[rest]]
     sigma_px = float(np.median(sigma))
     starts = [*_shifted(T_cam_w, xyz[point[rest]], uv, K, sigma_px)]
-    starts.append(resect(K, size_px, uv, xyz[point[rest]], sigma_px, seed, max_iterations=HYPOTHESES))
+    starts.append(resect(K, camera.size_px, uv, xyz[point[rest]], sigma_px, seed, max_iterations=HYPOTHESES))
     found: list[SecondPose] = []
     for T_start in starts:
         near = _within(T_start, xyz[point[rest]], uv, K, SAME_PX * sigma)
@@ -153,7 +155,7 @@ def find_other_poses(
         held = np.unique(point[_explained(T, xyz[point], features, feature, K)])
         if len(held) < MIN_CONSENSUS or _are_one(T_cam_w, T, xyz[held], K, sigma_px):
             continue
-        found.append(SecondPose(T, len(held), first_support, _n_in_view(T, xyz, K, size_px), first_in_view))
+        found.append(SecondPose(T, len(held), first_support, _n_in_view(T, xyz, K, camera), first_in_view))
     others: list[SecondPose] = []
     for second in sorted(found, key=lambda second: second.support / second.in_view, reverse=True):
         if not any(_are_one(second.T_cam_w, other.T_cam_w, xyz, K, sigma_px) for other in others):
@@ -238,9 +240,9 @@ def _within(T_cam_w: FloatArray, xyz: FloatArray, uv_px: FloatArray, K: FloatArr
     return np.asarray((depth > 0) & (np.linalg.norm(uv - uv_px, axis=1) < reach_px))
 
 
-def _n_in_view(T_cam_w: FloatArray, xyz: FloatArray, K: FloatArray, size_px: tuple[int, int]) -> int:
+def _n_in_view(T_cam_w: FloatArray, xyz: FloatArray, K: FloatArray, camera: Camera) -> int:
     uv, depth = project_points(K, T_cam_w, xyz)
-    return int(np.count_nonzero((depth > 0) & ((uv > 0) & (uv < size_px)).all(axis=1)))
+    return int(np.count_nonzero((depth > 0) & camera.shows(uv)))
 
 
 def _are_one(T_a: FloatArray, T_b: FloatArray, xyz: FloatArray, K: FloatArray, sigma_px: float) -> bool:

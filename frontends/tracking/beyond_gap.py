@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Failure, FailureReason, Track
@@ -36,7 +37,7 @@ def refuse_second_pose(
     track: Track,
     keyframe_ids: Sequence[int],
     frontend: Frontend,
-    size_px: tuple[int, int],
+    camera: Camera,
     seed: int,
 ) -> Failure | None:
     """Refuse a track if another pose explains nearly as much of what some keyframes see, by their own descriptors."""
@@ -54,6 +55,6 @@ def refuse_second_pose(
         track.view.features,
         track.T_cam_submap,
         submap.K,
-        size_px,
+        camera,
         seed,
     )

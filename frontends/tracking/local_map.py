@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.camera.base import Camera
 from dualslam.core.geometry.projection import project_points
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.frontends.tracking.near_points import N_PROOF, nearer_than_proven
@@ -94,7 +95,7 @@ class LocalMap:
         return len(self.landmark_ids)
 
     def predict(
-        self, T_cam_submap: FloatArray, K: FloatArray, size_px: tuple[int, int], scale_factor: float, n_octaves: int
+        self, T_cam_submap: FloatArray, K: FloatArray, camera: Camera, scale_factor: float, n_octaves: int
     ) -> Prediction:
         """Project into a camera and keep what it can see: in front, in the image, from a like side and distance.
 
@@ -102,15 +103,14 @@ class LocalMap:
         ----------
         T_cam_submap : (4, 4) float64
         K : (3, 3) float64
-        size_px : (width, height)
+        camera : Camera
+            As it was given: what self-calibration corrects moves the rim of its image by little.
         scale_factor, n_octaves
             The front end's pyramid.
         """
         R, t = T_cam_submap[:3, :3], T_cam_submap[:3, 3]
         uv, _ = project_points(K, T_cam_submap, self.xyz_mu)
-        width, height = size_px
-        # NaN, behind the camera, is in no image.
-        rows = np.flatnonzero((uv[:, 0] >= 0) & (uv[:, 1] >= 0) & (uv[:, 0] <= width - 1) & (uv[:, 1] <= height - 1))
+        rows = np.flatnonzero(camera.shows(uv))  # NaN, behind the camera, is in no image
         to_camera = -R.T @ t - self.xyz_mu[rows]
         distance = np.sqrt(np.einsum("ij,ij->i", to_camera, to_camera))
         cosine = np.einsum("ij,ij->i", to_camera, self.normal[rows]) / np.maximum(distance, 1e-12)

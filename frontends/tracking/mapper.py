@@ -7,6 +7,7 @@ from collections.abc import Set
 import numpy as np
 
 from dualslam.config.settings import MappingConfig
+from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_95
 from dualslam.core.estimates import MappingReport
 from dualslam.core.geometry import se3
@@ -64,11 +65,11 @@ def spread_choice(uv_px: FloatArray, priority: IntArray, n: int, size_px: tuple[
 class Mapper:
     """Extends a submap by keyframes; knows nothing of the order in which they come."""
 
-    def __init__(self, frontend: Frontend, config: MappingConfig, submap: Submap, size_px: tuple[int, int]) -> None:
+    def __init__(self, frontend: Frontend, config: MappingConfig, submap: Submap, camera: Camera) -> None:
         self._frontend = frontend
         self._config = config
         self._submap = submap
-        self._size_px = size_px
+        self._camera = camera
         self._young: list[tuple[int, IntArray]] = []  # keyframe count at birth, landmark ids
         self._n_inserted = 0
         self._grids: dict[int, tuple[Features, FeatureGrid]] = {}  # of the keyframes searched last
@@ -81,7 +82,8 @@ class Mapper:
         submap.add_keyframe(Keyframe(view.index, view.timestamp_s, view.features), T_submap_kf)
         feature = np.flatnonzero(track.landmark_ids >= 0)
         n_seen = submap.n_observations(track.landmark_ids[feature])
-        kept = spread_choice(view.features.uv_rect_px[feature], n_seen, self._config.max_observations, self._size_px)
+        uv_px = np.nan_to_num(self._camera.unrectify(view.features.uv_rect_px[feature]))
+        kept = spread_choice(uv_px, n_seen, self._config.max_observations, self._camera.size_px)
         feature = feature[kept]
         submap.add_observations(view.index, feature, track.landmark_ids[feature])
 
@@ -159,7 +161,7 @@ class Mapper:
         submap, frontend = self._submap, self._frontend
         features = submap.keyframes[k].features
         prediction = local.predict(
-            se3.inverse(submap.T_submap_kf[k]), submap.K, self._size_px, frontend.scale_factor, frontend.n_octaves
+            se3.inverse(submap.T_submap_kf[k]), submap.K, self._camera, frontend.scale_factor, frontend.n_octaves
         )
         matches = match_projected(
             frontend,

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.config.settings import TrackingConfig
+from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_99
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.projection import project_points, refine_pose
@@ -75,7 +76,7 @@ class Tracker:
         frontend: Frontend,
         config: TrackingConfig,
         submap: Submap,
-        size_px: tuple[int, int],
+        camera: Camera,
         seed: int,
         n_covering: int = 0,
         max_gap_scale_sigma: float = 0.025,
@@ -84,7 +85,7 @@ class Tracker:
         self._max_gap_scale_sigma = max_gap_scale_sigma
         self._config = config
         self._submap = submap
-        self._size_px = size_px
+        self._camera = camera
         self._seed = seed
         self._n_covering = n_covering
         self._last: Track | None = None
@@ -275,7 +276,7 @@ class Tracker:
             feature = matches.index[:, 1]
             xyz, uv = submap.landmarks["xyz_mu"][ids], view.features.uv_rect_px[feature]
             sigma_px = float(np.median(view.features.sigma_px[feature]))
-            T_cam_submap = resect(submap.K, self._size_px, uv, xyz, sigma_px, self._seed)
+            T_cam_submap = resect(submap.K, self._camera.size_px, uv, xyz, sigma_px, self._seed)
             found = self._refine(view, T_cam_submap, ids, xyz, feature)
             if found:
                 return found
@@ -301,7 +302,7 @@ class Tracker:
         return self._doubt
 
     def _refuse_second_pose(self, track: Track, keyframe_ids: Sequence[int]) -> Failure | None:
-        return refuse_second_pose(self._submap, track, keyframe_ids, self._frontend, self._size_px, self._seed)
+        return refuse_second_pose(self._submap, track, keyframe_ids, self._frontend, self._camera, self._seed)
 
     def _refine(
         self, view: View, T_start: FloatArray, ids: IntArray, xyz_mu: FloatArray, feature: IntArray
@@ -398,7 +399,7 @@ class Tracker:
 
     def _predict_local(self, local: LocalMap, T_cam_submap: FloatArray) -> Prediction:
         frontend = self._frontend
-        return local.predict(T_cam_submap, self._submap.K, self._size_px, frontend.scale_factor, frontend.n_octaves)
+        return local.predict(T_cam_submap, self._submap.K, self._camera, frontend.scale_factor, frontend.n_octaves)
 
     def _local_map(self, landmark_ids: IntArray) -> LocalMap:
         keyframe_ids, _ = self._submap.covisible(landmark_ids)

@@ -11,6 +11,7 @@ from collections.abc import Set
 import numpy as np
 
 from dualslam.config.settings import Config
+from dualslam.core.camera.base import Camera
 from dualslam.core.estimates import GraphEstimate, KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Frontend, SubmapGraph, WindowSolver
@@ -40,9 +41,10 @@ MIN_WINDOW_MATCHES = 40  # landmarks of a keyframe below which a window of its n
 class VisualFrontEnd:
     """Tracks frames against a submap and extends it by keyframes.
 
-    `refinder`: finds landmarks across gaps in the images themselves; without it features alone tie the keyframes there.
-    `n_covering`: see `Tracker`. `window`: poses new keyframes between the graph's updates; without it the graph does.
-    `first_id`: number of this run's first frame; keyframes before it are those of the saved map that it goes on in.
+    `camera`: as it was given; it says what an image shows. `refinder`: finds landmarks across gaps in the images
+    themselves; without it features alone tie the keyframes there. `n_covering`: see `Tracker`. `window`: poses new
+    keyframes between the graph's updates; without it the graph does. `first_id`: number of this run's first frame;
+    keyframes before it are those of the saved map that it goes on in.
     """
 
     def __init__(
@@ -51,7 +53,7 @@ class VisualFrontEnd:
         config: Config,
         submap: Submap,
         graph: SubmapGraph,
-        size_px: tuple[int, int],
+        camera: Camera,
         refinder: Refinder | None = None,
         n_covering: int = 0,
         window: WindowSolver | None = None,
@@ -64,12 +66,12 @@ class VisualFrontEnd:
             frontend,
             config.tracking,
             submap,
-            size_px,
+            camera,
             config.seed,
             n_covering,
             config.linking.max_live_scale_sigma,  # all that is mapped beyond inherits it
         )
-        self._mapper = Mapper(frontend, config.mapping, submap, size_px)
+        self._mapper = Mapper(frontend, config.mapping, submap, camera)
         self._refinder = refinder
         self._window = window
         self._first_id = first_id

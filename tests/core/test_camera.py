@@ -70,6 +70,19 @@ def test_rectified_pixels_are_those_of_the_pinhole(camera: Camera) -> None:
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=IDS)
+def test_rectified_pixels_are_told_to_be_in_the_image_or_not(camera: Camera) -> None:
+    """All pixels come back and are in the image, in its corners too; what is a pixel beyond its border is not."""
+    uv = pixels(camera)
+    rect, _ = camera.rectify(uv)
+    known = np.isfinite(rect).all(1)
+    assert known.mean() > 0.8  # the TUM-VI lens has corners beyond 80 degrees
+    np.testing.assert_allclose(camera.unrectify(rect[known]), uv[known], atol=ROUND_TRIP_PX)
+    assert np.array_equal(camera.shows(rect), known)
+    beyond = np.concatenate([uv * (1, 0) - (0, 1), uv * (0, 1) - (1, 0), uv * (1, 0) + (0, camera.height)])
+    assert not camera.shows(camera.rectify(beyond)[0]).any()
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=IDS)
 def test_magnification_is_the_area_derivative(camera: Camera) -> None:
     """Root of the determinant of the numerical Jacobian; 1 at the principal point."""
     uv, h = pixels(camera, middle=0.6), 1e-3

@@ -13,13 +13,13 @@ from dualslam.core.types import FailureReason
 from dualslam.frontends.place_matcher import FrontendPlaceMatcher
 from dualslam.map.submap import Submap
 from dualslam.places import PlaceMatch, PlaceVerifier, find_second_pose
-from dualslam.testing.point_world import SIZE_PX
+from dualslam.testing.point_world import CAMERA
 from tests.places.worlds import N_LAP, driven_lap, run, twice_the_same
 
 
 @cache
 def verifier() -> PlaceVerifier:
-    return PlaceVerifier(FrontendPlaceMatcher(create_frontend(FrontendConfig()), SIZE_PX), LinkingConfig(), 0)
+    return PlaceVerifier(FrontendPlaceMatcher(create_frontend(FrontendConfig()), CAMERA), LinkingConfig(), 0)
 
 
 def keyframe_near(submap: Submap, index: int) -> int:

@@ -303,8 +303,7 @@ def test_the_result_is_the_same_whatever_the_threads() -> None:
     for i in range(6, 52):
         system.step(world.frame(i))
     job = next(job for job in jobs if job.lost)
-    size_px = (world.camera.width, world.camera.height)
-    alone, beside = (run_recovery(job, recovery_parts(config, size_px, n_threads=n)) for n in (0, 2))
+    alone, beside = (run_recovery(job, recovery_parts(config, world.camera, n_threads=n)) for n in (0, 2))
     assert isinstance(beside, RecoveryResult)
     assert beside.events[-1].data["gaps"] == 1
     assert_same(alone, beside)

@@ -23,7 +23,6 @@ from dualslam.run.results import trajectories_of
 from dualslam.system import System
 from dualslam.testing.point_world import (
     CAMERA,
-    SIZE_PX,
     PointWorld,
     cloud,
     hand_held,
@@ -199,7 +198,7 @@ def test_what_is_lost_on_the_way_back_is_found_on_the_way_there() -> None:
         system.step(frame)
     (job,) = watched.jobs
     job = replace(job, views=(*job.views, *(world.view(i) for i in reversed(range(n_away)))))
-    result = run_recovery(job, recovery_parts(Config(), SIZE_PX))
+    result = run_recovery(job, recovery_parts(Config(), CAMERA))
     assert isinstance(result, RecoveryResult)
     order = [frame.pose.index for frame in result.frames]
     assert sorted(order)[:n_away] == list(range(n_away))

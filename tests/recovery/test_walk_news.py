@@ -15,7 +15,7 @@ from dualslam.recovery import walk_news
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.recovery.walk_news import MAX_POINTS, WalkNews, WalkTrace
-from dualslam.testing.point_world import SIZE_PX, PointWorld, cloud, hand_held, pose_errors, system_in
+from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, pose_errors, system_in
 from dualslam.workers.desk import WorkerDesk
 from dualslam.workers.jobs import JobKind
 from dualslam.workers.transport import Channel
@@ -23,7 +23,7 @@ from tests.workers.test_worker import COVERED, assert_same, wait_for
 from tests.workers.test_worker import desk as desk
 from tests.workers.test_worker import job as job
 
-PARTS = recovery_parts(Config.model_validate({"recovery": {"attempts": ["live"]}}), SIZE_PX)
+PARTS = recovery_parts(Config.model_validate({"recovery": {"attempts": ["live"]}}), CAMERA)
 POSITION_M, ROTATION_RAD = 0.08, 0.01
 
 

@@ -20,13 +20,13 @@ from dualslam.recovery.executor import Outcome
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.run.results import trajectories_of
-from dualslam.testing.point_world import SIZE_PX, PointWorld, cloud, hand_held, pose_errors, system_in
+from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, pose_errors, system_in
 from dualslam.workers.desk import Lane, WorkerDesk
 from dualslam.workers.jobs import JobKind
 
 COVERED = frozenset(range(35, 50))
-MAKE_PARTS = partial(recovery_parts, Config(), SIZE_PX)
-MAKE_HANDLERS = partial(walk_handlers, Config(), SIZE_PX, 1)
+MAKE_PARTS = partial(recovery_parts, Config(), CAMERA)
+MAKE_HANDLERS = partial(walk_handlers, Config(), CAMERA, 1)
 PATIENCE_S = 120.0  # of the test, on a busy machine
 
 
@@ -102,7 +102,7 @@ def assert_same(a: RecoveryResult | Failure, b: RecoveryResult | Failure) -> Non
 
 
 def test_a_recovery_out_of_time_gives_what_it_has(job: RecoveryJob) -> None:
-    result = run_recovery(job, recovery_parts(Config(), SIZE_PX, budget_s=0.0))
+    result = run_recovery(job, recovery_parts(Config(), CAMERA, budget_s=0.0))
     assert isinstance(result, RecoveryResult)
     assert result.link is None
     (attempt,) = result.events

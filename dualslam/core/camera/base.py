@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dualslam.core.errors import InputError
-from dualslam.core.types import FloatArray
+from dualslam.core.types import BoolArray, FloatArray
 
 MAX_RECTIFIED_ANGLE_RAD = math.radians(80.0)
 """Rays farther from the axis have no useful place in a pinhole image: `Camera.rectify` makes them NaN."""
@@ -75,6 +75,11 @@ class Camera(ABC):
         zoom = self._centre_zoom()
         return np.array([[self.fx * zoom, 0.0, self.cx], [0.0, self.fy * zoom, self.cy], [0.0, 0.0, 1.0]])
 
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height) of the raw image."""
+        return self.width, self.height
+
     def project(self, p_cam: ArrayLike) -> FloatArray:
         """Return raw pixels (N, 2) of points (N, 3) in the camera frame, NaN where they are not imaged."""
         xy = self._distort(np.asarray(p_cam, np.float64).reshape(-1, 3))
@@ -106,6 +111,19 @@ class Camera(ABC):
         ratio = self._area_ratio(xy)
         magnification = self._centre_zoom() / np.sqrt(np.where(ratio > 0, ratio, np.nan))
         return xy * (K[0, 0], K[1, 1]) + K[:2, 2], magnification
+
+    def unrectify(self, uv_rect: FloatArray) -> FloatArray:
+        """Take rectified pixels (N, 2) to raw ones: the inverse of `rectify`; NaN for rays that it has no pixel for."""
+        K = self.K
+        xy = (uv_rect - K[:2, 2]) / (K[0, 0], K[1, 1])
+        near_axis = np.einsum("ij,ij->i", xy, xy) < math.tan(MAX_RECTIFIED_ANGLE_RAD) ** 2
+        return self.project(lift(np.where(near_axis[:, None], xy, np.nan)))
+
+    def shows(self, uv_rect: FloatArray) -> BoolArray:
+        """Return which rectified pixels (N, 2) are in the image: a lens leaves no rectangle of them. NaN is not."""
+        u, v = self.unrectify(uv_rect).T
+        inside = (u >= 0) & (v >= 0) & (u <= self.width - 1) & (v <= self.height - 1)
+        return np.asarray(inside, np.bool_)
 
     def scaled(self, factor: float) -> Self:
         """Return the camera of the image resized by `factor` (sizes rounded, intrinsics follow the rounded sizes)."""

@@ -22,6 +22,10 @@ class PinholeCamera(Camera):
 
     model: ClassVar[str] = "pinhole"
 
+    def unrectify(self, uv_rect: FloatArray) -> FloatArray:
+        """Return the pixels themselves: see `Camera.unrectify`."""
+        return uv_rect
+
     def _distort(self, p_cam: FloatArray) -> FloatArray:
         return plane(p_cam)
 
@@ -56,8 +60,9 @@ class RadTanCamera(Camera):
 
     def _distort(self, p_cam: FloatArray) -> FloatArray:
         xy = plane(p_cam)
-        r2 = (xy * xy).sum(1)
-        xy = np.where((r2 < distortion.radial_limit(self._k) ** 2)[:, None], xy, np.nan)
+        limit = distortion.radial_limit(self._k)
+        if np.isfinite(limit):
+            xy = np.where((np.einsum("ij,ij->i", xy, xy) < limit**2)[:, None], xy, np.nan)
         return distortion.distort_radtan(xy, self._k, self.p1, self.p2)
 
     def _undistort(self, xy_distorted: FloatArray) -> FloatArray:

@@ -74,7 +74,7 @@ def odometry(
         Route([live.view(k) for k in KEYFRAMES], [live.view(i) for i in range(39, -1, -1)]),
         bundle_adjust_arrays,
         config or Config(),
-        SIZE_PX,
+        CAMERA,
         tracks_live,
         notes_rivals,
     )

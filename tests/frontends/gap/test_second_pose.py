@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
 from dualslam.core.types import FailureReason, Features, FloatArray
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.gap.second_pose import find_other_poses, match_under, refuse_look_alike
 
-SIZE_PX = (640, 480)
-K = np.array([[400.0, 0.0, 320.0], [0.0, 400.0, 240.0], [0.0, 0.0, 1.0]])
+CAMERA = PinholeCamera(640, 480, 400.0, 400.0, 320.0, 240.0)
+K = CAMERA.K
 PERIOD_M = 1.5
 SIGMA_PX = 0.5
 ORB = OrbFrontend()
@@ -30,7 +31,7 @@ def row_of_things(n_alike: int, n_own: int, seed: int) -> tuple[FloatArray, np.n
 
 def seen_from(T_cam_w: FloatArray, xyz: FloatArray, descriptors: np.ndarray, seed: int) -> tuple[Features, np.ndarray]:
     uv, depth = project_points(K, T_cam_w, xyz)
-    rows = np.flatnonzero((depth > 0) & ((uv > 0) & (uv < SIZE_PX)).all(axis=1))
+    rows = np.flatnonzero((depth > 0) & ((uv > 0) & (uv < CAMERA.size_px)).all(axis=1))
     uv = uv[rows] + SIGMA_PX * np.random.default_rng([seed, 1]).normal(size=(len(rows), 2))
     ones = np.ones(len(rows))
     return Features(uv, uv, SIGMA_PX * ones, ones, np.zeros(len(rows), np.int64), 0 * ones, descriptors[rows]), rows
@@ -51,7 +52,7 @@ def test_what_repeats_is_refused_whichever_pose_came_first(seed: int) -> None:
     a_period_off = T.copy()
     a_period_off[:3, 3] += T[:3, :3] @ [PERIOD_M, 0.0, 0.0]
     for first in (T, a_period_off):
-        refused = refuse_look_alike(ORB, descriptors, xyz, features, first, K, SIZE_PX, seed)
+        refused = refuse_look_alike(ORB, descriptors, xyz, features, first, K, CAMERA, seed)
         assert refused is not None
         assert refused.reason is FailureReason.LOOK_ALIKE
         assert refused.numbers["second_pose"] >= 12
@@ -60,7 +61,7 @@ def test_what_repeats_is_refused_whichever_pose_came_first(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_all_poses_that_are_a_period_off_are_told_and_each_has_its_own_matches(seed: int) -> None:
     xyz, descriptors, features, T = sight(60, 0, seed)
-    others = find_other_poses(ORB, descriptors, xyz, features, T, K, SIZE_PX, seed)
+    others = find_other_poses(ORB, descriptors, xyz, features, T, K, CAMERA, seed)
     places = np.array([np.linalg.inv(other.T_cam_w)[0, 3] - np.linalg.inv(T)[0, 3] for other in others])
     assert len(others) >= 2
     assert np.abs(places / PERIOD_M - np.round(places / PERIOD_M)).max() < 0.05
@@ -83,7 +84,7 @@ def test_a_pose_that_has_little_of_what_was_seen_in_view_is_none_the_worse_for_i
     T = np.eye(4)
     T[0, 3] = -3.0 * PERIOD_M
     features, _ = seen_from(T, xyz, descriptors, seed)
-    second, *_ = find_other_poses(ORB, descriptors[before], xyz[before], features, np.eye(4), K, SIZE_PX, seed)
+    second, *_ = find_other_poses(ORB, descriptors[before], xyz[before], features, np.eye(4), K, CAMERA, seed)
     assert np.linalg.norm(second.T_cam_w[:3, 3] - T[:3, 3]) < 0.1
     assert second.support < 0.5 * second.first_support
     assert second.support > 0.9 * second.in_view
@@ -93,17 +94,17 @@ def test_a_pose_that_has_little_of_what_was_seen_in_view_is_none_the_worse_for_i
 @pytest.mark.parametrize("seed", range(3))
 def test_what_does_not_repeat_has_one_pose(seed: int) -> None:
     xyz, descriptors, features, T = sight(0, 250, seed)
-    assert find_other_poses(ORB, descriptors, xyz, features, T, K, SIZE_PX, seed) == []
+    assert find_other_poses(ORB, descriptors, xyz, features, T, K, CAMERA, seed) == []
 
 
 def test_few_things_that_repeat_leave_the_pose_certain() -> None:
     xyz, descriptors, features, T = sight(5, 250, 4)
-    assert refuse_look_alike(ORB, descriptors, xyz, features, T, K, SIZE_PX, 4) is None
-    refused = refuse_look_alike(ORB, descriptors, xyz, features, T, K, SIZE_PX, 4, any_is_doubt=True)
+    assert refuse_look_alike(ORB, descriptors, xyz, features, T, K, CAMERA, 4) is None
+    refused = refuse_look_alike(ORB, descriptors, xyz, features, T, K, CAMERA, 4, any_is_doubt=True)
     assert refused is not None  # where others can decide
     assert refused.numbers["second_pose"] < 0.5 * refused.numbers["first_pose"]
 
 
 def test_nothing_to_compare_is_no_second_pose() -> None:
     xyz, descriptors, features, T = sight(0, 250, 5)
-    assert find_other_poses(ORB, descriptors[:0], xyz[:0], features, T, K, SIZE_PX, 5) == []
+    assert find_other_poses(ORB, descriptors[:0], xyz[:0], features, T, K, CAMERA, 5) == []

@@ -9,6 +9,8 @@ import pytest
 
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.config.settings import Config, KeyframeConfig
+from dualslam.core.camera.base import Camera
+from dualslam.core.camera.models import KannalaBrandtCamera, PinholeCamera, RadTanCamera
 from dualslam.core.chi_square import CHI2_95
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import se3, sim3
@@ -64,7 +66,7 @@ def front_end(world: PointWorld, keyframes: list[int], start_at: int, every: int
     submap = true_map(world, keyframes, every)
     graph = ISam2SubmapGraph(config.graph)
     graph.update(submap)
-    live = VisualFrontEnd(OrbFrontend(), config, submap, graph, SIZE_PX)
+    live = VisualFrontEnd(OrbFrontend(), config, submap, graph, CAMERA)
     live.start_at(start_at)
     return live
 
@@ -271,7 +273,7 @@ class TestMapping:
         for noise2 in (0.25, 1.0, 4.0):
             live = front_end(world, [0, 4, 8], start_at=8, every=2)
             track, submap = tracked(live, world.view(12)), live.submap
-            mapper = Mapper(OrbFrontend(), Config().mapping, submap, SIZE_PX)
+            mapper = Mapper(OrbFrontend(), Config().mapping, submap, CAMERA)
             mapper.observe(track)
             n_before = len(submap.observations)
             n_new[noise2] = mapper.grow(track, noise2=noise2).n_new
@@ -424,7 +426,7 @@ class TestKeyframing:
         config, submap, first_id = Config(), true_map(world, list(range(0, 42, 3))), 100
         graph = ISam2SubmapGraph(config.graph)
         graph.update(submap)
-        live = VisualFrontEnd(OrbFrontend(), config, submap, graph, SIZE_PX, first_id=first_id)
+        live = VisualFrontEnd(OrbFrontend(), config, submap, graph, CAMERA, first_id=first_id)
         live.start_at(0)
         due, passed = [], []
         for i in range(80):
@@ -467,13 +469,35 @@ def test_local_map_predicts_what_the_camera_sees(world: PointWorld) -> None:
     submap = true_map(world, [0, 4, 8])
     local = LocalMap.of_landmarks(submap, submap.landmarks_of_keyframes([0, 4, 8]))
     T_cam_w = se3.inverse(world.T_world_cam[6])
-    prediction = local.predict(T_cam_w, CAMERA.K, SIZE_PX, 1.2, 8)
+    prediction = local.predict(T_cam_w, CAMERA.K, CAMERA, 1.2, 8)
     assert len(prediction.rows) > 100
     p = se3.act(T_cam_w, local.xyz_mu[prediction.rows])
     np.testing.assert_allclose(prediction.uv_px, CAMERA.project(p), atol=1e-9)
     behind = se3.inverse(se3.from_parts(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)))
-    assert len(local.predict(behind, CAMERA.K, SIZE_PX, 1.2, 8).rows) == 0
+    assert len(local.predict(behind, CAMERA.K, CAMERA, 1.2, 8).rows) == 0
     assert len(local.take(prediction.rows)) == len(prediction.rows)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        PinholeCamera(640, 480, 450.0, 450.0, 319.5, 239.5),
+        RadTanCamera(752, 480, 458.654, 457.296, 367.215, 248.375, -0.28340811, 0.07395907, 0.00019359, 1.76187114e-05),
+        RadTanCamera(640, 480, 517.3, 516.5, 318.6, 255.3, 0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
+        KannalaBrandtCamera(1280, 720, 600.0, 600.0, 639.5, 359.5, 0.02, -0.005, 0.0, 0.0),
+    ],
+    ids=["pinhole", "barrel", "pincushion", "fisheye"],
+)
+def test_what_the_image_shows_is_looked_for_to_its_rim(camera: Camera) -> None:
+    """A quarter to a third of what a barrel or a fisheye shows lies beyond a rectangle of the raw image's size."""
+    rng = np.random.default_rng(0)
+    angle, about = np.radians(79.0) * np.sqrt(rng.random(4000)), rng.uniform(-np.pi, np.pi, 4000)
+    xyz = np.column_stack([np.sin(angle) * np.cos(about), np.sin(angle) * np.sin(about), np.cos(angle)])
+    distance = rng.uniform(2, 8, len(xyz))
+    local = LocalMap(np.arange(len(xyz)), distance[:, None] * xyz, -xyz, distance, np.zeros((len(xyz), 32), np.uint8))
+    uv = camera.project(xyz)
+    shown = np.flatnonzero(((uv >= 0) & (uv <= np.array(camera.size_px) - 1)).all(axis=1))
+    assert np.array_equal(local.predict(np.eye(4), camera.K, camera, 1.2, 8).rows, shown)
 
 
 @pytest.mark.parametrize("share_wrong", [0.0, 0.5])
