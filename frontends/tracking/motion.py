@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,11 @@ MAX_EXTRAPOLATION = 3.0
 STEADY_S = 1 / 6
 """For so long it says something in any case: what carries a camera does not turn round in less. Up to four frames of
 30 Hz that came too late are no gap, whatever the interval before them was."""
+N_RECENT = 5
+"""Intervals of which the middle one is the usual one: two stamps may be odd."""
+MIN_SHARE = 0.2
+"""Of the usual interval: a nearer stamp tells when a frame came, too late, and its motion took the usual time. Where up
+to three of four frames are left out, the next one is still a quarter away."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,22 +32,28 @@ class Motion:
     interval_s : float
         The time that it took; negative where frames come in reverse. At rest, the shortest time between two keyframes:
         no frame of a slow sequence is a gap.
+    recent_s : tuple of float
+        The last intervals, as they were stamped.
     """
 
     xi: FloatArray | None = None
     interval_s: float = 0.0
+    recent_s: tuple[float, ...] = ()
 
-    @classmethod
-    def between(cls, before: Track, after: Track) -> Motion:
-        """Return the motion from one track to another."""
+    def next(self, before: Track, after: Track) -> Motion:
+        """Return the motion that follows this one, from one track to the next."""
         interval_s = after.view.timestamp_s - before.view.timestamp_s
-        return cls(se3.log(after.T_cam_submap @ se3.inverse(before.T_cam_submap)), interval_s)
+        recent_s = (*self.recent_s, interval_s)[-N_RECENT:]
+        usual_s = sorted(recent_s, key=abs)[(len(recent_s) - 1) // 2]
+        if abs(interval_s) < MIN_SHARE * abs(usual_s):
+            interval_s = usual_s
+        return Motion(se3.log(after.T_cam_submap @ se3.inverse(before.T_cam_submap)), interval_s, recent_s)
 
     def scaled(self, scale: float) -> Motion:
         """Return the motion in another unit."""
         if self.xi is None:
             return self
-        return Motion(np.concatenate([self.xi[:3], scale * self.xi[3:]]), self.interval_s)
+        return replace(self, xi=np.concatenate([self.xi[:3], scale * self.xi[3:]]))
 
     def predict(self, last: Track, timestamp_s: float) -> FloatArray:
         """Return the pose `T_cam_submap` at a time: the motion scaled to the time that has passed since a track."""

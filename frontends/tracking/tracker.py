@@ -392,7 +392,7 @@ class Tracker:
 
     def _accept(self, track: Track, local: LocalMap) -> None:
         assert self._last is not None
-        self._motion = Motion.between(self._last, track)
+        self._motion = self._motion.next(self._last, track)
         self._last, self._local, self._doubt = track, local, None
 
     # --- the local map
