@@ -37,7 +37,7 @@ def turn_rates(submap: Submap, poses: Iterable[FramePose]) -> dict[int, FloatArr
     apart = np.abs(np.diff(t)) > MAX_GAP_S
     first = n - ~np.concatenate([[True], apart])
     last = n + ~np.concatenate([apart, [True]])
-    told = n[first < last]
+    told = n[t[first] != t[last]]
     first, last = first[told], last[told]
     rates = _rate(R[first], R[last], (t[last] - t[first])[:, None])
     return {posed[i].index: rate for i, rate in zip(told.tolist(), rates, strict=True)}

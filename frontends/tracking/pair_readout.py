@@ -106,7 +106,7 @@ class ReadoutEstimator:
     def _at(self, n: int, to_rad_s: FloatArray, from_rad_s: FloatArray) -> FloatArray:
         """Return the turn at a frame: between the turns to it and from it, which are those half-way between frames."""
         before_s, at_s, after_s = (self._recent[k][0].timestamp_s for k in (n - 1, n, n + 1))
-        share = (at_s - before_s) / (after_s - before_s)
+        share = np.clip((at_s - before_s) / (after_s - before_s), 0.0, 1.0) if after_s != before_s else 0.5
         return np.asarray((1 - share) * to_rad_s + share * from_rad_s, np.float64)
 
     def _curvature(self, best: int) -> float:

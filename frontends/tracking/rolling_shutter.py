@@ -68,7 +68,8 @@ class TurnMeter:
         uv_a, uv_b = seen.uv_rect_px[matches.index[:, 0]], sees.uv_rect_px[matches.index[:, 1]]
         turn = turn_between(K, uv_a, uv_b)
         self._gap_s = view.timestamp_s - last.timestamp_s
-        if turn is None or self._gap_s == 0:
+        goes_back = before is not None and self._gap_s * gap_s < 0  # its stamp says nothing of how fast that was
+        if turn is None or self._gap_s == 0 or goes_back:
             return np.zeros(3) if before is None else before
         self.between_rad_s = rate = turn / self._gap_s
         if before is None or abs(self._gap_s) > MAX_GAP * abs(gap_s):

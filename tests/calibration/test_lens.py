@@ -10,6 +10,7 @@ import pytest
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.build import adjust_submap, build_system
 from dualslam.calibration.lens import Calibration
+from dualslam.calibration.turns import turn_rates
 from dualslam.config.calibration_config import CalibrationConfig
 from dualslam.config.settings import Config, GraphConfig
 from dualslam.core.camera.base import Camera
@@ -179,6 +180,15 @@ def test_frames_between_keyframes_follow_a_map_that_bends() -> None:
         T = after.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
         np.testing.assert_allclose(after.resolve_anchor(k, np.eye(4)), T, atol=1e-12)
         assert np.linalg.norm(se3.log(se3.inverse(T) @ bend[k] @ truth[k])) < 0.006  # half a step
+
+
+def test_frames_on_both_sides_with_one_stamp_tell_no_turn() -> None:
+    submap = make_submap(TRUE, turning=True, n=3)
+    turns = [se3.from_parts(so3.exp(np.array([0.0, 0.02 * i, 0.0])), np.zeros(3)) for i in range(6)]
+    poses = [FramePose(i, 0.1 * step, 0, 0, turns[i]) for i, step in enumerate([0, 1, 2, 1, 4, 5])]
+    rates = turn_rates(submap, poses)
+    assert sorted(rates) == [0, 1, 3, 4, 5]  # 2 lies between 1 and 3
+    np.testing.assert_allclose(rates[5], [0.0, 0.2, 0.0], atol=1e-9)
 
 
 class CalibrationWorld:

@@ -16,7 +16,7 @@ from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray, Frame, View
 from dualslam.frontends.features.orb import OrbFrontend
-from dualslam.frontends.tracking.pair_readout import READOUTS_S, _mean
+from dualslam.frontends.tracking.pair_readout import READOUT_EVIDENCE, READOUTS_S, ReadoutEstimator, _mean
 from dualslam.frontends.tracking.rolling_shutter import RollingShutter, TurnMeter
 from dualslam.frontends.tracking.row_shifts import correct_shutter, find_as_read, straighten
 from dualslam.frontends.tracking.turning import turn_between
@@ -205,6 +205,34 @@ def test_the_turn_is_that_of_the_frame() -> None:
     fastest = max(np.linalg.norm(turn_rate(world.T_world_cam, i)) for i in range(1, 39))
     assert fastest > 1.0
     assert np.median(off) < 0.1 * fastest
+
+
+def stamped(world: PointWorld, steps: list[int]) -> list[View]:
+    """The views in their order, each with the time of the step that is named."""
+    return [replace(world.view(i), timestamp_s=step / RATE_HZ) for i, step in enumerate(steps)]
+
+
+def test_a_frame_that_is_stamped_as_an_earlier_one_tells_no_turn() -> None:
+    """The others do, and what it lasted until the next one bounds what is told there."""
+    world = PointWorld(cloud(), path(12, np.array([0.02, 0, 0]), np.array([0, 0.03, 0])))
+    meter, true = TurnMeter(OrbFrontend()), turn_rate(world.T_world_cam, 1)
+    for i, view in enumerate(stamped(world, [0, 1, 2, 3, 4, 5, 4, 7, 7, 9, 8, 11])):
+        rate = meter.rate_rad_s(view, CAMERA.K)
+        assert (meter.between_rad_s is None) == (i in (0, 6, 8, 10))
+        if i:
+            assert 0.3 < rate @ true / (true @ true) < 1.2
+
+
+def test_stamps_that_come_again_do_not_stop_the_search_for_a_readout() -> None:
+    world = PointWorld(cloud(), path(6, np.array([0.02, 0, 0]), np.array([0, 0.08, 0])))
+    true, chi2 = turn_rate(world.T_world_cam, 1), []
+    for steps in ([0, 1, 2, 3, 4, 5], [0, 1, 0, 3, 4, 3]):  # of a steady turn it does not matter
+        estimator = ReadoutEstimator(OrbFrontend(), 0, READOUT_EVIDENCE)
+        for view in stamped(world, steps):
+            estimator.add(view, true, CAMERA)
+        chi2.append(estimator._chi2)
+    assert chi2[0].any()
+    np.testing.assert_allclose(chi2[1], chi2[0])
 
 
 def test_a_view_knows_what_was_taken_out_of_it() -> None:
