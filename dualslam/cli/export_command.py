@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -19,9 +19,8 @@ from dualslam.export.metric import by_distance
 from dualslam.io.atomic import write_text
 from dualslam.io.map_store import StoredMap
 from dualslam.io.metric_scale import read_scale
-from dualslam.io.run_folder import TRAJECTORY, TRAJECTORY_KITTI, read_summary
+from dualslam.io.run_folder import TRAJECTORY, TRAJECTORY_KITTI, read_numbers
 from dualslam.io.trajectory_files import read_kitti, read_text, read_tum, write_tum
-from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.run.sources import open_images_of_run
 
 TRAJECTORIES = {"tum": TRAJECTORY, "kitti": TRAJECTORY_KITTI}
@@ -38,7 +37,7 @@ def execute(args: argparse.Namespace) -> int:
     if args.to in TRAJECTORIES:
         return _copy_trajectory(args)
     stored = read_stored(args.run)
-    numbers = _numbers(args.run)
+    numbers = read_numbers(args.run)
     exported = flatten(stored)
     metres = read_scale(args.run)
     if args.distance is not None:
@@ -114,13 +113,8 @@ def _in_metres(T_world_cam: FloatArray, metres: float) -> FloatArray:
     return T
 
 
-def _numbers(run: Path) -> FrameNumbers:
-    summary = read_summary(run)
-    return FrameNumbers(summary.get("first_id", 0), summary.get("first_index"))
-
-
 def _with_images(
-    args: argparse.Namespace, stored: StoredMap, exported: ExportedMap, numbers: FrameNumbers
+    args: argparse.Namespace, stored: StoredMap, exported: ExportedMap, numbers: Mapping[int, int]
 ) -> ExportedMap:
     assert stored.camera is not None
     camera = stored.camera

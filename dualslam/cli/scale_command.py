@@ -8,8 +8,7 @@ from dualslam.core.errors import InputError
 from dualslam.export.exported_map import flatten, read_stored
 from dualslam.export.metric import MetricScale, by_distance, by_height, by_marker
 from dualslam.io.metric_scale import write_scale
-from dualslam.io.run_folder import read_summary
-from dualslam.map.frame_numbers import FrameNumbers
+from dualslam.io.run_folder import read_numbers
 from dualslam.run.sources import open_images_of_run
 
 
@@ -17,8 +16,7 @@ def execute(args: argparse.Namespace) -> int:
     """Work out metres per unit of a run's map, and keep it in its run folder."""
     stored = read_stored(args.run)
     exported = flatten(stored)
-    summary = read_summary(args.run)
-    numbers = FrameNumbers(summary.get("first_id", 0), summary.get("first_index"))
+    numbers = read_numbers(args.run)
     if args.images is not None and args.marker is None:
         raise InputError("--images goes with --marker: the others need none.")
     scale: MetricScale

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -75,6 +76,11 @@ class ExportedMap:
         K = self.K[self.camera[self.view]]
         uv = np.stack([K[:, 0, 0] * p[:, 0] / z + K[:, 0, 2], K[:, 1, 1] * p[:, 1] / z + K[:, 1, 2]], 1)
         return np.asarray(np.linalg.norm(uv - self.uv_px, axis=1))
+
+    def rows_by_index(self, numbers: Mapping[int, int]) -> dict[int, int]:
+        """Return the views that are frames of a run, by their index in its source; `numbers` as of `read_numbers`."""
+        row_of = {k: v for v, k in enumerate(self.frame.tolist())}
+        return {index: row_of[number] for index, number in numbers.items() if number in row_of}
 
     def scaled(self, factor: float) -> ExportedMap:
         """Return the same map with all lengths times `factor`."""

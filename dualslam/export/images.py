@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,13 +15,12 @@ from dualslam.core.types import FloatArray, Frame
 from dualslam.export.colmap import image_name
 from dualslam.export.exported_map import ExportedMap
 from dualslam.io.atomic import atomic_file
-from dualslam.map.frame_numbers import FrameNumbers
 
 FOLDER = "images"
 
 
 def with_images(
-    exported: ExportedMap, camera: Camera, frames: Iterable[Frame], numbers: FrameNumbers, out: Path | None
+    exported: ExportedMap, camera: Camera, frames: Iterable[Frame], numbers: Mapping[int, int], out: Path | None
 ) -> ExportedMap:
     """Return the map with its points' colours, the median of their views, and write the images if a folder is given.
 
@@ -32,17 +31,17 @@ def with_images(
         As in the saved map: it knows the lens.
     frames : iterable of Frame
         Of the source that the run was made of; those that are no keyframes are passed over.
-    numbers : FrameNumbers
-        The run's.
+    numbers : mapping of int to int
+        Of the run's frames, as `read_numbers` gives them.
     out : Path, optional
         Images go into ``out/images``.
     """
-    row_of = {k: v for v, k in enumerate(exported.frame.tolist())}
+    row_of = exported.rows_by_index(numbers)
     maps: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
     seen = np.zeros((len(exported.view), 3))
     known = np.zeros(len(exported.view), bool)
     for frame in frames:
-        v = row_of.get(numbers.number_of(frame.index))
+        v = row_of.get(frame.index)
         if v is None or frame.image is None:
             continue
         c = int(exported.camera[v])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -14,7 +14,6 @@ from dualslam.core.geometry import se3
 from dualslam.core.types import BoolArray, FloatArray, Frame
 from dualslam.export.exported_map import ExportedMap
 from dualslam.export.images import undistortion
-from dualslam.map.frame_numbers import FrameNumbers
 
 MAX_TILT_DEG = 15.0
 """Of the ground against the image's rows: a camera that is mounted level, on a road that may slope."""
@@ -59,22 +58,36 @@ class MetricScale:
     words: str
 
 
-def by_distance(exported: ExportedMap, numbers: FrameNumbers, a: int, b: int, metres: float) -> MetricScale:
+def by_distance(exported: ExportedMap, numbers: Mapping[int, int], a: int, b: int, metres: float) -> MetricScale:
     """Return the scale by the true distance between two keyframes, named by their indices in the source.
+
+    Parameters
+    ----------
+    exported : ExportedMap
+    numbers : mapping of int to int
+        Of the run's frames, as `read_numbers` gives them.
+    a, b : int
+    metres : float
 
     Raises
     ------
     InputError
-        If one of them is no keyframe, or they do not lie apart.
+        If one of them is no frame of the run, or no keyframe, or they do not lie apart.
     """
-    row_of = {k: v for v, k in enumerate(exported.frame.tolist())}
-    nearest = [min(row_of, key=lambda k: abs(k - numbers.number_of(i))) for i in (a, b)]
-    for index, k in zip((a, b), nearest, strict=True):
-        if k != numbers.number_of(index):
+    row_of = exported.rows_by_index(numbers)
+    continued = len(row_of) < len(exported.frame)
+    for index in (a, b):
+        if index not in numbers:
+            those = "; those of the saved map cannot be named here" if continued else ""
             raise InputError(
-                f"--distance: frame {index} is no keyframe of the map; the nearest is {numbers.index_of(k)}."
+                f"--distance: frame {index} is none of the run's, which are {min(numbers)} to {max(numbers)}{those}."
             )
-    p, q = (exported.T_world_cam[row_of[k], :3, 3] for k in nearest)
+        if not row_of:
+            raise InputError("--distance: no frame of this run is a keyframe of the map, all are of the saved one.")
+        if index not in row_of:
+            nearest = min(row_of, key=lambda i: abs(i - index))
+            raise InputError(f"--distance: frame {index} is no keyframe of the map; the nearest is {nearest}.")
+    p, q = (exported.T_world_cam[row_of[i], :3, 3] for i in (a, b))
     length = float(np.linalg.norm(p - q))
     if not length > 0 or not metres > 0:
         raise InputError("--distance: give two frames that lie apart, and a distance above 0.")
@@ -152,7 +165,7 @@ def by_marker(
     exported: ExportedMap,
     camera: Camera,
     frames: Iterable[Frame],
-    numbers: FrameNumbers,
+    numbers: Mapping[int, int],
     metres: float,
     dictionary: str,
 ) -> MetricScale:
@@ -165,8 +178,8 @@ def by_marker(
         As in the saved map: it knows the lens.
     frames : iterable of Frame
         Of the source that the run was made of; those that are no keyframes are passed over.
-    numbers : FrameNumbers
-        The run's.
+    numbers : mapping of int to int
+        Of the run's frames, as `read_numbers` gives them.
     metres : float
         Side of the black square. Different markers of one number would be taken for one.
     dictionary : str
@@ -200,16 +213,16 @@ def by_marker(
 
 
 def _marker_corners(
-    exported: ExportedMap, camera: Camera, frames: Iterable[Frame], numbers: FrameNumbers, dictionary: str
+    exported: ExportedMap, camera: Camera, frames: Iterable[Frame], numbers: Mapping[int, int], dictionary: str
 ) -> dict[int, list[tuple[int, FloatArray]]]:
     """Return for each marker the views that show it, with its corners there (4, 2) in rectified pixels."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary]), parameters)
-    row_of = {k: v for v, k in enumerate(exported.frame.tolist())}
+    row_of = exported.rows_by_index(numbers)
     found: dict[int, list[tuple[int, FloatArray]]] = {}
     for frame in frames:
-        v = row_of.get(numbers.number_of(frame.index))
+        v = row_of.get(frame.index)
         if v is None or frame.image is None:
             continue
         maps = undistortion(camera, exported.K[int(exported.camera[v])], exported.size_px)

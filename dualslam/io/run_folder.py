@@ -24,6 +24,7 @@ from dualslam.io.atomic import atomic_file, write_text
 from dualslam.io.folder_lock import FolderLock
 from dualslam.io.map_files import METADATA, to_plain
 from dualslam.io.trajectory_files import Trajectory, read_text, write_kitti, write_tum
+from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameRow as FrameRow  # a row of frames.csv
 
 log = logging.getLogger(__name__)
@@ -382,6 +383,19 @@ def read_summary(run: Path) -> dict[str, Any]:
     if (misfit := _misfit(summary, _SUMMARY_KINDS)) is not None:
         raise InputError(f"{path} is damaged: {misfit}. Give another run, or run it again.")
     return summary
+
+
+def read_numbers(run: Path) -> dict[int, int]:
+    """Return the number that each frame of a run has in the run's map, by its index in the source.
+
+    Raises
+    ------
+    InputError
+        If the folder is none of a run, or a file is damaged.
+    """
+    summary = read_summary(run)
+    numbers = FrameNumbers(summary.get("first_id", 0), summary.get("first_index"))
+    return {row.index: numbers.number(row.index) for row in read_frames(run / FRAMES)}
 
 
 def _misfit(values: Mapping[str, Any], kinds: _Kinds) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from dualslam.core.types import FloatArray, Frame
 from dualslam.export.exported_map import ExportedMap
 from dualslam.export.metric import DICTIONARIES, by_distance, by_height, by_marker
 from dualslam.io.metric_scale import SCALE, read_scale, write_scale
-from dualslam.map.frame_numbers import FrameNumbers
+from dualslam.io.run_folder import FRAME_COLUMNS, read_numbers
 from dualslam.testing.point_world import CAMERA
 from tests.cli.conftest import _own_environment  # noqa: F401 (used by every test)
 from tests.cli.test_usage import one_sentence
@@ -25,6 +26,8 @@ from tests.cli.test_usage import one_sentence
 METRES_PER_UNIT = 3.7
 HEIGHT_M = 1.6
 TOLERANCE = 0.02
+NUMBERS = {i: i for i in range(100)}
+"""Of a run that begins with its source."""
 
 
 def seen_map(T_world_cam: FloatArray, xyz_m: FloatArray, noise_px: float = 0.5) -> ExportedMap:
@@ -96,10 +99,43 @@ def test_without_ground_no_height() -> None:
 
 
 def test_a_distance_between_two_keyframes() -> None:
-    scale = by_distance(seen_map(drive(), road(0)), FrameNumbers(0, 0), 3, 23, 10.0)
+    scale = by_distance(seen_map(drive(), road(0)), NUMBERS, 3, 23, 10.0)
     assert scale.metres_per_unit == pytest.approx(METRES_PER_UNIT)
     with pytest.raises(InputError, match="frame 90 is no keyframe of the map; the nearest is 29"):
-        by_distance(seen_map(drive(), road(0)), FrameNumbers(0, 0), 3, 90, 10.0)
+        by_distance(seen_map(drive(), road(0)), NUMBERS, 3, 90, 10.0)
+
+
+@pytest.mark.parametrize("index", [18, 29, 60])
+def test_a_frame_that_the_run_has_not_is_refused(index: int) -> None:
+    exported = replace(seen_map(drive(), road(0)), frame=np.arange(30, 60))
+    numbers = {i: i for i in range(30, 60)}  # --start 30: frame 42 would be the mirror image of frame 18
+    assert by_distance(exported, numbers, 33, 53, 10.0).metres_per_unit == pytest.approx(METRES_PER_UNIT)
+    with pytest.raises(InputError, match=rf"frame {index} is none of the run's, which are 30 to 59\.$"):
+        by_distance(exported, numbers, 33, index, 10.0)
+
+
+def test_on_a_saved_map_the_frames_are_those_of_the_run() -> None:
+    exported = seen_map(drive(), road(0))  # the first 20 keyframes are the saved map's
+    numbers = {i: 20 + i for i in range(3, 20)}
+    assert by_distance(exported, numbers, 3, 9, 3.0).metres_per_unit == pytest.approx(METRES_PER_UNIT)
+    with pytest.raises(InputError, match="frame 2 is none of the run's, which are 3 to 19; those of the saved map"):
+        by_distance(exported, numbers, 2, 9, 3.0)
+    with pytest.raises(InputError, match="frame 12 is no keyframe of the map; the nearest is 9"):
+        by_distance(exported, numbers, 3, 12, 3.0)
+    with pytest.raises(InputError, match="no frame of this run is a keyframe"):
+        by_distance(exported, {3: 900}, 3, 3, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("first_id", "indices", "numbers"), [(0, [30, 32, 34], [30, 32, 34]), (100, [9, 8, 5], [109, 110, 113])]
+)
+def test_a_run_folder_tells_the_numbers_of_its_frames(
+    first_id: int, indices: list[int], numbers: list[int], tmp_path: Path
+) -> None:
+    (tmp_path / "summary.json").write_text(json.dumps({"first_id": first_id, "first_index": indices[0]}))
+    rows = [f"{i},{0.1 * i},tracked,0,1,90,80,5.0,," for i in indices]
+    (tmp_path / "frames.csv").write_text("\n".join([",".join(FRAME_COLUMNS), *rows, ""]))
+    assert read_numbers(tmp_path) == dict(zip(indices, numbers, strict=True))
 
 
 MARKER_M = 0.3
@@ -137,7 +173,7 @@ def around(n: int = 12) -> FloatArray:
 def test_a_marker_of_known_size(dictionary: str) -> None:
     T = around()
     exported = seen_map(T, road(0))
-    scale = by_marker(exported, CAMERA, photographed(T, dictionary), FrameNumbers(0, 0), MARKER_M, dictionary)
+    scale = by_marker(exported, CAMERA, photographed(T, dictionary), NUMBERS, MARKER_M, dictionary)
     assert scale.metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=TOLERANCE)
     assert "1 markers" in scale.words
 
@@ -145,9 +181,7 @@ def test_a_marker_of_known_size(dictionary: str) -> None:
 def test_a_marker_of_another_kind_is_not_found() -> None:
     T = around()
     with pytest.raises(InputError, match=r"no marker of aruco_5x5 .*--dictionary"):
-        by_marker(
-            seen_map(T, road(0)), CAMERA, photographed(T, "apriltag_36h11"), FrameNumbers(0, 0), MARKER_M, "aruco_5x5"
-        )
+        by_marker(seen_map(T, road(0)), CAMERA, photographed(T, "apriltag_36h11"), NUMBERS, MARKER_M, "aruco_5x5")
 
 
 # --- the command
@@ -159,12 +193,16 @@ def test_a_scale_stays_with_the_map_and_exports_use_it(
     given = seen_map(drive(), road(0))
     (tmp_path / "map").mkdir()
     (tmp_path / "summary.json").write_text(json.dumps({"first_id": 0, "first_index": 0}))
+    rows = [f"{i},{0.1 * i},tracked,0,1,90,80,5.0,," for i in range(30)]
+    (tmp_path / "frames.csv").write_text("\n".join([",".join(FRAME_COLUMNS), *rows, ""]))
     for place in ("scale", "export"):
         monkeypatch.setattr(f"dualslam.cli.{place}_command.read_stored", lambda run: None)
         monkeypatch.setattr(f"dualslam.cli.{place}_command.flatten", lambda stored: given)
     assert main(["scale", str(tmp_path), "--distance", "3", "23", "10"]) == 0
     assert "a unit of the map is 3.7 m" in capsys.readouterr().out
     assert read_scale(tmp_path) == pytest.approx(METRES_PER_UNIT)
+    assert main(["scale", str(tmp_path), "--distance", "3", "30", "10"]) == 2
+    assert "frame 30 is none of the run's" in capsys.readouterr().err
     out = tmp_path / "map.ply"
     assert main(["export", str(tmp_path), "--to", "ply", "--out", str(out)]) == 0
     assert "in metres" in capsys.readouterr().out
