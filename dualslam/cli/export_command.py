@@ -11,7 +11,7 @@ import numpy as np
 from dualslam.cli.outputs import check_free
 from dualslam.cli.view_command import save_recording
 from dualslam.core.errors import InputError, OutputError
-from dualslam.core.types import FloatArray
+from dualslam.core.types import FloatArray, IntArray
 from dualslam.export.exported_map import ExportedMap, flatten, read_stored
 from dualslam.export.formats import FORMATS
 from dualslam.export.images import with_images
@@ -45,6 +45,7 @@ def execute(args: argparse.Namespace) -> int:
     if metres is not None:
         exported = exported.scaled(metres)
     chosen = FORMATS[args.to]
+    all_keyframes = exported.frame
     if args.images is not None:
         exported = _with_images(args, stored, exported, numbers)
     chosen.write(exported, args.out)
@@ -56,7 +57,16 @@ def execute(args: argparse.Namespace) -> int:
             f"mean reprojection error {np.nanmean(errors):.3f} px; {args.to} in {args.out}",
             flush=True,
         )
+        _tell_left_out(np.setdiff1d(all_keyframes, exported.frame), min(numbers.values(), default=0))
     return 0
+
+
+def _tell_left_out(keyframes: IntArray, first: int) -> None:
+    """Say how many keyframes have no image and are not exported; `first`: the number of the run's first frame."""
+    n_saved = int((keyframes < first).sum())
+    for n, whose in ((n_saved, "the saved map"), (len(keyframes) - n_saved, "the run")):
+        if n:
+            print(f"{n} keyframes of {whose} have no image in --images, and were left out", flush=True)
 
 
 def _check_out(args: argparse.Namespace) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import FloatArray, IntArray
+from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.io.map_store import StoredMap, load_atlas
 from dualslam.map.atlas import Atlas
 
@@ -81,6 +81,26 @@ class ExportedMap:
         """Return the views that are frames of a run, by their index in its source; `numbers` as of `read_numbers`."""
         row_of = {k: v for v, k in enumerate(self.frame.tolist())}
         return {index: row_of[number] for index, number in numbers.items() if number in row_of}
+
+    def of_views(self, kept: BoolArray) -> ExportedMap:
+        """Return what is left with some of the views (V,) alone: their observations, and points that enough see."""
+        of_kept = kept[self.view]
+        seen = np.bincount(self.point[of_kept], minlength=len(self.xyz)) >= MIN_VIEWS
+        rows = of_kept & seen[self.point]
+        return replace(
+            self,
+            frame=self.frame[kept],
+            timestamp_s=self.timestamp_s[kept],
+            camera=self.camera[kept],
+            T_world_cam=self.T_world_cam[kept],
+            xyz=self.xyz[seen],
+            colour=self.colour[seen],
+            view=(np.cumsum(kept) - 1)[self.view[rows]],
+            point=(np.cumsum(seen) - 1)[self.point[rows]],
+            uv_px=self.uv_px[rows],
+            sigma_px=self.sigma_px[rows],
+            feature=self.feature[rows],
+        )
 
     def scaled(self, factor: float) -> ExportedMap:
         """Return the same map with all lengths times `factor`."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera
+from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, Frame
 from dualslam.export.colmap import image_name
 from dualslam.export.exported_map import ExportedMap
@@ -24,6 +25,8 @@ def with_images(
 ) -> ExportedMap:
     """Return the map with its points' colours, the median of their views, and write the images if a folder is given.
 
+    With a folder, views whose image is not there are left out: those of an earlier run, whose map this one continues.
+
     Parameters
     ----------
     exported : ExportedMap
@@ -35,11 +38,17 @@ def with_images(
         Of the run's frames, as `read_numbers` gives them.
     out : Path, optional
         Images go into ``out/images``.
+
+    Raises
+    ------
+    InputError
+        If a folder is given, and there is no image.
     """
     row_of = exported.rows_by_index(numbers)
     maps: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
     seen = np.zeros((len(exported.view), 3))
     known = np.zeros(len(exported.view), bool)
+    has_image = np.zeros(len(exported.frame), bool)
     for frame in frames:
         v = row_of.get(frame.index)
         if v is None or frame.image is None:
@@ -51,12 +60,18 @@ def with_images(
         image = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
         if out is not None:
             _write(out / FOLDER / image_name(int(exported.frame[v])), image)
+        has_image[v] = True
         rows = np.flatnonzero(exported.view == v)
         at = np.rint(exported.uv_px[rows]).astype(int)
         inside = ((at >= 0) & (at < np.array(exported.size_px))).all(axis=1)
         seen[rows[inside]] = image[at[inside, 1], at[inside, 0], ::-1]
         known[rows[inside]] = True
-    return replace(exported, colour=_medians(exported, seen, known))
+    coloured = replace(exported, colour=_medians(exported, seen, known))
+    if out is None:
+        return coloured
+    if not has_image.any():
+        raise InputError("--images has the image of no keyframe: name the source that the run was made of.")
+    return coloured.of_views(has_image)
 
 
 def undistortion(

@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 
 from dualslam.cli import main
+from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3
+from dualslam.core.types import Frame
 from dualslam.export.bal import write_bal
 from dualslam.export.colmap import write_colmap
 from dualslam.export.exported_map import ExportedMap, flatten
 from dualslam.export.g2o import write_g2o
+from dualslam.export.images import with_images
 from dualslam.export.nerfstudio import write_nerfstudio
 from dualslam.export.ply import write_ply
 from dualslam.io.map_store import StoredMap
@@ -150,6 +153,27 @@ def test_nerfstudio_cameras_look_along_minus_z(exported: ExportedMap, tmp_path: 
     u = frame["fl_x"] * in_gl[:, 0] / -in_gl[:, 2] + frame["cx"] - 0.5
     v = frame["fl_y"] * in_gl[:, 1] / in_gl[:, 2] + frame["cy"] - 0.5
     assert np.median(np.linalg.norm(np.column_stack([u, v]) - exported.uv_px[rows], axis=1)) < 1.0
+
+
+def test_views_without_an_image_are_left_out(exported: ExportedMap, tmp_path: Path) -> None:
+    first = int(exported.frame[len(exported.frame) // 2])  # of the run: earlier ones are of the map that it continues
+    numbers = {i: first + i for i in range(1000)}
+    image = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    frames = [Frame(i, 0.1 * i, image) for i in range(60)]
+    kept = with_images(exported, CAMERA, frames, numbers, tmp_path)
+    write_colmap(kept, tmp_path)
+    write_nerfstudio(kept, tmp_path)
+    written = sorted(f"images/{file.name}" for file in (tmp_path / "images").iterdir())
+    assert written == [f"images/{k:06d}.png" for k in exported.frame.tolist() if k >= first]
+    named = [each["file_path"] for each in json.loads((tmp_path / "transforms.json").read_text())["frames"]]
+    assert named == written
+    before = {(int(exported.frame[v]), *uv) for v, uv in zip(exported.view, exported.uv_px.tolist(), strict=True)}
+    assert {(int(kept.frame[v]), *uv) for v, uv in zip(kept.view, kept.uv_px.tolist(), strict=True)} <= before
+    assert np.bincount(kept.point, minlength=len(kept.xyz)).min() >= 2
+    assert np.median(kept.reprojection_errors_px()) < 1.0
+    with pytest.raises(InputError, match="the image of no keyframe"):
+        with_images(exported, CAMERA, frames[:0], numbers, tmp_path)
+    assert len(with_images(exported, CAMERA, frames, numbers, None).frame) == len(exported.frame)
 
 
 def test_scaled_keeps_what_is_seen(exported: ExportedMap) -> None:
