@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -13,6 +14,8 @@ from dualslam.core.errors import ConfigError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame, IntArray
 from dualslam.lab.disturbances.images import U8Image, corrupt_image
+
+log = logging.getLogger(__name__)
 
 # In the order of the light's way: scene, lens, shutter, sensor. CorruptionKind is written down in it.
 _ON_IMAGES = (
@@ -28,7 +31,9 @@ _ON_STREAM = (CorruptionKind.FREEZE, CorruptionKind.DROP, CorruptionKind.STRIDE)
 
 
 def corrupted(sequence: Sequence, corruptions: Collection[Corruption]) -> Sequence:
-    """Return the sequence with corruptions put on it: itself, where none of them is for its frames.
+    """Return the sequence with corruptions put on it: itself, where all of them are faults inside the system.
+
+    One that meets none of the frames is told by a warning.
 
     Raises
     ------
@@ -38,8 +43,20 @@ def corrupted(sequence: Sequence, corruptions: Collection[Corruption]) -> Sequen
     for corruption in corruptions:
         if corruption.kind in RENDERED_KINDS:
             raise ConfigError(f"{corruption.kind} is for rendered worlds: write it into their script (events=FILE)")
+    _tell_idle(getattr(sequence, "source_indices", None), corruptions)
     chosen = [c for c in corruptions if c.kind in _ON_IMAGES + _ON_STREAM]
     return CorruptedSequence(sequence, chosen) if chosen else sequence
+
+
+def _tell_idle(indices: IntArray | None, corruptions: Iterable[Corruption]) -> None:
+    """Warn of corruptions that cover none of the frames; a live source does not know its own."""
+    if indices is None or not len(indices):
+        return
+    for c in corruptions:
+        if not any(map(c.covers, indices.tolist())):
+            end = " on" if c.length is None else f" to {c.start + c.length - 1}"
+            asked = f"{c.kind} at frames {c.start}{end}"
+            log.warning("%s never strikes: the run's frames are %d to %d", asked, indices.min(), indices.max())
 
 
 class CorruptedSequence:

@@ -186,3 +186,13 @@ def test_a_wrong_corruption_is_named(text: str, said: str) -> None:
 def test_all_kinds_have_a_default() -> None:
     for kind in CorruptionKind:
         assert isinstance(Corruption(kind=kind, length=3).level, float)
+
+
+def test_a_corruption_that_never_strikes_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    corrupted(Recorded(), [only("blur"), only("wrong_pose", start=19), only("stride", start=0, length=None)])
+    assert not caplog.records
+    corrupted(Recorded(), [only("blackout", start=5000, length=3), only("wrong_pose", start=20, length=None)])
+    assert [record.getMessage() for record in caplog.records] == [
+        "blackout at frames 5000 to 5002 never strikes: the run's frames are 0 to 19",
+        "wrong_pose at frames 20 on never strikes: the run's frames are 0 to 19",
+    ]
