@@ -5,6 +5,7 @@ An error is never given without its coverage: a run that gives up early can have
 
 from __future__ import annotations
 
+import logging
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -13,10 +14,12 @@ import numpy as np
 
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, IntArray
-from dualslam.io.run_folder import TRAJECTORY, unlinked_submaps
+from dualslam.io.run_folder import SUMMARY, TRAJECTORY, read_summary, unlinked_submaps
 from dualslam.io.trajectory_files import MAX_BEGIN_GAP_S, MAX_DT_S, Trajectory, associate, nearest_in_time, read_tum
 from dualslam.lab.audits.silent_breaks import find_silent_breaks
 from dualslam.lab.metrics.alignment import align_points
+
+log = logging.getLogger(__name__)
 
 Alignment = Literal["sim3", "se3"]
 
@@ -211,6 +214,8 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Score a run folder: the main map's trajectory, and each unlinked submap with an alignment of its own.
 
+    A run that was made of another sequence is scored all the same, and told by a warning.
+
     Returns
     -------
     dict
@@ -229,6 +234,7 @@ def evaluate_run(
     truth = sequence.ground_truth
     if truth is None:
         raise InputError(f"{sequence.name} has no ground truth; a run is evaluated against one.")
+    _tell_other_sequence(Path(run), sequence.name)
     is_run = Path(run).is_dir()
     path = Path(run) / TRAJECTORY if is_run else Path(run)
 
@@ -246,6 +252,13 @@ def evaluate_run(
     if any(part["off_clock"] for part in parts) and not any(part["posed"] for part in parts):
         raise InputError(f"{run}: no pose is at the time of any frame of {sequence.name}; is it of another sequence?")
     return score
+
+
+def _tell_other_sequence(run: Path, name: str) -> None:
+    """Warn where a run says that it was made of another sequence."""
+    made_of = read_summary(run).get("sequence", name) if (run / SUMMARY).is_file() else name
+    if made_of != name:
+        log.warning("%s was made of %s, and is scored against %s", run, made_of, name)
 
 
 def _positions(trajectory: Trajectory) -> FloatArray:

@@ -233,6 +233,16 @@ def test_evaluate_run_with_an_unlinked_submap(run: tuple[Path, KnownSequence]) -
     json.dumps(result)
 
 
+def test_a_run_of_another_sequence_is_told(run: tuple[Path, KnownSequence], caplog: pytest.LogCaptureFixture) -> None:
+    folder, sequence = run
+    (folder / "summary.json").write_text('{"sequence": "curve"}')
+    evaluate_run(folder, sequence)
+    assert not caplog.records
+    (folder / "summary.json").write_text('{"sequence": "kitti_03"}')
+    evaluate_run(folder, sequence)
+    assert [r.getMessage() for r in caplog.records] == [f"{folder} was made of kitti_03, and is scored against curve"]
+
+
 def test_evaluate_run_that_posed_nothing(tmp_path: Path) -> None:
     truth = curve()
     (tmp_path / "trajectory.txt").write_text("")
