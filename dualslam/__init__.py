@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from dualslam.recovery.linking import propose_correspondences
     from dualslam.recovery.reverse_tracking import track_in_reverse
     from dualslam.report import comparison_page, read_run, report_page
-    from dualslam.run.results import trajectories_of
+    from dualslam.run.results import frame_rows, trajectories_of
     from dualslam.run.runner import run_sequence
     from dualslam.run.session import run_to_folder
     from dualslam.run.sources import open_source
@@ -60,6 +60,7 @@ _WHERE = {
     "create_frontend": "build",
     "dump_config": "config.files",
     "evaluate_run": "lab.metrics.trajectory_metrics",
+    "frame_rows": "run.results",
     "keep_freed_memory": "core.memory",
     "limit_threads": "core.threads",
     "load_atlas": "io.map_store",
@@ -96,6 +97,7 @@ __all__ = [
     "create_frontend",
     "dump_config",
     "evaluate_run",
+    "frame_rows",
     "keep_freed_memory",
     "limit_threads",
     "load_atlas",

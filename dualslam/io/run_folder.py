@@ -239,7 +239,7 @@ class RunFolder:
         writer.writerow(FRAME_COLUMNS)
         for row in rows:
             submap = "" if row.submap is None else row.submap
-            counts = (int(row.in_main_map), row.n_matches, row.n_inliers)
+            counts = (int(bool(row.in_main_map)), row.n_matches, row.n_inliers)
             latency = f"{row.latency_ms:.3f}"
             sigmas = ["" if sigma is None else f"{sigma:.3g}" for sigma in (row.sigma_position_rel, row.sigma_scale)]
             time_s = repr(float(row.timestamp_s))

@@ -20,17 +20,17 @@ class FrameRow:
         The frame's number inside the system; its index in the source in what a run leaves behind.
     submap : int or None
         The one that it is in.
-    in_main_map : bool
-        Known at the end of the run.
+    in_main_map : bool or None
+        None in `System.rows`: it is known once a run has ended, to `dualslam.frame_rows` and ``frames.csv``.
     sigma_position_rel, sigma_scale : float or None
-        What the map claims of it, known at the end of the run (`run/claims.py`).
+        What the map claims of it (`run/claims.py`), known there as well; None also where it cannot tell.
     """
 
     index: int
     timestamp_s: float
     status: FrameStatus
     submap: int | None = None
-    in_main_map: bool = False
+    in_main_map: bool | None = None
     n_matches: int = 0
     n_inliers: int = 0
     latency_ms: float = 0.0

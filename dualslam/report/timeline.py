@@ -66,7 +66,7 @@ def _status_lanes(run: RunData) -> list[Markup]:
 def _submap_lane(run: RunData) -> Markup:
     n = len(run.rows)
     shapes, words = [], []
-    owners = [(row.submap, row.in_main_map) for row in run.rows]
+    owners = [(row.submap, bool(row.in_main_map)) for row in run.rows]
     for stretch in stretches(owners):
         submap, in_main = owners[stretch.start]
         if submap is None:

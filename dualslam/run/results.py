@@ -81,15 +81,25 @@ def trajectories_of(system: System) -> Trajectories:
 
 def frame_rows(
     system: System,
-    main: Trajectory,
+    main: Trajectory | None = None,
     dropped: Iterable[tuple[int, float]] = (),
     latencies_ms: Sequence[float] | None = None,
 ) -> list[FrameRow]:
-    """Return a row for every frame of the source, in the order in which they came; dropped ones where they belong.
+    """Return a row for every frame of the source, in the order in which they came: those of ``frames.csv``.
 
-    `latencies_ms`: of the frames that were looked at, as the harness measured them; else the time of their steps.
+    Unlike `System.rows` they name a frame by its index in the source, and know what is known at the end.
+
+    Parameters
+    ----------
+    system : System
+    main : Trajectory, optional
+        That of `trajectories_of`, if it is there already.
+    dropped : iterable of (int, float), optional
+        Index and time of frames that the system was not given; they come where they belong.
+    latencies_ms : sequence of float, optional
+        Of the frames that were looked at, as the harness measured them; else the time of their steps.
     """
-    in_main = set(main.index.tolist())
+    in_main = set((trajectories_of(system).main if main is None else main).index.tolist())
     claims = {m: claims_of(submap) for m, submap in system.atlas.submaps.items()}
     rows = [
         replace(
@@ -100,7 +110,7 @@ def frame_rows(
         )
         for n, row in enumerate(system.rows.values())
     ]
-    late = [FrameRow(i, t, FrameStatus.DROPPED) for i, t in dropped]
+    late = [FrameRow(i, t, FrameStatus.DROPPED, in_main_map=False) for i, t in dropped]
     if not late:
         return rows
     return sorted(rows + late, key=lambda row: system.numbers.number_of(row.index))

@@ -39,7 +39,12 @@ def without_ties(submap: Submap, border: int) -> Submap:
 
 def test_every_posed_frame_has_the_claim_of_its_keyframe() -> None:
     system, _ = run()
-    rows = frame_rows(system, trajectories_of(system).main)
+    rows = frame_rows(system)
+    main = trajectories_of(system).main.index.tolist()
+    assert main
+    assert [row.index for row in rows if row.in_main_map] == main
+    assert all(row.in_main_map is not None for row in frame_rows(system, dropped=[(N, 99.0)]))
+    assert all(row.in_main_map is None for row in system.rows.values()), "it is not known there"
     claims = claims_of(system.atlas.submaps[0])
     assert len(claims) == len(system.atlas.submaps[0].keyframes)
     for row in rows:
