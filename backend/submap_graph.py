@@ -175,6 +175,11 @@ class ISam2SubmapGraph:
     def point_covariances(self, landmark_ids: IntArray) -> FloatArray:
         """Return (L, 3, 3) marginal covariances of landmarks, in the submap's frame; NaN for those not in the graph.
 
+        Parameters
+        ----------
+        landmark_ids : (L,) int64
+            One below 0 is none, as in `Submap.landmark_of`: NaN.
+
         Raises
         ------
         SolverError
@@ -185,7 +190,7 @@ class ISam2SubmapGraph:
         if self._solver is None:
             return covariances
         for i, j in enumerate(ids.tolist()):
-            if not self._solver.has(j):
+            if j < 0 or not self._solver.has(j):
                 continue
             try:
                 covariances[i] = self._solver.covariance(j)
