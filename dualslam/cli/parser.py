@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from dualslam import __version__
+from dualslam.run.interrupts import held_back
 
 WORLDS = (
     *("street", "room", "circuit", "eight", "terrace", "corridors", "posters"),
@@ -80,7 +81,9 @@ def _late(name: str) -> Callable[[argparse.Namespace], int]:
     """Return a function that imports a command's module when it is called."""
 
     def execute(args: argparse.Namespace) -> int:
-        status: int = import_module(f"dualslam.cli.{name}_command").execute(args)
+        with held_back():
+            command = import_module(f"dualslam.cli.{name}_command")
+        status: int = command.execute(args)
         return status
 
     return execute

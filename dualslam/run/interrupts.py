@@ -15,6 +15,26 @@ log = logging.getLogger(__name__)
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
+@contextmanager
+def held_back() -> Iterator[None]:
+    """Hold SIGINT back in this block, to act behind it: an extension module that it meets at its start is a broken one.
+
+    Outside the main thread, where no signal comes, nothing is done.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before in (signal.SIG_IGN, None):
+        yield
+        return
+    came: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, stack: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        signal.raise_signal(signal.SIGINT)
+
+
 class Interrupts:
     """Takes the signals that end a run, while it is entered; each asks for more than the one before.
 

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
 import platform
+import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 import dualslam
+from dualslam.__main__ import main as command
 from dualslam.cli import main
 from dualslam.cli.configuration import config_of
 from dualslam.cli.parser import parse
@@ -124,6 +127,32 @@ def test_an_unexpected_exception_is_a_sentence_and_a_log(
     (log,) = tmp_path.glob("dualslam-bug-*.log")
     assert str(log) in sentence
     assert "Traceback" in log.read_text()
+
+
+def test_an_interrupt_while_a_command_is_loaded(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load(name: str) -> object:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as error:
+            raise ImportError("initialization failed") from error  # as pybind does
+        return SimpleNamespace(execute=lambda args: 0)
+
+    monkeypatch.setattr("dualslam.cli.parser.import_module", load)
+    assert main(["config"]) == 130
+    assert one_sentence(capsys) == "dualslam: interrupted"
+
+
+def test_an_interrupt_before_the_command_is_one_sentence(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted() -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("dualslam.cli.main", interrupted)
+    assert command() == 130
+    assert one_sentence(capsys) == "dualslam: interrupted"
 
 
 def test_a_keyboard_interrupt_outside_of_a_run(

@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from dualslam.run.interrupts import ENDING, Interrupts
+from dualslam.run.interrupts import ENDING, Interrupts, held_back
 
 
 @pytest.mark.parametrize("number", ENDING)
@@ -23,6 +23,23 @@ def test_the_first_asks_the_second_leaves_and_the_third_acts_as_ever(number: sig
             assert came == [number]
     finally:
         signal.signal(number, before)
+
+
+def test_held_back_it_acts_behind() -> None:
+    done = []
+
+    def load() -> None:
+        with held_back():
+            signal.raise_signal(signal.SIGINT)
+            done.append("the block")
+
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        load()
+    assert done == ["the block"]
+    assert signal.getsignal(signal.SIGINT) is before
+    with held_back():
+        pass
 
 
 def test_what_must_not_be_left_is_not() -> None:

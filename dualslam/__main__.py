@@ -1,0 +1,22 @@
+"""`python -m dualslam` is the command `dualslam`, which begins here: an interrupt may come before it is imported."""
+
+from __future__ import annotations
+
+import sys
+
+EXIT_INTERRUPTED = 130
+
+
+def main() -> int:
+    """Run the command and return its exit status."""
+    try:
+        from dualslam.cli import main as command
+
+        return command()
+    except KeyboardInterrupt:
+        sys.stderr.write("dualslam: interrupted\n")
+        return EXIT_INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main())
