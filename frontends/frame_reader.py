@@ -9,6 +9,7 @@ from dualslam.core.camera.rectification import rectify
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend, Shutter
 from dualslam.core.types import Failure, FailureReason, Frame, View
+from dualslam.frontends.asking import checked
 from dualslam.frontends.features.images import to_grey
 
 
@@ -51,5 +52,5 @@ def view_of(frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: fl
             f"frame {frame.index} is {width}x{height}, the calibration is for {camera.width}x{camera.height}",
         )
     found = frontend.extract(frame.image) if frame.features is None else frame.features
-    features = rectify(found, camera, model_sigma_px)
+    features = rectify(checked(frontend, found), camera, model_sigma_px)
     return View(frame.index, frame.timestamp_s, features, GreyImage.of(to_grey(frame.image)))

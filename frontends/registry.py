@@ -69,6 +69,15 @@ def create_frontend(config: FrontendConfig, needs: Iterable[str] = FOR_MAPS) -> 
     return frontend
 
 
+def package_of(name: str) -> str | None:
+    """Return the package that a front end's name points into; None for a built-in one, and for an unknown name."""
+    if name in BUILT_IN:
+        return None
+    if ":" not in name:
+        name = next((entry.module for entry in entry_points(group=ENTRY_POINT_GROUP, name=name)), "")
+    return name.partition(":")[0].partition(".")[0] or None
+
+
 def check_frontend(config: FrontendConfig) -> Frontend | None:
     """Refuse what `create_frontend` would, as far as can be told without what an extra installs, and without weights.
 

@@ -4,7 +4,7 @@ In reading order: `system` (the system and the live front end), `parts` (solvers
 tracking), `workers` (what is done beside the tracking), `checks` (mistakes in a config, told at once).
 """
 
-from dualslam.build.checks import check_config
+from dualslam.build.checks import check_config, fault_of_frontend
 from dualslam.build.parts import adjust_submap, find_focal, new_initialiser, window_solver
 from dualslam.build.system import LiveParts, build_system
 from dualslam.build.walks import recovery_parts
@@ -17,6 +17,7 @@ __all__ = [
     "build_system",
     "check_config",
     "create_frontend",
+    "fault_of_frontend",
     "feature_handlers",
     "find_focal",
     "graph_handlers",

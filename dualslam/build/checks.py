@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from traceback import walk_tb
 
 from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.camera.base import Camera
-from dualslam.core.errors import ConfigError, InputError
+from dualslam.core.errors import ConfigError, FrontendError, InputError
 from dualslam.frontends.features.motion_statistics import nearest_search
-from dualslam.frontends.registry import check_frontend
+from dualslam.frontends.registry import check_frontend, package_of
 from dualslam.io.map_store import StoredMap
 
 
@@ -44,6 +45,19 @@ def check_given(camera: Camera, saved: StoredMap | None) -> None:
         raise InputError(f"the camera is a {type(camera).__name__}; a sequence has one, as sequence.camera.")
     if saved is not None and not isinstance(saved, StoredMap):
         raise InputError(f"the saved map is a {type(saved).__name__}; load_atlas reads one.")
+
+
+def fault_of_frontend(error: BaseException, config: Config) -> FrontendError | None:
+    """Return what to say of an exception that a front end of another package has raised; None where none has."""
+    names = [config.frontend.name, *(a.frontend for a in config.recovery.attempts if not a.is_live)]
+    for name in names:
+        package = package_of(name)
+        for frame, line in reversed(list(walk_tb(error.__traceback__))):
+            module = str(frame.f_globals.get("__name__", ""))
+            if package is not None and module.partition(".")[0] == package:
+                where = f"{frame.f_code.co_filename}, line {line}, in {frame.f_code.co_name}"
+                return FrontendError(f"front end '{name}' raised {type(error).__name__}: {error} ({where})")
+    return None
 
 
 def auxiliary_config(attempt: AttemptConfig) -> FrontendConfig:

@@ -16,6 +16,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import FocalSearch, ToldFocal
 from dualslam.core.interfaces import Frontend, SelfCalibrator, WindowSolver
 from dualslam.core.types import Failure, FloatArray, Frame
+from dualslam.frontends.asking import features_of
 from dualslam.frontends.place_matcher import FrontendPlaceMatcher
 from dualslam.frontends.registry import create_frontend
 from dualslam.frontends.tracking.initialiser import Initialiser
@@ -82,7 +83,7 @@ def find_focal(
     from dualslam.frontends.tracking.focal_search import search_focal  # an optimiser that no other run needs
 
     frontend = create_frontend(config.frontend)
-    features = [frontend.extract(frame.image) for frame in frames if frame.image is not None]
+    features = [features_of(frontend, frame.image) for frame in frames if frame.image is not None]
     return search_focal(frontend, features, size_px, config.seed, told)
 
 

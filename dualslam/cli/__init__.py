@@ -15,7 +15,7 @@ from pathlib import Path
 from dualslam.cli import logs
 from dualslam.cli.parser import parse
 from dualslam.cli.streams import lenient
-from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError
+from dualslam.core.errors import ConfigError, DualSlamError, FrontendError, InputError, OutputError
 from dualslam.core.memory import keep_freed_memory
 from dualslam.core.threads import limit_threads
 
@@ -45,7 +45,7 @@ def _run(arguments: list[str]) -> int:
         status = int(args.execute(args))
         logs.release()
         return status
-    except (ConfigError, InputError, OutputError) as error:
+    except (ConfigError, InputError, OutputError, FrontendError) as error:
         logs.discard()
         return _say(error, EXIT_BAD_INPUT)
     except DualSlamError as error:

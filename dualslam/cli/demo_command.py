@@ -12,7 +12,7 @@ from dualslam.cli.compare_command import present
 from dualslam.cli.configuration import config_of
 from dualslam.cli.console import progress
 from dualslam.cli.outputs import check_free
-from dualslam.cli.run_command import conclude
+from dualslam.cli.run_command import conclude, naming_frontend
 from dualslam.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.types import Frame
@@ -45,7 +45,7 @@ def execute(args: argparse.Namespace) -> int:
     for name, enabled in (("off", False), ("on", True)):
         if not args.quiet:
             print(f"Recovery {name}:", flush=True)
-        with progress(sequence, args.quiet) as shown:
+        with naming_frontend(config), progress(sequence, args.quiet) as shown:
             outcome = run_to_folder(
                 _with_recovery(config, enabled), sequence, args.out / name, overwrite=args.overwrite, watcher=shown
             )

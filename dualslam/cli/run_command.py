@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from dualslam.build import fault_of_frontend
 from dualslam.cli import logs
 from dualslam.cli.configuration import config_of
 from dualslam.cli.console import final_line, progress, stage_table, waiting
+from dualslam.config.settings import Config
 from dualslam.core.camera.focal import FocalSearch
-from dualslam.core.errors import InputError, NoCalibrationError
+from dualslam.core.errors import DualSlamError, InputError, NoCalibrationError
 from dualslam.io.atomic import atomic_file
 from dualslam.io.reduced import MAX_SIDE_PX
 from dualslam.io.sequence import RecordedSequence
@@ -20,6 +23,8 @@ from dualslam.run.focal import open_without_calibration, with_camera_found, with
 from dualslam.run.session import Outcome, Watchers, check_out, run_to_folder
 from dualslam.run.sources import open_source
 from dualslam.viewer.live import LiveView
+
+log = logging.getLogger(__name__)
 
 PAGE = "live_map.html"
 """In the run folder: the map as it stood when a person saved it in the live view."""
@@ -31,6 +36,11 @@ def execute(args: argparse.Namespace) -> int:
     if args.localise and args.map is None:
         raise InputError("--localise finds poses in a saved map: name its run folder with --map.")
     config = config_of(args)
+    with naming_frontend(config):
+        return _run(args, config)
+
+
+def _run(args: argparse.Namespace, config: Config) -> int:
     check_out(args.out, overwrite=args.overwrite, saved_map=args.map)  # before a search for the camera
     selection = {
         "start": args.start,
@@ -76,6 +86,23 @@ def execute(args: argparse.Namespace) -> int:
         if following <= sequence.source_indices[-1]:
             print(f"to go on: the same with --start {following}, --map {outcome.out} and another --out", flush=True)
     return status
+
+
+@contextmanager
+def naming_frontend(config: Config) -> Iterator[None]:
+    """Say of an exception that a front end of another package has raised that it did; it is no bug of ours."""
+    try:
+        yield
+    except DualSlamError:
+        raise
+    except Exception as error:
+        fault = fault_of_frontend(error, config)
+        if fault is None:
+            raise
+        log.info("what the front end raised", exc_info=error)
+        for note in getattr(error, "__notes__", ()):
+            fault.add_note(note)
+        raise fault from error
 
 
 @contextmanager

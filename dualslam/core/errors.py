@@ -23,5 +23,9 @@ class OutputError(DualSlamError):
     """A result cannot be written where it was asked for. Names the path."""
 
 
+class FrontendError(DualSlamError):
+    """A front end of another package raises, or returns what is none of features. Names it, and where."""
+
+
 class SolverError(DualSlamError):
     """The factor graph cannot be solved, and could not be rebuilt either. Names the graph and the variable."""

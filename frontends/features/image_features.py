@@ -15,6 +15,7 @@ from weakref import WeakKeyDictionary
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Features
+from dualslam.frontends.asking import features_of
 
 MAX_BYTES = 48 * 2**20
 """About 120 images of 2000 SIFT features: what a walk sees that ends in a gap. One that gets farther needs no other."""
@@ -65,7 +66,7 @@ class ImageFeatures:
                 self._begun[image] = self._threads.submit(self._look_at, image)
 
     def _look_at(self, image: GreyImage) -> Features:
-        return self.frontend.extract(image.pixels())
+        return features_of(self.frontend, image.pixels())
 
     def _make_room(self) -> None:
         nbytes = sum(features.nbytes for features in self._known.values())
