@@ -41,7 +41,7 @@ def check_frontend(factory: FrontendFactory, options: Mapping[str, Any] | None =
     Raises
     ------
     NotConforming
-        Says everything that is wrong, one line for each check.
+        Says everything that is wrong, one line for each check; whatever the front end raises is wrong, too.
     """
     subject = Subject(factory, options or {})
     problems = []
@@ -50,5 +50,12 @@ def check_frontend(factory: FrontendFactory, options: Mapping[str, Any] | None =
             check(subject)
         except NotConforming as problem:
             problems.append(f"{check.__name__}: {problem}")
+        except Exception as error:  # theirs, whatever it is: the other checks have more to tell
+            problems.append(f"{check.__name__}: {_kind(error)}: {' '.join(str(error).split())}")
     if problems:
         raise NotConforming(f"{len(problems)} of {len(CHECKS)} checks failed\n" + "\n".join(problems))
+
+
+def _kind(error: Exception) -> str:
+    kind = type(error)
+    return kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__name__}"

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -173,6 +174,14 @@ class Greedy(OrbFrontend):
         return Matches(index, self.distance(a.descriptors, b.descriptors[index[:, 1]]))
 
 
+class Stumbling(OrbFrontend):
+    """Lets OpenCV raise at images that are tiny."""
+
+    def extract(self, image: NDArray[np.uint8]) -> Features:
+        cv2.resize(image, (image.shape[1] // 9, image.shape[0] // 9))
+        return super().extract(image)
+
+
 class OneSided(OrbFrontend):
     """Matches half of the first set's features."""
 
@@ -236,3 +245,11 @@ def test_report_names_every_check_that_failed() -> None:
     assert lines[0].endswith("checks failed")
     assert {"check_matches_are_one_to_one", "check_other_scenes_do_not_match"} <= {line.split(":")[0] for line in lines}
     check_frontend(OrbFrontend)
+
+
+def test_report_goes_on_where_a_front_end_raises() -> None:
+    with pytest.raises(NotConforming) as report:
+        check_frontend(Stumbling)
+    lines = str(report.value).splitlines()
+    assert any(line.startswith("check_flat_and_tiny_images: cv2.error: OpenCV") for line in lines)
+    assert len(lines) < len(CHECKS), "the others are made all the same"
