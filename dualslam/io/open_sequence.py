@@ -114,6 +114,8 @@ def _open_recording(source: Path, given: Given) -> Recording:
             f"{source} does not exist; give a sequence folder, a video file, the number of a webcam or the "
             "address of a stream."
         )
+    if not source.is_file() and not source.is_dir():
+        raise InputError(f"{source} is neither a file nor a folder (a pipe?); give one, or the address of a stream.")
     if source.is_file():
         return video.open_recording(source, given)
     for known in FORMATS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -284,3 +285,8 @@ def test_bad_ground_truth(dataset: Path) -> None:
 )
 def test_bad_options(dataset: Path, options: dict[str, object], words: list[str]) -> None:
     raises_sentence(dataset, *words, **options)
+
+
+def test_a_pipe_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    raises_sentence(tmp_path / "pipe", "pipe is neither a file nor a folder")
