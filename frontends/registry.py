@@ -10,6 +10,7 @@ from typing import Any, Protocol, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from dualslam.config.problems import nearest_of, written
 from dualslam.config.settings import FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.interfaces import Frontend
@@ -113,7 +114,7 @@ def parse_options(model: type[OptionsT], frontend: str, options: Mapping[str, An
         return model.model_validate_json(json.dumps(dict(options)), strict=True)
     except ValidationError as error:
         problems = "; ".join(
-            f"frontend.options.{'.'.join(map(str, each['loc'])) or '*'}: "
+            f"frontend.options.{written(each['loc']) or '*'}: "
             f"{'there is no such option' if each['type'] == 'extra_forbidden' else each['msg']}"
             for each in error.errors()
         )
@@ -145,4 +146,7 @@ def _import(name: str) -> Any:
         return getattr(importlib.import_module(module), attribute)
     for entry in entry_points(group=ENTRY_POINT_GROUP, name=name):
         return entry.load()
-    raise ConfigError(f"frontend.name: no front end is called '{name}'; known: {', '.join(known_frontends())}")
+    known = known_frontends()
+    raise ConfigError(
+        f"frontend.name: no front end is called '{name}'{nearest_of(name, known)}; known: {', '.join(known)}"
+    )

@@ -71,4 +71,6 @@ def naming_attempt(number: int) -> Iterator[None]:
     try:
         yield
     except ConfigError as error:
-        raise ConfigError(f"recovery.attempts[{number}]: {error}") from error
+        where = f"recovery.attempts[{number}]"
+        named = str(error).replace("frontend.options", f"{where}.options").replace("frontend.name", f"{where}.frontend")
+        raise ConfigError(named if where in named else f"{where}: {named}") from error

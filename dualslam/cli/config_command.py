@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 
 from dualslam.build import check_config
-from dualslam.cli.configuration import config_of
+from dualslam.cli.configuration import config_of, naming_source
 from dualslam.config.files import dump_config
 
 
 def execute(args: argparse.Namespace) -> int:
     """Print the configuration as YAML, if `run` would take it."""
     config = config_of(args)
-    check_config(config)
+    with naming_source(args):
+        check_config(config)
     print(dump_config(config), end="", flush=True)
     return 0

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,10 @@ def config_of(args: argparse.Namespace) -> Config:
     ------
     ConfigError
     """
+    return load_config(args.config, _overrides(args))
+
+
+def _overrides(args: argparse.Namespace) -> list[Override]:
     overrides = []
     if getattr(args, "realtime", False):  # before --set, which may say otherwise
         overrides.append(Override(("recovery", "workers"), 1, "--realtime"))
@@ -36,7 +42,17 @@ def config_of(args: argparse.Namespace) -> Config:
         overrides.append(Override(("corruptions",), _read_corruptions(corrupt), f"--corrupt {corrupt}"))
     if getattr(args, "no_recovery", False):
         overrides.append(Override(("recovery", "enabled"), False, "--no-recovery"))
-    return load_config(args.config, overrides)
+    return overrides
+
+
+@contextmanager
+def naming_source(args: argparse.Namespace) -> Iterator[None]:
+    """Say of a mistake in a value of the configuration where it stands: in which option, or which file."""
+    try:
+        yield
+    except ConfigError as error:
+        source = next((o.source for o in reversed(_overrides(args)) if ".".join(o.path) in str(error)), args.config)
+        raise ConfigError(str(error) if source is None else f"{source}: {error}") from error
 
 
 def _read_corruptions(path: Path) -> list[Any]:

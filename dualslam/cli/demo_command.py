@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from dualslam.build import check_config
 from dualslam.cli import logs
 from dualslam.cli.compare_command import present
-from dualslam.cli.configuration import config_of
+from dualslam.cli.configuration import config_of, naming_source
 from dualslam.cli.console import progress
 from dualslam.cli.outputs import check_free
 from dualslam.cli.run_command import conclude, naming_frontend
@@ -32,6 +33,8 @@ def execute(args: argparse.Namespace) -> int:
     if args.frames < MIN_FRAMES:
         raise InputError(f"--frames {args.frames}: the demo needs at least {MIN_FRAMES} to lose track and start again.")
     config = config_of(args)
+    with naming_source(args):
+        check_config(config)
     page: Path = args.out / "compare.html"
     check_free(page, args.overwrite, "another folder with --out")
     if not args.quiet:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from dualslam.cli.outputs import check_free
 from dualslam.cli.view_command import save_recording
-from dualslam.core.errors import InputError, OutputError
+from dualslam.core.errors import DualSlamError, InputError, OutputError
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.export.exported_map import ExportedMap, flatten, read_stored
 from dualslam.export.formats import FORMATS
@@ -31,7 +33,11 @@ RECORDING = "rerun"
 
 def execute(args: argparse.Namespace) -> int:
     """Write the map of a run in another format."""
-    _check_out(args)
+    with _folder_for(args):
+        return _execute(args)
+
+
+def _execute(args: argparse.Namespace) -> int:
     if args.to == RECORDING:
         return _write_recording(args)
     if args.to in TRAJECTORIES:
@@ -69,7 +75,9 @@ def _tell_left_out(keyframes: IntArray, first: int) -> None:
             print(f"{n} keyframes of {whose} have no image in --images, and were left out", flush=True)
 
 
-def _check_out(args: argparse.Namespace) -> None:
+@contextmanager
+def _folder_for(args: argparse.Namespace) -> Iterator[None]:
+    """Refuse what must not be written to, and make the folder; an export that is refused leaves none behind."""
     is_folder = args.to in FORMATS and FORMATS[args.to].is_folder
     if is_folder and args.out.exists():
         if not args.out.is_dir():
@@ -80,11 +88,20 @@ def _check_out(args: argparse.Namespace) -> None:
         if args.out.is_dir():
             raise OutputError(f"{args.out} is a folder, and {args.to} is one file; name another with --out.")
         check_free(args.out, args.overwrite, "another with --out")
+    folder: Path = args.out if is_folder else args.out.parent
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
-        (args.out if is_folder else args.out.parent).mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         problem = error.strerror or error
         raise OutputError(f"{args.out} cannot be written: {problem}; name another with --out.") from error
+    try:
+        yield
+    except DualSlamError:
+        with suppress(OSError):  # there is something in one of them
+            for path in made:
+                path.rmdir()
+        raise
 
 
 def _copy_trajectory(args: argparse.Namespace) -> int:

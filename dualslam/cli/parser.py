@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from typing import NoReturn
@@ -32,10 +34,37 @@ SOURCE_HELP = (
 
 
 class _Parser(argparse.ArgumentParser):
-    """An argument parser that says what is wrong in one sentence."""
+    """An argument parser that says what is wrong in one sentence, and what may have been meant."""
+
+    _given: Sequence[str] = ()
+
+    def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
+        """Note the words, for the sentence."""
+        self._given = list(args or ())
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+        self.exit(2, f"{self.prog}: {message}{self._meant(message)}; see {self.prog} --help\n")
+
+    def _meant(self, message: str) -> str:
+        wrong, offered, choices = message.partition(" (choose from ")
+        if offered:
+            near = get_close_matches(wrong.rpartition(": ")[2].strip("'"), re.findall(r"'([^']+)'", choices), n=1)
+            return f"; did you mean '{near[0]}'?" if near else ""
+        parser = self._of_command()
+        options = parser._option_string_actions
+        for word in parser._given:
+            option = word.partition("=")[0]
+            if option.startswith("--") and option not in options and (near := get_close_matches(option, options, n=1)):
+                return f"; {option} is no option, did you mean {near[0]}?"
+        return ""
+
+    def _of_command(self) -> _Parser:
+        """Return the parser of the command that was given, or this one."""
+        for action in self._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                return next((action.choices[word] for word in self._given if word in action.choices), self)
+        return self
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:

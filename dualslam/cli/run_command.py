@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from dualslam.build import fault_of_frontend
+from dualslam.build import check_config, fault_of_frontend
 from dualslam.cli import logs
-from dualslam.cli.configuration import config_of
+from dualslam.cli.configuration import config_of, naming_source
 from dualslam.cli.console import final_line, progress, stage_table, waiting
 from dualslam.config.settings import Config
 from dualslam.core.camera.focal import FocalSearch
@@ -36,6 +36,8 @@ def execute(args: argparse.Namespace) -> int:
     if args.localise and args.map is None:
         raise InputError("--localise finds poses in a saved map: name its run folder with --map.")
     config = config_of(args)
+    with naming_source(args):
+        check_config(config)
     with naming_frontend(config):
         return _run(args, config)
 

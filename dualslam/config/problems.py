@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+from collections.abc import Iterable
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
@@ -39,6 +40,17 @@ def sentence(error: ValidationError, root: type[BaseModel]) -> str:
     return _of_one(problems[0], tuple(problems[0]["loc"]), root) + more
 
 
+def written(path: Iterable[str | int]) -> str:
+    """Return the path to a field as it is told: ``recovery.attempts[1].frontend``."""
+    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).removeprefix(".")
+
+
+def nearest_of(word: str, known: Iterable[str]) -> str:
+    """Return the question whether the nearest known word was meant, behind a comma; nothing where none is near."""
+    near = difflib.get_close_matches(word, list(known), n=1)
+    return f", did you mean '{near[0]}'?" if near else ""
+
+
 def kind(value: Any) -> str:
     """Return what a value is, in a word."""
     kinds = {dict: "mapping", list: "list", str: "text", bool: "bool", int: "number", float: "number"}
@@ -46,7 +58,7 @@ def kind(value: Any) -> str:
 
 
 def _of_one(problem: Any, path: tuple[str | int, ...], root: type[BaseModel]) -> str:
-    name = ".".join(map(str, path))
+    name = written(path)
     if problem["type"] == "extra_forbidden":
         return _unknown(path, root)
     if problem["type"] == "missing":
@@ -63,23 +75,23 @@ def _of_one(problem: Any, path: tuple[str | int, ...], root: type[BaseModel]) ->
 
 
 def _unknown(path: tuple[str | int, ...], root: type[BaseModel]) -> str:
-    *sections, field = map(str, path)
+    sections, field = path[:-1], str(path[-1])
     model = _model_at(root, path[:-1])
     known = list(model.model_fields) if model else []
     if RENAMED.get(field) in known:
-        return f"{'.'.join(map(str, path))} is now called {'.'.join([*sections, RENAMED[field]])}"
+        return f"{written(path)} is now called {written([*sections, RENAMED[field]])}"
     former = what_became_of(".".join(map(str, path)))
     if former:
         return former
-    section = ".".join(sections)
+    section = written(sections)
     near = difflib.get_close_matches(field, known, n=1)
     if near:
-        hint = f"did you mean {'.'.join([*sections, near[0]])}?"
+        hint = f"did you mean {written([*sections, near[0]])}?"
     else:
         elsewhere = [p for p in all_paths(root) if p.rpartition(".")[2] == field]
         hint = f"did you mean {elsewhere[0]}?" if elsewhere else ""
     owner = f"of {section}" if section else "at the top"
-    return f"unknown field {'.'.join(map(str, path))}{'; ' + hint if hint else ''} (fields {owner}: {', '.join(known)})"
+    return f"unknown field {written(path)}{'; ' + hint if hint else ''} (fields {owner}: {', '.join(known)})"
 
 
 def _model_at(model: type[BaseModel], path: tuple[str | int, ...]) -> type[BaseModel] | None:

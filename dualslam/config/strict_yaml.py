@@ -109,7 +109,10 @@ def loads(text: str) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
-        raise ValueError(f"{where}{error.problem or 'not valid YAML'}") from error
+        problem = error.problem or "not valid YAML"
+        if problem == "but found another document":
+            problem = "a second document begins here, and only one is read; remove what divides them (---)"
+        raise ValueError(f"{where}{problem}") from error
     except yaml.YAMLError as error:
         raise ValueError(f"not valid YAML ({' '.join(str(error).split())})") from error
 

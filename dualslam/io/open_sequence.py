@@ -158,7 +158,7 @@ def _reduced(recording: Recording, camera: Camera, max_side_px: int | None) -> t
 def _camera_from_fov(recording: Recording, fov_degrees: float | None) -> Camera:
     if fov_degrees is None:
         raise NoCalibrationError(
-            f"{recording.name} has no calibration; give a camera file, or a field of view in degrees."
+            f"{recording.name} has no calibration; give a camera file, or a field of view in degrees (--camera, --fov)."
         )
     width, height = image_size(recording.images, recording.name)
     return make_camera("the field of view", lambda: camera_from_fov(width, height, fov_degrees))

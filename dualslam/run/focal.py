@@ -54,7 +54,8 @@ def with_camera_found(config: Config, sequence: RecordedSequence) -> tuple[Recor
         n_frames = min(len(sequence), SEARCHED_FRAMES)
         raise InputError(
             f"{sequence.name} has no calibration, and its first {n_frames} frames do not tell the "
-            f"focal length ({found.detail}); give a camera file, or a field of view in degrees."
+            f"focal length ({found.detail}); give a camera file, or a field of view "
+            "in degrees (--camera, --fov)."
         )
     return sequence.with_camera(found.camera()), found
 

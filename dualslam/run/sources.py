@@ -58,9 +58,10 @@ def open_source(
     InputError
     """
     if isinstance(source, str) and source.startswith(SYNTHETIC):
-        if camera_file is not None or fov_degrees is not None:
+        world = WorldSequence(parse_world(source), Selection(start, stride, max_frames, reverse))
+        if camera_file is not None or fov_degrees is not None:  # said last: another mistake matters more
             raise InputError(f"{source} has a camera of its own; leave out --camera and --fov.")
-        return WorldSequence(parse_world(source), Selection(start, stride, max_frames, reverse))
+        return world
     return open_sequence(
         source,
         camera_file=camera_file,

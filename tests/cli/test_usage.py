@@ -63,10 +63,24 @@ def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
         ),
         ("config --seed 18446744073709551616", "seed must be less than or equal to 18446744073709551615"),
         ("config --frontend sift9", "no front end is called 'sift9'"),
-        ("config --frontend os:path", "frontend.name: 'os:path' is no front end"),
+        ("config --frontend os:path", "--frontend os:path: frontend.name: 'os:path' is no front end"),
         ("config --set frontend.options.octaves=8", "frontend.options.octaves: there is no such option"),
-        ("config --set recovery.attempts=[live,sift9]", "recovery.attempts[1]: frontend.name: no front end is called"),
+        ("config --set recovery.attempts=[live,sift9]", "recovery.attempts[1].frontend: no front end is called"),
         ("config --frontend sift --set initialiser.matching=gms", "initialiser.matching: gms takes a front end with"),
+        ("config --frontend obr", "--frontend obr: frontend.name: no front end is called 'obr', did you mean 'orb'?"),
+        ("config --config typo.yaml", "typo.yaml: frontend.name: no front end is called 'obr'"),
+        (
+            "config --config typo.yaml --frontend orb --set recovery.attempts=[orbb]",
+            "--set recovery.attempts=[orbb]: ",
+        ),
+        ("config --config two.yaml", "two.yaml: line 2, column 1: a second document begins here"),
+        ("config --set corruptions=[{kind:bluur}]", "corruptions[0]"),
+        ("run synthetic:stret --fov 70 --out there", "stret"),
+        ("run here --ouut there", "--ouut is no option, did you mean --out?"),
+        ("run here --out there --sed 3", "--sed is no option, did you mean --seed?"),
+        ("rnu here", "invalid choice: 'rnu'"),
+        ("rnu here", "did you mean 'run'?"),
+        ("export here --to colmp --out there", "did you mean 'colmap'?"),
         ("config --set seed", "write key.path=value"),
         ("run synthetic:street,frames=5 --out there --map nowhere", "nowhere does not exist or is no folder"),
         (
@@ -86,9 +100,12 @@ def test_bad_usage_is_one_sentence_and_status_2(
     arguments: str, expected: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    files = {"typo.yaml": "frontend: {name: obr}\n", "two.yaml": "seed: 1\n---\nseed: 2\n"}
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
     assert main(arguments.split()) == 2
     assert expected in one_sentence(capsys)
-    assert list(tmp_path.iterdir()) == []
+    assert {path.name for path in tmp_path.iterdir()} == set(files)
 
 
 @pytest.mark.parametrize("command", ["", "run ", "eval ", "view ", "render ", "config ", "demo "])

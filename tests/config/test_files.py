@@ -205,7 +205,7 @@ def test_every_former_setting_is_where_it_is_said_to_be() -> None:
     [
         ("recovery.resume_after=5", "recovery.resume_after is now called recovery.relocalise_after"),
         ("fusion.seam_keyframes=5", "fusion.seam_keyframes is now called fusion.overlap_keyframes"),
-        ("recovery.attempts=[{frontend: sift, walk: live}]", "recovery.attempts.0.walk is now called"),
+        ("recovery.attempts=[{frontend: sift, walk: live}]", "recovery.attempts[0].walk is now called"),
         (
             "linking.max_scale_sigma=0.1",
             "linking.max_scale_sigma is no setting any more: it follows from linking.wrong_scale",

@@ -176,6 +176,15 @@ def test_views_without_an_image_are_left_out(exported: ExportedMap, tmp_path: Pa
     assert len(with_images(exported, CAMERA, frames, numbers, None).frame) == len(exported.frame)
 
 
+def test_a_refused_export_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for to, out in (("colmap", "a/b"), ("ply", "c/map.ply"), ("tum", "d/e.txt")):
+        assert main(["export", str(tmp_path / "none"), "--to", to, "--out", str(tmp_path / out)]) == 2
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "mine").mkdir()
+    assert main(["export", str(tmp_path / "none"), "--to", "colmap", "--out", str(tmp_path / "mine")]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
 def test_scaled_keeps_what_is_seen(exported: ExportedMap) -> None:
     metric = exported.scaled(2.5)
     np.testing.assert_allclose(metric.reprojection_errors_px(), exported.reprojection_errors_px(), atol=1e-9)

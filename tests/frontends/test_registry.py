@@ -37,7 +37,7 @@ def test_unknown_name_lists_the_known_ones() -> None:
         ({"scale_factor": object()}, r"frontend\.options holds what YAML cannot"),
         ({"scale_factor": 0.5}, r"frontend\.options\.scale_factor"),
         ({"fast_thresholds": []}, r"frontend\.options\.fast_thresholds"),
-        ({"fast_thresholds": [20, 0]}, r"frontend\.options\.fast_thresholds\.1"),
+        ({"fast_thresholds": [20, 0]}, r"frontend\.options\.fast_thresholds\[1\]"),
     ],
 )
 def test_wrong_option_is_named(options: dict[str, Any], named: str) -> None:
