@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from rich.progress import Progress as Bars
 
 from dualslam.core.interfaces import Sequence
+from dualslam.report.statuses import count, seen_again
 from dualslam.run.session import Outcome, Watcher
 from dualslam.viewer.progress import RunState
 
@@ -56,18 +57,20 @@ class _Bar(RunState):
 
 
 def final_line(outcome: Outcome) -> str:
-    """Return coverage, submaps, failures, speed, why there is no map, and place in one line."""
+    """Return coverage, submaps, failures, places seen again, speed, why there is no map, and place in one line."""
     s = outcome.summary
+    n_apart = s["posed_in_all_submaps"] - s["posed"]
+    is_one = s["submaps"] > 1 and s["links"] >= s["submaps"] - 1 and not n_apart
     parts = [
         f"coverage {100 * s['coverage']:.1f} % ({s['posed']} of {s['frames']} frames)",
-        _count(s["submaps"], "submap"),
-        _count(s["failures"], "failure"),
+        count(s["submaps"], "submap") + (" (linked)" if is_one else ""),
+        count(s["failures"], "failure"),
     ]
     if s["recoveries"]:
-        parts.append(_count(s["recoveries"], "recovery", "recoveries"))
-    n_apart = s["posed_in_all_submaps"] - s["posed"]
+        parts.append(count(s["recoveries"], "recovery", "recoveries"))
+    parts += seen_again(s)
     if s["first_id"] and n_apart:
-        parts.append(f"{_count(n_apart, 'frame')} posed in submaps that are not joined to the saved map")
+        parts.append(f"{count(n_apart, 'frame')} posed in submaps that are not joined to the saved map")
     if s["dropped"]:
         parts.append(f"{s['dropped']} frames dropped")
     if s.get("ate_rmse_m") is not None:
@@ -107,7 +110,3 @@ def stage_table(outcome: Outcome) -> str:
         "(beside: in processes of their own, --workers; their longest counts from when a job was submitted)",
     ]
     return "\n".join(lines)
-
-
-def _count(n: int, one: str, many: str | None = None) -> str:
-    return f"{n} {one if n == 1 else many or one + 's'}"

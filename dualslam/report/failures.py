@@ -116,26 +116,26 @@ def failures_section(run: RunData) -> Markup:
 
 
 def _card(run: RunData, scene: PlacedRun | None, story: FailureStory) -> Markup:
-    verdict, cls = _verdict(run, story)
-    head = tag(
-        "h3", tag("span", story.letter, cls="break"), f" Frame {story.lost_since} ", tag("span", verdict, cls=cls)
-    )
+    words, is_good = verdict(run, story)
+    pill = tag("span", f"{'✓' if is_good else '✕'} {words}", cls=f"pill {'good' if is_good else 'bad'}")
+    head = tag("h3", tag("span", story.letter, cls="break"), f" Frame {story.lost_since} ", pill)
     parts = [head, tag("p", _told(run, story)), _sample_frames(run, story), _close_up(run, scene, story)]
     parts += [attempt_table(story.walks), link_table(story.tries)]
     return tag("article", parts, cls="failure")
 
 
-def _verdict(run: RunData, story: FailureStory) -> tuple[str, str]:
+def verdict(run: RunData, story: FailureStory) -> tuple[str, bool]:
+    """Return what came of a failure, in a few words, and whether the lost map goes on."""
     rows = [row for row in run.rows if row.submap == story.failed.get("submap")]
     if story.relocalised is not None:
-        return "✓ seen again", "pill good"
+        return "seen again", True
     if story.linked is not None:
-        return "✓ linked with the map after it", "pill good"
+        return "linked with the map after it", True
     if story.absorbed is not None:
-        return "✓ taken over by a later map", "pill good"
+        return "taken over by a later map", True
     if any(row.in_main_map for row in rows) and story.restart is None:
-        return "✕ no map after it", "pill bad"
-    return "✕ not linked", "pill bad"
+        return "no map after it", False
+    return "not linked", False
 
 
 def _told(run: RunData, story: FailureStory) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,11 @@ from dualslam.io.run_folder import EVENTS, MAP_PAGE
 from dualslam.report.atlas_table import atlas_section
 from dualslam.report.charts import beside_table, latency_histogram, pace_words, stage_table
 from dualslam.report.event_words import event_words
-from dualslam.report.failures import failures_section, stories
+from dualslam.report.failures import failures_section, stories, verdict
 from dualslam.report.markup import Markup, cards, document, duration, join, number, table, tag
 from dualslam.report.places import places_section
 from dualslam.report.run_data import RunData, read_run
-from dualslam.report.statuses import WITHOUT_POSE, count
+from dualslam.report.statuses import WITHOUT_POSE, count, seen_again
 from dualslam.report.timeline import timeline
 from dualslam.report.top_view import top_view
 from dualslam.report.trust import trust_section
@@ -74,11 +75,16 @@ def headline(run: RunData) -> str:
     if not told:
         failures = "Tracking never failed"
     else:
-        linked = sum(story.linked is not None for story in told)
-        times = "once" if len(told) == 1 else f"{len(told)} times"
-        failures = f"Tracking failed {times}; {linked} of {len(told)} linked by a recovery"
+        ends = Counter(verdict(run, story)[0] for story in told)
+        failures = (
+            f"Tracking failed once: {next(iter(ends))}"
+            if len(told) == 1
+            else f"Tracking failed {len(told)} times: {', '.join(f'{n} {words}' for words, n in ends.items())}"
+        )
+    # What ended a failure has been told with it.
+    also = seen_again(run.summary, -sum(story.relocalised is not None for story in told))
     apart = f"; {count(len(run.unlinked), 'submap')} stayed apart" if run.unlinked else ""
-    return f"{failures}; {posed}{apart}."
+    return f"{'; '.join([failures, *also])}; {posed}{apart}."
 
 
 def _warnings(run: RunData) -> Markup:
@@ -131,8 +137,10 @@ def _tiles(run: RunData) -> Markup:
 def _recovery_words(summary: dict[str, Any]) -> str:
     seconds = sorted(summary.get("recovery_s") or [])
     if not seconds:
-        return "links made by reverse tracking"
-    return f"links made; {number(seconds[len(seconds) // 2])} s each (median)"
+        words = "links made by reverse tracking"
+    else:
+        words = f"links made; {number(seconds[len(seconds) // 2])} s each (median)"
+    return "; ".join([words, *seen_again(summary)])
 
 
 def _tile(name: str, value: str, words: str) -> Markup:

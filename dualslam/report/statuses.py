@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from dualslam.core.types import FrameStatus
 
@@ -43,6 +44,14 @@ def stretches(values: Sequence[object]) -> Iterator[Stretch]:
 def count(n: int, one: str, many: str | None = None) -> str:
     """Return a number with its noun."""
     return f"{n} {one if n == 1 else many or one + 's'}"
+
+
+def seen_again(summary: Mapping[str, Any], relocalisations_more: int = 0) -> list[str]:
+    """Return how often a place was seen again, by what came of it; nothing for what never did."""
+    nouns = {"relocalised": "relocalisation", "loops": "loop", "merges": "merge"}
+    found = {key: summary.get(key) or 0 for key in nouns}
+    found["relocalised"] += relocalisations_more
+    return [count(n, nouns[key]) for key, n in found.items() if n > 0]
 
 
 def span(first: int, last: int) -> str:

@@ -26,6 +26,7 @@ _MARKS = {
     "initialised": ("○", "mark", "a map begins"),
     "reinitialised": ("○", "mark", "a new map begins"),
     "gap_relocalised": ("↺", "mark quiet", "found again"),
+    "relocalised": ("↺", "mark good", "a place of the map is seen again, and the map goes on"),
     "rolled_over": ("→", "mark quiet", "a full submap hands over to the next"),
     "linked": ("◆", "mark good", "two submaps are linked"),
     "loop_closed": ("◆", "mark good", "a loop is closed"),
@@ -97,7 +98,7 @@ def _event_lane(run: RunData) -> Markup:
         row = row_of.get(event.get("lost_since", event["frame"]))
         if row is not None:
             marks.append(_at(_percent(run, row), failure_letter(i), "break", f"failure {i}, lost since here"))
-    return _lane("events", "A failure, ○ new map, ◆ link", tag("div", cls="empty-lane"), marks)
+    return _lane("events", "A failure, ○ new map, ◆ link, ↺ found again", tag("div", cls="empty-lane"), marks)
 
 
 def _inlier_lane(run: RunData) -> Markup:

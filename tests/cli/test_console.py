@@ -71,6 +71,7 @@ def test_frames_that_the_saved_map_does_not_show_are_told(tmp_path: Path) -> Non
         "frames": 300,
         "posed_in_all_submaps": 280,
         "submaps": 2,
+        "links": 0,
         "failures": 0,
         "recoveries": 0,
         "dropped": 0,
@@ -87,3 +88,13 @@ def test_frames_that_the_saved_map_does_not_show_are_told(tmp_path: Path) -> Non
     line = final_line(outcome)  # type: ignore[arg-type]
     assert line.startswith("no map: ")
     assert line.endswith(f"; nothing moves; results in {tmp_path}")
+
+
+def test_what_a_run_found_again_and_linked_is_told(tmp_path: Path) -> None:
+    counts = {"submaps": 2, "links": 1, "failures": 1, "recoveries": 0, "relocalised": 1, "loops": 2, "merges": 0}
+    rest = {"dropped": 0, "fps": 20.0, "interrupted": False, "first_id": 0}
+    summary = {"coverage": 1.0, "posed": 9, "frames": 9, "posed_in_all_submaps": 9} | counts | rest
+    outcome = SimpleNamespace(summary=summary, has_map=True, out=tmp_path)
+    assert ", 2 submaps (linked), 1 failure, 1 relocalisation, 2 loops, 20.0 frames/s" in final_line(outcome)  # type: ignore[arg-type]
+    summary["posed_in_all_submaps"] = 12  # a later map has frames of its own
+    assert ", 2 submaps, 1 failure" in final_line(outcome)  # type: ignore[arg-type]

@@ -24,6 +24,8 @@ def test_the_table_puts_the_numbers_side_by_side(pair: list[Path]) -> None:
     assert table[""] == ["base", "dual"]
     assert table["coverage"] == ["50.0 %", "100.0 %"]
     assert table["failures"] == ["1", "0"]
+    for measure in ("relocalisations", "loops closed", "maps merged"):
+        assert table[measure] == ["0", "0"]
     assert all(cell.endswith(" m") for cell in table["ATE"])
 
 

@@ -24,6 +24,7 @@ from dualslam.report import RunData, SampleKeeper, read_run, report_page
 from dualslam.report.canvas import Canvas, nice_step, ticks
 from dualslam.report.failures import stories
 from dualslam.report.markup import Markup, tag
+from dualslam.report.page import headline
 from dualslam.report.placement import place, plane_from_above
 from dualslam.report.run_data import PosedRows, _map_points
 from tests.cli.fakes import NO_FEATURES
@@ -77,7 +78,7 @@ def test_every_run_leaves_a_report_that_needs_nothing_else(broken_run: RunData) 
 
 def test_it_says_what_happened(broken_run: RunData) -> None:
     text = outline(broken_run).text
-    assert "Tracking failed once; 0 of 1 linked by a recovery; 50.0 % of 40 frames" in text
+    assert "Tracking failed once: not linked; 50.0 % of 40 frames" in text
     assert "Tracking was lost at frame 20" in text
     assert "<b>0 features</b>" in text  # as words
     assert "The one link that was tried was refused: too few inliers" in text
@@ -87,6 +88,20 @@ def test_it_says_what_happened(broken_run: RunData) -> None:
     for words in ("sift", "9 frames", "the buffer ends", "1.25 s", "31", "0.72 ± 0.21 %", "± 0.13°", "4 shared"):
         assert words in text
     assert "seed" in text
+
+
+def test_a_map_that_was_found_again_counts_as_such(broken_run: RunData) -> None:
+    again = {"event": "relocalised", "frame": 26, "timestamp_s": 2.6, "submap": 0, "n_inliers": 80}
+    events = [event for event in broken_run.events if event["event"] in ("initialised", "failed")] + [again]
+    counts = {"relocalised": 1, "loops": 2, "merges": 0}
+    found = outline(run := replace(broken_run, events=events, summary=broken_run.summary | counts))
+    assert headline(run).startswith("Tracking failed once: seen again; 2 loops; 50.0 % of 40 frames")
+    assert [a["title"] for a in found.of_class("at") if (a.get("title") or "").startswith("frame 26: a place")]
+    assert "1 relocalisation; 2 loops" in found.text
+    assert headline(replace(run, events=[])).startswith("Tracking never failed; 1 relocalisation; 2 loops; ")
+    twice = [{"event": "failed", "frame": f, "timestamp_s": 0.1 * f, "submap": m} for f, m in ((20, 0), (35, 1))]
+    both = replace(run, events=[twice[0], again, twice[1]])
+    assert headline(both).startswith("Tracking failed 2 times: 1 seen again, 1 not linked; 2 loops; ")
 
 
 def test_hostile_words_stay_words(broken_run: RunData) -> None:
