@@ -39,7 +39,7 @@ def report_page(run: RunData | str | Path) -> str:
         run = read_run(run)
     sequence = run.summary.get("sequence", run.name)
     body = [
-        tag("header", tag("h1", str(sequence)), tag("p", headline(run), cls="lead"), _warnings(run), _tiles(run)),
+        _header(run, str(sequence)),
         _section("Trajectory", [top_view(run), _map_link(run)]),
         _section("Every frame", timeline(run)),
         _section("Failures and recoveries", failures_section(run)),
@@ -52,6 +52,11 @@ def report_page(run: RunData | str | Path) -> str:
         _footer(run),
     ]
     return document(f"{sequence} - dualslam report", body)
+
+
+def _header(run: RunData, sequence: str) -> Markup:
+    lead = tag("p", headline(run), cls="lead")
+    return tag("header", tag("h1", sequence), lead, _saved_map(run), _warnings(run), _tiles(run))
 
 
 def _map_link(run: RunData) -> Markup | None:
@@ -85,6 +90,17 @@ def headline(run: RunData) -> str:
     also = seen_again(run.summary, -sum(story.relocalised is not None for story in told))
     apart = f"; {count(len(run.unlinked), 'submap')} stayed apart" if run.unlinked else ""
     return f"{'; '.join([failures, *also])}; {posed}{apart}."
+
+
+def _saved_map(run: RunData) -> Markup | None:
+    """Tell of the map that a run began with: it explains numbers of more than this run's frames."""
+    s = run.summary
+    if not s.get("saved_map"):
+        return None
+    aim = "finds its frames in" if s.get("localise") else "continues"
+    keyframes = f"{s.get('saved_keyframes', 0)} of the {s.get('keyframes', 0)} keyframes are of it"
+    words = f"This run {aim} the map saved in {s['saved_map']}: {keyframes}."
+    return tag("p", f"{words} Frames below 0 are those of earlier runs, -1 their last.", cls="note")
 
 
 def _warnings(run: RunData) -> Markup:

@@ -153,6 +153,9 @@ def summarise(
         "connections": _connections(system),
         "rejected_connections": sum(link.rejected for link in system.atlas.links),
         "keyframes": sum(len(submap.keyframes) for submap in system.atlas.submaps.values()),
+        "saved_keyframes": sum(
+            k < system.numbers.first_id for submap in system.atlas.submaps.values() for k in submap.keyframes
+        ),
         "landmarks": sum(int(submap.landmarks["alive"].sum()) for submap in system.atlas.submaps.values()),
         "condemned_keyframes": sum(len(submap.condemned) for submap in system.atlas.submaps.values()),
         "condemned_landmarks": sum(int(s.landmarks["condemned"].sum()) for s in system.atlas.submaps.values()),

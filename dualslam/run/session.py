@@ -167,7 +167,10 @@ def run_to_folder(
     """
     if not hasattr(sequence, "camera"):
         raise InputError(f"the sequence is a {type(sequence).__name__}; open_source opens one.")
-    given = _given(sequence, realtime)
+    given = _given(sequence, realtime) | {
+        "saved_map": None if saved_map is None else str(saved_map),
+        "localise": localise and saved_map is not None,
+    }
     if focal is not None:
         given["focal_search"] = focal.as_dict()
     sequence = corrupted(sequence, config.corruptions)

@@ -30,6 +30,15 @@ def test_a_run_on_a_saved_map_ends_with_all_its_pages(first: Path, localise: boo
     assert {path.name for path in out.iterdir()} >= {"map.html", "report.html", "trajectory.txt", "summary.json"}
     run, before = read_run(out), play(read_run(first)).spaces[0]
     assert run.summary["posed"] >= 10
+    assert run.summary["saved_map"] == str(first)
+    assert run.summary["localise"] is localise
+    n_saved, n_keyframes = run.summary["saved_keyframes"], run.summary["keyframes"]
+    assert 0 < n_saved <= n_keyframes
+    assert (n_saved == n_keyframes) == localise
+    page = (out / "report.html").read_text()
+    assert f"the map saved in {first}: {n_saved} of the {n_keyframes} keyframes are of it" in page
+    assert "the map saved in" not in (first / "report.html").read_text()
+    assert read_run(first).summary["saved_map"] is None
     space = play(run).spaces[0]
     there = (space.keyframes.row == 0).sum()
     assert there >= len(before.keyframes.row), "the first run's keyframes are in the picture from the start"
