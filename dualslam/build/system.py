@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -22,6 +23,7 @@ from dualslam.calibration.lens import Calibration
 from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import CorrectedCamera
+from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Frontend, SubmapGraph
 from dualslam.frontends.frame_reader import FrameReader
 from dualslam.frontends.gap.refinding import Refinder
@@ -51,6 +53,7 @@ def build_system(
     recovery: RecoveryExecutor | None = None,
     saved: StoredMap | None = None,
     localise: bool = False,
+    new_graph: Callable[[], SubmapGraph] | None = None,
 ) -> System:
     """Build a system from its config.
 
@@ -66,6 +69,8 @@ def build_system(
         out, is taken as known.
     localise : bool
         Find poses in the saved map, and add nothing to it.
+    new_graph : callable, optional
+        Makes the factor graph of a submap, each time anew, in the place of `ISam2SubmapGraph`; in one process alone.
 
     Returns
     -------
@@ -74,12 +79,15 @@ def build_system(
     Raises
     ------
     InputError
-        As `check_given`.
+        As `check_given`; and where graphs of one's own are to go into other processes.
     ConfigError
         As `check_config`, and where an extra or weights that a front end needs are missing.
     """
     check_config(config)
     check_given(camera, saved)
+    if new_graph is not None and config.recovery.workers:
+        raise InputError("new_graph: a graph of one's own cannot go into other processes; set recovery.workers to 0.")
+    new_graph = new_graph or partial(ISam2SubmapGraph, config.graph)
     frontend = create_frontend(config.frontend)
     known = camera if saved is None else _camera_of(saved, camera)
     is_known = saved is not None and known is saved.camera
@@ -97,11 +105,13 @@ def build_system(
     workers = config.recovery.workers
     if recovery is None:
         # Built here in any case: a mistake in the config is told at once, not by a worker.
-        parts = recovery_parts(config, camera, frontend=frontend)
+        parts = recovery_parts(config, camera, frontend=frontend, new_graph=new_graph)
     places = place_parts(config, frontend, camera)
     watch = WalkWatch()
     desk = (
-        worker_desk(config, camera, faults, watch) if workers else InlineDesk(inline_handlers(config, places.verifier))
+        worker_desk(config, camera, faults, watch)
+        if workers
+        else InlineDesk(inline_handlers(config, places.verifier, new_graph))
     )
     graphs = BesideGraphs(desk, window_solver(config)) if workers else None
     if recovery is None:
@@ -111,7 +121,7 @@ def build_system(
         Components(
             view_of=faults.around_views(reader),
             new_starter=partial(_starter_beside, desk, live) if isinstance(desk, WorkerDesk) else live.new_starter,
-            new_graph=graphs.new_graph if graphs is not None else live.new_graph,
+            new_graph=graphs.new_graph if graphs is not None else new_graph,
             new_odometry=faults.around_odometry(live.new_odometry),
             new_relocaliser=faults.around_odometry(live.new_relocaliser),
             calibration=calibration,
@@ -136,7 +146,7 @@ class LiveParts:
     """What the system makes anew with each start and each submap: the stations of a frame's walk after its features.
 
     `FrameReader` finds a frame's features; `Initialiser` starts a map from them; `VisualFrontEnd` poses the frames that
-    follow, and extends the map by keyframes; `ISam2SubmapGraph` solves it.
+    follow, and extends the map by keyframes; a `SubmapGraph` solves it.
     """
 
     config: Config
@@ -153,10 +163,6 @@ class LiveParts:
     def new_starter(self) -> Initialiser:
         """Make what collects views until two of them start a map."""
         return new_initialiser(self.config, self.frontend, self.given.size_px, self.camera().K)
-
-    def new_graph(self) -> ISam2SubmapGraph:
-        """Make the factor graph of a submap, solved in this process."""
-        return ISam2SubmapGraph(self.config.graph)
 
     def new_odometry(self, submap: Submap, graph: SubmapGraph) -> VisualFrontEnd:
         """Make the front end that tracks frames against a submap and extends it."""

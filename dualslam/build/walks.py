@@ -49,11 +49,12 @@ def recovery_parts(
     budget_s: float | None = None,
     frontend: Frontend | None = None,
     n_threads: int = FEATURE_THREADS,
+    new_graph: Callable[[], SubmapGraph] | None = None,
 ) -> RecoveryParts:
     """Build what reverse tracking is made of, for a camera as it was given; see `RecoveryParts.budget_s`.
 
     `frontend`: the live one, where this process has it already: it may hold networks. `n_threads`: that find other
-    front ends' features beside the walk; the results do not depend on it.
+    front ends' features beside the walk; the results do not depend on it. `new_graph`: instead of `ISam2SubmapGraph`.
 
     Raises
     ------
@@ -73,7 +74,7 @@ def recovery_parts(
     return RecoveryParts(
         attempts=_attempts(config, frontend, live, camera, n_threads),
         posing=Attempt("live", live),
-        new_graph=lambda: ISam2SubmapGraph(config.graph),
+        new_graph=new_graph or partial(ISam2SubmapGraph, config.graph),
         link=lambda old, new, onset: estimate_link(
             old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
         ),

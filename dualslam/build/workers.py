@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 from dualslam.backend.submap_graph import ISam2SubmapGraph
@@ -10,6 +11,7 @@ from dualslam.build.walks import FEATURE_THREADS, recovery_parts
 from dualslam.calibration.lens import CalibrationAnswer, CalibrationJob, answer
 from dualslam.config.settings import Config, FrontendConfig
 from dualslam.core.camera.base import Camera
+from dualslam.core.interfaces import SubmapGraph
 from dualslam.core.threads import spare_cores
 from dualslam.core.types import Failure
 from dualslam.frontends.registry import create_frontend
@@ -38,12 +40,12 @@ GRAPH_NICENESS, WALK_NICENESS = 3, 8
 where cores are short."""
 
 
-def calibration_handlers(config: Config) -> Handlers:
-    """Build what answers questions about the camera."""
+def calibration_handlers(config: Config, new_graph: Callable[[], SubmapGraph] | None = None) -> Handlers:
+    """Build what answers questions about the camera; `new_graph`: instead of `ISam2SubmapGraph`."""
 
     def answered(job: CalibrationJob) -> CalibrationAnswer | Failure:
         calibration = new_calibration(config, job.camera, job.covariance)
-        return answer(job, calibration, lambda: ISam2SubmapGraph(config.graph))
+        return answer(job, calibration, new_graph or partial(ISam2SubmapGraph, config.graph))
 
     return {JobKind.CALIBRATION: answered}
 
@@ -63,13 +65,13 @@ READOUT_HANDLERS: Handlers = {JobKind.READOUT: answer_readout}
 """What tells how long images were read."""
 
 
-def inline_handlers(config: Config, verifier: PlaceVerifier) -> Handlers:
+def inline_handlers(config: Config, verifier: PlaceVerifier, new_graph: Callable[[], SubmapGraph]) -> Handlers:
     """Build what is done at once where there are no workers; reverse tracking has an executor of its own."""
     return {
         **edge_handlers(config),
         **SCALE_HANDLERS,
         **READOUT_HANDLERS,
-        **calibration_handlers(config),
+        **calibration_handlers(config, new_graph),
         **place_handlers(verifier),
     }
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pytest
+
+import dualslam
 from dualslam.backend import ISam2SubmapGraph
 from dualslam.config.settings import GraphConfig
 from dualslam.testing.graph_scene import guessed_submap, make_scene, pose_errors
@@ -16,3 +19,25 @@ def test_a_factor_graph_finds_the_truth_from_a_bad_guess() -> None:
     assert before.max() > 0.02
     assert after.max() < 0.01
     assert turned_rad.max() < 0.01
+
+
+def test_a_graph_of_ones_own_serves_a_whole_run() -> None:
+    made: list[ISam2SubmapGraph] = []
+
+    def new_graph() -> ISam2SubmapGraph:
+        made.append(ISam2SubmapGraph(GraphConfig()))
+        return made[-1]
+
+    sequence = dualslam.open_source("synthetic:street,frames=30,seed=3,width=320,height=240")
+    config = dualslam.load_config(overrides=["frontend.n_features=500"])
+    system = dualslam.build_system(config, sequence.camera, new_graph=new_graph)
+    for frame in sequence:
+        system.step(frame)
+    assert system.live is not None
+    assert system.live.graph in made
+    graph = made[made.index(system.live.graph)]  # type: ignore[arg-type]
+    assert len(graph.factor_rows) > 0
+    assert len(graph.full_estimate(system.live.submap).keyframe_ids) == len(system.live.submap.keyframes)
+    beside = dualslam.load_config(overrides=["recovery.workers=1"])
+    with pytest.raises(dualslam.InputError, match=r"recovery\.workers to 0"):
+        dualslam.build_system(beside, sequence.camera, new_graph=new_graph)
