@@ -26,8 +26,8 @@ BUILT_IN: Mapping[str, str] = {
 }
 """Name to ``module:attribute``; the module is imported only when its name is asked for."""
 
-EXTRAS: Mapping[str, str] = {"kornia": "dualslam[kornia]"}
-"""What to install for a built-in front end that needs more than the core's dependencies."""
+EXTRAS: Mapping[str, str] = {"kornia": "kornia"}
+"""The extra to install for a built-in front end that needs more than the core's dependencies."""
 
 EXTRA_OPTIONS: Mapping[str, str] = {"kornia": "dualslam.frontends.features.kornia.options:KorniaOptions"}
 """Options of the built-in front ends that need an extra, in modules that can be imported without it."""
@@ -130,7 +130,7 @@ def _factory(name: str) -> FrontendFactory:
         found = _import(name)
     except (ImportError, AttributeError, ValueError, SyntaxError) as error:
         missing_extra = isinstance(error, ModuleNotFoundError) and name in EXTRAS
-        advice = f"; pip install '{EXTRAS[name]}'" if missing_extra else ""
+        advice = f'; pip install -e ".[{EXTRAS[name]}]" in the checkout' if missing_extra else ""
         raise ConfigError(f"frontend.name: '{name}' cannot be imported: {error}{advice}") from error
     if not callable(getattr(found, "from_options", None)):
         raise ConfigError(f"frontend.name: '{name}' is no front end: it has no from_options")

@@ -21,7 +21,7 @@ def draw_figures(
 ) -> list[Path]:
     """Draw the figures into ``figures/``; return what was written: nothing without matplotlib, and the log says so."""
     if find_spec("matplotlib") is None:
-        log.warning("no figures: they need matplotlib (pip install 'dualslam[report]')")
+        log.warning('no figures: they need matplotlib (pip install -e ".[report]" in the checkout)')
         return []
     from dualslam.report.bench_figures import draw_delays, draw_end_points, draw_rates, draw_statuses
 

@@ -57,10 +57,9 @@ def _execute(args: argparse.Namespace) -> int:
     chosen.write(exported, args.out)
     if not args.quiet:
         errors = exported.reprojection_errors_px()
-        unit = "the map's unit" if metres is None else "metres"
         print(
-            f"{len(exported.frame)} views, {len(exported.xyz)} points, {len(exported.view)} observations, in {unit}, "
-            f"mean reprojection error {np.nanmean(errors):.3f} px; {args.to} in {args.out}",
+            f"{len(exported.frame)} views, {len(exported.xyz)} points, {len(exported.view)} observations, "
+            f"in {_unit(metres)}, mean reprojection error {np.nanmean(errors):.3f} px; {args.to} in {args.out}",
             flush=True,
         )
         _tell_left_out(np.setdiff1d(all_keyframes, exported.frame), min(numbers.values(), default=0))
@@ -123,7 +122,7 @@ def _copy_trajectory(args: argparse.Namespace) -> int:
         rows = [" ".join(f"{x:.9g}" for x in T[:3].ravel()) for T in _in_metres(read_kitti(source), metres)]
         write_text(args.out, "".join(f"{row}\n" for row in rows))
     if not args.quiet:
-        print(f"trajectory in {args.out}", flush=True)
+        print(f"trajectory, in {_unit(metres)}, in {args.out}", flush=True)
     return 0
 
 
@@ -132,6 +131,10 @@ def _write_recording(args: argparse.Namespace) -> int:
         raise InputError(f"--images and --distance do not go with --to {args.to}, which records the run as it was.")
     save_recording(args.run, args.out, args.quiet)
     return 0
+
+
+def _unit(metres: float | None) -> str:
+    return "the map's unit" if metres is None else "metres"
 
 
 def _in_metres(T_world_cam: FloatArray, metres: float) -> FloatArray:

@@ -26,10 +26,15 @@ MAX_PORT = 65535
 SHORTEST_M, LONGEST_M = 1e-6, 1e9
 """Of a known length: a mistyped exponent, and nothing that a camera could see, lies outside."""
 SOURCE_HELP = (
-    "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours), a folder of images or a video file with --camera or "
-    "--fov, a webcam's number, or an embedded world: synthetic:street, room, circuit, eight, terrace, "
-    "corridors, posters, board, parked, takeoff, standstill, hover, with options as in "
+    "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours); a folder of images or a video file, whose camera is "
+    "searched for without --camera or --fov; with one of these a webcam's number, or the address of a stream "
+    "(rtsp://..., http://...); or an embedded world: synthetic:street, room, circuit, eight, terrace, corridors, "
+    "posters, board, parked, takeoff, standstill, hover, with options as in "
     "synthetic:street,frames=300,seed=1,events=FILE"
+)
+EXIT_STATUSES = (
+    "Exit status: 0 done; 1 no frame has a pose, or something failed that was not asked for; 2 bad usage or bad input; "
+    "130 interrupted (what a run has found by then is written)."
 )
 
 
@@ -79,7 +84,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def _build_parser() -> _Parser:
-    parser = _Parser(prog="dualslam", description="Monocular SLAM that recovers from tracking failure.")
+    parser = _Parser(
+        prog="dualslam", description="Monocular SLAM that recovers from tracking failure.", epilog=EXIT_STATUSES
+    )
     parser.add_argument("--version", action="version", version=f"dualslam {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
     _add_run(commands)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from dualslam.core.errors import InputError
 from dualslam.export.exported_map import flatten, read_stored
 from dualslam.export.metric import MetricScale, by_distance, by_height, by_marker
-from dualslam.io.metric_scale import write_scale
+from dualslam.io.metric_scale import read_scale, write_scale
 from dualslam.io.run_folder import read_numbers
 from dualslam.run.sources import open_images_of_run
+
+NOTABLE = 0.05
+"""Change of a scale that is told: a height and a marker are right to 2 % each (docs/exports.md)."""
 
 
 def execute(args: argparse.Namespace) -> int:
@@ -30,8 +34,19 @@ def execute(args: argparse.Namespace) -> int:
         assert stored.camera is not None
         source = open_images_of_run(args.images, exported.size_px)
         scale = by_marker(exported, stored.camera, source, numbers, args.marker, args.dictionary)
+    before = _scale_before(args.run)
     write_scale(args.run, scale.metres_per_unit, scale.sigma_rel, scale.words)
     if not args.quiet:
         how_sure = "" if scale.sigma_rel is None else f" (sigma {100 * scale.sigma_rel:.2g} %)"
         print(f"a unit of the map is {scale.metres_per_unit:.5g} m{how_sure}: {scale.words}", flush=True)
+        if before is not None and abs(scale.metres_per_unit / before - 1) > NOTABLE:
+            times = scale.metres_per_unit / before
+            print(f"that is {times:.3g} times what it was ({before:.5g} m): exports made before do not go with it")
     return 0
+
+
+def _scale_before(run: Path) -> float | None:
+    try:
+        return read_scale(run)
+    except InputError:  # damaged: to scale again is what mends it
+        return None

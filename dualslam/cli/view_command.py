@@ -37,5 +37,5 @@ def _record(run: RunData) -> bytes:
     try:
         from dualslam.viewer.recording import make_recording
     except ImportError as error:
-        raise InputError('dualslam view needs the Rerun viewer: pip install "dualslam[view]".') from error
+        raise InputError('dualslam view needs the Rerun viewer: pip install -e ".[view]" in the checkout.') from error
     return make_recording(run)

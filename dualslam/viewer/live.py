@@ -57,7 +57,7 @@ class LiveView:
 
     def __init__(self, port: int = 0) -> None:
         if importlib.util.find_spec("viser") is None:
-            raise InputError('--live needs the live viewer: pip install "dualslam[live]".')
+            raise InputError('--live needs the live viewer: pip install -e ".[live]" in the checkout.')
         self.on_save: Callable[[str], None] | None = None
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()

@@ -203,6 +203,13 @@ def test_a_scale_stays_with_the_map_and_exports_use_it(
     assert read_scale(tmp_path) == pytest.approx(METRES_PER_UNIT)
     assert main(["scale", str(tmp_path), "--distance", "3", "30", "10"]) == 2
     assert "frame 30 is none of the run's" in capsys.readouterr().err
+    assert main(["scale", str(tmp_path), "--distance", "3", "23", "10.2"]) == 0
+    assert "times what it was" not in capsys.readouterr().out
+    assert main(["scale", str(tmp_path), "--distance", "3", "23", "20.4"]) == 0
+    assert "that is 2 times what it was (3.774 m)" in capsys.readouterr().out
+    (tmp_path / "map" / SCALE).write_text("{")  # mended by a scale
+    assert main(["scale", str(tmp_path), "--distance", "3", "23", "10"]) == 0
+    assert "times" not in capsys.readouterr().out
     out = tmp_path / "map.ply"
     assert main(["export", str(tmp_path), "--to", "ply", "--out", str(out)]) == 0
     assert "in metres" in capsys.readouterr().out
@@ -212,11 +219,15 @@ def test_a_scale_stays_with_the_map_and_exports_use_it(
     assert np.allclose(xyz, METRES_PER_UNIT * given.xyz, atol=1e-3)
 
 
-def test_trajectories_come_in_metres_too(tmp_path: Path) -> None:
+def test_trajectories_come_in_metres_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "map").mkdir()
     (tmp_path / "trajectory.txt").write_text("0.5 1 2 3 0 0 0 1\n")
     (tmp_path / "trajectory_kitti.txt").write_text("1 0 0 1 0 1 0 2 0 0 1 3\n")
+    assert main(["export", str(tmp_path), "--to", "tum", "--out", str(tmp_path / "unit")]) == 0
+    assert "in the map's unit" in capsys.readouterr().out
     write_scale(tmp_path, 2.0, None, "a ruler")
+    assert main(["export", str(tmp_path), "--to", "tum", "--out", str(tmp_path / "metres")]) == 0
+    assert "in metres" in capsys.readouterr().out
     for name in ("tum", "kitti"):
         assert main(["export", str(tmp_path), "--to", name, "--out", str(tmp_path / name), "--quiet"]) == 0
     assert [float(x) for x in (tmp_path / "tum").read_text().split()[1:4]] == [2, 4, 6]

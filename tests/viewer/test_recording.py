@@ -266,7 +266,7 @@ def test_without_rerun_it_says_how_to_get_it(
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.delitem(sys.modules, "dualslam.viewer.recording")
     assert main(["view", str(broken_run.path), "--save", str(tmp_path / "run.rrd")]) == 2
-    assert 'pip install "dualslam[view]"' in one_sentence(capsys)
+    assert 'pip install -e ".[view]"' in one_sentence(capsys)
     assert list(tmp_path.iterdir()) == []
 
 

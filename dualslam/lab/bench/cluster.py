@@ -34,7 +34,7 @@ def run_on_cluster(run_trial: RunTrial, trials: Iterable[Trial], address: str) -
     try:
         from distributed import Client, as_completed
     except ImportError as error:
-        raise InputError("--scheduler needs dask.distributed: pip install 'dualslam[cluster]'.") from error
+        raise InputError('--scheduler needs dask.distributed: pip install -e ".[cluster]" in the checkout.') from error
     try:
         client = Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -261,4 +261,4 @@ def test_without_the_extra_the_error_says_what_to_install(missing: str) -> None:
         "try: create_frontend(FrontendConfig(name='kornia'))\n"
         "except ConfigError as error: print(error)"
     )
-    assert "pip install 'dualslam[kornia]'" in run(code)
+    assert 'pip install -e ".[kornia]"' in run(code)
