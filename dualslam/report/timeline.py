@@ -13,7 +13,7 @@ import numpy as np
 
 from dualslam.core.types import FloatArray, FrameStatus
 from dualslam.report.canvas import ticks
-from dualslam.report.markup import Markup, coordinate, duration, number, stretched, tag
+from dualslam.report.markup import ROUNDING, Markup, coordinate, duration, number, stretched, tag
 from dualslam.report.placement import PlacedRun, place
 from dualslam.report.run_data import RunData
 from dualslam.report.statuses import MEANING, count, span, stretches
@@ -106,14 +106,13 @@ def _inlier_lane(run: RunData) -> Markup:
     inliers = np.array([row.n_inliers for row in run.rows], float)
     top = max(float(matches.max()), 1.0)
     shapes = [_area(matches, top, "matches"), _area(inliers, top, "inliers")]
-    words = [tag("span", number(top), cls="y-max")]
     threshold = (run.config.get("health") or {}).get("min_inliers")
-    note = "matched, and agreeing (dark)"
+    note = f"matched, and agreeing (dark), up to {number(top)}"
     if isinstance(threshold, int) and threshold < top:
         y = 100 * (1 - threshold / top)
         shapes.append(tag("path", cls="threshold", d=f"M0 {coordinate(y)}H{len(run.rows)}"))
         note += f"; dashed: {threshold} needed"
-    return _lane("landmarks", note, stretched(len(run.rows), 100, shapes, "Landmarks matched and agreeing"), words)
+    return _lane("landmarks", note, stretched(len(run.rows), 100, shapes, "Landmarks matched and agreeing"))
 
 
 def _error_lane(run: RunData, scene: PlacedRun) -> Markup | None:
@@ -124,10 +123,9 @@ def _error_lane(run: RunData, scene: PlacedRun) -> Markup | None:
     if not np.isfinite(error).any():
         return None
     top = float(np.nanmax(error))
-    note = "distance from the truth after alignment, each map by itself"
+    note = f"distance from the truth after alignment, each map by itself, up to {number(top)} m"
     shape = _curve(error, max(top, 1e-12), "error")
-    words = [tag("span", f"{number(top)} m", cls="y-max")]
-    return _lane("error", note, stretched(len(run.rows), 100, shape, "Position error"), words)
+    return _lane("error", note, stretched(len(run.rows), 100, shape, "Position error"))
 
 
 def _latency_lane(run: RunData) -> Markup:
@@ -135,15 +133,16 @@ def _latency_lane(run: RunData) -> Markup:
     # Logarithmic, as a recovery in this process takes a thousand times longer than a frame.
     low, top = 1.0, max(float(latency.max()), 10.0)
     height = np.log10(np.clip(latency, low, None) / low)
-    words = [tag("span", duration(top), cls="y-max")]
     svg = stretched(len(latency), 100, _area(height, float(np.log10(top / low)), "latency"), "Latency of each frame")
-    return _lane("latency", "wall time of each frame, logarithmic from 1 ms", svg, words)
+    return _lane("latency", f"wall time of each frame, logarithmic from 1 ms to {duration(top)}", svg)
 
 
 def _axis(run: RunData) -> Markup:
     n, first, last = len(run.rows), run.rows[0].index, run.rows[-1].index
     words = []
     for value in ticks(min(first, last), max(first, last), 6):
+        if abs(value - round(value)) > ROUNDING:  # of a few frames
+            continue
         share = (value - first) / (last - first) if last != first else 0.0
         words.append(_at(100 * (share * (n - 1) + 0.5) / n, number(value, 6), "tick"))
     seconds = abs(run.rows[-1].timestamp_s - run.rows[0].timestamp_s)

@@ -27,6 +27,7 @@ from dualslam.report.markup import Markup, tag
 from dualslam.report.page import headline
 from dualslam.report.placement import place, plane_from_above
 from dualslam.report.run_data import PosedRows, _map_points
+from dualslam.report.timeline import _axis
 from tests.cli.fakes import NO_FEATURES
 from tests.report.conftest import LOST, N_FRAMES, MakeRun, with_events
 
@@ -102,6 +103,12 @@ def test_a_map_that_was_found_again_counts_as_such(broken_run: RunData) -> None:
     twice = [{"event": "failed", "frame": f, "timestamp_s": 0.1 * f, "submap": m} for f, m in ((20, 0), (35, 1))]
     both = replace(run, events=[twice[0], again, twice[1]])
     assert headline(both).startswith("Tracking failed 2 times: 1 seen again, 1 not linked; 2 loops; ")
+
+
+def test_ticks_stand_at_frames(broken_run: RunData) -> None:
+    few = replace(broken_run, rows=broken_run.rows[:2])
+    ticks_of_axis = re.findall(r'class="at tick"[^>]*>([^<]*)<', str(_axis(few)))
+    assert ticks_of_axis == ["0", "1"]
 
 
 def test_hostile_words_stay_words(broken_run: RunData) -> None:
