@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dualslam.core.geometry import se3, so3
+from dualslam.export.decimals import decimals
 from dualslam.export.exported_map import ExportedMap
 from dualslam.io.atomic import write_text
 
@@ -41,7 +42,7 @@ def _cameras(exported: ExportedMap) -> str:
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy"]
     for c, K in enumerate(exported.K):
         numbers = (K[0, 0], K[1, 1], K[0, 2] + CORNER_PX, K[1, 2] + CORNER_PX)
-        lines.append(f"{c + 1} PINHOLE {width} {height} {_words(numbers)}")
+        lines.append(f"{c + 1} PINHOLE {width} {height} {decimals(numbers)}")
     return "\n".join(lines) + "\n"
 
 
@@ -50,12 +51,12 @@ def _images(exported: ExportedMap, by_view: np.ndarray, first: np.ndarray) -> st
     T_cam_world = se3.inverse(exported.T_world_cam)
     quat = so3.quat_xyzw_from_matrix(T_cam_world[:, :3, :3])[:, [3, 0, 1, 2]]
     for v, frame in enumerate(exported.frame.tolist()):
-        pose = _words((*quat[v], *T_cam_world[v, :3, 3]))
+        pose = decimals((*quat[v], *T_cam_world[v, :3, 3]))
         lines.append(f"{v + 1} {pose} {exported.camera[v] + 1} {image_name(frame)}")
         rows = by_view[first[v] : first[v + 1]]
         uv = exported.uv_px[rows] + CORNER_PX
         points = (exported.point[rows] + 1).tolist()
-        lines.append(" ".join(f"{x!r} {y!r} {p}" for (x, y), p in zip(uv.tolist(), points, strict=True)))
+        lines.append(" ".join(f"{decimals(at)} {p}" for at, p in zip(uv.tolist(), points, strict=True)))
     return "\n".join(lines) + "\n"
 
 
@@ -70,9 +71,5 @@ def _points(exported: ExportedMap, place: np.ndarray) -> str:
     for p in range(n):
         track = " ".join(f"{views[r]} {places[r]}" for r in range(first[p], first[p + 1]))
         colour = " ".join(str(c) for c in exported.colour[p].tolist())
-        lines.append(f"{p + 1} {_words(exported.xyz[p])} {colour} {float(mean[p])!r} {track}")
+        lines.append(f"{p + 1} {decimals(exported.xyz[p])} {colour} {decimals(mean[p : p + 1])} {track}")
     return "\n".join(lines) + "\n"
-
-
-def _words(numbers: object) -> str:
-    return " ".join(repr(float(x)) for x in numbers)  # type: ignore[attr-defined]

@@ -13,6 +13,7 @@ import numpy as np
 
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray
+from dualslam.export.decimals import decimals
 from dualslam.export.exported_map import ExportedMap
 from dualslam.io.atomic import write_text
 
@@ -45,4 +46,4 @@ def edges(exported: ExportedMap) -> list[tuple[int, int, int]]:
 
 def _pose(T: FloatArray) -> str:
     quat = so3.quat_xyzw_from_matrix(T[:3, :3])
-    return " ".join(repr(float(x)) for x in (*T[:3, 3], *quat))
+    return decimals((*T[:3, 3], *quat))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dualslam.export.colmap import image_name
+from dualslam.export.decimals import DECIMALS
 from dualslam.export.exported_map import ExportedMap
 from dualslam.export.ply import ply_bytes
 from dualslam.io.atomic import atomic_file, write_text
@@ -26,7 +27,7 @@ def write_nerfstudio(exported: ExportedMap, out: Path) -> None:
         frames.append(
             {
                 "file_path": f"images/{image_name(frame)}",
-                "transform_matrix": (exported.T_world_cam[v] @ TO_OPENGL).tolist(),
+                "transform_matrix": (np.round(exported.T_world_cam[v] @ TO_OPENGL, DECIMALS) + 0.0).tolist(),
                 "fl_x": K[0, 0],
                 "fl_y": K[1, 1],
                 "cx": K[0, 2] + 0.5,

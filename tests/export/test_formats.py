@@ -16,6 +16,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.types import Frame
 from dualslam.export.bal import write_bal
 from dualslam.export.colmap import write_colmap
+from dualslam.export.decimals import decimals
 from dualslam.export.exported_map import ExportedMap, flatten
 from dualslam.export.g2o import write_g2o
 from dualslam.export.images import with_images
@@ -224,3 +225,11 @@ def test_bad_input_is_one_sentence(
     assert len(error.splitlines()) == 1
     assert not (tmp_path / "a.txt").exists()
     assert (tmp_path / "taken" / "mine").read_text() == "keep"
+
+
+def test_numbers_have_no_exponents_and_read_back_the_same() -> None:
+    numbers = [1.0, -0.1, 1 / 3, 1e9 / 3, 1e-7, 123456.789012345, 4.9e-19, -4.9e-19]
+    text = decimals(numbers)
+    assert "e" not in text
+    assert [float(x) for x in text.split()] == pytest.approx([*numbers[:-2], 0.0, 0.0], rel=1e-15, abs=1e-15)
+    assert text.split()[-2:] == ["0", "0"]
