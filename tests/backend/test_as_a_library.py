@@ -35,7 +35,7 @@ def test_a_graph_of_ones_own_serves_a_whole_run() -> None:
         system.step(frame)
     assert system.live is not None
     assert system.live.graph in made
-    graph = made[made.index(system.live.graph)]  # type: ignore[arg-type]
+    graph = made[made.index(system.live.graph)]
     assert len(graph.factor_rows) > 0
     assert len(graph.full_estimate(system.live.submap).keyframe_ids) == len(system.live.submap.keyframes)
     beside = dualslam.load_config(overrides=["recovery.workers=1"])
