@@ -67,23 +67,29 @@ def collect(
     system.finish()
     truth = sequence.ground_truth_T_world_cam[:, :3, 3]
     for submap in system.atlas.submaps.values():
-        claims = claims_of(submap)
-        ids = np.array(sorted(submap.keyframes))
-        centres = submap.keyframe_poses(ids)[:, :3, 3]
-        for n in range(AROUND, len(ids) - AROUND):
-            k = int(ids[n])
-            about = np.arange(n - AROUND, n + AROUND + 1)
-            s, R, t = align_points(centres[about], truth[ids[about]])
-            error = float(np.linalg.norm(s * centres[n] @ R.T + t - truth[k]))
-            claimed = s * claims[k].sigma_position_rel * _depth(submap, k)
-            kind = _kind(n, k, ids)
-            if claimed > 0:
-                position[kind].append(error / claimed)
-        for begin in range(GROUP, len(ids) - 2 * GROUP, GROUP):
-            k, sigma = int(ids[begin]), claims[int(ids[begin])].sigma_scale
-            before, after = (_scale(centres, truth, ids, at) for at in (begin - GROUP, begin + GROUP))
-            if np.isfinite(sigma) and sigma > 0:
-                scale[_kind(begin, k, ids)].append(float(np.log(after / before)) / sigma)
+        compare(submap, truth, position, scale)
+
+
+def compare(submap: Submap, truth: FloatArray, position: dict[str, list[float]], scale: dict[str, list[float]]) -> None:
+    """Add the ratios of one map; `truth`: the true centres (F, 3) of all frames."""
+    claims = claims_of(submap)
+    # What a by-pass has condemned claims nothing: no frame of the run goes by it.
+    ids = np.array(sorted(submap.keyframes.keys() - submap.condemned))
+    centres = submap.keyframe_poses(ids)[:, :3, 3]
+    for n in range(AROUND, len(ids) - AROUND):
+        k = int(ids[n])
+        about = np.arange(n - AROUND, n + AROUND + 1)
+        s, R, t = align_points(centres[about], truth[ids[about]])
+        error = float(np.linalg.norm(s * centres[n] @ R.T + t - truth[k]))
+        claimed = s * claims[k].sigma_position_rel * _depth(submap, k)
+        kind = _kind(n, k, ids)
+        if claimed > 0:
+            position[kind].append(error / claimed)
+    for begin in range(GROUP, len(ids) - 2 * GROUP, GROUP):
+        k, sigma = int(ids[begin]), claims[int(ids[begin])].sigma_scale
+        before, after = (_scale(centres, truth, ids, at) for at in (begin - GROUP, begin + GROUP))
+        if np.isfinite(sigma) and sigma > 0:
+            scale[_kind(begin, k, ids)].append(float(np.log(after / before)) / sigma)
 
 
 def _scale(centres: FloatArray, truth: FloatArray, ids: IntArray, begin: int) -> float:

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.core.chi_square import MEDIAN_CHI2
 from dualslam.core.geometry import se3
-from dualslam.core.geometry.projection import projection_jacobians
+from dualslam.core.geometry.projection import project_points, projection_jacobians
 from dualslam.core.types import FloatArray
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
@@ -25,6 +26,14 @@ sink, by a quarter with 6 (a room), since more of the map holds the scale: the i
 MIN_LANDMARKS = 6
 POSITION_INFLATION = 1.1
 """As `SCALE_INFLATION` (`recovery/scale_watch.py`), for positions."""
+USUAL_NOISE = 0.33
+"""Standard deviation of residuals, in the pixels' sigmas, for which the inflations are made: that of plain stretches.
+In blurred ones it is 0.4 to 0.7."""
+NEAR = 2
+"""Keyframes before and after by whose residuals, too, a position is judged: it is one against what they hold. The first
+after a blurred stretch see sharply what the blurred ones have placed."""
+MIN_VIEWS, MIN_RESIDUALS = 3, 10
+"""What a keyframe's residuals are read from: landmarks of so many views, and so many of them. With less it is usual."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +55,36 @@ class Claim:
 
 def claims_of(submap: Submap) -> dict[int, Claim]:
     """Return what a submap claims of its keyframes."""
-    scale, covariances = _scale_sigmas(submap), landmark_covariances(submap, np.arange(len(submap.landmarks)))
-    return {k: Claim(_position_sigma(submap, k, covariances), scale[k]) for k in submap.keyframes}
+    excess = _excess(submap)
+    ids = sorted(submap.keyframes)
+    scale, covariances = _scale_sigmas(submap, excess), landmark_covariances(submap, np.arange(len(submap.landmarks)))
+    claims = {}
+    for n, k in enumerate(ids):
+        near = max(excess[other] for other in ids[max(n - NEAR, 0) : n + NEAR + 1])
+        claims[k] = Claim(near * _position_sigma(submap, k, covariances), scale[k])
+    return claims
+
+
+def _excess(submap: Submap) -> dict[int, float]:
+    """Return how many times larger than is usual each keyframe's residuals are, by their median; at least 1.
+
+    What a soft image adds to them, it adds to the errors that do not average out.
+    """
+    obs = submap.observations
+    n_views = np.bincount(obs["landmark"][obs["alive"]], minlength=len(submap.landmarks))
+    excess = dict.fromkeys(submap.keyframes, 1.0)
+    for k, keyframe in submap.keyframes.items():
+        feature = np.flatnonzero(submap.landmark_of[k] >= 0)
+        ids = submap.landmark_of[k][feature]
+        feature, ids = feature[n_views[ids] >= MIN_VIEWS], ids[n_views[ids] >= MIN_VIEWS]
+        uv, _ = project_points(submap.K, se3.inverse(submap.T_submap_kf[k]), submap.landmarks["xyz_mu"][ids])
+        features = keyframe.features
+        chi2 = ((uv - features.uv_rect_px[feature]) ** 2).sum(axis=1) / features.sigma_px[feature] ** 2
+        chi2 /= 1 - 1.5 / n_views[ids]  # a landmark takes 3 of its views' numbers
+        chi2 = chi2[np.isfinite(chi2)]
+        if len(chi2) >= MIN_RESIDUALS:
+            excess[k] = max(1.0, float(np.sqrt(np.median(chi2) / MEDIAN_CHI2[2])) / USUAL_NOISE)
+    return excess
 
 
 def _position_sigma(submap: Submap, keyframe_id: int, covariances: FloatArray) -> float:
@@ -72,8 +109,11 @@ def _position_sigma(submap: Submap, keyframe_id: int, covariances: FloatArray) -
     return POSITION_INFLATION * float(np.sqrt(max(variance, 0.0)) / np.median(depth[known]))
 
 
-def _scale_sigmas(submap: Submap) -> dict[int, float]:
-    """Ask, for each group of keyframes, how well those before and those after it hold one scale."""
+def _scale_sigmas(submap: Submap, excess: dict[int, float]) -> dict[int, float]:
+    """Ask, for each group of keyframes, how well those before and those after it hold one scale.
+
+    The noisiest of them says how much less well: the scale goes through all of them.
+    """
     ids = np.array(sorted(submap.keyframes), np.int64)
     groups = [ids[begin : begin + GROUP] for begin in range(0, len(ids), GROUP)]
     sigma_of: dict[int, float] = {}
@@ -82,5 +122,7 @@ def _scale_sigmas(submap: Submap) -> dict[int, float]:
         # At either end of the map the group itself stands for those that are missing.
         around = [(groups[max(g - 1, 0)], groups[min(g + 1, len(groups) - 1)]) for g in asked]
         for g, sigma in zip(asked, scale_sigmas_between(submap, around, PIXEL_CHI2), strict=True):
-            sigma_of |= dict.fromkeys(groups[g].tolist(), SCALE_INFLATION * sigma)
+            through = np.concatenate(groups[max(g - 1, 0) : g + 2]).tolist()
+            inflation = SCALE_INFLATION * max(excess[k] for k in through)
+            sigma_of |= dict.fromkeys(groups[g].tolist(), inflation * sigma)
     return sigma_of if len(groups) > 1 else dict.fromkeys(sigma_of, float("nan"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -62,6 +63,22 @@ def test_fewer_landmarks_leave_a_position_less_sure() -> None:
     rows = np.flatnonzero((poor.observations["kf"] == k) & poor.observations["alive"])
     poor.remove_observations(rows[: int(0.9 * len(rows))])
     assert claims_of(poor)[k].sigma_position_rel > 2 * claims_of(submap)[k].sigma_position_rel
+
+
+def test_where_pixels_fit_worse_less_is_claimed_of_what_lies_about() -> None:
+    submap = run()[0].atlas.submaps[0]
+    ids = sorted(submap.keyframes)
+    at = len(ids) // 2
+    soft = submap.copy()
+    keyframe = soft.keyframes[ids[at]]
+    noise = np.random.default_rng(0).normal(0.0, 3.0, keyframe.features.uv_rect_px.shape)
+    features = replace(keyframe.features, uv_rect_px=keyframe.features.uv_rect_px + noise)
+    soft.keyframes[ids[at]] = replace(keyframe, features=features)
+    sharp, claims = claims_of(submap), claims_of(soft)
+    for k in ids[at - 2 : at + 3]:
+        assert claims[k].sigma_position_rel > 1.5 * sharp[k].sigma_position_rel
+    assert claims[ids[at]].sigma_scale > 1.5 * sharp[ids[at]].sigma_scale
+    assert claims[ids[0]].sigma_position_rel == sharp[ids[0]].sigma_position_rel
 
 
 def test_where_nothing_is_seen_on_both_sides_the_scale_is_not_handed_on() -> None:
