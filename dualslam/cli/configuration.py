@@ -17,11 +17,17 @@ from dualslam.core.errors import ConfigError
 def config_of(args: argparse.Namespace) -> Config:
     """Resolve ``--config``, ``--set``, ``--corrupt`` and the options that stand for single fields, the latter last.
 
+    The files are read once, as they may be pipes: `args` keeps what is found, as `resolved` and `overrides`.
+
     Raises
     ------
     ConfigError
     """
-    return load_config(args.config, _overrides(args))
+    if getattr(args, "resolved", None) is None:
+        args.overrides = _overrides(args)
+        args.resolved = load_config(args.config, args.overrides)
+    config: Config = args.resolved
+    return config
 
 
 def _overrides(args: argparse.Namespace) -> list[Override]:
@@ -51,7 +57,7 @@ def naming_source(args: argparse.Namespace) -> Iterator[None]:
     try:
         yield
     except ConfigError as error:
-        source = next((o.source for o in reversed(_overrides(args)) if ".".join(o.path) in str(error)), args.config)
+        source = next((o.source for o in reversed(args.overrides) if ".".join(o.path) in str(error)), args.config)
         raise ConfigError(str(error) if source is None else f"{source}: {error}") from error
 
 

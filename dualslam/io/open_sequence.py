@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import camera_from_fov
 from dualslam.core.errors import InputError, NoCalibrationError
+from dualslam.core.missing import check_exists
 from dualslam.io import dataset_folder, euroc, folder, kitti, tum_mono, tum_rgbd, video
 from dualslam.io.camera_files import make_camera, read_camera_file
 from dualslam.io.reduced import MAX_SIDE_PX, ReducedImages, reduced_camera, reduction
@@ -109,11 +110,7 @@ def open_sequence(
 
 
 def _open_recording(source: Path, given: Given) -> Recording:
-    if not source.exists():
-        raise InputError(
-            f"{source} does not exist; give a sequence folder, a video file, the number of a webcam or the "
-            "address of a stream."
-        )
+    check_exists(source)
     if not source.is_file() and not source.is_dir():
         raise InputError(f"{source} is neither a file nor a folder (a pipe?); give one, or the address of a stream.")
     if source.is_file():

@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import os
 import platform
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -75,7 +77,7 @@ def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
         ),
         ("config --config two.yaml", "two.yaml: line 2, column 1: a second document begins here"),
         ("config --set corruptions=[{kind:bluur}]", "corruptions[0]"),
-        ("run synthetic:stret --fov 70 --out there", "stret"),
+        ("run synthetic:street,size=3 --fov 70 --out there", "no option 'size'"),
         ("run here --ouut there", "--ouut is no option, did you mean --out?"),
         ("run here --out there --sed 3", "--sed is no option, did you mean --seed?"),
         ("rnu here", "invalid choice: 'rnu'"),
@@ -129,6 +131,14 @@ def test_config_prints_what_reads_back(capsys: pytest.CaptureFixture[str], tmp_p
     assert "seed: 6" in capsys.readouterr().out
 
 
+def test_a_configuration_may_come_by_a_pipe(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    writer = threading.Thread(target=lambda: (tmp_path / "pipe").write_text("seed: 7\n"), daemon=True)
+    writer.start()
+    assert main(["config", "--config", str(tmp_path / "pipe")]) == 0
+    assert "seed: 7" in capsys.readouterr().out
+
+
 def test_an_unexpected_exception_is_a_sentence_and_a_log(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,7 +164,7 @@ def test_an_interrupt_while_a_command_is_loaded(
             signal.raise_signal(signal.SIGINT)
         except KeyboardInterrupt as error:
             raise ImportError("initialization failed") from error  # as pybind does
-        return SimpleNamespace(execute=lambda args: 0)
+        return SimpleNamespace(execute=lambda args: 0, check=lambda args: None)
 
     monkeypatch.setattr("dualslam.cli.parser.import_module", load)
     assert main(["config"]) == 130
@@ -266,3 +276,21 @@ def test_an_export_to_where_no_folder_can_be(form: str, tmp_path: Path, capsys: 
     out = tmp_path / "file" / "deeper" / "map"
     assert main(["export", str(tmp_path), "--to", form, "--out", str(out)]) == 2
     assert f"{out} cannot be written: Not a directory; name another with --out." in one_sentence(capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ("run nowhere.mp4 --out there", "nowhere.mp4 does not exist"),
+        ("run synthetic:street --out there --set sed=3", "did you mean seed?"),
+        ("run synthetic:street --out there --config none.yaml", "none.yaml"),
+        ("demo --set sed=3", "did you mean seed?"),
+    ],
+)
+def test_mistyped_paths_and_fields_are_answered_before_anything_heavy_is_loaded(arguments: str, expected: str) -> None:
+    code = f"import sys; from dualslam.cli import main; print(main({arguments.split()!r}), *sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    status, *loaded = done.stdout.split()
+    assert status == "2"
+    assert expected in done.stderr
+    assert not {"cv2", "gtsam", "scipy", "faiss"} & set(loaded)

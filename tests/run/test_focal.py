@@ -68,7 +68,7 @@ def test_what_became_of_a_searched_camera_is_as_unsure_as_its_lens() -> None:
 def test_where_nothing_moves_the_person_is_asked(tmp_path: Path) -> None:
     image = make_sequence("room", 2, 3, 320, 240).frame(0).image
     folder = write(tmp_path / "images", [image] * 12)
-    with pytest.raises(InputError, match="give a camera file, or a field of view"):
+    with pytest.raises(InputError, match=r"give a camera file, or a field of view .*--camera, --fov"):
         with_camera_found(Config(), open_without_calibration(str(folder), start=0, stride=1, max_frames=None))
 
 
