@@ -56,7 +56,7 @@ def fault_of_frontend(error: BaseException, config: Config) -> FrontendError | N
             module = str(frame.f_globals.get("__name__", ""))
             if package is not None and module.partition(".")[0] == package:
                 where = f"{frame.f_code.co_filename}, line {line}, in {frame.f_code.co_name}"
-                return FrontendError(f"front end '{name}' raised {type(error).__name__}: {error} ({where})")
+                return FrontendError(f"front end '{name}' raised {type(error).__name__}: {error} ({where}).")
     return None
 
 
