@@ -41,7 +41,7 @@ def test_what_is_not_said_has_a_default(tmp_path: Path) -> None:
         ("conditions: [{name: x, corruptions: [{kind: blackout, frames: 2, seconds: 1.0}]}]", "give one of them"),
         ("conditions: [{name: x, corruptions: [{kind: blur, strength: 900.0}]}]", "strength of blur is 900"),
         ("conditions: [{name: x, corruptions: [{kind: blur, at: [0.9, 0.1]}]}]", "two shares of the clip"),
-        ("conditions: [{name: a b}]", "conditions.0.name"),
+        ("conditions: [{name: a b}]", "conditions[0].name"),
         ("conditions: [{name: x}, {name: x}]", "two conditions are called x"),
         ("conditions: [{name: x, sequences: [road]}]", "condition x is for road, which is none of the sequences"),
     ],
