@@ -111,11 +111,11 @@ def _attempts(
             with naming_attempt(number):
                 auxiliaries[key] = ImageFeatures(create_frontend(wanted, FOR_WALKS), n_threads)
         by_images = partial(_after, (), auxiliaries[key], config.camera.model_sigma_px)
-        thorough = _attempt_by(by_images, attempt, config, live, camera)
+        thorough = replace(_attempt_by(by_images, attempt, config, live, camera), features=key)
         if attempt.tracking == "live":
             own_first = partial(_after, (own,), auxiliaries[key], config.camera.model_sigma_px)
             short = _attempt_by(own_first, attempt, config, live, camera)
-            attempts.append(replace(short, thorough=thorough))
+            attempts.append(replace(short, features=key, thorough=thorough))
         else:
             attempts.append(thorough)
     return tuple(attempts)

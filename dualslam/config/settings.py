@@ -172,8 +172,8 @@ class RecoveryConfig(StrictModel):
     retry_keyframes: tuple[int, ...] = (5, 15)
     """Keyframes of the new map, from its start on, at which reverse tracking that has found no link, or left buffered
     frames without a pose, is made again: the map knows depths better then, and more of the scene. It is too when the
-    camera has been calibrated since, and, if any number stands here, when the run ends and the map has grown since. One
-    for poses alone that finds none is the last."""
+    camera has been calibrated since, and, if any number stands here, when the run ends and the map has grown by half.
+    One for poses alone that finds none is the last."""
     covering_keyframes: int = Field(20, ge=0)
     """Keyframes that a walk which only poses frames, or a search for a lost map, matches widely at most, beyond those
     nearest in time: the ones that together show the most of the map, since in a gap the

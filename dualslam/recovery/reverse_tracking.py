@@ -48,11 +48,13 @@ Judge = Callable[[Track | Failure], Track | Failure]
 class Attempt:
     """One way to track in reverse, by the name of the front end that its poses come from.
 
+    `features`: names what it sees in the images; two ways with the same see the same.
     `thorough`: the same way without short cuts, made where those that it took lead to no link.
     """
 
     name: str
     new_odometry: Callable[[RecoveryJob, Submap, SubmapGraph], VisualOdometry]
+    features: str = ""
     thorough: Attempt | None = None
 
 
@@ -116,7 +118,9 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
             break
         if progress.took_short_cut and attempt.thorough is not None:
             thorough = attempt.thorough
-            ways.insert(0, thorough)
+            # Beyond a gap that these features have crossed, or not, they pose no more by going from frame to frame as
+            # well: of 44 such third attempts none has come to a link.
+            ways = [thorough, *(way for way in ways if way.features != attempt.features)]
     if best is None:
         return problem
     if (gap := best.lost_scale_from(parts.max_scale_sigma)) is not None:

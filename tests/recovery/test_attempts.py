@@ -100,17 +100,29 @@ class TestOrder:
         second = events_of(["sift", "live"])[-2].data
         assert {k: v for k, v in alone.items() if k != "seconds"} == {k: v for k, v in second.items() if k != "seconds"}
 
-    @pytest.mark.parametrize("links", [True, False])
-    def test_a_short_cut_without_a_link_is_followed_by_the_thorough_way(self, links: bool) -> None:
-        """Live features cross the gap; where no link comes of it other features are asked, which here see nothing."""
+    @pytest.mark.parametrize(
+        ("given", "links", "made"),
+        [
+            (["gap"], True, ["gap (sift)"]),
+            (["gap"], False, ["gap (sift)", "gap (sift)"]),
+            (["gap", "sift", "live"], False, ["gap (sift)", "gap (sift)", "live"]),
+        ],
+    )
+    def test_a_short_cut_without_a_link_is_followed_by_the_thorough_way(
+        self, given: list[str], links: bool, made: list[str]
+    ) -> None:
+        """Live features cross the gap; where no link comes of it other features are asked, which here see nothing.
+
+        They are asked once.
+        """
         world = PointWorld(cloud(), hand_held(60), covered=COVERED)
         linking = {} if links else {"min_inliers": 100_000}
-        system = system_in(world, recovery={"attempts": ["gap"], "retry_keyframes": []}, linking=linking)
+        system = system_in(world, recovery={"attempts": given, "retry_keyframes": []}, linking=linking)
         for frame in world.frames():
             system.step(frame)
         attempts = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)
         assert attempts[0].data["gaps"] == 1
-        assert [attempt.data["attempt"] for attempt in attempts] == ["gap (sift)"] * (1 if links else 2)
+        assert [attempt.data["attempt"] for attempt in attempts] == made
         if not links:
             assert attempts[1].data["gaps"] == 0
 

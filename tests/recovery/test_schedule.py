@@ -283,14 +283,17 @@ class TestSchedule:
                 schedule.leave_open(0, schedule.n_live(submap, now), CAMERA)
         assert due == [12, 14]
 
-    @pytest.mark.parametrize(("keyframes", "n_new", "due"), [((100,), 1, True), ((100,), 0, False), ((), 1, False)])
-    def test_the_last_walk_wants_a_map_that_has_grown_at_all(
-        self, keyframes: tuple[int, ...], n_new: int, due: bool
+    @pytest.mark.parametrize(
+        ("keyframes", "n_tried", "n_new", "due"),
+        [((100,), 2, 1, True), ((100,), 2, 0, False), ((), 2, 1, False), ((100,), 6, 2, False), ((100,), 6, 3, True)],
+    )
+    def test_the_last_walk_wants_a_map_that_has_grown_by_half(
+        self, keyframes: tuple[int, ...], n_tried: int, n_new: int, due: bool
     ) -> None:
         schedule = RetrySchedule(keyframes)
-        assert schedule.start_of(submap_with([10, 11]), 10) == 10
-        schedule.leave_open(0, 2, CAMERA)
-        grown = submap_with(range(10, 12 + n_new))
+        assert schedule.start_of(submap_with(range(10, 10 + n_tried)), 10) == 10
+        schedule.leave_open(0, n_tried, CAMERA)
+        grown = submap_with(range(10, 10 + n_tried + n_new))
         assert not schedule.take_if_due(grown, 20, CAMERA)
         assert schedule.take_if_due(grown, 20, CAMERA, last_chance=True) == due
 
