@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -22,8 +24,6 @@ ASPECT_SIGMA, SKEW_SIGMA, TANGENTIAL_SIGMA = 1e-4, 1e-7, 1e-7
 MIN_NOISE_RATIO = 0.05
 """Residuals smaller than this share of their sigmas would be an exact simulation."""
 CALIBRATION_KEY = 1 << 60
-HELD_SIGMA = 1e-5
-"""Prior sigma of a correction that is to stay where it is."""
 MAX_ITERATIONS, TOLERANCE = 100, 1e-5
 """Most need a few. Where the focal length is far off, the way is long and bent, as lens and focal length make up for
 each other: Ceres' rule for the damping gets there, GTSAM's own stays near the start (KITTI 03 from 36 % off)."""
@@ -47,6 +47,8 @@ class CalibratedOptimum:
         Of the typical residual to its sigma.
     cost_before, cost_after : float
         Sum of the Huber losses.
+    poses_under : callable
+        From another correction (5,) to the poses (K, 4, 4) at which the cost is least, were the camera to stay there.
     """
 
     T_submap_kf: FloatArray
@@ -55,6 +57,7 @@ class CalibratedOptimum:
     noise_ratio: float
     cost_before: float
     cost_after: float
+    poses_under: Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,34 +101,45 @@ def optimise_with_camera(
     RuntimeError, LinAlgError, ...
         What GTSAM and numpy raise (`dualslam.backend.solver.GTSAM_ERRORS`).
     """
-    found = _in_front(problem, start, prior, robust_k, np.zeros(5))
+    found = _in_front(problem, start, prior, robust_k)
     correction, J = _from_cal3_ds2(found.vector, problem.K)
     marginal = np.asarray(gtsam.Marginals(found.graph, found.values).marginalCovariance(CALIBRATION_KEY))
     noise_ratio = _noise_ratio(found.problem, found.T_submap_kf, found.xyz_mu, correction)
     return CalibratedOptimum(
-        found.T_submap_kf, correction, J @ marginal @ J.T, noise_ratio, found.cost_before, found.cost_after
+        found.T_submap_kf,
+        correction,
+        J @ marginal @ J.T,
+        noise_ratio,
+        found.cost_before,
+        found.cost_after,
+        partial(_poses_under, found, robust_k),
     )
 
 
-def poses_with_camera(problem: BundleProblem, correction: FloatArray, robust_k: float) -> FloatArray:
-    """Return the poses (K, 4, 4) that `optimise_with_camera` would find, were the camera to stay as it is.
+def _poses_under(found: _Found, robust_k: float, correction: FloatArray) -> FloatArray:
+    """Return the poses (K, 4, 4) at which the cost is least, were the camera another one.
 
-    `correction`: (5,), of the camera as it was given.
+    It begins where the normal equations at the optimum lead: a few steps are left.
     """
-    return _in_front(problem, correction, np.full(5, HELD_SIGMA), robust_k, correction).T_submap_kf
+    keyframes = np.arange(len(found.T_submap_kf))
+    ordering = gtsam.Ordering([*range(len(found.xyz_mu)), *convert.pose_keys(keyframes)])
+    given_calibration, _ = found.graph.linearize(found.values).eliminatePartialSequential(ordering)
+    step = gtsam.VectorValues()
+    step.insert(CALIBRATION_KEY, _to_cal3_ds2(found.problem.K, correction).vector() - found.vector)
+    near = found.values.retract(given_calibration.optimize(step))
+    problem = replace(found.problem, T_submap_kf=convert.poses_of(near), xyz_mu=convert.points_of(near))
+    return _in_front(problem, correction, None, robust_k).T_submap_kf
 
 
-def _in_front(
-    problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float, mean: FloatArray
-) -> _Found:
-    """Minimise without the points that a step has put behind a camera; `mean`: of the prior."""
+def _in_front(problem: BundleProblem, start: FloatArray, prior: FloatArray | None, robust_k: float) -> _Found:
+    """Minimise without the points that a step has put behind a camera; without a prior the correction stays."""
     for _ in range(MAX_DROPS):
         try:
-            return _optimise(problem, start, prior, robust_k, mean)
+            return _optimise(problem, start, prior, robust_k)
         except _BehindCameraError as error:
             # From where it has got to: the others have found their places.
             problem, start = _without(error.reached, error.points), error.correction
-    return _optimise(problem, start, prior, robust_k, mean)
+    return _optimise(problem, start, prior, robust_k)
 
 
 def _without(problem: BundleProblem, points: IntArray) -> BundleProblem:
@@ -138,25 +152,28 @@ def _without(problem: BundleProblem, points: IntArray) -> BundleProblem:
     )
 
 
-def _optimise(
-    problem: BundleProblem, start: FloatArray, prior: FloatArray, robust_k: float, mean: FloatArray
-) -> _Found:
-    """Minimise over poses, points and calibration; the points are eliminated first, the calibration last."""
+def _optimise(problem: BundleProblem, start: FloatArray, prior: FloatArray | None, robust_k: float) -> _Found:
+    """Minimise over poses and points, which are eliminated first; and calibration, last, where it has a prior."""
     p = problem
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    noise, factor = PixelNoise(robust_k), gtsam.GeneralSFMFactor2Cal3DS2
+    noise, camera = PixelNoise(robust_k), _to_cal3_ds2(p.K, start)
     keyframes, points = np.arange(len(p.T_submap_kf)), np.arange(len(p.xyz_mu))
     poses = convert.pose_keys(keyframes)
     for uv, sigma, k, j in zip(p.uv_px, p.sigma_px.tolist(), p.kf.tolist(), p.point.tolist(), strict=True):
-        graph.push_back(factor(uv, noise(sigma), poses[k], j, CALIBRATION_KEY))
+        if prior is None:
+            graph.push_back(gtsam.GenericProjectionFactorCal3DS2(uv, noise(sigma), poses[k], j, camera))
+        else:
+            graph.push_back(gtsam.GeneralSFMFactor2Cal3DS2(uv, noise(sigma), poses[k], j, CALIBRATION_KEY))
     distance = np.linalg.norm(p.T_submap_kf[:, :3, 3] - p.T_submap_kf[0, :3, 3], axis=1)
     far = int(np.argmax(distance))
     graph.push_back(pose_prior(0, p.T_submap_kf[0]))
     graph.push_back(baseline_factor(0, far, float(distance[far])))
-    expected = _to_cal3_ds2(p.K, mean)
-    of_prior = gtsam.noiseModel.Gaussian.Covariance(_prior(p.K, prior))
-    graph.push_back(gtsam.PriorFactorCal3DS2(CALIBRATION_KEY, expected, of_prior))
-    values.insert(CALIBRATION_KEY, _to_cal3_ds2(p.K, start))
+    ordering = [*points.tolist(), *poses]
+    if prior is not None:
+        of_prior = gtsam.noiseModel.Gaussian.Covariance(_prior(p.K, prior))
+        graph.push_back(gtsam.PriorFactorCal3DS2(CALIBRATION_KEY, _to_cal3_ds2(p.K, np.zeros(5)), of_prior))
+        values.insert(CALIBRATION_KEY, camera)
+        ordering.append(CALIBRATION_KEY)
     convert.insert_poses(values, keyframes, p.T_submap_kf)
     convert.insert_points(values, points, p.xyz_mu)
     params = gtsam.LevenbergMarquardtParams.CeresDefaults()
@@ -164,13 +181,13 @@ def _optimise(
     params.setMaxIterations(MAX_ITERATIONS)
     params.setRelativeErrorTol(TOLERANCE)
     params.setLinearSolverType("SEQUENTIAL_CHOLESKY")
-    params.setOrdering(gtsam.Ordering([*points.tolist(), *poses, CALIBRATION_KEY]))
+    params.setOrdering(gtsam.Ordering(ordering))
     with without_gtsam_output():  # the factor prints each point that a step puts behind a camera
         before = float(graph.error(values))
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
         result = optimizer.optimize()
     T, xyz = convert.poses_of(result), convert.points_of(result)
-    vector = np.asarray(result.atCal3DS2(CALIBRATION_KEY).vector())
+    vector = np.asarray((camera if prior is None else result.atCal3DS2(CALIBRATION_KEY)).vector())
     behind = np.unique(p.point[_depths(p, T, xyz) <= MIN_DEPTH_MU])
     if len(behind):
         reached = replace(p, T_submap_kf=T, xyz_mu=xyz)

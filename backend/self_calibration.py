@@ -24,7 +24,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from dualslam.backend.calibration_bundle import CalibratedOptimum, optimise_with_camera, poses_with_camera
+from dualslam.backend.calibration_bundle import CalibratedOptimum, optimise_with_camera
 from dualslam.backend.observability import compute_depth_sigmas, compute_residuals
 from dualslam.backend.solver import GTSAM_ERRORS, SolverFailure
 from dualslam.config.calibration_config import CalibrationConfig
@@ -133,9 +133,7 @@ def find_preferred_camera(
     if isinstance(answer, Failure):
         return None
     try:
-        now, preferred = (
-            poses_with_camera(problem, correction, robust_k) for correction in (present.vector, answer.correction)
-        )
+        now, preferred = (answer.best.poses_under(each) for each in (present.vector, answer.correction))
     except (*GTSAM_ERRORS, np.linalg.LinAlgError):
         return None
     return PreferredCamera(
