@@ -103,6 +103,8 @@ class RecoveryResult:
         Wall time of all attempts, and CPU time of the process, whose threads find features beside the walk.
     looks_alike : bool
         Whether beyond a gap two poses explained as much: no later walk over it would tell them apart.
+    needs_camera : bool
+        Whether a link was refused as the map's pixels contradict the camera: no later walk does better under it.
     tries : LinkTries
         The job's, with the tries of this walk.
     """
@@ -114,4 +116,5 @@ class RecoveryResult:
     seconds: float
     cpu_s: float
     looks_alike: bool = False
+    needs_camera: bool = False
     tries: LinkTries = field(default_factory=LinkTries)

@@ -248,7 +248,8 @@ class Recoveries:
             if not isinstance(result, Failure) and result.looks_alike:
                 continue
             if unlinked or self._way_to_gaps(self._record.atlas.submaps[job.submap.id]):
-                self._retries.leave_open(job.submap.id, walk.n_live, job.camera)
+                needs_camera = not isinstance(result, Failure) and result.needs_camera
+                self._retries.leave_open(job.submap.id, walk.n_live, job.camera, needs_camera)
 
     def _refuse_leaps(self, result: RecoveryResult) -> Failure | None:
         """Return why a link is not to be believed whose walk has leapt as the lost map's camera never moved."""

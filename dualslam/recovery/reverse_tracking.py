@@ -97,7 +97,7 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
     best: Progress | None = None
     problem = Failure(FailureReason.SOLVER)
     events: list[Event] = []
-    looks_alike, tries = False, job.tries.copy()
+    looks_alike, needs_camera, tries = False, False, job.tries.copy()
     until = np.inf if parts.budget_s is None else started + parts.budget_s
     ways = list(parts.attempts if job.lost else (parts.posing,))
     thorough: Attempt | None = None
@@ -110,7 +110,7 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
             problem = progress
             continue
         events += progress.events
-        looks_alike |= progress.looks_alike
+        looks_alike, needs_camera = looks_alike or progress.looks_alike, progress.needs_camera
         came_as_far = best is not None and len(progress.frames) >= len(best.frames)
         if best is None or progress.link is not None or (attempt is thorough and came_as_far):
             best, way = progress, attempt
@@ -127,7 +127,8 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
         best = yield from _as_far_as(gap, job, parts, way, until)
     seconds, cpu_s = time.perf_counter() - started, time.process_time() - cpu_started
     frames = tuple(best.frames.values())
-    return RecoveryResult(best.submap, frames, best.link, tuple(events), seconds, cpu_s, looks_alike, tries)
+    ending = looks_alike, needs_camera, tries
+    return RecoveryResult(best.submap, frames, best.link, tuple(events), seconds, cpu_s, *ending)
 
 
 def _as_far_as(

@@ -19,7 +19,9 @@ class RetrySchedule:
     """Knows of each submap whose walk has left something to find when the next walk is due.
 
     That is when the submap has grown at its live end, or its camera has been calibrated: it knows depths better then,
-    and more of what there is to see.
+    and more of what there is to see. A walk whose link its own pixels refuse, as they contradict the camera, waits for
+    another camera: in two clips, five that were made after mere growth were refused so again, and three after the
+    calibration were linked.
 
     Parameters
     ----------
@@ -30,7 +32,7 @@ class RetrySchedule:
     def __init__(self, keyframes: tuple[int, ...]) -> None:
         self._keyframes = keyframes
         self._starts: dict[int, int] = {}
-        self._tried: dict[int, tuple[int, Camera]] = {}
+        self._tried: dict[int, tuple[int, Camera, bool]] = {}
 
     def start_of(self, submap: Submap, newest_id: int) -> int:
         """Return the keyframe that the submap's first walk started from: `newest_id`, if this is the first."""
@@ -40,9 +42,12 @@ class RetrySchedule:
         """Count the keyframes from the start to frame `now`: not those that walks have added."""
         return sum(self._starts[submap.id] <= k <= now for k in submap.keyframes)
 
-    def leave_open(self, submap_id: int, n_live: int, camera: Camera) -> None:
-        """Note that a walk which knew so many live keyframes, and this camera, has left something to find."""
-        self._tried[submap_id] = n_live, camera
+    def leave_open(self, submap_id: int, n_live: int, camera: Camera, needs_camera: bool = False) -> None:
+        """Note that a walk which knew so many live keyframes, and this camera, has left something to find.
+
+        `needs_camera`: as the camera is contradicted.
+        """
+        self._tried[submap_id] = n_live, camera, needs_camera
 
     def take_if_due(self, submap: Submap, now: int, camera: Camera, last_chance: bool = False) -> bool:
         """Return whether the next walk is due; if so it is off the list, until it too leaves something to find.
@@ -51,9 +56,10 @@ class RetrySchedule:
         """
         if submap.id not in self._tried:
             return False
-        tried_with, tried_camera = self._tried[submap.id]
+        tried_with, tried_camera, needs_camera = self._tried[submap.id]
         n_live = self.n_live(submap, now)
-        due = camera != tried_camera or any(tried_with < n <= n_live for n in self._keyframes)
+        due = not needs_camera and any(tried_with < n <= n_live for n in self._keyframes)
+        due |= camera != tried_camera
         due |= last_chance and bool(self._keyframes) and n_live >= LAST_GROWTH * tried_with
         if due:
             del self._tried[submap.id]

@@ -312,6 +312,16 @@ class TestSchedule:
         assert not schedule.take_if_due(submap, 11, CAMERA)
         assert schedule.take_if_due(submap, 11, replace(CAMERA, fx=451.0))
 
+    def test_a_camera_that_is_contradicted_must_change_or_the_run_end(self) -> None:
+        schedule = RetrySchedule((3, 5))
+        schedule.start_of(submap_with([10, 11]), 10)
+        grown = submap_with(range(10, 16))
+        schedule.leave_open(0, 2, CAMERA, needs_camera=True)
+        assert not schedule.take_if_due(grown, 15, CAMERA)
+        assert schedule.take_if_due(grown, 15, replace(CAMERA, fx=451.0))
+        schedule.leave_open(0, 2, CAMERA, needs_camera=True)
+        assert schedule.take_if_due(grown, 15, CAMERA, last_chance=True)
+
 
 @pytest.mark.slow
 def test_a_walk_reads_no_frame_that_is_older_than_the_lost_map() -> None:
