@@ -119,7 +119,7 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
         if progress.took_short_cut and attempt.thorough is not None:
             thorough = attempt.thorough
             # Beyond a gap that these features have crossed, or not, they pose no more by going from frame to frame as
-            # well: of 44 such third attempts none has come to a link.
+            # well: of 16 such third attempts none has come to a link, nor of 28 after `gap` and `live`.
             ways = [thorough, *(way for way in ways if way.features != attempt.features)]
     if best is None:
         return problem
