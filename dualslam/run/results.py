@@ -195,9 +195,10 @@ def _connections(system: System) -> dict[str, int]:
 
 
 def truth_of_frames(truth: Trajectory, rows: Iterable[FrameRow]) -> Trajectory:
-    """Return the true poses that are nearest to the frames in time, each once, on the truth's own clock."""
+    """Return the true poses that are nearest to the frames in time, each once, on the truth's own clock; no NaN."""
     pose, near = associate(truth.timestamps_s, np.array([row.timestamp_s for row in rows]), MAX_DT_S)
     chosen = np.unique(pose[near])
+    chosen = chosen[np.isfinite(truth.T_world_cam[chosen]).all(axis=(1, 2))]
     return Trajectory(truth.timestamps_s[chosen], truth.T_world_cam[chosen])
 
 

@@ -16,6 +16,7 @@ from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import FloatArray, Frame
 from dualslam.io.map_store import load_atlas
 from dualslam.io.run_folder import read_frames
+from dualslam.io.trajectory_files import read_tum
 from dualslam.map.frame_records import FrameResult
 from dualslam.run.session import run_to_folder
 from dualslam.testing.point_world import CAMERA
@@ -124,6 +125,18 @@ def test_a_truth_that_is_of_no_use_costs_its_errors_alone(
     assert load_atlas(outcome.out).poses.keys() == set(range(12))
     assert (outcome.out / "report.html").exists()
     assert not (outcome.out / "groundtruth.txt").exists()
+
+
+def test_a_truth_of_no_numbers_costs_a_run_without_a_map_nothing(tmp_path: Path) -> None:
+    nowhere = FakeSystem({}, lost=tuple(range(12)))
+    nowhere.desk = ClosedDesk({})
+    partly = STILL.copy()
+    partly[:6] = np.nan
+    sequence = WithTruth(TIMES_S, partly, 1 / 30)
+    outcome = run_to_folder(Config(), sequence, tmp_path / "run", build=lambda *_: nowhere)  # type: ignore[arg-type,return-value]
+    assert not outcome.has_map
+    assert len(read_tum(outcome.out / "groundtruth.txt")) == 6
+    assert (outcome.out / "report.html").exists()
 
 
 def test_no_process_outlives_a_run_that_ends_before_its_first_frame_or_has_no_folder(
