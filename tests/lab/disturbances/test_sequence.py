@@ -171,9 +171,9 @@ def test_the_rest_is_the_sequence_itself() -> None:
     ("text", "said"),
     [
         ("[{kind: blurr}]", "kind must be 'wipe'"),
-        ("[{kind: blur, strength: 900}]", "corruptions.0: strength of blur is 900; it must lie between 0 and 100"),
-        ("[{kind: blur, from: 3}]", "unknown field corruptions.0.from"),
-        ("[{kind: blur, length: 0}]", "corruptions.0.length must be greater than or equal to 1"),
+        ("[{kind: blur, strength: 900}]", "corruptions[0]: strength of blur is 900; it must lie between 0 and 100"),
+        ("[{kind: blur, from: 3}]", "unknown field corruptions[0].from"),
+        ("[{kind: blur, length: 0}]", "corruptions[0].length must be greater than or equal to 1"),
         ("blur", "corruptions must be a list"),
     ],
 )
