@@ -191,8 +191,7 @@ def relative_error(
     """Return the fields of the relative pose error of paired trajectories over `interval_s`, where it can be had."""
     times = est.timestamps_s
     later = nearest_in_time(times, times + interval_s)
-    near = np.abs(times[later] - times - interval_s) <= frame_dt_s
-    i = np.flatnonzero(near & (later != np.arange(len(times))))  # a frame has no error against itself
+    i = np.flatnonzero(np.abs(times[later] - times - interval_s) <= frame_dt_s)
     j = later[i]
     if len(i) == 0:
         return {}
