@@ -31,7 +31,7 @@ def outputs_of(cell: Any) -> list[dict[str, Any]]:
         for kind, data in output.get("data", {}).items():
             if kind.startswith("text/") and isinstance(data, str):
                 output["data"][kind] = data.splitlines(keepends=True)
-    return kept
+    return [dict(sorted(output.items())) for output in kept]
 
 
 def execute(path: Path) -> None:
