@@ -321,7 +321,7 @@ def test_a_port_that_is_taken_is_one_sentence() -> None:
 def test_without_the_extra_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "viser" else find(name))
-    with pytest.raises(InputError, match=r'pip install "dualslam\[live\]"'):
+    with pytest.raises(InputError, match=r'pip install -e "\.\[live\]"'):
         LiveView()
 
 
