@@ -11,7 +11,7 @@ from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Features, FloatArray, View
 from dualslam.frontends.tracking.resection import poselib_camera
-from dualslam.frontends.tracking.row_shifts import at_mid_row
+from dualslam.frontends.tracking.row_shifts import correct_shutter
 
 INFLATION = 4.0
 """How much larger errors are taken to be than they seem, as neighbouring pixels err alike."""
@@ -123,7 +123,7 @@ class ReadoutEstimator:
         lens = poselib_camera(camera.K, (camera.width, camera.height))
         gate_px = CHI2_95[1] ** 0.5 * float(np.median(sigma_px))
         straight = [
-            tuple(at_mid_row(x.uv_rect_px, x.uv_px[:, 1], camera, s * rate) for x, rate in ((a, rate_a), (b, rate_b)))
+            tuple(correct_shutter(x, camera, s * rate).uv_rect_px for x, rate in ((a, rate_a), (b, rate_b)))
             for s in READOUTS_S
         ]
         ransac = {"max_epipolar_error": gate_px, "max_iterations": 500, "min_iterations": 50, "seed": self._seed}

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from dualslam.core.camera.base import Camera
-from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.geometry import so3
 from dualslam.core.types import Features, FloatArray
 
@@ -22,29 +21,15 @@ def correct_shutter(
     features : Features
         As found in an image that was read row by row.
     camera : Camera
-        That rectified them.
     turn_rad : (3,)
         Rotation vector by which the camera turns while an image is read, in its own axes.
     read_v_px : (N,), optional
         Rows in which the features were read, where `features` does not tell.
     """
     read_v_px = features.uv_px[:, 1] if read_v_px is None else read_v_px
-    uv_rect_px = at_mid_row(features.uv_rect_px, read_v_px, camera, turn_rad)
-    # The found pixels move with them, so that the same features can be rectified again by a better camera.
-    uv_px = _moved(features.uv_px, features.uv_rect_px, uv_rect_px, camera)
-    return replace(features, uv_px=uv_px, uv_rect_px=uv_rect_px)
-
-
-def _moved(uv_px: FloatArray, from_rect_px: FloatArray, to_rect_px: FloatArray, camera: Camera) -> FloatArray:
-    """Return where raw pixels (N, 2) are once the rectified ones that they have by this camera have moved.
-
-    Near the rim of a wide lens a step of rectified pixels is a much shorter one in the image.
-    """
-    by_as_much = uv_px + to_rect_px - from_rect_px
-    if isinstance(camera, PinholeCamera):
-        return by_as_much
-    moved = camera.unrectify(to_rect_px)
-    return np.where(np.isfinite(moved), moved, by_as_much)
+    uv_rect_px = _at_mid_row(features.uv_rect_px, read_v_px, camera, turn_rad)
+    # The found pixels move alike, so that the same features can be rectified again by a better camera.
+    return replace(features, uv_px=features.uv_px + uv_rect_px - features.uv_rect_px, uv_rect_px=uv_rect_px)
 
 
 def _turned(rays: FloatArray, share: FloatArray, turn_rad: FloatArray) -> FloatArray:
@@ -58,7 +43,7 @@ def _turned(rays: FloatArray, share: FloatArray, turn_rad: FloatArray) -> FloatA
     return np.asarray(rays + np.sin(by)[:, None] * across + (2 * np.sin(0.5 * by) ** 2)[:, None] * inwards, np.float64)
 
 
-def at_mid_row(uv_rect_px: FloatArray, read_v_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
+def _at_mid_row(uv_rect_px: FloatArray, read_v_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
     """Return rectified pixels (N, 2), read in rows (N,), as they would be at the time of the middle row."""
     K = camera.K
     f, c = np.diag(K)[:2], K[:2, 2]
@@ -70,7 +55,7 @@ def at_mid_row(uv_rect_px: FloatArray, read_v_px: FloatArray, camera: Camera, tu
 def straighten(uv_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
     """Return where things that an image shows at pixels (N, 2) are in the features: as `correct_shutter` moves them."""
     uv_rect_px, _ = camera.rectify(uv_px)
-    return _moved(uv_px, uv_rect_px, at_mid_row(uv_rect_px, uv_px[:, 1], camera, turn_rad), camera)
+    return uv_px + _at_mid_row(uv_rect_px, uv_px[:, 1], camera, turn_rad) - uv_rect_px
 
 
 def find_as_read(uv_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
@@ -79,5 +64,5 @@ def find_as_read(uv_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> Flo
     read_px = uv_px
     # Each was read in a row that is known once it is put back: a second time, it is.
     for _ in range(2):
-        read_px = _moved(uv_px, uv_rect_px, at_mid_row(uv_rect_px, read_px[:, 1], camera, -turn_rad), camera)
+        read_px = uv_px + _at_mid_row(uv_rect_px, read_px[:, 1], camera, -turn_rad) - uv_rect_px
     return read_px

@@ -8,17 +8,13 @@ import numpy as np
 import pytest
 
 from dualslam.config.settings import CameraConfig
-from dualslam.core.camera.base import Camera
-from dualslam.core.camera.corrected import LensCorrection, correct
-from dualslam.core.camera.models import KannalaBrandtCamera, RadTanCamera
-from dualslam.core.camera.rectification import rectify
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray, Frame, View
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.tracking.pair_readout import READOUT_EVIDENCE, READOUTS_S, ReadoutEstimator, _mean
 from dualslam.frontends.tracking.rolling_shutter import RollingShutter, TurnMeter
-from dualslam.frontends.tracking.row_shifts import correct_shutter, find_as_read, straighten
+from dualslam.frontends.tracking.row_shifts import correct_shutter
 from dualslam.frontends.tracking.turning import turn_between
 from dualslam.system import System
 from dualslam.testing.point_world import (
@@ -160,38 +156,6 @@ def test_straightened_pixels_are_those_of_a_global_shutter() -> None:
         assert off_before.max() > 5
         assert off.max() < 1e-3
         assert np.allclose(straight.uv_px, straight.uv_rect_px)
-
-
-EUROC = RadTanCamera(752, 480, 458.654, 457.296, 367.215, 248.375, -0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
-LENSES = {
-    "barrel": EUROC,
-    "pincushion": RadTanCamera(
-        640, 480, 517.3, 516.5, 318.6, 255.3, 0.262383, -0.953104, -0.005358, 0.002628, 1.163314
-    ),
-    "fisheye": KannalaBrandtCamera(1280, 720, 600.0, 600.0, 639.5, 359.5, 0.02, -0.005, 0.0, 0.0),
-    "corrected": correct(EUROC, LensCorrection(0.03, 2.0, -1.0, 0.02, -0.01)),
-}
-
-
-@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
-def test_behind_a_lens_the_pixels_of_the_image_are_a_global_shutter_s_too(camera: Camera) -> None:
-    """A better camera rectifies them again: they must be where the lens has the rectified ones."""
-    turn_rad = np.array([0.01, 0.05, -0.03])
-    exact = np.random.default_rng(0).uniform([0, 0], np.array(camera.size_px) - 1, (500, 2))
-    rays, read = camera.unproject(exact), exact
-    for _ in range(12):  # the row in which a point is found depends on where it is found
-        late = read[:, 1] / camera.height - 0.5
-        read = camera.project(np.einsum("nji,nj->ni", so3.exp(late[:, None] * turn_rad), rays))
-    inside = ((read >= 0) & (read < camera.size_px)).all(axis=1)  # a point that leaves the image is not found
-    read, exact, n = read[inside], exact[inside], np.count_nonzero(inside)
-    assert n > 400
-    assert np.linalg.norm(read - exact, axis=1).max() > 5
-    found = make_features(read, np.ones(n), np.zeros(n, np.int64), np.zeros((n, 32), np.uint8))
-    straight = correct_shutter(rectify(found, camera, 0.0), camera, turn_rad)
-    assert np.linalg.norm(straight.uv_rect_px - camera.rectify(exact)[0], axis=1).max() < 0.01
-    assert np.linalg.norm(straight.uv_px - exact, axis=1).max() < 0.01
-    assert np.linalg.norm(straighten(read, camera, turn_rad) - exact, axis=1).max() < 0.01
-    assert np.linalg.norm(find_as_read(exact, camera, turn_rad) - read, axis=1).max() < 0.1
 
 
 def test_the_turn_is_that_of_the_frame() -> None:
