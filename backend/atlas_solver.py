@@ -19,7 +19,7 @@ from dualslam.backend.edge_covariance import edge_covariances
 from dualslam.backend.refit import refit_points
 from dualslam.backend.sim3_graph import Sim3Edge, Sim3Prior, Sim3Solution, optimise_sim3
 from dualslam.core.atlas_problem import AtlasProblem, AtlasSolution
-from dualslam.core.chi_square import CHI2_99, MEDIAN_CHI2
+from dualslam.core.chi_square import CHI2_99, MEDIAN_CHI2, squared_distances
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import sim3
 from dualslam.core.types import BoolArray, FloatArray, IntArray
@@ -66,10 +66,9 @@ class GtsamAtlasSolver:
         SolverError
         """
         graph = _Graph(problem)
-        all_edges = np.ones(len(problem.edges), bool)
         doubtful = np.array([e.doubtful for e in problem.edges], bool)
         drift, chi2 = graph.take_in_drift(doubtful)
-        believed = all_edges
+        believed = np.ones(len(problem.edges), bool)
         if self._robust and doubtful.any():
             believed, of_doubtful = graph.choose(doubtful)
             chi2 = np.where(doubtful, of_doubtful, chi2)
@@ -167,7 +166,7 @@ class _Graph:
         if not len(tested):
             return 1.0, chi2
         C, r = self._innovations(self.optimise(believed), believed, tested)
-        chi2[tested] = np.einsum("ei,ei->e", r, np.linalg.solve(C, r[..., None])[..., 0])
+        chi2[tested] = squared_distances(r, C)
         ratio2 = max(1.0, float(np.sort(chi2[tested])[(len(tested) - 1) // 2]) / MEDIAN_CHI2[7])
         for i in np.flatnonzero(odometry).tolist():
             self.edges[i] = replace(self.edges[i], covariance=ratio2 * self.edges[i].covariance)
@@ -196,7 +195,7 @@ class _Graph:
             tested = np.flatnonzero(doubtful & ~self._bridges(believed, doubtful))
             C, r = self._innovations(solution, believed, tested)
             chi2[:] = np.nan
-            chi2[tested] = np.einsum("ei,ei->e", r, np.linalg.solve(C, r[..., None])[..., 0])
+            chi2[tested] = squared_distances(r, C)
             after = self._connected(self._graduate(solution, tested, C), doubtful)
             if (after == believed).all():
                 break

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from dualslam.core.chi_square import CHI2_99, MEDIAN_CHI2
+from dualslam.core.chi_square import CHI2_99, variance_by_median
 from dualslam.core.types import FloatArray, IntArray
 
 OUTLIER_CHI2 = CHI2_99[2]
@@ -26,7 +26,7 @@ the median's own sigma at 7 %."""
 
 
 def residual_variance(chi2: FloatArray, n_views: IntArray, least: float) -> float:
-    """Return the variance of whitened residuals, by their median: 1 where the pixels' sigmas are right.
+    """Return the variance of whitened residuals that gates go by (`variance_by_median`).
 
     A lens model's error is much the same in neighbouring views, so that residuals are smaller than the error of a
     pixel, and a gate in the pixel's sigmas lets outliers in. Where pixels are noisier than their sigmas say, a gate
@@ -37,7 +37,7 @@ def residual_variance(chi2: FloatArray, n_views: IntArray, least: float) -> floa
     chi2 : (R,) float64
         Squared whitened residuals (2 degrees of freedom) of observations.
     n_views : (R,) int64
-        Views that each one's landmark has. The landmark takes 3 of their ``2 n`` numbers, which is given back.
+        Views that each one's landmark has.
     least : float
         The smallest answer, at most 1.
 
@@ -49,8 +49,7 @@ def residual_variance(chi2: FloatArray, n_views: IntArray, least: float) -> floa
     tells = n_views >= MIN_VIEWS
     if np.count_nonzero(tells) < MIN_OBSERVATIONS:
         return 1.0
-    per_number = chi2[tells] / (1 - 1.5 / n_views[tells])
-    return max(least, float(np.median(per_number)) / MEDIAN_CHI2[2])
+    return max(least, variance_by_median(chi2[tells], n_views[tells]))
 
 
 class PixelNoise:

@@ -1,8 +1,11 @@
-"""Quantiles of chi-square by degrees of freedom: one table, from SciPy."""
+"""Chi-square: its quantiles by degrees of freedom, one table, from SciPy; and what is held against them."""
 
 from __future__ import annotations
 
+import numpy as np
 from scipy.special import gammaincinv
+
+from dualslam.core.types import FloatArray, IntArray
 
 MAX_DOF = 7
 
@@ -21,3 +24,22 @@ def _row(confidence: float) -> tuple[float, ...]:
 
 MEDIAN_CHI2, CHI2_90, CHI2_95, CHI2_99, CHI2_999, CHI2_9999 = map(_row, (0.5, 0.9, 0.95, 0.99, 0.999, 0.9999))
 """By degrees of freedom: `CHI2_95[2]` is the squared whitened distance to a point that 95 % of true matches keep."""
+
+
+def squared_distances(residuals: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return (E,) squared residuals (E, N), each in its own covariance (E, N, N)."""
+    return np.asarray(np.einsum("ei,ei->e", residuals, np.linalg.solve(covariances, residuals[..., None])[..., 0]))
+
+
+def variance_by_median(chi2: FloatArray, n_views: IntArray) -> float:
+    """Return the variance of whitened pixel residuals, by their median: 1 where the pixels' sigmas are right.
+
+    Parameters
+    ----------
+    chi2 : (R,) float64
+        Squared whitened residuals (2 degrees of freedom) of observations.
+    n_views : (R,) int64
+        Views that each one's landmark has, at least 2. The landmark takes 3 of their ``2 n`` numbers, which is given
+        back.
+    """
+    return float(np.median(chi2 / (1 - 1.5 / n_views))) / MEDIAN_CHI2[2]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.core.atlas_problem import AtlasEdge, AtlasProblem
-from dualslam.core.chi_square import CHI2_999
+from dualslam.core.chi_square import CHI2_999, squared_distances
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
@@ -310,8 +310,7 @@ def _are_torn(own: FloatArray, now: FloatArray, covariances: FloatArray) -> Bool
     that had the bend taken out of it would deny it.
     """
     off = sim3.log(sim3.inverse(own) @ now)
-    chi2: FloatArray = np.einsum("ei,ei->e", off, np.linalg.solve(covariances, off[..., None])[..., 0])
-    return chi2 > CHI2_999[7]
+    return squared_distances(off, covariances) > CHI2_999[7]
 
 
 def _inflated(submap: Submap, pairs: list[tuple[int, int]], covariances: FloatArray) -> FloatArray:

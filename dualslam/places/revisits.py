@@ -160,9 +160,8 @@ class Revisits:
             return
         self.sightings.end()
         self._n_asked += 1
-        if (self._provisional is None and self._n_asked % ASK_EVERY) or self._desk.n_open(JobKind.LOOP):
-            return
-        if self._believed is not None:  # another could take its place before it is linked
+        busy = self._desk.n_open(JobKind.LOOP) or self._believed is not None  # which another must not take the place of
+        if busy or (self._provisional is None and self._n_asked % ASK_EVERY):
             return
         submap, keyframe_id = live.submap, live.reference_id
         self.take_in(submap, at_most)

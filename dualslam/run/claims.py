@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.core.chi_square import MEDIAN_CHI2
+from dualslam.core.chi_square import variance_by_median
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, projection_jacobians
 from dualslam.core.types import FloatArray
@@ -80,10 +80,10 @@ def _excess(submap: Submap) -> dict[int, float]:
         uv, _ = project_points(submap.K, se3.inverse(submap.T_submap_kf[k]), submap.landmarks["xyz_mu"][ids])
         features = keyframe.features
         chi2 = ((uv - features.uv_rect_px[feature]) ** 2).sum(axis=1) / features.sigma_px[feature] ** 2
-        chi2 /= 1 - 1.5 / n_views[ids]  # a landmark takes 3 of its views' numbers
-        chi2 = chi2[np.isfinite(chi2)]
-        if len(chi2) >= MIN_RESIDUALS:
-            excess[k] = max(1.0, float(np.sqrt(np.median(chi2) / MEDIAN_CHI2[2])) / USUAL_NOISE)
+        finite = np.isfinite(chi2)
+        if np.count_nonzero(finite) >= MIN_RESIDUALS:
+            variance = variance_by_median(chi2[finite], n_views[ids[finite]])
+            excess[k] = max(1.0, float(np.sqrt(variance)) / USUAL_NOISE)
     return excess
 
 
