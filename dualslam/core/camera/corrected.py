@@ -158,8 +158,7 @@ class CorrectedCamera(Camera):
 
     def _distort(self, p_cam: FloatArray) -> FloatArray:
         xy = p_cam[:, :2] / np.where(p_cam[:, 2] > 0, p_cam[:, 2], np.nan)[:, None]
-        k = (self.correction.k1, self.correction.k2)
-        xy = np.where(((xy * xy).sum(1) < distortion.radial_limit(k) ** 2)[:, None], xy, np.nan)
+        xy = distortion.within_limit(xy, (self.correction.k1, self.correction.k2))
         base = self.base.K
         plane = (self.correction.distort_px(base, xy) - base[:2, 2]) / (base[0, 0], base[1, 1])
         return self.base._distort(np.concatenate([plane, np.ones((len(plane), 1))], 1))

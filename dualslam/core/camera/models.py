@@ -59,10 +59,7 @@ class RadTanCamera(Camera):
         return self.k1, self.k2, self.k3
 
     def _distort(self, p_cam: FloatArray) -> FloatArray:
-        xy = plane(p_cam)
-        limit = distortion.radial_limit(self._k)
-        if np.isfinite(limit):
-            xy = np.where((np.einsum("ij,ij->i", xy, xy) < limit**2)[:, None], xy, np.nan)
+        xy = distortion.within_limit(plane(p_cam), self._k)
         return distortion.distort_radtan(xy, self._k, self.p1, self.p2)
 
     def _undistort(self, xy_distorted: FloatArray) -> FloatArray:

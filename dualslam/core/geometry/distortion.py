@@ -36,6 +36,14 @@ def radial_limit(k: tuple[float, ...]) -> float:
     return float(np.sqrt(real.min())) if len(real) else float("inf")
 
 
+def within_limit(xy: FloatArray, k: tuple[float, ...]) -> FloatArray:
+    """Return undistorted points (N, 2), NaN from where on `radial` no longer grows: no image shows them."""
+    limit = radial_limit(k)
+    if not np.isfinite(limit):
+        return xy
+    return np.where((np.einsum("ij,ij->i", xy, xy) < limit**2)[:, None], xy, np.nan)
+
+
 def invert_radial(r_distorted: FloatArray, k: tuple[float, ...], limit: float) -> FloatArray:
     """Return r with ``radial(r, k) == r_distorted`` on the growing branch, NaN where there is none below `limit`.
 
