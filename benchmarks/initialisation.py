@@ -109,8 +109,7 @@ def read(source: str, config: Config, stride: int) -> tuple[list[View], dict[int
 def trial(views: list[View], truth: dict[int, FloatArray], camera: Any, config: Config) -> StartTrial:
     """Feed views until a map starts."""
     frontend = create_frontend(config.frontend)
-    size_px = (camera.width, camera.height)
-    starter = Initialiser(frontend, bundle_adjust_arrays, config.initialiser, camera.K, size_px, config.seed)
+    starter = Initialiser(frontend, bundle_adjust_arrays, config.initialiser, camera.K, camera.size_px, config.seed)
     begin = time.process_time()
     for n, view in enumerate(views):
         start = starter.add(view)

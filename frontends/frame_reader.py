@@ -46,7 +46,7 @@ def view_of(frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: fl
     if frame.image is None:
         return Failure(FailureReason.UNREADABLE, frame.error)
     height, width = frame.image.shape[:2]
-    if (width, height) != (camera.width, camera.height):
+    if (width, height) != camera.size_px:
         return Failure(
             FailureReason.UNREADABLE,
             f"frame {frame.index} is {width}x{height}, the calibration is for {camera.width}x{camera.height}",

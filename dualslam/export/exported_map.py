@@ -169,7 +169,7 @@ def flatten(stored: StoredMap) -> ExportedMap:
         timestamp_s=np.array([atlas.submaps[owner[k]].keyframes[k].timestamp_s for k in row_of]),
         camera=np.array([main.index(owner[k]) for k in row_of], np.int64),
         K=K,
-        size_px=(camera.width, camera.height),
+        size_px=camera.size_px,
         T_world_cam=T_world_cam,
         xyz=np.concatenate(xyz),
         colour=np.full((n_points, 3), GREY, np.uint8),

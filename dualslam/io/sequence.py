@@ -178,7 +178,7 @@ class RecordedSequence:
         except UnreadableImageError as e:
             return Frame(index, timestamp_s, None, str(e))
         height, width = image.shape[:2]
-        if (width, height) != (self.camera.width, self.camera.height):
+        if (width, height) != self.camera.size_px:
             error = (
                 f"image {index} of {self.name} is {width} x {height} pixels, "
                 f"the camera {self.camera.width} x {self.camera.height}."
@@ -226,8 +226,8 @@ def image_size(images: ImageStore, name: str, wanted: tuple[int, int] | None = N
 
 def check_image_size(images: ImageStore, name: str, camera: Camera, calibration: str) -> None:
     """Refuse a calibration that was made for images of another size."""
-    width, height = image_size(images, name, (camera.width, camera.height))
-    if (width, height) != (camera.width, camera.height):
+    width, height = image_size(images, name, camera.size_px)
+    if (width, height) != camera.size_px:
         raise InputError(
             f"{calibration} is for images of {camera.width} x {camera.height} pixels, but those of {name} are "
             f"{width} x {height}; give the calibration of these images."

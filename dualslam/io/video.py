@@ -315,7 +315,7 @@ def open_webcam(
     if camera is None:
         degrees = float(fov_degrees or 0.0)
         camera = make_camera("the field of view", lambda: camera_from_fov(width, height, degrees))
-    elif (camera.width, camera.height) != (width, height):
+    elif camera.size_px != (width, height):
         raise InputError(
             f"The camera file is for images of {camera.width} x {camera.height} pixels, but those of {name} "
             f"are {width} x {height}; give the calibration of these images."

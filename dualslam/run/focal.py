@@ -48,8 +48,7 @@ def with_camera_found(config: Config, sequence: RecordedSequence) -> tuple[Recor
     InputError
         If they do not tell.
     """
-    size_px = sequence.camera.width, sequence.camera.height
-    found = find_focal(config, islice(sequence, SEARCHED_FRAMES), size_px, sequence.told_focal())
+    found = find_focal(config, islice(sequence, SEARCHED_FRAMES), sequence.camera.size_px, sequence.told_focal())
     if isinstance(found, Failure):
         n_frames = min(len(sequence), SEARCHED_FRAMES)
         raise InputError(
@@ -74,7 +73,7 @@ def with_camera_of_map(saved_map: str | Path, sequence: RecordedSequence) -> Rec
     if camera is None:
         return None
     given = given_camera(camera)
-    same_size = (given.width, given.height) == (sequence.camera.width, sequence.camera.height)
+    same_size = given.size_px == sequence.camera.size_px
     return sequence.with_camera(given) if same_size else None
 
 

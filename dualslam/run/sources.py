@@ -93,7 +93,7 @@ def open_images_of_run(source: str | Path, size_px: tuple[int, int]) -> Sequence
     """
     has_camera = str(source).startswith(SYNTHETIC)  # recordings may have one, and that comes before a field of view
     opened = open_source(source, fov_degrees=None if has_camera else ANY_FOV_DEG, max_side_px=max(size_px))
-    if (opened.camera.width, opened.camera.height) != size_px:
+    if opened.camera.size_px != size_px:
         raise InputError(f"{source} has images of another size than the run's.")
     return opened
 

@@ -227,7 +227,7 @@ class Refinder:
         uv_kf = uv_kf if turn_kf_rad is None else find_as_read(uv_kf, camera, turn_kf_rad)
         zoom = _zoom(J)
         margin = HALF_PX * np.maximum(zoom, 1.0)[:, None]
-        inside = ((uv > margin) & (uv < np.array([camera.width, camera.height]) - 1 - margin)).all(axis=1)
+        inside = ((uv > margin) & (uv < np.array(camera.size_px) - 1 - margin)).all(axis=1)
         usable = np.flatnonzero(inside & (depth > 0) & (zoom > 1 / MAX_ZOOM) & (zoom < MAX_ZOOM))
         matches = match_patches(
             self._levels_of(sought.keyframe_id),

@@ -120,7 +120,7 @@ class ReadoutEstimator:
         scatter would drown what the times differ by.
         """
         sigma_px = np.sqrt(0.5 * (a.sigma_px**2 + b.sigma_px**2))
-        lens = poselib_camera(camera.K, (camera.width, camera.height))
+        lens = poselib_camera(camera.K, camera.size_px)
         gate_px = CHI2_95[1] ** 0.5 * float(np.median(sigma_px))
         straight = [
             tuple(correct_shutter(x, camera, s * rate).uv_rect_px for x, rate in ((a, rate_a), (b, rate_b)))
