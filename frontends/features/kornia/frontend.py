@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import RLock
@@ -150,28 +151,53 @@ def choose_device(name: str) -> torch.device:
             f"frontend.options.device: torch {torch.__version__} sees no CUDA device: install a torch built for CUDA, "
             "or choose cpu or auto"
         )
-    return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
+    device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
+    if device.type == "cuda":  # read when cuBLAS starts: without it the sums of a product may change their order
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    return device
 
 
 @contextmanager
 def inference(device: torch.device) -> Iterator[None]:
-    """Run torch without gradients; on the CPU in one thread.
+    """Run torch without gradients, and so that the same input gives the same output, bit for bit.
 
-    The number of threads belongs to the process: it is put back. One, because the order of a sum, and so its last bit,
-    would depend on it, and because our parallelism is processes (`dualslam.core.threads`). Callers in other threads
-    wait: they would put back each other's.
+    What that takes belongs to the process, and is put back. Callers in other threads wait: they would put back each
+    other's.
     """
-    if device.type != "cpu":
-        with torch.inference_mode():
+    exact = one_thread() if device.type == "cpu" else deterministic_cuda()
+    with _ONE_CALLER, torch.inference_mode(), exact:
+        yield
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch in one thread.
+
+    The order of a sum, and so its last bit, depends on their number, and our parallelism is processes
+    (`dualslam.core.threads`).
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextmanager
+def deterministic_cuda() -> Iterator[None]:
+    """Run torch on a CUDA device with sums in a fixed order, and in the precision of the CPU.
+
+    The histograms of an orientation and of SIFT are atomic additions otherwise, whose order changes. torch warns where
+    an operation has no such form.
+    """
+    before, warns = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    try:
+        with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False):
             yield
-        return
-    with _ONE_CALLER, torch.inference_mode():
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            yield
-        finally:
-            torch.set_num_threads(threads)
+    finally:
+        torch.use_deterministic_algorithms(before, warn_only=warns)
 
 
 def _unit(descriptors: torch.Tensor) -> NDArray[np.float32]:

@@ -25,6 +25,7 @@ from tests.frontends.features.test_orb import same, warped
 
 Image = NDArray[np.uint8]
 CPU = torch.device("cpu")
+on_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")
 
 
 def on_cpu(n_features: int = 500, **options: object) -> KorniaFrontend:
@@ -69,6 +70,38 @@ def test_cuda_without_a_device_is_a_config_error_and_auto_takes_the_cpu(image: I
     with pytest.raises(ConfigError, match=r"frontend\.options\.device: torch .* sees no CUDA device"):
         KorniaFrontend(100, KorniaOptions(device="cuda"))
     assert same(KorniaFrontend(500).extract(image), features)
+
+
+@on_cuda
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+def test_conforms_on_cuda(check: Callable[[Subject], None]) -> None:
+    check(Subject(KorniaFrontend, {"device": "cuda"}))
+
+
+@on_cuda
+@pytest.mark.parametrize("detector", ["dog", "harris"])
+def test_cuda_finds_the_same_each_time_and_what_the_cpu_finds(image: Image, detector: str) -> None:
+    cuda, cpu = (KorniaFrontend(800, KorniaOptions(detector=detector, device=name)) for name in ("cuda", "cpu"))
+    a = cuda.extract(image)
+    assert all(same(cuda.extract(image), a) for _ in range(5))
+    b = cpu.extract(image)
+    apart = np.hypot(*(a.uv_px[:, None] - b.uv_px).transpose(2, 0, 1))
+    nearest = np.argmin(np.where(a.octave[:, None] == b.octave, apart, np.inf), axis=1)
+    both = apart[np.arange(len(a)), nearest] < 0.05
+    assert both.mean() > 0.97
+    distance = cpu.distance(a.descriptors[both], b.descriptors[nearest[both]])
+    assert np.percentile(distance, 99) < 0.05  # a tenth of what descriptors of a point in two images may differ
+    other = warped(image, 1.0, 5.0)[0]
+    of_cuda, of_cpu = (len(each.match_wide(each.extract(image), each.extract(other))) for each in (cuda, cpu))
+    assert abs(of_cuda - of_cpu) < 0.05 * of_cpu
+
+
+@on_cuda
+def test_settings_of_cuda_are_put_back() -> None:
+    before = torch.are_deterministic_algorithms_enabled(), torch.backends.cudnn.allow_tf32
+    with inference(torch.device("cuda")):
+        assert torch.are_deterministic_algorithms_enabled()
+    assert (torch.are_deterministic_algorithms_enabled(), torch.backends.cudnn.allow_tf32) == before
 
 
 def test_shapes_types_and_noise(features: Features) -> None:

