@@ -75,7 +75,7 @@ def refine_points(
     xyz = best
     cost = np.full(n, np.inf)
     for step in range(STEPS + 1):
-        xyz_cam, front, uv = reproject(K, T_submap_kf, pose, xyz[point])
+        xyz_cam, front, uv = reproject(K, T_submap_kf, pose, xyz.take(point, axis=0))
         safe = np.where(front[:, None], xyz_cam, [0.0, 0.0, 1.0])
         r = uv - uv_px
         r /= sigma_px[:, None]

@@ -312,7 +312,8 @@ class ISam2SubmapGraph:
         landmarks = np.union1d(landmarks, beside)
 
         pose = np.searchsorted(keyframes, kf[row])
-        res = compute_residuals(submap.K, T, pose, xyz[lm[row]], rows["uv_px"][row], rows["sigma_px"][row])
+        uv_px, sigma_px = rows["uv_px"].take(row, axis=0), rows["sigma_px"][row]
+        res = compute_residuals(submap.K, T, pose, xyz.take(lm[row], axis=0), uv_px, sigma_px)
         chi2 = res.chi2
         # The solver threw these points away. Linearised there, they would be the death of it: they go before that.
         self._suspects = np.unique(lm[row[np.isinf(chi2) | (res.depth_mu > FAR_MU)]])
@@ -340,7 +341,7 @@ class ISam2SubmapGraph:
         """Return landmarks that are no variables as their views have them; `poses` are those that were read now."""
         views = views_of(submap, ids, inside, poses)
         rows, k = self._factor_index.rows, self._robust_k
-        uv, sigma = rows["uv_px"][views.row], rows["sigma_px"][views.row]
+        uv, sigma = rows["uv_px"].take(views.row, axis=0), rows["sigma_px"][views.row]
         return refine_points(submap.K, views.T_submap_kf, views.pose, xyz_mu[ids], views.point, uv, sigma, k)
 
     # --- starting again

@@ -155,7 +155,7 @@ def adjust_window(window: Window, robust_k: float, iterations: int = ITERATIONS)
     damping = FIRST_DAMPING
     for _ in range(iterations):
         safe = np.where(np.isfinite(state.chi2)[:, None], state.xyz_cam, [0.0, 0.0, 1.0])
-        R = state.T[window.pose, :3, :3]
+        R = state.T.take(window.pose, axis=0)[:, :3, :3]
         J = projection_jacobian(window.K, R, safe, window.sigma_px)
         weighted = J * state.weight[:, None, None]
         V = sum_by(window.point, weighted.transpose(0, 2, 1) @ J, n_points)
@@ -211,7 +211,7 @@ def _step(
 
 
 def _evaluate(window: Window, T: FloatArray, xyz: FloatArray, robust_k: float) -> _State:
-    xyz_cam, front, uv_px = reproject(window.K, T, window.pose, xyz[window.point])
+    xyz_cam, front, uv_px = reproject(window.K, T, window.pose, xyz.take(window.point, axis=0))
     residuals = uv_px - window.uv_px
     residuals /= window.sigma_px[:, None]
     chi2 = np.einsum("ri,ri->r", residuals, residuals)

@@ -133,14 +133,16 @@ class Features:
 
     def take(self, rows: NDArray[np.generic]) -> Features:
         """Return the features at `rows` (indices or a mask)."""
+        rows = np.asarray(rows)
+        index = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
         return Features(
-            self.uv_px[rows],
-            self.uv_rect_px[rows],
-            self.sigma_px[rows],
-            self.scale[rows],
-            self.octave[rows],
-            self.angle_rad[rows],
-            self.descriptors[rows],
+            self.uv_px.take(index, axis=0),  # of rows of several columns, ten times as fast as [index]
+            self.uv_rect_px.take(index, axis=0),
+            self.sigma_px[index],
+            self.scale[index],
+            self.octave[index],
+            self.angle_rad[index],
+            self.descriptors.take(index, axis=0),
         )
 
 

@@ -335,7 +335,7 @@ class Submap:
         ids, starts = np.unique(kf[order], return_index=True)
         for k, here in zip(ids.tolist(), np.split(order, starts[1:]), strict=False):
             features = self.keyframes[k].features
-            uv[here] = features.uv_rect_px[feature[here]]
+            uv[here] = features.uv_rect_px.take(feature[here], axis=0)
             sigma[here] = features.sigma_px[feature[here]]
         return uv, sigma
 

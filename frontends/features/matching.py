@@ -158,7 +158,8 @@ def match_projected(
     if len(query) == 0:
         return NO_MATCHES
     limit = frontend.max_distance if max_distance is None else max_distance
-    distance = frontend.distance(descriptors[query], features.descriptors[feature])
+    # `take`: of rows of several columns ten times as fast as an index in brackets.
+    distance = frontend.distance(descriptors.take(query, axis=0), features.descriptors.take(feature, axis=0))
     chosen = best_pairs(query, feature, distance, features.octave[feature], ratio, len(uv_pred), len(features))
     chosen = chosen[distance[chosen] <= limit]
     if angle_rad is not None:
@@ -229,7 +230,9 @@ def match_epipolar(
     if len(first) == 0:
         return NO_MATCHES
     limit = frontend.max_distance if max_distance is None else max_distance
-    distance = frontend.distance(a.descriptors[rows_a[first]], b.descriptors[rows_b[second]])
+    distance = frontend.distance(
+        a.descriptors.take(rows_a[first], axis=0), b.descriptors.take(rows_b[second], axis=0)
+    )
     octave_b = b.octave[rows_b[second]]
     chosen = best_pairs(first, second, distance, octave_b, ratio, len(rows_a), len(rows_b))
     # Best for b among all candidates, not only among those that are some feature's best.

@@ -75,10 +75,10 @@ class LocalMap:
         lm = submap.landmarks
         return cls(
             landmark_ids,
-            lm["xyz_mu"][landmark_ids],
-            lm["normal"][landmark_ids],
+            lm["xyz_mu"].take(landmark_ids, axis=0),
+            lm["normal"].take(landmark_ids, axis=0),
             lm["distance_mu"][landmark_ids] * lm["scale"][landmark_ids],
-            lm["descriptor"][landmark_ids],
+            lm["descriptor"].take(landmark_ids, axis=0),
         )
 
     def take(self, rows: NDArray[np.generic]) -> LocalMap:
@@ -111,15 +111,15 @@ class LocalMap:
         R, t = T_cam_submap[:3, :3], T_cam_submap[:3, 3]
         uv, _ = project_points(K, T_cam_submap, self.xyz_mu)
         rows = np.flatnonzero(camera.shows(uv))  # NaN, behind the camera, is in no image
-        to_camera = -R.T @ t - self.xyz_mu[rows]
+        to_camera = -R.T @ t - self.xyz_mu.take(rows, axis=0)
         distance = np.sqrt(np.einsum("ij,ij->i", to_camera, to_camera))
-        cosine = np.einsum("ij,ij->i", to_camera, self.normal[rows]) / np.maximum(distance, 1e-12)
+        cosine = np.einsum("ij,ij->i", to_camera, self.normal.take(rows, axis=0)) / np.maximum(distance, 1e-12)
         scale = self.reference_mu[rows] / np.maximum(distance, 1e-12)
         coarsest = scale_factor ** (n_octaves - 1)
         # One octave beyond the pyramid at either end.
         ok = (cosine > VIEW_COSINE_MIN) & (scale > 1 / scale_factor) & (scale < coarsest * scale_factor)
         octave = np.clip(np.rint(np.log(scale[ok]) / np.log(scale_factor)), 0, n_octaves - 1).astype(np.int64)
-        return Prediction(rows[ok], uv[rows[ok]], octave)
+        return Prediction(rows[ok], uv.take(rows[ok], axis=0), octave)
 
 
 def trusted(submap: Submap, ids: IntArray, T_cam_submap: FloatArray, min_inliers: int) -> BoolArray:

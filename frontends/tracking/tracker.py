@@ -260,7 +260,7 @@ class Tracker:
             angle_rad=self._last.view.features.angle_rad[last_rows][prediction.rows],
         )
         rows, feature = prediction.rows[matches.index[:, 0]], matches.index[:, 1]
-        return self._refine(view, T_predicted, ids[rows], local.xyz_mu[rows], feature)
+        return self._refine(view, T_predicted, ids[rows], local.xyz_mu.take(rows, axis=0), feature)
 
     def _pose_from_wide_matches(
         self, view: View, keyframe_ids: list[int] | None = None
@@ -315,7 +315,7 @@ class Tracker:
             self._submap.K,
             T_start,
             xyz_mu,
-            features.uv_rect_px[feature],
+            features.uv_rect_px.take(feature, axis=0),
             features.sigma_px[feature],
             tolerance=GUIDE_TOLERANCE,
         )
@@ -345,8 +345,8 @@ class Tracker:
         estimate = refine_pose(
             submap.K,
             T_cam_submap,
-            submap.landmarks["xyz_mu"][ids],
-            features.uv_rect_px[feature],
+            submap.landmarks["xyz_mu"].take(ids, axis=0),
+            features.uv_rect_px.take(feature, axis=0),
             features.sigma_px[feature],
             tolerance=POSE_TOLERANCE,
             counted=trusted(submap, ids, T_cam_submap, self._config.min_inliers),
