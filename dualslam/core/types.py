@@ -134,7 +134,7 @@ class Features:
     def take(self, rows: NDArray[np.generic]) -> Features:
         """Return the features at `rows` (indices or a mask)."""
         rows = np.asarray(rows)
-        index = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
+        index: IntArray = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows.astype(np.int64, copy=False)
         return Features(
             self.uv_px.take(index, axis=0),  # of rows of several columns, ten times as fast as [index]
             self.uv_rect_px.take(index, axis=0),
