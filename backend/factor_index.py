@@ -252,7 +252,9 @@ class FactorIndex:
         T = np.array([poses[k] for k in ids.tolist()]).reshape(-1, 4, 4)
         point = submap.observations["landmark"][row]
         sigma = self.rows["sigma_px"][row]
-        res = compute_residuals(submap.K, T, pose, xyz_mu.take(point, axis=0), self.rows["uv_px"].take(row, axis=0), sigma)
+        res = compute_residuals(
+            submap.K, T, pose, xyz_mu.take(point, axis=0), self.rows["uv_px"].take(row, axis=0), sigma
+        )
         fits = np.where(inside[row], res.depth_mu > MIN_DEPTH_MU, res.chi2 < gate_sigmas[point] ** 2)
         asked = fits & ~trusted[point]
         certain = trusted.copy()

@@ -17,6 +17,9 @@ from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 CELLS_ACROSS = 16
 """Cells of an image's width by which observations are spread, as in the choice of what a keyframe observes."""
+_CELLS_A_ROW = 4 * CELLS_ACROSS + 1
+"""Up to four times the width: what lies farther out, as a lens may have it, is in the last."""
+_N_CELLS = _CELLS_A_ROW**2
 FIRST_VIEWS = 3
 """Views that a landmark gets back when it has lost some: two fit almost any pair of poses, a third one does not."""
 
@@ -133,7 +136,7 @@ class _Cells:
 
     def __init__(self, candidates: Candidates, rows: IntArray) -> None:
         self._candidates = candidates
-        self._occupied: dict[int, int] = {}
+        self._occupied = np.zeros(_N_CELLS, np.int64)
         self._n = 0
         self._add(self._cell(rows))
 
@@ -141,13 +144,14 @@ class _Cells:
         return self._n
 
     def _cell(self, rows: IntArray) -> IntArray:
-        at = np.clip(self._candidates.uv_px[rows] * (CELLS_ACROSS / self._candidates.width_px), 0, 4 * CELLS_ACROSS)
+        at = np.clip(
+            self._candidates.uv_px.take(rows, axis=0) * (CELLS_ACROSS / self._candidates.width_px), 0, 4 * CELLS_ACROSS
+        )
         column, row = at.astype(np.int64).T
-        return np.asarray(row * (4 * CELLS_ACROSS + 1) + column, np.int64)
+        return np.asarray(row * _CELLS_A_ROW + column, np.int64)
 
     def _add(self, cells: IntArray) -> None:
-        for cell, n in zip(*(a.tolist() for a in np.unique(cells, return_counts=True)), strict=True):
-            self._occupied[cell] = self._occupied.get(cell, 0) + n
+        self._occupied += np.bincount(cells, minlength=_N_CELLS)
         self._n += len(cells)
 
     def take(self, rows: IntArray, span: IntArray, n: int) -> IntArray:
@@ -156,8 +160,7 @@ class _Cells:
             return rows
         cell = self._cell(rows)
         order = np.lexsort((rows, -span, cell))
-        level = np.array([self._occupied.get(c, 0) for c in cell[order].tolist()], np.int64)
-        level += rank_in_runs(cell[order])
+        level = self._occupied[cell[order]] + rank_in_runs(cell[order])
         first = order[np.lexsort((rows[order], -span[order], level))[:n]]
         self._add(cell[first])
         return rows[first]

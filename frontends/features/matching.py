@@ -230,9 +230,7 @@ def match_epipolar(
     if len(first) == 0:
         return NO_MATCHES
     limit = frontend.max_distance if max_distance is None else max_distance
-    distance = frontend.distance(
-        a.descriptors.take(rows_a[first], axis=0), b.descriptors.take(rows_b[second], axis=0)
-    )
+    distance = frontend.distance(a.descriptors.take(rows_a[first], axis=0), b.descriptors.take(rows_b[second], axis=0))
     octave_b = b.octave[rows_b[second]]
     chosen = best_pairs(first, second, distance, octave_b, ratio, len(rows_a), len(rows_b))
     # Best for b among all candidates, not only among those that are some feature's best.
@@ -294,9 +292,10 @@ def _near_lines(
         off_line = lines[a0:a1] @ points[:, b0:b1]
         off_line *= off_line
         off_line -= gate_b[b0:b1]
-        row, column = np.divmod(np.flatnonzero(off_line <= gate_a[a0:a1]), max(b1 - b0, 1))
+        near = np.flatnonzero(off_line <= gate_a[a0:a1])
+        row = near // max(b1 - b0, 1)
         first.append(order_a[row + a0])
-        second.append(order_b[column + b0])
+        second.append(order_b[near - row * (b1 - b0) + b0])
     rows_a, rows_b = np.concatenate(first), np.concatenate(second)
     if (np.diff(octave_a) < 0).any() or (np.diff(octave_b) < 0).any():  # not given octave by octave
         order = np.lexsort((rows_b, rows_a))

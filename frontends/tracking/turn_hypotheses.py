@@ -107,7 +107,7 @@ class _Views:
         return self._moved_by(R_b_a[None], np.arange(len(self._a)))[0]
 
     def _moved_by(self, turns: FloatArray, rows: IntArray) -> BoolArray:
-        # All turns in one product, x, y and z each a block of its own: numpy is twice as fast as along strided columns.
+        # All turns in one product, x, y and z each a block of its own: twice as fast as along strided columns.
         moved = (self._K @ turns).swapaxes(0, 1).reshape(-1, 3) @ np.ascontiguousarray(self._a[rows].T)
         x, y, z = moved.reshape(3, len(turns), len(rows))
         z = np.where(z > 1e-9, z, np.inf)

@@ -21,10 +21,7 @@ def radial(r: FloatArray, k: tuple[float, ...]) -> FloatArray:
 def radial_derivative(r: FloatArray, k: tuple[float, ...]) -> FloatArray:
     """Return the derivative of `radial` by r."""
     s = r * r
-    total = np.zeros_like(s)
-    for i in reversed(range(len(k))):
-        total = (total + (2 * i + 3) * k[i]) * s
-    return 1.0 + total
+    return _factor(s, tuple((2 * i + 3) * c for i, c in enumerate(k)))
 
 
 @lru_cache(maxsize=64)  # of one lens it is asked for with each image
@@ -98,15 +95,18 @@ def _factor(s: FloatArray, k: tuple[float, ...]) -> FloatArray:
     """Return by how much points of squared radius s are moved outwards: ``1 + k[0] s + k[1] s^2 + ...``."""
     total = np.zeros_like(s)
     for c in reversed(k):
-        total = (total + c) * s
-    return 1.0 + total
+        total += c
+        total *= s
+    total += 1.0
+    return total
 
 
 def _factor_slope(s: FloatArray, k: tuple[float, ...]) -> FloatArray:
     """Return the derivative of `_factor` by s."""
     slope = np.zeros_like(s)
     for i in reversed(range(len(k))):
-        slope = slope * s + (i + 1) * k[i]
+        slope *= s
+        slope += (i + 1) * k[i]
     return slope
 
 

@@ -134,10 +134,8 @@ class _PoseProblem:
     def normal_equations(self, weight: FloatArray) -> FloatArray:
         """Return (7, 7): J'WJ bordered by J'Wr, for per-point weights, at the pose last evaluated."""
         A, iz, (x, y) = self.rows, self.inverse_depth, self.xy
-        A[0, 0] = A[1, 1] = x
-        A[0, 0] *= y  # xy
-        A[1, 1] = A[0, 0]
-        np.negative(A[0, 0], out=A[0, 0])
+        np.multiply(x, y, out=A[1, 1])
+        np.negative(A[1, 1], out=A[0, 0])
         np.multiply(x, x, out=A[1, 0])
         A[1, 0] += 1.0
         np.multiply(y, y, out=A[0, 1])
