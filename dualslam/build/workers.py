@@ -17,6 +17,7 @@ from dualslam.core.types import Failure
 from dualslam.frontends.registry import create_frontend
 from dualslam.frontends.tracking.map_readout import answer_readout
 from dualslam.lab.disturbances import FaultScript
+from dualslam.map.atlas_beside import answer_atlas
 from dualslam.map.graph_beside import GraphServer
 from dualslam.map.skeleton import answer_edges
 from dualslam.places import PlaceVerifier
@@ -55,10 +56,13 @@ def place_handlers(verifier: PlaceVerifier) -> Handlers:
     return {JobKind.LOOP: lambda search: search_places(search, verifier)}
 
 
-def edge_handlers(config: Config) -> Handlers:
-    """Build what gives covariances of edges within submaps."""
+def atlas_handlers(config: Config) -> Handlers:
+    """Build what solves the atlas, and gives the covariances that this needs."""
     solver = atlas_solver(config)
-    return {JobKind.EDGES: lambda question: answer_edges(question, solver.edge_covariances)}
+    return {
+        JobKind.EDGES: lambda question: answer_edges(question, solver.edge_covariances),
+        JobKind.ATLAS: lambda question: answer_atlas(question, solver.solve),
+    }
 
 
 READOUT_HANDLERS: Handlers = {JobKind.READOUT: answer_readout}
@@ -68,7 +72,7 @@ READOUT_HANDLERS: Handlers = {JobKind.READOUT: answer_readout}
 def inline_handlers(config: Config, verifier: PlaceVerifier, new_graph: Callable[[], SubmapGraph]) -> Handlers:
     """Build what is done at once where there are no workers; reverse tracking has an executor of its own."""
     return {
-        **edge_handlers(config),
+        **atlas_handlers(config),
         **SCALE_HANDLERS,
         **READOUT_HANDLERS,
         **calibration_handlers(config, new_graph),
@@ -98,7 +102,7 @@ def walk_handlers(config: Config, camera: Camera, n_threads: int) -> Handlers:
     verifier = place_parts(config, frontend, camera).verifier
     return {
         JobKind.WALK: lambda job: recover_in_steps(job, parts),
-        **edge_handlers(config),
+        **atlas_handlers(config),
         **SCALE_HANDLERS,
         **READOUT_HANDLERS,
         **calibration_handlers(config),
@@ -118,7 +122,15 @@ def worker_desk(config: Config, camera: Camera, faults: FaultScript, watch: Walk
     n_threads = min(FEATURE_THREADS, spare_cores(1 + recovery.workers))
     walks = Lane(
         "walks",
-        (JobKind.EDGES, JobKind.SCALE, JobKind.READOUT, JobKind.CALIBRATION, JobKind.LOOP, JobKind.WALK),
+        (
+            JobKind.EDGES,
+            JobKind.ATLAS,
+            JobKind.SCALE,
+            JobKind.READOUT,
+            JobKind.CALIBRATION,
+            JobKind.LOOP,
+            JobKind.WALK,
+        ),
         partial(walk_handlers, config, camera, n_threads),
         recovery.workers,
         recovery.time_limit_s,

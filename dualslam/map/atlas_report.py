@@ -9,8 +9,8 @@ import numpy as np
 
 from dualslam.core.atlas_problem import AtlasEdge, AtlasSolution
 from dualslam.core.geometry import sim3
-from dualslam.core.types import Failure, FloatArray
-from dualslam.map.atlas import Atlas, Link
+from dualslam.core.types import Failure
+from dualslam.map.atlas import Link
 from dualslam.map.bending import Move
 from dualslam.map.skeleton import Skeleton
 from dualslam.map.warp import Warp
@@ -67,12 +67,23 @@ class AtlasReport:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """A linked set with its solution, what that moves (None: all stays), and what is to hold the bends."""
+    """A linked set with its solution, and what that moves (None: all stays)."""
 
     skeleton: Skeleton
     solution: AtlasSolution
     moves: list[Move] | None
-    holds: dict[int, tuple[list[int], FloatArray]]
+
+    @classmethod
+    def of(cls, skeleton: Skeleton, solution: AtlasSolution, new: Sequence[Link]) -> Solved:
+        """Say what a solution moves. `new`: connections that came with it."""
+        if new and changes_nothing(skeleton, solution, new):
+            return cls(skeleton, solution, None)
+        return cls(skeleton, solution, [] if skeleton.is_tree else moves_of(skeleton, solution))
+
+    @property
+    def bends(self) -> list[Move]:
+        """The moves that bend a submap."""
+        return [move for move in self.moves or () if move.bent]
 
     @property
     def edges(self) -> tuple[AtlasEdge, ...]:
@@ -102,21 +113,20 @@ def changes_nothing(skeleton: Skeleton, solution: AtlasSolution, new: Sequence[L
     return True
 
 
-def moves_of(atlas: Atlas, skeleton: Skeleton, solution: AtlasSolution) -> list[Move]:
+def moves_of(skeleton: Skeleton, solution: AtlasSolution) -> list[Move]:
     """Return what a solution does to each submap, whose frame stays with the keyframe of its gauge."""
     moves = []
     for m in skeleton.component:
-        submap = atlas.submaps[m]
         rows, knots = skeleton.knots(m)
-        T = submap.keyframe_poses(knots)
+        T = skeleton.T_submap_node[rows]
         at = skeleton.reference[m]
-        S_world_submap = solution.S_world_node[at] @ sim3.inverse(submap.T_submap_kf[skeleton.nodes[at][1]])
+        S_world_submap = solution.S_world_node[at] @ sim3.inverse(skeleton.T_submap_node[at])
         S = sim3.inverse(S_world_submap) @ solution.S_world_node[rows] @ sim3.inverse(T)
         bent = bool(np.abs(sim3.log(S)).max() > STILL)
         warp = Warp(np.array(knots, np.int64), sim3.normalise(S))
         centres = T[:, :3, 3]
         bend_mu = float(np.linalg.norm(sim3.act_each(S, centres) - centres, axis=1).max())
-        moves.append(Move(m, warp, S_world_submap, bend_mu, bent))
+        moves.append(Move(m, warp, S_world_submap, bend_mu, bent, skeleton.steps[m]))
     return moves
 
 

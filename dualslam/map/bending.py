@@ -35,6 +35,8 @@ class Move:
         Farthest that a keyframe goes.
     bent : bool
         Whether any goes anywhere.
+    steps : (K - 1, 7, 7)
+        Covariances from knot to knot of the warp, as the submap's own factors give them: what is to hold the bend.
     """
 
     submap_id: int
@@ -42,6 +44,7 @@ class Move:
     S_world_submap: FloatArray
     bend_mu: float
     bent: bool
+    steps: FloatArray
 
 
 def bend_submap(submap: Submap, warp: Warp) -> None:
@@ -123,7 +126,7 @@ def hold(submap: Submap, knots: Sequence[int], covariances: FloatArray, held: fr
         submap.relative_poses.pop(k, None)
     now = set()
     for first, second, C in zip(knots[:-1], knots[1:], covariances, strict=True):
-        if second in submap.relative_poses:
+        if second in submap.relative_poses or not {first, second} <= submap.keyframes.keys():
             continue
         T = se3.inverse(submap.T_submap_kf[first]) @ submap.T_submap_kf[second]
         submap.relative_poses[second] = RelativePose(first, T, HOLD_RATIO**2 * C[:6, :6])

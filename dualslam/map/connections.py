@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
-from dualslam.core.atlas_problem import AtlasSolver
+from dualslam.core.atlas_problem import AtlasSolution, AtlasSolver
 from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
@@ -20,25 +20,20 @@ from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.atlas import Atlas, Link, LinkKind, joined
-from dualslam.map.atlas_report import (
-    AtlasReport,
-    Solved,
-    changes_nothing,
-    count_kinds,
-    moves_of,
-    named,
-    placed_by,
-    together,
-)
+from dualslam.map.atlas_beside import AskedSolution
+from dualslam.map.atlas_report import AtlasReport, Solved, count_kinds, named, placed_by, together
 from dualslam.map.bending import Move, bend_frames, bend_link, bend_submap, hold
 from dualslam.map.overlap_sides import OverlapRefinement, apply_overlap, overlap_problem
 from dualslam.map.propagation import propagate_anchors, propagate_links, propagate_poses
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.skeleton import Covariances, EdgeCovariances, Skeleton, build_skeleton, skeleton_knots
 from dualslam.map.submap import Submap
-from dualslam.workers.jobs import Desk
+from dualslam.workers.jobs import Desk, JobKind
 
 log = logging.getLogger(__name__)
+
+MAX_TRIES = 3
+"""How many times a solution is asked for beside the tracking, where workers die over it or the map changes under it."""
 
 
 class Connections:
@@ -53,9 +48,11 @@ class Connections:
     adjust : BundleAdjuster
         Of overlaps.
     desk : Desk
-        Where covariances are computed that are needed soon.
+        Where solutions are computed, and covariances that they will need.
     front_ends : callable
         Gives those that go on, or may go on, in a submap of the atlas.
+    forget_graph : callable
+        Told of each submap that has been bent: what its graph is solving is of before.
     """
 
     def __init__(
@@ -66,13 +63,21 @@ class Connections:
         adjust: BundleAdjuster,
         desk: Desk,
         front_ends: Callable[[], Iterable[VisualOdometry]] = tuple,
+        forget_graph: Callable[[int], None] = lambda submap_id: None,
     ) -> None:
         self._record = record
         self._solver = solver
         self._new_graph = new_graph
         self._adjust = adjust
         self._front_ends = front_ends
+        self._forget_graph = forget_graph
+        self._desk = desk
         self._covariances = EdgeCovariances(solver.edge_covariances, desk)
+        self._asked: AskedSolution | None = None  # what is being solved beside the tracking
+        self._due: set[int] = set()  # submaps whose linked sets are to be solved next
+        self._left: list[Move] = []  # moves of a solution that are still to be made
+        self._changes: dict[int, int] = {}  # by submap: how many times others than its graph have changed it
+        self._is_over = False
 
     @property
     def _atlas(self) -> Atlas:
@@ -82,6 +87,9 @@ class Connections:
 
     def connect(self, links: Sequence[Link], now: FrameStamp) -> AtlasReport:
         """Take connections in, solve what they join, and move all that the solution moves.
+
+        A connection that alone ties two sets contradicts nothing: where its solution is not there at once, the sets
+        are joined by it as they are, and move when it comes.
 
         Parameters
         ----------
@@ -95,10 +103,70 @@ class Connections:
             Falsy where the solver failed: the connections are not taken in then.
         """
         touched = {m for link in links for m in (link.a, link.b)}
-        report = self._solve(touched, links, now)
+        if len(links) > 1 or any(touched <= set(component) for component in self._atlas.components()):
+            self._complete()
+            report = self._solve(touched, links, now)
+        else:
+            report = self._connect_sets(links[0], now)
         for link in links if report else ():
             if link.kind is LinkKind.ROLLOVER:
                 self._foresee_rollover(link.a)
+        return report
+
+    def connect_later(self, link: Link, now: FrameStamp) -> AtlasReport | None:
+        """Take a connection in as soon as the atlas has been solved with it; not while it `is_solving`.
+
+        Returns
+        -------
+        AtlasReport or None
+            As for `connect`. None: `collect` will return it.
+        """
+        if not any({link.a, link.b} <= set(component) for component in self._atlas.components()):
+            return self.connect([link], now)
+        return self._ask({link.a, link.b}, [link], now)
+
+    def _connect_sets(self, link: Link, now: FrameStamp) -> AtlasReport:
+        touched = {link.a, link.b}
+        if self.is_solving:
+            self._count_change(self._join(link))
+            self._due |= touched
+            return AtlasReport()
+        report = self._ask(touched, [link], now)
+        if report is None:
+            self._join(link)
+            assert self._asked is not None
+            self._asked.take_in(len(self._atlas.links) - 1)
+        return AtlasReport() if report is None else report
+
+    @property
+    def is_solving(self) -> bool:
+        """Whether a solution is still to come, or a part of what it moves still to be moved."""
+        return self._asked is not None or bool(self._left)
+
+    def collect(self, now: FrameStamp) -> AtlasReport | None:
+        """Take in what has been solved meanwhile; one submap follows it at once, the live one, and then one each time.
+
+        Returns
+        -------
+        AtlasReport or None
+            Of connections that have waited for it.
+        """
+        if self._left:
+            self._bend_next()
+        for ended in self._desk.poll(JobKind.ATLAS):
+            return self._take(ended.result, now, late=True)
+        if self._due and not self.is_solving:
+            touched, self._due = self._due, set()
+            self._ask(touched, (), now)
+        return None
+
+    def finish(self, now: FrameStamp) -> AtlasReport | None:
+        """Wait, for a limited time, for what is being solved; from now on all is solved at once. See `collect`."""
+        self._is_over = True
+        self._complete()
+        report = None
+        for ended in self._desk.drain(JobKind.ATLAS):
+            report = self._take(ended.result, now, late=False)
         return report
 
     def foresee(self, link: Link) -> None:
@@ -123,10 +191,16 @@ class Connections:
             For the event log.
         """
         self._carry(before, after)
-        if after.id in self._atlas.placement:
-            self._solve({after.id}, (), now)
+        if after.id not in self._atlas.placement:
+            return
+        if self.is_solving:
+            self._due.add(after.id)
+        else:
+            self._ask({after.id}, (), now)
 
     def _carry(self, before: Submap, after: Submap) -> None:
+        self._count_change([after.id])
+        self._left = [move for move in self._left if move.submap_id != after.id]  # it is solved again
         for pose in propagate_poses(self._record.poses.values(), before, after):
             self._record.poses[pose.index] = pose
         propagate_anchors(before, after)
@@ -137,7 +211,7 @@ class Connections:
                 self._atlas.warps.pop(after.id, None)
 
     def settle(self, now: FrameStamp) -> None:
-        """Solve all sets with cycles once more, as their submaps are by now."""
+        """Solve all sets with cycles once more, here and now, as their submaps are by then."""
         for component in self._atlas.components():
             if component[0] in self._atlas.placement:
                 self._solve(set(component), (), now)
@@ -225,27 +299,86 @@ class Connections:
             lambda link: id(link) not in fresh and not link.rejected,
         )
 
-    def _solve(self, touched: set[int], new: Sequence[Link], now: FrameStamp) -> AtlasReport:
-        started = time.perf_counter()
-        solved: list[Solved] = []
+    def _problems(self, touched: set[int], new: Sequence[Link]) -> list[Skeleton]:
+        """Make the problems of all linked sets that are touched."""
+        skeletons = []
+        while touched:
+            skeletons.append(self._skeleton(touched, [link for link in new if link.a in touched]))
+            touched = touched - set(skeletons[-1].component)
+        return skeletons
+
+    def _ask(self, touched: set[int], new: Sequence[Link], now: FrameStamp, tries: int = 0) -> AtlasReport | None:
+        """Have what is touched solved; return None where that is not done at once."""
+        if self._is_over or tries >= MAX_TRIES:
+            return self._solve(touched, new, now)
         try:
-            while touched:
-                skeleton = self._skeleton(touched, [link for link in new if link.a in touched])
-                solution = self._solver.solve(skeleton.problem)
-                moves: list[Move] | None = None
-                if not new or not changes_nothing(skeleton, solution, new):
-                    moves = [] if skeleton.is_tree else moves_of(self._atlas, skeleton, solution)
-                bent = [move.submap_id for move in moves or () if move.bent]
-                holds = {m: self._to_hold(skeleton, m) for m in bent}
-                solved.append(Solved(skeleton, solution, moves, holds))
-                touched = touched - set(skeleton.component)
+            skeletons = self._problems(touched, new)
         except SolverError as error:
-            log.warning("the atlas stays as it is: %s", error)
-            return AtlasReport(failure=Failure(FailureReason.SOLVER, str(error)))
+            return _failed(str(error))
+        self._asked = AskedSolution.of(self._atlas, touched, skeletons, list(new), self._changes, tries)
+        self._desk.submit(JobKind.ATLAS, self._asked.question())
+        for ended in self._desk.poll(JobKind.ATLAS):
+            return self._take(ended.result, now, late=False)
+        return None
+
+    def _take(self, result: tuple[AtlasSolution, ...] | Failure, now: FrameStamp, late: bool) -> AtlasReport | None:
+        """Move what a solution moves, if it still holds; else ask again."""
+        asked, self._asked = self._asked, None
+        assert asked is not None, "there is one question at a time"
+        new = asked.links_now(self._atlas)
+        if isinstance(result, Failure) and result.reason is FailureReason.SOLVER:
+            report = _failed(result.detail)
+        elif isinstance(result, Failure) or not asked.holds(self._atlas, self._changes):
+            why = result.detail if isinstance(result, Failure) else "the map has changed meanwhile"
+            log.info("the atlas is solved again: %s", why)
+            again = self._ask(asked.touched, new, now, asked.tries + 1)
+            return again if new else None
+        else:
+            skeletons = asked.skeletons_now(self._atlas, new)
+            report = self._move(skeletons, result, new, now, time.perf_counter() - asked.started_s, late)
+        return report if new else None
+
+    def _solve(self, touched: set[int], new: Sequence[Link], now: FrameStamp) -> AtlasReport:
+        """Solve what is touched here and now."""
+        started = time.perf_counter()
+        try:
+            skeletons = self._problems(touched, new)
+            solutions = [self._solver.solve(skeleton.problem) for skeleton in skeletons]
+        except SolverError as error:
+            return _failed(str(error))
+        return self._move(skeletons, solutions, new, now, time.perf_counter() - started)
+
+    def _move(
+        self,
+        skeletons: Sequence[Skeleton],
+        solutions: Sequence[AtlasSolution],
+        new: Sequence[Link],
+        now: FrameStamp,
+        seconds: float,
+        late: bool = False,
+    ) -> AtlasReport:
+        """Take connections in, and move what solutions move; `late`: one submap after the other."""
+        solved = [Solved.of(*each, new) for each in zip(skeletons, solutions, strict=True)]
         self._atlas.links.extend(new)
-        report = replace(together([self._apply(s) for s in solved]), seconds=time.perf_counter() - started)
+        report = replace(together([self._apply(s, late) for s in solved]), seconds=seconds)
         self._tell(report, solved, now)
         return report
+
+    def _join(self, link: Link) -> list[int]:
+        """Join two sets by the only connection between them, and return the second, which moves into the first's world.
+
+        Where it has cycles, it is composed along its connections until the next solution.
+        """
+        atlas = self._atlas
+        second = max(component for component in atlas.components() if link.a in component or link.b in component)
+        for m in second:
+            atlas.placement.pop(m, None)
+        atlas.link(link)
+        return second
+
+    def _count_change(self, submap_ids: Iterable[int]) -> None:
+        for m in submap_ids:
+            self._changes[m] = self._changes.get(m, 0) + 1
 
     def _foresee_rollover(self, submap_id: int) -> None:
         """Ask a full submap for its covariances now: the first loop of a long run would wait for those of all."""
@@ -253,59 +386,72 @@ class Connections:
         pairs = list(pairwise(skeleton_knots(submap)))
         self._covariances.foresee(submap, pairs, self._atlas.held.get(submap_id, frozenset()))
 
-    def _to_hold(self, skeleton: Skeleton, submap_id: int) -> tuple[list[int], FloatArray]:
-        """Return the knots that are to hold a submap's bend, and what its own factors say from one to the next."""
-        _, knots = skeleton.knots(submap_id)
-        pairs = list(pairwise(knots))
-        held = self._atlas.held.get(submap_id, frozenset())
-        return knots, self._covariances(self._atlas.submaps[submap_id], pairs, held)
-
     # --- the transaction
 
-    def _apply(self, solved: Solved) -> AtlasReport:
+    def _apply(self, solved: Solved, late: bool) -> AtlasReport:
         """Move all that a solution moves. Whatever can fail has been done before."""
         atlas, skeleton = self._atlas, solved.skeleton
-        ends = {id(link): link.attached(atlas) for link in skeleton.links}
-        moves = solved.moves or []
-        warps = {move.submap_id: move.warp for move in moves if move.bent}
-        befores = {m: atlas.submaps[m].copy() for m in warps}
-        for m, warp in warps.items():
-            submap = atlas.submaps[m]
-            bend_submap(submap, warp)
-            for pose in bend_frames(self._record.poses.values(), befores[m], submap, warp):
-                self._record.poses[pose.index] = pose
-            atlas.warps[m] = warp.after(atlas.warps[m]) if m in atlas.warps else warp
-            atlas.held[m] = hold(submap, *solved.holds[m], atlas.held.get(m, frozenset()))
-            submap.landmarks["xyz_mu"][:] = self._solver.refit_points(submap)
-            self._covariances.bent(submap, warp)
+        self._count_change(skeleton.component)
         if solved.moves is not None:
             for m in skeleton.component:
                 atlas.placement.pop(m, None)
-            atlas.placement |= {move.submap_id: move.S_world_submap for move in moves}
+            atlas.placement |= {move.submap_id: move.S_world_submap for move in solved.moves}
         believed = dict(zip(map(id, skeleton.links), solved.believed, strict=True))
-        changed: dict[bool, list[Link]] = {True: [], False: []}
+        changed: dict[bool, list[int]] = {True: [], False: []}
         for i, link in enumerate(atlas.links):
-            if id(link) not in believed:
-                continue
-            kept = believed[id(link)]
-            atlas.links[i] = replace(bend_link(link, ends[id(link)], warps), rejected=not kept)
-            if kept == link.rejected:
-                changed[kept].append(atlas.links[i])
-        for front_end in self._front_ends():
-            if front_end.submap.id in befores:
-                front_end.adopt(self._new_graph(), befores[front_end.submap.id])
+            if id(link) in believed and (kept := believed[id(link)]) == link.rejected:
+                atlas.links[i] = replace(link, rejected=not kept)
+                changed[kept].append(i)
+        # The live ones first; of the others, where that cannot wait, all at once.
+        live = {front_end.submap.id for front_end in self._front_ends()}
+        self._bend([move for move in solved.bends if not late or move.submap_id in live])
+        self._left += [move for move in solved.bends if late and move.submap_id not in live]
         return AtlasReport(
             rejected=tuple(k for k in atlas.links if k.rejected and k.a in skeleton.component),
-            newly_rejected=tuple(changed[False]),
-            readmitted=tuple(changed[True]),
+            newly_rejected=tuple(atlas.links[i] for i in changed[False]),
+            readmitted=tuple(atlas.links[i] for i in changed[True]),
             factors=count_kinds(e for e, kept in zip(solved.edges, solved.solution.believed, strict=True) if kept),
             cost_before=solved.solution.cost_before,
             cost_after=solved.solution.cost_after,
             drift=solved.solution.drift,
             newest_chi2=solved.newest_chi2,
-            bent={move.submap_id: move.bend_mu for move in moves if move.bent},
+            bent={move.submap_id: move.bend_mu for move in solved.bends},
             placed=placed_by(skeleton, solved.solution) if solved.moves is not None else {},
         )
+
+    def _complete(self) -> None:
+        """Make all moves that are left of a solution."""
+        left, self._left = self._left, []
+        self._bend(left)
+
+    def _bend_next(self) -> None:
+        """Make one of the moves that are left."""
+        self._bend([self._left.pop(0)])
+
+    def _bend(self, moves: Sequence[Move]) -> None:
+        """Bend submaps, with all that lies in them: each is whole again before anything else looks at it."""
+        atlas = self._atlas
+        warps = {move.submap_id: move.warp for move in moves}
+        ends = [link.attached(atlas) for link in atlas.links]
+        befores = {m: atlas.submaps[m].copy() for m in warps}
+        for move in moves:
+            m, warp = move.submap_id, move.warp
+            submap = atlas.submaps[m]
+            bend_submap(submap, warp)
+            for pose in bend_frames(self._record.poses.values(), befores[m], submap, warp):
+                self._record.poses[pose.index] = pose
+            atlas.warps[m] = warp.after(atlas.warps[m]) if m in atlas.warps else warp
+            knots = warp.index.tolist()
+            atlas.held[m] = hold(submap, knots, move.steps, atlas.held.get(m, frozenset()))
+            submap.landmarks["xyz_mu"][:] = self._solver.refit_points(submap)
+            self._covariances.bent(submap, warp)
+            self._forget_graph(m)
+        for i, (link, attached) in enumerate(zip(atlas.links, ends, strict=True)):
+            if link.a in warps or link.b in warps:
+                atlas.links[i] = bend_link(link, attached, warps)
+        for front_end in self._front_ends():
+            if front_end.submap.id in befores:
+                front_end.adopt(self._new_graph(), befores[front_end.submap.id])
 
     def _tell(self, report: AtlasReport, solved: Sequence[Solved], now: FrameStamp) -> None:
         self._record.event(
@@ -329,3 +475,8 @@ class Connections:
         ):
             for link in links:
                 self._record.event(kind, now, link.b, **named(link))
+
+
+def _failed(detail: str) -> AtlasReport:
+    log.warning("the atlas stays as it is: %s", detail)
+    return AtlasReport(failure=Failure(FailureReason.SOLVER, detail))

@@ -253,6 +253,10 @@ class BesideGraphs:
                 elif (moved := self._take(ended.result, submaps)) is not None:
                     yield moved
 
+    def forget(self, submap_id: int) -> None:
+        """Let what a submap's graph is solving, or knows, be of no more use: it was moved by others."""
+        self._graphs.pop(submap_id, None)
+
     def _note(self, submap: Submap, graph: BesideGraph) -> None:
         self._graphs[submap.id] = graph
         self._answered.setdefault(submap.id, frozenset(submap.keyframes))

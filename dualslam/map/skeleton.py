@@ -64,6 +64,10 @@ class Skeleton:
         Those of its edges that are connections, in order; the last edges of the problem.
     is_tree : bool
         Whether there is one way only between any two of its submaps, and none was ever bent: nothing to optimise.
+    T_submap_node : (N, 4, 4)
+        Keyframe to submap.
+    steps : dict of int to (K - 1, 7, 7)
+        For each submap the covariances from node to node, as its own factors give them (a tree: of no meaning).
     """
 
     component: list[int]
@@ -72,6 +76,8 @@ class Skeleton:
     reference: dict[int, int]
     links: list[Link]
     is_tree: bool
+    T_submap_node: FloatArray
+    steps: dict[int, FloatArray]
 
     def knots(self, submap_id: int) -> tuple[list[int], list[int]]:
         """Return rows and keyframes of a submap's nodes, ascending."""
@@ -234,7 +240,9 @@ def build_skeleton(
     is_tree = len(links) < len(component) and not any(m in atlas.warps for m in component)
     nodes: list[Node] = []
     S_world_node: list[FloatArray] = []
+    T_submap_node: list[FloatArray] = []
     edges: list[AtlasEdge] = []
+    steps: dict[int, FloatArray] = {}
     reference: dict[int, int] = {}
     for m in component:
         submap = atlas.submaps[m]
@@ -244,7 +252,11 @@ def build_skeleton(
         nodes += [(m, k) for k in knots]
         T = submap.keyframe_poses(knots)
         S_world_node += list(S_world_submap[m] @ T)
-        edges += _within(atlas, submap, knots, first, None if is_tree and not with_covariances else covariances)
+        T_submap_node += list(T)
+        within, steps[m] = _within(
+            atlas, submap, knots, first, None if is_tree and not with_covariances else covariances
+        )
+        edges += within
     row = {node: i for i, node in enumerate(nodes)}
     for link in links:
         k_a, k_b = link.attached(atlas)
@@ -252,7 +264,7 @@ def build_skeleton(
             k_a, k_b = _nearest(knots_of[link.a], k_a), _nearest(knots_of[link.b], k_b)
         edges.append(_across(atlas, link, k_a, k_b, row, known(link)))
     problem = AtlasProblem(np.array(S_world_node), reference[component[0]], tuple(edges))
-    return Skeleton(component, problem, nodes, reference, list(links), is_tree)
+    return Skeleton(component, problem, nodes, reference, list(links), is_tree, np.array(T_submap_node), steps)
 
 
 def _initial(atlas: Atlas, component: list[int], links: Sequence[Link]) -> dict[int, FloatArray]:
@@ -285,22 +297,24 @@ def _reference(submap: Submap) -> int:
 
 def _within(
     atlas: Atlas, submap: Submap, knots: list[int], first: int, covariances: Covariances | None
-) -> list[AtlasEdge]:
-    """Tie a submap's nodes to each other, as it says itself."""
+) -> tuple[list[AtlasEdge], FloatArray]:
+    """Tie a submap's nodes to each other, as it says itself; return also what its factors say from node to node."""
     places = [(i, i + 1) for i in range(len(knots) - 1)] + ([] if covariances is None else _across_knots(submap, knots))
     pairs = [(knots[i], knots[j]) for i, j in places]
     if covariances is None:  # in a tree no edge pulls at another, whatever they are
-        C = np.broadcast_to(np.eye(7), (len(pairs), 7, 7))
+        own_C = C = np.broadcast_to(np.eye(7), (len(pairs), 7, 7))
     else:
-        C = _inflated(submap, pairs, covariances(submap, pairs, atlas.held.get(submap.id, frozenset())))
+        own_C = covariances(submap, pairs, atlas.held.get(submap.id, frozenset()))
+        C = _inflated(submap, pairs, own_C)
     i, j = np.array(places, np.int64).reshape(-1, 2).T
     T = submap.keyframe_poses(knots)
     S = sim3.inverse(atlas.warps[submap.id].at(knots)) @ T if submap.id in atlas.warps else T
     own, now = (sim3.inverse(at[i]) @ at[j] for at in (S, T))
     kept = (j == i + 1) | ~_are_torn(own, now, C)
-    return [
+    edges = [
         AtlasEdge(first + int(i[n]), first + int(j[n]), own[n], C[n], WITHIN) for n in np.flatnonzero(kept).tolist()
     ]
+    return edges, own_C[: len(knots) - 1]
 
 
 def _are_torn(own: FloatArray, now: FloatArray, covariances: FloatArray) -> BoolArray:

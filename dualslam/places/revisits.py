@@ -98,6 +98,15 @@ class _Believed:
     then: tuple[FloatArray, FloatArray]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Closing:
+    """A place whose connection the atlas is being solved with."""
+
+    match: PlaceMatch
+    seconds: int
+    kind: LinkKind
+
+
 class Revisits:
     """Searches for places, keyframe by keyframe, and links those that are seen again.
 
@@ -137,6 +146,7 @@ class Revisits:
         self._config = config
         self._provisional: _Provisional | None = None
         self._believed: _Believed | None = None
+        self._closing: _Closing | None = None
         self._n_asked = 0
         self._rest = REST
         self._rests_until = 0  # counted in `_n_asked`; other maps may be found all the same
@@ -160,7 +170,9 @@ class Revisits:
             return
         self.sightings.end()
         self._n_asked += 1
-        busy = self._desk.n_open(JobKind.LOOP) or self._believed is not None  # which another must not take the place of
+        # Which another must not take the place of.
+        waits = self._believed is not None or self._closing is not None
+        busy = waits or self._desk.n_open(JobKind.LOOP)
         if busy or (self._provisional is None and self._n_asked % ASK_EVERY):
             return
         submap, keyframe_id = live.submap, live.reference_id
@@ -172,6 +184,22 @@ class Revisits:
         search = PlaceSearch(submap.id, keyframe_id, candidates, {m: submaps[m].copy() for m in sorted(named)})
         self._desk.submit(JobKind.LOOP, search)
 
+    def take_solution(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
+        """Let the maps follow what has been solved meanwhile.
+
+        Returns
+        -------
+        AtlasReport or None
+            Of the link that has waited for it.
+        """
+        return self._closed(self._connections.collect(now), live, now)
+
+    def _closed(self, report: AtlasReport | None, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
+        if report is None or self._closing is None:
+            return None
+        closing, self._closing = self._closing, None
+        return self._linked(closing, report, live, now)
+
     def collect(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
         """Take in the places found meanwhile, and link those that are sure.
 
@@ -181,12 +209,14 @@ class Revisits:
             Of the link that was made.
         """
         self._take_answers(self._desk.poll(JobKind.LOOP), live, now)
-        return None if self._connections.foreseeing else self._link_believed(live, now)
+        waits = self._connections.foreseeing or self._connections.is_solving
+        return None if waits else self._link_believed(live, now)
 
     def finish(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
         """Do the same at the end of the run, with what is under way."""
+        report = self._closed(self._connections.finish(now), live, now)
         self._take_answers(self._desk.drain(JobKind.LOOP), live, now)
-        return self._link_believed(live, now)
+        return self._link_believed(live, now) or report
 
     def _take_answers(self, answers: list[Ended], live: VisualOdometry | None, now: FrameStamp) -> None:
         for ended in answers:
@@ -288,11 +318,21 @@ class Revisits:
         return Link(a, b, match.S_place_query, match.covariance, kind, (), keyframe_a, keyframe_b, doubtful=False)
 
     def _link(self, match: PlaceMatch, seconds: int, live: VisualOdometry, now: FrameStamp) -> AtlasReport | None:
-        """Give a link to the atlas, and record whether it was accepted."""
-        atlas = self._record.atlas
-        (a, keyframe_a), (b, keyframe_b) = match.place, match.query
+        """Give a link to the atlas; None where that has to be solved with it first, or did not take it."""
         link = self._link_of(match)
-        report = self._connections.connect([link], now)
+        closing = _Closing(match, seconds, link.kind)
+        report = self._connections.connect_later(link, now)
+        if report is None:
+            self._closing = closing
+            return None
+        return self._linked(closing, report, live, now)
+
+    def _linked(
+        self, closing: _Closing, report: AtlasReport, live: VisualOdometry | None, now: FrameStamp
+    ) -> AtlasReport | None:
+        """Record whether a link was accepted, and what follows."""
+        atlas, match = self._record.atlas, closing.match
+        (a, keyframe_a), (b, keyframe_b) = match.place, match.query
         self._rest_after(report)
         if not report:
             assert report.failure is not None
@@ -300,15 +340,16 @@ class Revisits:
             return None
         if a == b:
             self._merge_duplicates(atlas.submaps[a], match)
-            live.adopt(live.graph, live.submap)  # its last frame holds ids that are no more
+            if live is not None and live.submap.id == a:
+                live.adopt(live.graph, live.submap)  # its last frame holds ids that are no more
         self._record.event(
-            EventKind.LOOP_CLOSED if link.kind is LinkKind.LOOP else EventKind.MERGED,
+            EventKind.LOOP_CLOSED if closing.kind is LinkKind.LOOP else EventKind.MERGED,
             now,
             b,
             other_submap=a,
             other_frame=keyframe_a,
             keyframe=keyframe_b,
-            seconds=seconds,
+            seconds=closing.seconds,
             matches=match.n_matches,
             inliers=match.n_inliers,
             chi2_drift=report.newest_chi2,

@@ -40,10 +40,13 @@ class PlaceKeeping:
     def collect(self, now: FrameStamp) -> None:
         """Link the places that were found; while reverse tracking is under way, they wait for its end."""
         live = self._state.live
+        with self._state.record.timer.measure("places"):
+            report = self._revisits.take_solution(live, now)
         if live is not None and self._recoveries.is_under_way(live.submap):
             return
-        with self._state.record.timer.measure("places"):
-            report = self._revisits.collect(live, now)
+        if report is None:
+            with self._state.record.timer.measure("places"):
+                report = self._revisits.collect(live, now)
         if report is not None and live is not None:
             self._recoveries.settle(live)
 

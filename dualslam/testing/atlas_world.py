@@ -15,6 +15,7 @@ from dualslam.config.settings import GraphConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import BoolArray, FloatArray, FrameStatus, Keyframe
 from dualslam.map.atlas import Atlas, Link, LinkKind
+from dualslam.map.atlas_beside import answer_atlas
 from dualslam.map.connections import Connections
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.record import Record
@@ -74,7 +75,12 @@ class DriftingMap:
             solver,
             lambda: ISam2SubmapGraph(GraphConfig()),
             bundle_adjust_arrays,
-            InlineDesk({JobKind.EDGES: lambda question: answer_edges(question, solver.edge_covariances)}),
+            InlineDesk(
+                {
+                    JobKind.EDGES: lambda question: answer_edges(question, solver.edge_covariances),
+                    JobKind.ATLAS: lambda question: answer_atlas(question, solver.solve),
+                }
+            ),
             lambda: self.front_ends,
         )
         self.front_ends: list[Any] = []

@@ -27,6 +27,7 @@ class JobKind(StrEnum):
     START = "start search"
     GRAPH = "graph"
     EDGES = "edge covariances"
+    ATLAS = "atlas"
     SCALE = "scale watch"
     READOUT = "readout"
     CALIBRATION = "calibration"

@@ -170,6 +170,22 @@ def test_a_graph_that_fails_at_the_end_keeps_no_other_from_being_solved(reason: 
     assert translation.max() < 0.01
 
 
+def test_what_a_graph_was_solving_when_its_submap_was_bent_straightens_nothing() -> None:
+    desk = LateDesk(InlineDesk({JobKind.GRAPH: GraphServer(lambda: ISam2SubmapGraph(Config().graph))}), 1)
+    graphs = BesideGraphs(desk, lambda submap, k: Failure(FailureReason.SOLVER, "no window"))
+    submap = guessed_submap(make_scene(6, noise_px=0.5), pose_noise=0.02)
+    graphs.new_graph().update(submap)
+    assert not list(graphs.collect({submap.id: submap}))
+    submap.transform(1.5, np.eye(4))
+    bent = submap.keyframe_poses(range(6))
+    graphs.forget(submap.id)
+    assert desk.n_open(JobKind.GRAPH)
+    assert not list(graphs.finish({submap.id: submap}))
+    np.testing.assert_array_equal(submap.keyframe_poses(range(6)), bent)
+    graphs.new_graph().rebuild(submap)
+    assert any(each.rebuilt for each in graphs.finish({submap.id: submap}))
+
+
 def test_a_process_that_is_killed_costs_the_map_nothing(world: PointWorld) -> None:
     """With a real one: its graph is lost, and made anew from the arrays by the next."""
     settings = {"recovery": {"enabled": False, "workers": 1}, "calibration": {"refine": False}}

@@ -158,6 +158,42 @@ def test_a_loop_whose_covariances_come_late_is_closed_when_they_have_come(polls:
     assert errors(system).max() < errors(driven_lap()).max()
 
 
+@pytest.mark.parametrize("polls", [2, 15])
+@pytest.mark.parametrize("settings", [{}, ROLLING])
+def test_a_loop_whose_solution_comes_late_is_closed_when_it_has_come(polls: int, settings: dict[str, object]) -> None:
+    world = lap()
+    system = system_in(world, **settings)
+    system._connections._desk = desk = LateDesk(system._state.parts.desk, polls)
+    closed_at = None
+    for frame in world.frames():
+        system.step(frame)
+        if closed_at is None and system.events.of_kind(EventKind.LOOP_CLOSED):
+            closed_at = frame.index
+    assert desk.n_polls[JobKind.ATLAS] > polls
+    system.finish()
+    as_if = run(lap(), **settings) if settings else closed_lap()
+    first, loop = (each.events.of_kind(EventKind.LOOP_CLOSED)[0] for each in (as_if, system))
+    assert closed_at is not None
+    assert closed_at > first.frame, "not before it was there"
+    assert (loop.data["keyframe"], loop.data["other_frame"]) == (first.data["keyframe"], first.data["other_frame"])
+    assert loop.data["chi2_drift"] == pytest.approx(first.data["chi2_drift"], rel=1e-6)
+    assert set(system.poses) == set(as_if.poses)
+    assert errors(system).max() < max(errors(driven_lap()).max(), 1.2 * errors(as_if).max())
+    assert not system._connections.is_solving
+
+
+def test_a_loop_that_is_being_solved_when_the_run_ends_is_closed_then() -> None:
+    world = lap()
+    system = system_in(world)
+    system._connections._desk = LateDesk(system._state.parts.desk, 100_000)
+    for frame in world.frames():
+        system.step(frame)
+    assert not system.atlas.links
+    system.finish()
+    assert [link.kind for link in system.atlas.believed] == [LinkKind.LOOP]
+    assert len(system.events.of_kind(EventKind.LOOP_CLOSED)) == 1
+
+
 def test_a_worker_that_dies_over_a_search_costs_that_search_alone() -> None:
     """The first two searches that would have found the loop come to nothing; those after them close it."""
     world = lap()
