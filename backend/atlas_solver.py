@@ -104,9 +104,9 @@ class GtsamAtlasSolver:
         """
         return edge_covariances(submap, pairs, self._robust_k, held)
 
-    def refit_points(self, submap: Submap) -> FloatArray:
-        """Return (L, 3) a submap's landmarks as their views have them by the poses as they are."""
-        return refit_points(submap, self._robust_k)
+    def refit_points(self, submap: Submap, landmark_ids: IntArray) -> FloatArray:
+        """Return (N, 3) some of a submap's landmarks as their views have them by the poses as they are."""
+        return refit_points(submap, self._robust_k, landmark_ids)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,8 +13,8 @@ DAMPING = 1e-6
 """Relative to the trace of a point's information: the depth of one seen along a single line stays where it is."""
 
 
-def refit_points(submap: Submap, robust_k: float) -> FloatArray:
-    """Return (L, 3) landmarks that fit their views better, robustly; one that would not gain stays where it is.
+def refit_points(submap: Submap, robust_k: float, landmark_ids: IntArray) -> FloatArray:
+    """Return (N, 3) landmarks that fit their views better, robustly; one that would not gain stays where it is.
 
     Parameters
     ----------
@@ -22,12 +22,15 @@ def refit_points(submap: Submap, robust_k: float) -> FloatArray:
         Is not changed.
     robust_k : float
         Huber threshold in sigmas.
+    landmark_ids : (N,) int64
+        Each once.
     """
-    obs = submap.observations
-    rows = np.flatnonzero(obs["alive"])
+    obs, place = submap.observations, np.full(len(submap.landmarks), -1)
+    place[landmark_ids] = np.arange(len(landmark_ids))
+    rows = np.flatnonzero(obs["alive"] & (place[obs["landmark"]] >= 0))
     ids, pose = np.unique(obs["kf"][rows], return_inverse=True)
     T = submap.keyframe_poses(ids)[pose]
-    point, best = obs["landmark"][rows], submap.landmarks["xyz_mu"].copy()
+    point, best = place[obs["landmark"][rows]], submap.landmarks["xyz_mu"][landmark_ids]
     uv, sigma = submap.observed_pixels(rows)
     xyz, cost = best, np.full(len(best), np.inf)
     for step in range(STEPS + 1):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from dualslam.core.types import BoolArray, FloatArray
+from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from dualslam.map.submap import Submap
@@ -123,6 +123,6 @@ class AtlasSolver(Protocol):
         """
         ...
 
-    def refit_points(self, submap: Submap) -> FloatArray:
-        """Return (L, 3) a submap's landmarks as their views have them by the poses as they are; cannot fail."""
+    def refit_points(self, submap: Submap, landmark_ids: IntArray) -> FloatArray:
+        """Return (N, 3) some of a submap's landmarks as their views have them by the poses as they are; cannot fail."""
         ...

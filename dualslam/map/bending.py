@@ -56,16 +56,17 @@ def bend_submap(submap: Submap, warp: Warp) -> None:
     """
     keyframe_ids, culled = list(submap.keyframes), list(submap.anchors)
     T_culled = [submap.resolve_anchor(a.keyframe_id, a.T_kf_cam) for a in submap.anchors.values()]
-    S = dict(zip(keyframe_ids, warp.at(keyframe_ids), strict=True))
-    for k, S_k in S.items():
-        submap.T_submap_kf[k] = sim3.act_on_pose(S_k, submap.T_submap_kf[k])
+    S = warp.at(keyframe_ids)
+    scales = dict(zip(keyframe_ids, sim3.scale(S).tolist(), strict=True))
+    for k, T in zip(keyframe_ids, sim3.act_on_pose(S, submap.keyframe_poses(keyframe_ids)), strict=True):
+        submap.T_submap_kf[k] = T
     if culled:
         moved = sim3.act_on_pose(warp.at(culled), np.array(T_culled))
         for k, T in zip(culled, moved, strict=True):
             stays = _heir(submap, submap.anchors[k].keyframe_id)
             submap.anchors[k] = Anchor(stays, se3.inverse(submap.T_submap_kf[stays]) @ T)
     for k, known in submap.relative_poses.items():
-        submap.relative_poses[k] = known.scaled(float(sim3.scale(S[k])))
+        submap.relative_poses[k] = known.scaled(scales[k])
     lm = submap.landmarks
     if len(lm):
         S_lm = warp.at(lm["first_kf"])

@@ -22,7 +22,7 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.atlas import Atlas, Link, LinkKind, joined
 from dualslam.map.atlas_beside import AskedSolution
 from dualslam.map.atlas_report import AtlasReport, Solved, count_kinds, named, placed_by, together
-from dualslam.map.bending import Move, bend_frames, bend_link, bend_submap, hold
+from dualslam.map.moving import Mover
 from dualslam.map.overlap_sides import OverlapRefinement, apply_overlap, overlap_problem
 from dualslam.map.propagation import propagate_anchors, propagate_links, propagate_poses
 from dualslam.map.record import FrameStamp, Record
@@ -70,12 +70,13 @@ class Connections:
         self._new_graph = new_graph
         self._adjust = adjust
         self._front_ends = front_ends
-        self._forget_graph = forget_graph
         self._desk = desk
         self._covariances = EdgeCovariances(solver.edge_covariances, desk)
+        self._mover = Mover(record, solver, self._covariances, new_graph, front_ends, forget_graph)
         self._asked: AskedSolution | None = None  # what is being solved beside the tracking
         self._due: set[int] = set()  # submaps whose linked sets are to be solved next
-        self._left: list[Move] = []  # moves of a solution that are still to be made
+        self._is_due_foreseen = False
+        self._newest: dict[int, int] = {}  # by submap: its newest keyframe when it was foreseen what is to be solved
         self._changes: dict[int, int] = {}  # by submap: how many times others than its graph have changed it
         self._is_over = False
 
@@ -104,7 +105,7 @@ class Connections:
         """
         touched = {m for link in links for m in (link.a, link.b)}
         if len(links) > 1 or any(touched <= set(component) for component in self._atlas.components()):
-            self._complete()
+            self._mover.complete()
             report = self._solve(touched, links, now)
         else:
             report = self._connect_sets(links[0], now)
@@ -127,7 +128,10 @@ class Connections:
 
     def _connect_sets(self, link: Link, now: FrameStamp) -> AtlasReport:
         touched = {link.a, link.b}
-        if self.is_solving:
+        if not (busy := self.is_solving or self.foreseeing):
+            self._foresee(touched, [link])
+            busy = self.foreseeing
+        if busy:
             self._count_change(self._join(link))
             self._due |= touched
             return AtlasReport()
@@ -141,37 +145,54 @@ class Connections:
     @property
     def is_solving(self) -> bool:
         """Whether a solution is still to come, or a part of what it moves still to be moved."""
-        return self._asked is not None or bool(self._left)
+        return self._asked is not None or self._mover.is_moving
 
     def collect(self, now: FrameStamp) -> AtlasReport | None:
-        """Take in what has been solved meanwhile; one submap follows it at once, the live one, and then one each time.
+        """Take in what has been solved meanwhile, and go on moving what it moves: the live submap first.
 
         Returns
         -------
         AtlasReport or None
             Of connections that have waited for it.
         """
-        if self._left:
-            self._bend_next()
+        self._mover.step()
         for ended in self._desk.poll(JobKind.ATLAS):
             return self._take(ended.result, now, late=True)
-        if self._due and not self.is_solving:
-            touched, self._due = self._due, set()
-            self._ask(touched, (), now)
+        self._ask_due(now)
         return None
+
+    def _ask_due(self, now: FrameStamp) -> None:
+        """Have solved what is due, once it has been computed what that needs."""
+        if not self._due or self.is_solving or self.foreseeing:
+            return
+        if not self._is_due_foreseen:
+            self._foresee(self._due, ())
+            self._is_due_foreseen = True
+        if not self.foreseeing:
+            touched, self._due, self._is_due_foreseen = self._due, set(), False
+            self._ask(touched, (), now)
 
     def finish(self, now: FrameStamp) -> AtlasReport | None:
         """Wait, for a limited time, for what is being solved; from now on all is solved at once. See `collect`."""
         self._is_over = True
-        self._complete()
+        self._mover.complete()
         report = None
         for ended in self._desk.drain(JobKind.ATLAS):
             report = self._take(ended.result, now, late=False)
+        if self._due:
+            self._solve(self._due, (), now)
+        self._due = set()
         return report
 
     def foresee(self, link: Link) -> None:
         """Have computed beside the tracking what the solution with a connection to come needs of the submaps."""
-        self._skeleton({link.a, link.b}, (link,), self._covariances.foresee)
+        self._foresee({link.a, link.b}, [link])
+
+    def _foresee(self, touched: set[int], new: Sequence[Link]) -> None:
+        self._newest = {}
+        self._problems(touched, new, self._covariances.foresee)
+        # What has come by the time that they are there goes with the keyframes that were asked about.
+        self._newest = {m: max(submap.keyframes) for m, submap in self._atlas.submaps.items()}
 
     @property
     def foreseeing(self) -> bool:
@@ -191,16 +212,13 @@ class Connections:
             For the event log.
         """
         self._carry(before, after)
-        if after.id not in self._atlas.placement:
-            return
-        if self.is_solving:
+        if after.id in self._atlas.placement:
             self._due.add(after.id)
-        else:
-            self._ask({after.id}, (), now)
+            self._ask_due(now)
 
     def _carry(self, before: Submap, after: Submap) -> None:
         self._count_change([after.id])
-        self._left = [move for move in self._left if move.submap_id != after.id]  # it is solved again
+        self._mover.leave(after.id)  # it is solved again
         for pose in propagate_poses(self._record.poses.values(), before, after):
             self._record.poses[pose.index] = pose
         propagate_anchors(before, after)
@@ -285,7 +303,7 @@ class Connections:
 
     # --- solving
 
-    def _skeleton(self, touched: set[int], new: Sequence[Link], covariances: Covariances | None = None) -> Skeleton:
+    def _skeleton(self, touched: set[int], new: Sequence[Link], covariances: Covariances) -> Skeleton:
         """Make the problem of the linked set that new connections make of what they touch."""
         links = [*self._atlas.links, *new]
         component = next(c for c in joined(self._atlas.submaps, links) if touched & set(c))
@@ -295,15 +313,16 @@ class Connections:
             self._atlas,
             component,
             within,
-            covariances or self._covariances,
+            covariances,
             lambda link: id(link) not in fresh and not link.rejected,
+            newest=self._newest,
         )
 
-    def _problems(self, touched: set[int], new: Sequence[Link]) -> list[Skeleton]:
+    def _problems(self, touched: set[int], new: Sequence[Link], covariances: Covariances) -> list[Skeleton]:
         """Make the problems of all linked sets that are touched."""
         skeletons = []
         while touched:
-            skeletons.append(self._skeleton(touched, [link for link in new if link.a in touched]))
+            skeletons.append(self._skeleton(touched, [link for link in new if link.a in touched], covariances))
             touched = touched - set(skeletons[-1].component)
         return skeletons
 
@@ -312,9 +331,10 @@ class Connections:
         if self._is_over or tries >= MAX_TRIES:
             return self._solve(touched, new, now)
         try:
-            skeletons = self._problems(touched, new)
+            skeletons = self._problems(touched, new, self._covariances if tries else self._covariances.as_foreseen)
         except SolverError as error:
             return _failed(str(error))
+        self._newest = {}
         self._asked = AskedSolution.of(self._atlas, touched, skeletons, list(new), self._changes, tries)
         self._desk.submit(JobKind.ATLAS, self._asked.question())
         for ended in self._desk.poll(JobKind.ATLAS):
@@ -340,9 +360,9 @@ class Connections:
 
     def _solve(self, touched: set[int], new: Sequence[Link], now: FrameStamp) -> AtlasReport:
         """Solve what is touched here and now."""
-        started = time.perf_counter()
+        started, self._newest = time.perf_counter(), {}
         try:
-            skeletons = self._problems(touched, new)
+            skeletons = self._problems(touched, new, self._covariances)
             solutions = [self._solver.solve(skeleton.problem) for skeleton in skeletons]
         except SolverError as error:
             return _failed(str(error))
@@ -402,10 +422,10 @@ class Connections:
             if id(link) in believed and (kept := believed[id(link)]) == link.rejected:
                 atlas.links[i] = replace(link, rejected=not kept)
                 changed[kept].append(i)
-        # The live ones first; of the others, where that cannot wait, all at once.
-        live = {front_end.submap.id for front_end in self._front_ends()}
-        self._bend([move for move in solved.bends if not late or move.submap_id in live])
-        self._left += [move for move in solved.bends if late and move.submap_id not in live]
+        if late:
+            self._mover.begin(solved.bends)
+        else:
+            self._mover.make(solved.bends)
         return AtlasReport(
             rejected=tuple(k for k in atlas.links if k.rejected and k.a in skeleton.component),
             newly_rejected=tuple(atlas.links[i] for i in changed[False]),
@@ -418,40 +438,6 @@ class Connections:
             bent={move.submap_id: move.bend_mu for move in solved.bends},
             placed=placed_by(skeleton, solved.solution) if solved.moves is not None else {},
         )
-
-    def _complete(self) -> None:
-        """Make all moves that are left of a solution."""
-        left, self._left = self._left, []
-        self._bend(left)
-
-    def _bend_next(self) -> None:
-        """Make one of the moves that are left."""
-        self._bend([self._left.pop(0)])
-
-    def _bend(self, moves: Sequence[Move]) -> None:
-        """Bend submaps, with all that lies in them: each is whole again before anything else looks at it."""
-        atlas = self._atlas
-        warps = {move.submap_id: move.warp for move in moves}
-        ends = [link.attached(atlas) for link in atlas.links]
-        befores = {m: atlas.submaps[m].copy() for m in warps}
-        for move in moves:
-            m, warp = move.submap_id, move.warp
-            submap = atlas.submaps[m]
-            bend_submap(submap, warp)
-            for pose in bend_frames(self._record.poses.values(), befores[m], submap, warp):
-                self._record.poses[pose.index] = pose
-            atlas.warps[m] = warp.after(atlas.warps[m]) if m in atlas.warps else warp
-            knots = warp.index.tolist()
-            atlas.held[m] = hold(submap, knots, move.steps, atlas.held.get(m, frozenset()))
-            submap.landmarks["xyz_mu"][:] = self._solver.refit_points(submap)
-            self._covariances.bent(submap, warp)
-            self._forget_graph(m)
-        for i, (link, attached) in enumerate(zip(atlas.links, ends, strict=True)):
-            if link.a in warps or link.b in warps:
-                atlas.links[i] = bend_link(link, attached, warps)
-        for front_end in self._front_ends():
-            if front_end.submap.id in befores:
-                front_end.adopt(self._new_graph(), befores[front_end.submap.id])
 
     def _tell(self, report: AtlasReport, solved: Sequence[Solved], now: FrameStamp) -> None:
         self._record.event(

@@ -151,6 +151,13 @@ class EdgeCovariances:
             self._note(submap, new, self._compute(submap, new, held))
         return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, 7, 7)
 
+    def as_foreseen(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
+        """Return (E, 7, 7), also where the keyframes are not quite as they were: they were asked about a moment ago."""
+        self._collect()
+        if new := [pair for pair in pairs if (submap.id, *pair) not in self._known]:
+            self._note(submap, new, self._compute(submap, new, held))
+        return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, 7, 7)
+
     def foresee(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
         """Have those that are missing computed beside the tracking; return anything of the right shape."""
         self._collect()
@@ -166,9 +173,9 @@ class EdgeCovariances:
 
     def _missing(self, submap: Submap, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
         new = []
-        for pair in pairs:
+        for pair, state in zip(pairs, _states(submap, pairs), strict=True):
             known = self._known.get((submap.id, *pair))
-            if known is None or not known.holds(*_state(submap, pair)):
+            if known is None or not known.holds(*state):
                 new.append(pair)
         return new
 
@@ -178,28 +185,33 @@ class EdgeCovariances:
                 self._note(ended.work.submap, ended.work.pairs, ended.result)
 
     def _note(self, submap: Submap, pairs: Sequence[tuple[int, int]], covariances: FloatArray) -> None:
-        for pair, C in zip(pairs, covariances, strict=True):
-            self._known[(submap.id, *pair)] = _Known(*_state(submap, pair), C)
+        for pair, state, C in zip(pairs, _states(submap, pairs), covariances, strict=True):
+            self._known[(submap.id, *pair)] = _Known(*state, C)
 
     def bent(self, submap: Submap, warp: Warp) -> None:
         """Take in that a submap stands otherwise by a solution of the atlas: its own factors say what they said."""
-        for key, known in list(self._known.items()):
-            m, first, second = key
-            if m != submap.id:
-                continue
-            if first not in submap.keyframes or second not in submap.keyframes:
-                del self._known[key]
-                continue
+        kept = []
+        for m, first, second in [key for key in self._known if key[0] == submap.id]:
+            if first in submap.keyframes and second in submap.keyframes:
+                kept.append((first, second))
+            else:
+                del self._known[m, first, second]
+        scales = sim3.scale(warp.at([second for _, second in kept]))
+        for pair, state, scale in zip(kept, _states(submap, kept), scales.tolist(), strict=True):
             units = np.ones(7)
-            units[3:6] = sim3.scale(warp.at([second])[0])
-            self._known[key] = _Known(*_state(submap, (first, second)), units[:, None] * known.covariance * units)
+            units[3:6] = scale
+            covariance = self._known[(submap.id, *pair)].covariance
+            self._known[(submap.id, *pair)] = _Known(*state, units[:, None] * covariance * units)
 
 
-def _state(submap: Submap, pair: tuple[int, int]) -> tuple[FloatArray, tuple[int, int]]:
-    first, second = pair
-    T_first_second = se3.inverse(submap.T_submap_kf[first]) @ submap.T_submap_kf[second]
-    n_first, n_second = (int((submap.landmark_of[k] >= 0).sum()) for k in pair)
-    return T_first_second, (n_first, n_second)
+def _states(submap: Submap, pairs: Sequence[tuple[int, int]]) -> list[tuple[FloatArray, tuple[int, int]]]:
+    """Return for each pair of keyframes the pose between them, and how many landmarks they see."""
+    if not pairs:
+        return []
+    first, second = np.array(pairs, np.int64).T
+    T = se3.inverse(submap.keyframe_poses(first)) @ submap.keyframe_poses(second)
+    n = {k: int(np.count_nonzero(submap.landmark_of[k] >= 0)) for k in {k for pair in pairs for k in pair}}
+    return [(T_pair, (n[a], n[b])) for T_pair, (a, b) in zip(T, pairs, strict=True)]
 
 
 def build_skeleton(
@@ -210,6 +222,7 @@ def build_skeleton(
     known: Callable[[Link], bool],
     more_nodes: Mapping[int, set[int]] | None = None,
     with_covariances: bool = False,
+    newest: Mapping[int, int] | None = None,
 ) -> Skeleton:
     """Make the problem of a linked set of submaps.
 
@@ -228,6 +241,8 @@ def build_skeleton(
         Keyframes, by submap, that are to be nodes besides.
     with_covariances : bool
         Ask for them also where there is nothing to optimise.
+    newest : mapping of int to int, optional
+        By submap, the keyframe after which none is a node unless a link stands there.
     """
     wanted: dict[int, set[int]] = {m: set((more_nodes or {}).get(m, set())) for m in component}
     for link in links:
@@ -235,7 +250,7 @@ def build_skeleton(
             k_a, k_b = link.attached(atlas)
             wanted[link.a].add(k_a)
             wanted[link.b].add(k_b)
-    knots_of = {m: skeleton_knots(atlas.submaps[m], wanted[m]) for m in component}
+    knots_of = {m: skeleton_knots(atlas.submaps[m], wanted[m], (newest or {}).get(m)) for m in component}
     S_world_submap = _initial(atlas, component, links)
     is_tree = len(links) < len(component) and not any(m in atlas.warps for m in component)
     nodes: list[Node] = []
@@ -277,9 +292,10 @@ def _initial(atlas: Atlas, component: list[int], links: Sequence[Link]) -> dict[
     return trial.S_world_submap(component)
 
 
-def skeleton_knots(submap: Submap, wanted: Set[int] = frozenset()) -> list[int]:
-    """Return the keyframes of a submap that are nodes, ascending; `wanted` ones besides."""
+def skeleton_knots(submap: Submap, wanted: Set[int] = frozenset(), newest: int | None = None) -> list[int]:
+    """Return the keyframes of a submap that are nodes, ascending, none after `newest`; `wanted` ones besides."""
     ids = sorted(submap.keyframes)
+    ids = [k for k in ids if newest is None or k <= newest] or ids
     return sorted({*ids[::STRIDE], ids[-1], _reference(submap), *wanted})
 
 
@@ -333,10 +349,11 @@ def _inflated(submap: Submap, pairs: list[tuple[int, int]], covariances: FloatAr
         return covariances
     first, second = np.array(pairs).T.tolist()
     T = se3.inverse(submap.keyframe_poses(first)) @ submap.keyframe_poses(second)
-    depth_of = {}
+    depth_of, distance_mu = {}, submap.landmarks["distance_mu"]
     for k in set(second):
         ids = submap.landmark_of[k]
-        depth_of[k] = float(np.median(submap.landmarks["distance_mu"][ids[ids >= 0]])) if (ids >= 0).any() else 1.0
+        ids = ids[ids >= 0]
+        depth_of[k] = float(np.median(distance_mu[ids])) if len(ids) else 1.0
     depth = np.array([depth_of[k] for k in second])
     motion = np.linalg.norm(so3.log(T[:, :3, :3]), axis=1) + np.linalg.norm(T[:, :3, 3], axis=1) / depth
     units = np.ones((len(pairs), 7))
@@ -347,10 +364,13 @@ def _inflated(submap: Submap, pairs: list[tuple[int, int]], covariances: FloatAr
 
 def _across_knots(submap: Submap, knots: list[int]) -> list[tuple[int, int]]:
     """Return pairs of nodes that are no neighbours and yet see the same landmarks."""
-    sees = np.zeros((len(knots), len(submap.landmarks)), np.float32)
-    for i, k in enumerate(knots):
-        ids = submap.landmark_of[k]
-        sees[i, ids[ids >= 0]] = 1
+    seen = [ids[ids >= 0] for ids in (submap.landmark_of[k] for k in knots)]
+    any_sees = np.zeros(len(submap.landmarks), bool)
+    any_sees[np.concatenate(seen)] = True
+    column = np.cumsum(any_sees) - 1
+    sees = np.zeros((len(knots), np.count_nonzero(any_sees)), np.float32)
+    for i, ids in enumerate(seen):
+        sees[i, column[ids]] = 1
     shared = sees @ sees.T
     place = np.arange(len(knots))
     shared[np.abs(place[:, None] - place) <= 1] = 0

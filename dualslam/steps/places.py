@@ -38,15 +38,21 @@ class PlaceKeeping:
         self._is_due = False  # for the newest keyframe
 
     def collect(self, now: FrameStamp) -> None:
-        """Link the places that were found; while reverse tracking is under way, they wait for its end."""
+        """Let the maps follow what was solved meanwhile, and link the places that were found."""
         live = self._state.live
         with self._state.record.timer.measure("places"):
             report = self._revisits.take_solution(live, now)
+        if report is not None and live is not None:
+            self._recoveries.settle(live)
+        self._link(now)
+
+    def _link(self, now: FrameStamp) -> None:
+        """Link the places that were found; while reverse tracking is under way, they wait for its end."""
+        live = self._state.live
         if live is not None and self._recoveries.is_under_way(live.submap):
             return
-        if report is None:
-            with self._state.record.timer.measure("places"):
-                report = self._revisits.collect(live, now)
+        with self._state.record.timer.measure("places"):
+            report = self._revisits.collect(live, now)
         if report is not None and live is not None:
             self._recoveries.settle(live)
 
@@ -79,7 +85,7 @@ class PlaceKeeping:
             return
         with self._state.record.timer.measure("places"):
             self._revisits.note_keyframe(live, TAKEN_IN_A_FRAME if self._state.pace.in_real_time else None)
-        self.collect(view)
+        self._link(view)
 
     # --- a place that an earlier run has mapped
 

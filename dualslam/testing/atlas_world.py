@@ -225,5 +225,5 @@ def lap_in_submaps(n: int = 130, every: int = 50, robust: bool = True, **options
             world.roll_over()
     for submap in world.atlas.submaps.values():
         for _ in range(4):
-            submap.landmarks["xyz_mu"][:] = refit_points(submap, 0.8)
+            submap.landmarks["xyz_mu"][:] = refit_points(submap, 0.8, np.arange(len(submap.landmarks)))
     return world

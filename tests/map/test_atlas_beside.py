@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import Failure, FailureReason
+from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.atlas import Link, LinkKind
 from dualslam.map.atlas_report import AtlasReport
+from dualslam.map.submap import Submap
 from dualslam.testing.atlas_world import LINK_SIGMAS, DriftingMap, lap_in_submaps
 from dualslam.testing.late_desk import LateDesk
 from dualslam.workers.jobs import Ended, InlineDesk, JobKind
@@ -88,14 +89,13 @@ def test_late_it_is_the_same_atlas_and_the_live_submap_follows_first(seed: int) 
     before = state(world)
     assert world.connections.connect_later(world.loop(*CLOSED), world.now) is None
     steps = []
-    for _ in range(POLLS + 3):
+    while world.connections.is_solving:
         report = world.connections.collect(world.now)
         steps.append((report is not None, moved(before, world), len(front_end.adopted)))
     n = POLLS - 1  # it was asked for once already
     assert steps[n - 1] == (False, [False, False, False], 0)
     assert steps[n] == (True, [False, False, True], 1)
-    assert [sum(bent) for _, bent, _ in steps[n : n + 3]] == [1, 2, 3]
-    assert not world.connections.is_solving
+    assert [sum(bent) for _, bent, _ in steps[n:]] == [1, 1, 2, 2, 3, 3], "and its points in the step after"
     assert_same(world, immediate(seed))
 
 
@@ -119,7 +119,7 @@ def test_what_is_left_to_move_is_moved_when_the_run_ends() -> None:
 def test_what_graphs_are_solving_of_bent_submaps_is_of_no_more_use() -> None:
     world, _, _ = late()
     forgotten: list[int] = []
-    world.connections._forget_graph = forgotten.append
+    world.connections._mover._forget_graph = forgotten.append
     assert world.connections.connect_later(world.loop(*CLOSED), world.now) is None
     (report,) = wait(world)
     assert sorted(forgotten) == sorted(report.bent)
@@ -301,3 +301,39 @@ def test_a_solver_that_fails_leaves_all_as_it_is() -> None:
     assert len(world.atlas.links) == n_links
     for was, now in zip(before, state(world), strict=True):
         np.testing.assert_array_equal(was, now)
+
+
+# --- covariances come late as well
+
+
+def test_with_late_covariances_nothing_is_computed_in_between() -> None:
+    world, desk, _ = late()
+    world.connections._covariances._desk = desk
+    computed: list[int] = []
+    compute = world.connections._covariances._compute
+
+    def count(submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
+        computed.append(submap.id)
+        return compute(submap, pairs, held)
+
+    world.connections._covariances._compute = count
+    before = rms(world.errors())
+    link = world.loop(*CLOSED)
+    world.connections.foresee(link)
+    for _ in range(POLLS + 1):  # a poll of its own is in `foreseeing`
+        assert world.connections.collect(world.now) is None
+        if not world.connections.foreseeing:
+            break
+    for submap in world.atlas.submaps.values():  # and the newest places are not quite as they were
+        newest = max(submap.keyframes)
+        submap.T_submap_kf[newest] = submap.T_submap_kf[newest] @ se3.exp([0.0, 0.0, 0.0, 0.0, 0.0, 0.01])
+    assert world.connections.connect_later(link, world.now) is None
+    wait(world)
+    assert rms(world.errors()) < 0.7 * before
+    world.roll_over()
+    assert world.atlas.components() == [[0, 1, 2, 3]]
+    assert 3 not in world.atlas.placement
+    for _ in range(40):
+        world.connections.collect(world.now)
+    assert 3 in world.atlas.placement, "solved with the rest"
+    assert not computed
