@@ -8,10 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dualslam.core.atlas_problem import AtlasEdge, AtlasSolution
+from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure
 from dualslam.map.atlas import Link
 from dualslam.map.bending import Move
+from dualslam.map.record import FrameStamp, Record
 from dualslam.map.skeleton import Skeleton
 from dualslam.map.warp import Warp
 
@@ -102,6 +104,21 @@ class Solved:
         chi2 = self.solution.chi2[-1] if self.skeleton.links else float("nan")
         return float(chi2) if np.isfinite(chi2) else None
 
+    def report(self, links: Sequence[Link], readmitted: Sequence[int], newly_rejected: Sequence[int]) -> AtlasReport:
+        """Report what was done. `links`: of the atlas, as they are now; the others: rows of it."""
+        return AtlasReport(
+            rejected=tuple(link for link in links if link.rejected and link.a in self.skeleton.component),
+            newly_rejected=tuple(links[i] for i in newly_rejected),
+            readmitted=tuple(links[i] for i in readmitted),
+            factors=count_kinds(e for e, kept in zip(self.edges, self.solution.believed, strict=True) if kept),
+            cost_before=self.solution.cost_before,
+            cost_after=self.solution.cost_after,
+            drift=self.solution.drift,
+            newest_chi2=self.newest_chi2,
+            bent={move.submap_id: move.bend_mu for move in self.bends},
+            placed=placed_by(self.skeleton, self.solution) if self.moves is not None else {},
+        )
+
 
 def changes_nothing(skeleton: Skeleton, solution: AtlasSolution, new: Sequence[Link]) -> bool:
     """Whether all that is new was rejected, and what was there before is believed as before."""
@@ -172,3 +189,28 @@ def named(link: Link) -> dict[str, object]:
         "keyframe": link.keyframe_b,
         "other_keyframe": link.keyframe_a,
     }
+
+
+def tell(record: Record, report: AtlasReport, solved: Sequence[Solved], now: FrameStamp) -> None:
+    """Record what solutions did, in the order of their linked sets."""
+    record.event(
+        EventKind.ATLAS_SOLVED,
+        now,
+        solved[0].skeleton.component[0],
+        submaps=[m for each in solved for m in each.skeleton.component],
+        factors=report.factors,
+        cost_before=report.cost_before,
+        cost_after=report.cost_after,
+        drift=report.drift,
+        rejected=[{"submap": link.b, **named(link)} for link in report.rejected],
+        bent={str(m): bend for m, bend in report.bent.items()},
+        largest_bend=max(report.bent.values(), default=0.0),
+        largest_move=max(report.placed.values(), default=0.0),
+        seconds=report.seconds,
+    )
+    for kind, links in (
+        (EventKind.CONNECTION_REJECTED, report.newly_rejected),
+        (EventKind.CONNECTION_READMITTED, report.readmitted),
+    ):
+        for link in links:
+            record.event(kind, now, link.b, **named(link))

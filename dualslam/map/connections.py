@@ -15,13 +15,12 @@ from itertools import pairwise
 from dualslam.core.atlas_problem import AtlasSolution, AtlasSolver
 from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.errors import SolverError
-from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.atlas import Atlas, Link, LinkKind, joined
 from dualslam.map.atlas_beside import AskedSolution
-from dualslam.map.atlas_report import AtlasReport, Solved, count_kinds, named, placed_by, together
+from dualslam.map.atlas_report import AtlasReport, Solved, tell, together
 from dualslam.map.moving import Mover
 from dualslam.map.overlap_sides import OverlapRefinement, apply_overlap, overlap_problem
 from dualslam.map.propagation import propagate_anchors, propagate_links, propagate_poses
@@ -381,7 +380,7 @@ class Connections:
         solved = [Solved.of(*each, new) for each in zip(skeletons, solutions, strict=True)]
         self._atlas.links.extend(new)
         report = replace(together([self._apply(s, late) for s in solved]), seconds=seconds)
-        self._tell(report, solved, now)
+        tell(self._record, report, solved, now)
         return report
 
     def _join(self, link: Link) -> list[int]:
@@ -426,41 +425,7 @@ class Connections:
             self._mover.begin(solved.bends)
         else:
             self._mover.make(solved.bends)
-        return AtlasReport(
-            rejected=tuple(k for k in atlas.links if k.rejected and k.a in skeleton.component),
-            newly_rejected=tuple(atlas.links[i] for i in changed[False]),
-            readmitted=tuple(atlas.links[i] for i in changed[True]),
-            factors=count_kinds(e for e, kept in zip(solved.edges, solved.solution.believed, strict=True) if kept),
-            cost_before=solved.solution.cost_before,
-            cost_after=solved.solution.cost_after,
-            drift=solved.solution.drift,
-            newest_chi2=solved.newest_chi2,
-            bent={move.submap_id: move.bend_mu for move in solved.bends},
-            placed=placed_by(skeleton, solved.solution) if solved.moves is not None else {},
-        )
-
-    def _tell(self, report: AtlasReport, solved: Sequence[Solved], now: FrameStamp) -> None:
-        self._record.event(
-            EventKind.ATLAS_SOLVED,
-            now,
-            solved[0].skeleton.component[0],
-            submaps=[m for each in solved for m in each.skeleton.component],
-            factors=report.factors,
-            cost_before=report.cost_before,
-            cost_after=report.cost_after,
-            drift=report.drift,
-            rejected=[{"submap": link.b, **named(link)} for link in report.rejected],
-            bent={str(m): bend for m, bend in report.bent.items()},
-            largest_bend=max(report.bent.values(), default=0.0),
-            largest_move=max(report.placed.values(), default=0.0),
-            seconds=report.seconds,
-        )
-        for kind, links in (
-            (EventKind.CONNECTION_REJECTED, report.newly_rejected),
-            (EventKind.CONNECTION_READMITTED, report.readmitted),
-        ):
-            for link in links:
-                self._record.event(kind, now, link.b, **named(link))
+        return solved.report(atlas.links, changed[True], changed[False])
 
 
 def _failed(detail: str) -> AtlasReport:

@@ -64,7 +64,7 @@ class Mover:
     def begin(self, moves: Sequence[Move]) -> None:
         """Make the moves of a solution one by one; of what is live, now."""
         live = {front_end.submap.id for front_end in self._front_ends()}
-        self._left = [move for move in moves if move.submap_id not in live]
+        self._left += [move for move in moves if move.submap_id not in live]
         for move in moves:
             if move.submap_id in live:
                 self._left = [move, *self._left]
