@@ -18,8 +18,8 @@ from dualslam.frontends.registry import create_frontend
 from dualslam.frontends.tracking.map_readout import answer_readout
 from dualslam.lab.disturbances import FaultScript
 from dualslam.map.atlas_beside import answer_atlas
+from dualslam.map.edge_covariances import answer_edges
 from dualslam.map.graph_beside import GraphServer
-from dualslam.map.skeleton import answer_edges
 from dualslam.places import PlaceVerifier
 from dualslam.places.search import search_places
 from dualslam.recovery.reverse_tracking import recover_in_steps

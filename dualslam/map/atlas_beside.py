@@ -20,7 +20,8 @@ from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.atlas import Atlas, Link
-from dualslam.map.skeleton import SAME_TURN_RAD, SAME_WAY, Skeleton
+from dualslam.map.edge_covariances import SAME_TURN_RAD, SAME_WAY
+from dualslam.map.skeleton import Skeleton
 from dualslam.map.submap import Submap
 
 

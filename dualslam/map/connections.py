@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -21,11 +21,12 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.atlas import Atlas, Link, LinkKind, joined
 from dualslam.map.atlas_beside import AskedSolution
 from dualslam.map.atlas_report import AtlasReport, Solved, tell, together
+from dualslam.map.edge_covariances import Covariances, EdgeCovariances
 from dualslam.map.moving import Mover
 from dualslam.map.overlap_sides import OverlapRefinement, apply_overlap, overlap_problem
 from dualslam.map.propagation import propagate_anchors, propagate_links, propagate_poses
 from dualslam.map.record import FrameStamp, Record
-from dualslam.map.skeleton import Covariances, EdgeCovariances, Skeleton, build_skeleton, skeleton_knots
+from dualslam.map.skeleton import Skeleton, build_skeleton, foresee_skeleton, skeleton_knots
 from dualslam.map.submap import Submap
 from dualslam.workers.jobs import Desk, JobKind
 
@@ -188,8 +189,8 @@ class Connections:
         self._foresee({link.a, link.b}, [link])
 
     def _foresee(self, touched: set[int], new: Sequence[Link]) -> None:
-        self._newest = {}
-        self._problems(touched, new, self._covariances.foresee)
+        for component, links in self._touched(touched, new):
+            foresee_skeleton(self._atlas, component, links, self._covariances)
         # What has come by the time that they are there goes with the keyframes that were asked about.
         self._newest = {m: max(submap.keyframes) for m, submap in self._atlas.submaps.items()}
 
@@ -302,28 +303,24 @@ class Connections:
 
     # --- solving
 
-    def _skeleton(self, touched: set[int], new: Sequence[Link], covariances: Covariances) -> Skeleton:
-        """Make the problem of the linked set that new connections make of what they touch."""
+    def _touched(self, touched: set[int], new: Sequence[Link]) -> Iterator[tuple[list[int], list[Link]]]:
+        """Give the linked sets that new connections make of what they touch, each with its connections."""
         links = [*self._atlas.links, *new]
-        component = next(c for c in joined(self._atlas.submaps, links) if touched & set(c))
-        within = [link for link in links if link.a in component]
-        fresh = set(map(id, new))
-        return build_skeleton(
-            self._atlas,
-            component,
-            within,
-            covariances,
-            lambda link: id(link) not in fresh and not link.rejected,
-            newest=self._newest,
-        )
+        for component in joined(self._atlas.submaps, links):
+            if touched & set(component):
+                yield component, [link for link in links if link.a in component]
 
     def _problems(self, touched: set[int], new: Sequence[Link], covariances: Covariances) -> list[Skeleton]:
         """Make the problems of all linked sets that are touched."""
-        skeletons = []
-        while touched:
-            skeletons.append(self._skeleton(touched, [link for link in new if link.a in touched], covariances))
-            touched = touched - set(skeletons[-1].component)
-        return skeletons
+        fresh = set(map(id, new))
+
+        def known(link: Link) -> bool:
+            return id(link) not in fresh and not link.rejected
+
+        return [
+            build_skeleton(self._atlas, component, links, covariances, known, newest=self._newest)
+            for component, links in self._touched(touched, new)
+        ]
 
     def _ask(self, touched: set[int], new: Sequence[Link], now: FrameStamp, tries: int = 0) -> AtlasReport | None:
         """Have what is touched solved; return None where that is not done at once."""

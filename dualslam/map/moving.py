@@ -11,8 +11,8 @@ from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import IntArray
 from dualslam.map.bending import Move, bend_frames, bend_link, bend_submap, hold
+from dualslam.map.edge_covariances import EdgeCovariances
 from dualslam.map.record import Record
-from dualslam.map.skeleton import EdgeCovariances
 
 REFITTED = 2000
 """Landmarks that are found again under their new poses in one step: 10 to 20 ms, where a full submap has 9,000."""

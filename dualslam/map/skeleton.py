@@ -8,7 +8,6 @@ out of these measurements (`Atlas.warps`): a bend is no evidence.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 
@@ -16,15 +15,11 @@ import numpy as np
 
 from dualslam.core.atlas_problem import AtlasEdge, AtlasProblem
 from dualslam.core.chi_square import CHI2_999, squared_distances
-from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, sim3, so3
-from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
+from dualslam.core.types import BoolArray, FloatArray
 from dualslam.map.atlas import Atlas, Link, joined
+from dualslam.map.edge_covariances import Covariances, EdgeCovariances
 from dualslam.map.submap import Submap
-from dualslam.map.warp import Warp
-from dualslam.workers.jobs import Desk, JobKind
-
-log = logging.getLogger(__name__)
 
 WITHIN = "within"
 """The kind of an edge between keyframes of one submap."""
@@ -39,12 +34,8 @@ radians, way in depths of the scene). Chosen on `tum_fr1_rpy`, `hololens_000` an
 keyframes: RMS errors over what the factors say are 0.8 to 2.2 where the camera is exact, 2.4 to 18 on the sequences.
 With these numbers they are 0.03 to 0.3, and 0.7 to 2.5 (a submap with a broken stretch: to 5)."""
 
-SAME_TURN_RAD, SAME_WAY, SAME_SEEN = 0.02, 0.05, 0.2
-"""Changes of an edge, and of how much its keyframes see, up to which its covariance is that of before."""
-
 Node = tuple[int, int]
 """Submap and keyframe."""
-Covariances = Callable[[Submap, Sequence[tuple[int, int]], frozenset[int]], FloatArray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,135 +76,6 @@ class Skeleton:
         return rows, [self.nodes[row][1] for row in rows]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Known:
-    """The covariance of an edge, and the state of the two keyframes for which it was computed."""
-
-    T_first_second: FloatArray
-    n_seen: tuple[int, int]
-    covariance: FloatArray
-
-    def holds(self, T_first_second: FloatArray, n_seen: tuple[int, int]) -> bool:
-        """Whether the keyframes are much as they were."""
-        change = np.abs(T_first_second - self.T_first_second)
-        way = float(np.linalg.norm(self.T_first_second[:3, 3]))
-        seen = all(abs(now - was) <= SAME_SEEN * was for now, was in zip(n_seen, self.n_seen, strict=True))
-        return seen and bool(change[:3, :3].max() < SAME_TURN_RAD and change[:3, 3].max() < SAME_WAY * way)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EdgeQuestion:
-    """Edges of a submap whose covariances are asked for, and a snapshot of it.
-
-    Attributes
-    ----------
-    submap : Submap
-    pairs : tuple of (int, int)
-        Keyframe ids.
-    held : frozenset of int
-        Keyframes whose relative pose is no evidence.
-    """
-
-    submap: Submap
-    pairs: tuple[tuple[int, int], ...]
-    held: frozenset[int]
-
-
-def answer_edges(question: EdgeQuestion, compute: Covariances) -> FloatArray | Failure:
-    """Return the covariances (E, 7, 7) that a question asks for: a job beside the tracking."""
-    try:
-        return compute(question.submap, question.pairs, question.held)
-    except SolverError as error:
-        log.warning("submap %d: %s", question.submap.id, error)
-        return Failure(FailureReason.SOLVER, str(error))
-
-
-class EdgeCovariances:
-    """Covariances of edges within submaps, remembered as long as the edge's keyframes are much as they were.
-
-    Parameters
-    ----------
-    compute : callable
-        Gives them from a submap's factors, here and now.
-    desk : Desk
-        Where they are computed that `foresee` asks for.
-    """
-
-    def __init__(self, compute: Covariances, desk: Desk) -> None:
-        self._compute = compute
-        self._desk = desk
-        self._known: dict[tuple[int, int, int], _Known] = {}
-
-    def __call__(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
-        """Return (E, 7, 7)."""
-        self._collect()
-        if new := self._missing(submap, pairs):
-            self._note(submap, new, self._compute(submap, new, held))
-        return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, 7, 7)
-
-    def as_foreseen(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
-        """Return (E, 7, 7), also where the keyframes are not quite as they were: they were asked about a moment ago."""
-        self._collect()
-        if new := [pair for pair in pairs if (submap.id, *pair) not in self._known]:
-            self._note(submap, new, self._compute(submap, new, held))
-        return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, 7, 7)
-
-    def foresee(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
-        """Have those that are missing computed beside the tracking; return anything of the right shape."""
-        self._collect()
-        if new := self._missing(submap, pairs):
-            self._desk.submit(JobKind.EDGES, EdgeQuestion(submap.copy(), tuple(new), held))
-        return np.broadcast_to(np.eye(7), (len(pairs), 7, 7))
-
-    @property
-    def foreseeing(self) -> bool:
-        """Whether some are still being computed."""
-        self._collect()
-        return self._desk.n_open(JobKind.EDGES) > 0
-
-    def _missing(self, submap: Submap, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-        new = []
-        for pair, state in zip(pairs, _states(submap, pairs), strict=True):
-            known = self._known.get((submap.id, *pair))
-            if known is None or not known.holds(*state):
-                new.append(pair)
-        return new
-
-    def _collect(self) -> None:
-        for ended in self._desk.poll(JobKind.EDGES):
-            if not isinstance(ended.result, Failure):  # else they are computed when they are needed
-                self._note(ended.work.submap, ended.work.pairs, ended.result)
-
-    def _note(self, submap: Submap, pairs: Sequence[tuple[int, int]], covariances: FloatArray) -> None:
-        for pair, state, C in zip(pairs, _states(submap, pairs), covariances, strict=True):
-            self._known[(submap.id, *pair)] = _Known(*state, C)
-
-    def bent(self, submap: Submap, warp: Warp) -> None:
-        """Take in that a submap stands otherwise by a solution of the atlas: its own factors say what they said."""
-        kept = []
-        for m, first, second in [key for key in self._known if key[0] == submap.id]:
-            if first in submap.keyframes and second in submap.keyframes:
-                kept.append((first, second))
-            else:
-                del self._known[m, first, second]
-        scales = sim3.scale(warp.at([second for _, second in kept]))
-        for pair, state, scale in zip(kept, _states(submap, kept), scales.tolist(), strict=True):
-            units = np.ones(7)
-            units[3:6] = scale
-            covariance = self._known[(submap.id, *pair)].covariance
-            self._known[(submap.id, *pair)] = _Known(*state, units[:, None] * covariance * units)
-
-
-def _states(submap: Submap, pairs: Sequence[tuple[int, int]]) -> list[tuple[FloatArray, tuple[int, int]]]:
-    """Return for each pair of keyframes the pose between them, and how many landmarks they see."""
-    if not pairs:
-        return []
-    first, second = np.array(pairs, np.int64).T
-    T = se3.inverse(submap.keyframe_poses(first)) @ submap.keyframe_poses(second)
-    n = {k: int(np.count_nonzero(submap.landmark_of[k] >= 0)) for k in {k for pair in pairs for k in pair}}
-    return [(T_pair, (n[a], n[b])) for T_pair, (a, b) in zip(T, pairs, strict=True)]
-
-
 def build_skeleton(
     atlas: Atlas,
     component: list[int],
@@ -244,15 +106,9 @@ def build_skeleton(
     newest : mapping of int to int, optional
         By submap, the keyframe after which none is a node unless a link stands there.
     """
-    wanted: dict[int, set[int]] = {m: set((more_nodes or {}).get(m, set())) for m in component}
-    for link in links:
-        if not link.rejected:
-            k_a, k_b = link.attached(atlas)
-            wanted[link.a].add(k_a)
-            wanted[link.b].add(k_b)
-    knots_of = {m: skeleton_knots(atlas.submaps[m], wanted[m], (newest or {}).get(m)) for m in component}
+    knots_of = _knots_of(atlas, component, links, more_nodes or {}, newest or {})
     S_world_submap = _initial(atlas, component, links)
-    is_tree = len(links) < len(component) and not any(m in atlas.warps for m in component)
+    is_tree = _is_tree(atlas, component, links)
     nodes: list[Node] = []
     S_world_node: list[FloatArray] = []
     T_submap_node: list[FloatArray] = []
@@ -272,14 +128,39 @@ def build_skeleton(
             atlas, submap, knots, first, None if is_tree and not with_covariances else covariances
         )
         edges += within
-    row = {node: i for i, node in enumerate(nodes)}
-    for link in links:
-        k_a, k_b = link.attached(atlas)
-        if link.rejected:  # it is asked again, but adds no node: what does not count changes nothing
-            k_a, k_b = _nearest(knots_of[link.a], k_a), _nearest(knots_of[link.b], k_b)
-        edges.append(_across(atlas, link, k_a, k_b, row, known(link)))
+    edges += _across(atlas, links, knots_of, {node: i for i, node in enumerate(nodes)}, known)
     problem = AtlasProblem(np.array(S_world_node), reference[component[0]], tuple(edges))
     return Skeleton(component, problem, nodes, reference, list(links), is_tree, np.array(T_submap_node), steps)
+
+
+def foresee_skeleton(atlas: Atlas, component: list[int], links: Sequence[Link], covariances: EdgeCovariances) -> None:
+    """Have computed beside the tracking what `build_skeleton` would ask for."""
+    if _is_tree(atlas, component, links):
+        return
+    for m, knots in _knots_of(atlas, component, links, {}, {}).items():
+        submap = atlas.submaps[m]
+        pairs = [(knots[i], knots[j]) for i, j in _places(submap, knots)]
+        covariances.foresee(submap, pairs, atlas.held.get(m, frozenset()))
+
+
+def _is_tree(atlas: Atlas, component: list[int], links: Sequence[Link]) -> bool:
+    return len(links) < len(component) and not any(m in atlas.warps for m in component)
+
+
+def _knots_of(
+    atlas: Atlas,
+    component: list[int],
+    links: Sequence[Link],
+    more_nodes: Mapping[int, set[int]],
+    newest: Mapping[int, int],
+) -> dict[int, list[int]]:
+    wanted: dict[int, set[int]] = {m: set(more_nodes.get(m, set())) for m in component}
+    for link in links:
+        if not link.rejected:
+            k_a, k_b = link.attached(atlas)
+            wanted[link.a].add(k_a)
+            wanted[link.b].add(k_b)
+    return {m: skeleton_knots(atlas.submaps[m], wanted[m], newest.get(m)) for m in component}
 
 
 def _initial(atlas: Atlas, component: list[int], links: Sequence[Link]) -> dict[int, FloatArray]:
@@ -315,7 +196,7 @@ def _within(
     atlas: Atlas, submap: Submap, knots: list[int], first: int, covariances: Covariances | None
 ) -> tuple[list[AtlasEdge], FloatArray]:
     """Tie a submap's nodes to each other, as it says itself; return also what its factors say from node to node."""
-    places = [(i, i + 1) for i in range(len(knots) - 1)] + ([] if covariances is None else _across_knots(submap, knots))
+    places = _neighbours(knots) if covariances is None else _places(submap, knots)
     pairs = [(knots[i], knots[j]) for i, j in places]
     if covariances is None:  # in a tree no edge pulls at another, whatever they are
         own_C = C = np.broadcast_to(np.eye(7), (len(pairs), 7, 7))
@@ -331,6 +212,15 @@ def _within(
         AtlasEdge(first + int(i[n]), first + int(j[n]), own[n], C[n], WITHIN) for n in np.flatnonzero(kept).tolist()
     ]
     return edges, own_C[: len(knots) - 1]
+
+
+def _neighbours(knots: list[int]) -> list[tuple[int, int]]:
+    return [(i, i + 1) for i in range(len(knots) - 1)]
+
+
+def _places(submap: Submap, knots: list[int]) -> list[tuple[int, int]]:
+    """Return which of a submap's nodes are tied, by their places among them: the neighbours first."""
+    return _neighbours(knots) + _across_knots(submap, knots)
 
 
 def _are_torn(own: FloatArray, now: FloatArray, covariances: FloatArray) -> BoolArray:
@@ -381,11 +271,28 @@ def _across_knots(submap: Submap, knots: list[int]) -> list[tuple[int, int]]:
     return sorted(found)
 
 
-def _across(atlas: Atlas, link: Link, k_a: int, k_b: int, row: dict[Node, int], known: bool) -> AtlasEdge:
-    """Make the factor of a connection."""
-    T_a, T_b = atlas.submaps[link.a].T_submap_kf[k_a], atlas.submaps[link.b].T_submap_kf[k_b]
-    S_ka_kb = sim3.inverse(T_a) @ link.S_a_b @ T_b
+def _across(
+    atlas: Atlas,
+    links: Sequence[Link],
+    knots_of: Mapping[int, list[int]],
+    row: Mapping[Node, int],
+    known: Callable[[Link], bool],
+) -> list[AtlasEdge]:
+    """Make the factors of connections."""
+    if not links:
+        return []
+    ends: list[tuple[Node, Node]] = []
+    for link in links:
+        k_a, k_b = link.attached(atlas)
+        if link.rejected:  # it is asked again, but adds no node: what does not count changes nothing
+            k_a, k_b = _nearest(knots_of[link.a], k_a), _nearest(knots_of[link.b], k_b)
+        ends.append(((link.a, k_a), (link.b, k_b)))
+    T_a, T_b = (np.array([atlas.submaps[m].T_submap_kf[k] for m, k in side]) for side in zip(*ends, strict=True))
+    S_ka_kb = sim3.inverse(T_a) @ np.array([link.S_a_b for link in links]) @ T_b
     Ad = sim3.adjoint(sim3.inverse(T_b))
-    C = Ad @ link.covariance @ Ad.T
-    first, second = row[link.a, k_a], row[link.b, k_b]
-    return AtlasEdge(first, second, S_ka_kb, 0.5 * (C + C.T), str(link.kind), link.doubtful, known)
+    C = Ad @ np.array([link.covariance for link in links]) @ Ad.transpose(0, 2, 1)
+    C = 0.5 * (C + C.transpose(0, 2, 1))
+    return [
+        AtlasEdge(row[a], row[b], S_ka_kb[i], C[i], str(link.kind), link.doubtful, known(link))
+        for i, (link, (a, b)) in enumerate(zip(links, ends, strict=True))
+    ]

@@ -17,9 +17,9 @@ from dualslam.core.types import BoolArray, FloatArray, FrameStatus, Keyframe
 from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.atlas_beside import answer_atlas
 from dualslam.map.connections import Connections
+from dualslam.map.edge_covariances import answer_edges
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.record import Record
-from dualslam.map.skeleton import answer_edges
 from dualslam.map.split import next_submap
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose, compose

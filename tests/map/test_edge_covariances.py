@@ -10,7 +10,7 @@ import pytest
 from dualslam.backend.edge_covariance import edge_covariances
 from dualslam.core.errors import SolverError
 from dualslam.core.types import FloatArray
-from dualslam.map.skeleton import EdgeCovariances, answer_edges
+from dualslam.map.edge_covariances import EdgeCovariances, answer_edges
 from dualslam.map.submap import Submap
 from dualslam.testing.atlas_world import DriftingMap
 from dualslam.testing.late_desk import LateDesk

@@ -1,0 +1,151 @@
+"""What a submap says of the similarities between its keyframes, remembered, and computed beside the tracking."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.core.errors import SolverError
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.types import Failure, FailureReason, FloatArray
+from dualslam.map.submap import Submap
+from dualslam.map.warp import Warp
+from dualslam.workers.jobs import Desk, JobKind
+
+log = logging.getLogger(__name__)
+
+SAME_TURN_RAD, SAME_WAY, SAME_SEEN = 0.02, 0.05, 0.2
+"""Changes of an edge, and of how much its keyframes see, up to which its covariance is that of before."""
+
+Covariances = Callable[[Submap, Sequence[tuple[int, int]], frozenset[int]], FloatArray]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """The covariance of an edge, and the state of the two keyframes for which it was computed."""
+
+    T_first_second: FloatArray
+    n_seen: tuple[int, int]
+    covariance: FloatArray
+
+    def holds(self, T_first_second: FloatArray, n_seen: tuple[int, int]) -> bool:
+        """Whether the keyframes are much as they were."""
+        change = np.abs(T_first_second - self.T_first_second)
+        way = float(np.linalg.norm(self.T_first_second[:3, 3]))
+        seen = all(abs(now - was) <= SAME_SEEN * was for now, was in zip(n_seen, self.n_seen, strict=True))
+        return seen and bool(change[:3, :3].max() < SAME_TURN_RAD and change[:3, 3].max() < SAME_WAY * way)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeQuestion:
+    """Edges of a submap whose covariances are asked for, and a snapshot of it.
+
+    Attributes
+    ----------
+    submap : Submap
+    pairs : tuple of (int, int)
+        Keyframe ids.
+    held : frozenset of int
+        Keyframes whose relative pose is no evidence.
+    """
+
+    submap: Submap
+    pairs: tuple[tuple[int, int], ...]
+    held: frozenset[int]
+
+
+def answer_edges(question: EdgeQuestion, compute: Covariances) -> FloatArray | Failure:
+    """Return the covariances (E, 7, 7) that a question asks for: a job beside the tracking."""
+    try:
+        return compute(question.submap, question.pairs, question.held)
+    except SolverError as error:
+        log.warning("submap %d: %s", question.submap.id, error)
+        return Failure(FailureReason.SOLVER, str(error))
+
+
+class EdgeCovariances:
+    """Covariances of edges within submaps, remembered as long as the edge's keyframes are much as they were.
+
+    Parameters
+    ----------
+    compute : callable
+        Gives them from a submap's factors, here and now.
+    desk : Desk
+        Where they are computed that `foresee` asks for.
+    """
+
+    def __init__(self, compute: Covariances, desk: Desk) -> None:
+        self._compute = compute
+        self._desk = desk
+        self._known: dict[tuple[int, int, int], _Known] = {}
+
+    def __call__(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
+        """Return (E, 7, 7)."""
+        self._collect()
+        if new := self._missing(submap, pairs):
+            self._note(submap, new, self._compute(submap, new, held))
+        return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, 7, 7)
+
+    def as_foreseen(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
+        """Return (E, 7, 7), also where the keyframes are not quite as they were: they were asked about a moment ago."""
+        self._collect()
+        if new := [pair for pair in pairs if (submap.id, *pair) not in self._known]:
+            self._note(submap, new, self._compute(submap, new, held))
+        return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, 7, 7)
+
+    def foresee(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> None:
+        """Have those that are missing computed beside the tracking."""
+        self._collect()
+        if new := self._missing(submap, pairs):
+            self._desk.submit(JobKind.EDGES, EdgeQuestion(submap.copy(), tuple(new), held))
+
+    @property
+    def foreseeing(self) -> bool:
+        """Whether some are still being computed."""
+        self._collect()
+        return self._desk.n_open(JobKind.EDGES) > 0
+
+    def _missing(self, submap: Submap, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+        new = []
+        for pair, state in zip(pairs, _states(submap, pairs), strict=True):
+            known = self._known.get((submap.id, *pair))
+            if known is None or not known.holds(*state):
+                new.append(pair)
+        return new
+
+    def _collect(self) -> None:
+        for ended in self._desk.poll(JobKind.EDGES):
+            if not isinstance(ended.result, Failure):  # else they are computed when they are needed
+                self._note(ended.work.submap, ended.work.pairs, ended.result)
+
+    def _note(self, submap: Submap, pairs: Sequence[tuple[int, int]], covariances: FloatArray) -> None:
+        for pair, state, C in zip(pairs, _states(submap, pairs), covariances, strict=True):
+            self._known[(submap.id, *pair)] = _Known(*state, C)
+
+    def bent(self, submap: Submap, warp: Warp) -> None:
+        """Take in that a submap stands otherwise by a solution of the atlas: its own factors say what they said."""
+        kept = []
+        for m, first, second in [key for key in self._known if key[0] == submap.id]:
+            if first in submap.keyframes and second in submap.keyframes:
+                kept.append((first, second))
+            else:
+                del self._known[m, first, second]
+        scales = sim3.scale(warp.at([second for _, second in kept]))
+        for pair, state, scale in zip(kept, _states(submap, kept), scales.tolist(), strict=True):
+            units = np.ones(7)
+            units[3:6] = scale
+            covariance = self._known[(submap.id, *pair)].covariance
+            self._known[(submap.id, *pair)] = _Known(*state, units[:, None] * covariance * units)
+
+
+def _states(submap: Submap, pairs: Sequence[tuple[int, int]]) -> list[tuple[FloatArray, tuple[int, int]]]:
+    """Return for each pair of keyframes the pose between them, and how many landmarks they see."""
+    if not pairs:
+        return []
+    first, second = np.array(pairs, np.int64).T
+    T = se3.inverse(submap.keyframe_poses(first)) @ submap.keyframe_poses(second)
+    n = {k: int(np.count_nonzero(submap.landmark_of[k] >= 0)) for k in {k for pair in pairs for k in pair}}
+    return [(T_pair, (n[a], n[b])) for T_pair, (a, b) in zip(T, pairs, strict=True)]
