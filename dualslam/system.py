@@ -245,6 +245,7 @@ class System:
             self._endings.archive(state.live, "end of sequence")
         if last is not None:
             self._connections.settle(last)
+            self._endings.part_what_lost_its_scale(last)
         state.parts.desk.close()
 
     def _unusable(self, frame: Frame, failure: Failure) -> Failure:

@@ -81,6 +81,11 @@ def answer_question(asked: _Asked) -> float:
 SCALE_HANDLERS: Handlers = {JobKind.SCALE: answer_question}
 
 
+def lost_from(config: LinkingConfig) -> float:
+    """Return the standard deviation from which on a scale is wrong with the probability `SURE`."""
+    return config.wrong_scale / float(ndtri(1.0 - 0.5 * SURE))
+
+
 class ScaleWatch:
     """Asks about each group of a live map's keyframes, once, when `BEHIND` have come after it.
 
@@ -96,8 +101,7 @@ class ScaleWatch:
 
     def __init__(self, config: LinkingConfig, desk: Desk | None = None) -> None:
         self._desk = desk or InlineDesk(SCALE_HANDLERS)
-        self.max_sigma = config.wrong_scale / float(ndtri(1.0 - 0.5 * SURE))
-        """From here on the scale is wrong with that probability."""
+        self.max_sigma = lost_from(config)
         self._asked: dict[int, int] = {}  # by submap: the newest keyframe that was in a group
 
     def judge(self, submap: Submap, links: Iterable[Link]) -> ScaleLoss | None:
@@ -129,9 +133,9 @@ class ScaleWatch:
         before, group = ids[begin - GROUP : begin], ids[begin : begin + GROUP]
         after = ids[begin + GROUP : begin + 2 * GROUP]
         self._asked[submap.id] = int(group[-1])
-        if len(before) < GROUP or _n_ties(submap, ids, begin, begin + GROUP, n_views=2) >= FIRM_TIES:
+        if len(before) < GROUP or count_ties(submap, ids, begin, begin + GROUP, n_views=2) >= FIRM_TIES:
             return
-        self._desk.submit(JobKind.SCALE, _Asked(submap.id, group, _question(submap, ids, before, after)))
+        self._desk.submit(JobKind.SCALE, _Asked(submap.id, group, question_about(submap, ids, before, after)))
 
     @staticmethod
     def _loss_at(submap: Submap, group: IntArray, sigma: float, links: Iterable[Link]) -> ScaleLoss | None:
@@ -140,23 +144,37 @@ class ScaleWatch:
         begin, end = np.searchsorted(ids, [group[0], group[-1] + 1]).tolist()
         if end == len(ids):
             return None  # the map was parted meanwhile: nothing is left behind the group
-        if _n_ties(submap, ids, begin, end, n_views=2) >= FIRM_TIES:
+        if count_ties(submap, ids, begin, end, n_views=2) >= FIRM_TIES:
             return None  # reverse tracking, or a loop, has tied them meanwhile
-        seam = min(range(begin, end + 1), key=lambda place: _n_ties(submap, ids, place, place))
+        seam = min(range(begin, end + 1), key=lambda place: count_ties(submap, ids, place, place))
         first = int(ids[seam])
         return None if _is_linked(submap.id, first, links) else ScaleLoss(int(group[0]), first, sigma)
 
 
-def _question(submap: Submap, ids: IntArray, before: IntArray, after: IntArray) -> ScaleQuestion:
-    """Ask what the map claims of its scale after a group, against that before it."""
-    seen = submap.covisible(submap.landmarks_of_keyframes(ids[ids >= after[0]]))[0]
-    earliest = ids[max(int(np.searchsorted(ids, before[0])) - N_AROUND, 0)]
-    # Where others than those just before them have seen the same, they may hold the places together.
-    n_around = len(ids) if (seen < earliest).any() else N_AROUND
+def question_about(
+    submap: Submap, ids: IntArray, before: IntArray, after: IntArray, n_around: int | None = None
+) -> ScaleQuestion:
+    """Ask what the map claims of its scale at one place, against that at an earlier one.
+
+    Parameters
+    ----------
+    submap : Submap
+    ids : (F,) int64
+        Its keyframes, ascending.
+    before, after : (P,) int64
+        Keyframes of the two places.
+    n_around : int, optional
+        Keyframes before and after them that count as well. By default few, and all where others than those just before
+        have seen the same as those after: they may hold the places together.
+    """
+    if n_around is None:
+        seen = submap.covisible(submap.landmarks_of_keyframes(ids[ids >= after[0]]))[0]
+        earliest = ids[max(int(np.searchsorted(ids, before[0])) - N_AROUND, 0)]
+        n_around = len(ids) if (seen < earliest).any() else N_AROUND
     return ask_scale(submap, [(before, after)], PIXEL_CHI2, n_around)
 
 
-def _n_ties(submap: Submap, ids: IntArray, end: int, begin: int, n_views: int = 1) -> int:
+def count_ties(submap: Submap, ids: IntArray, end: int, begin: int, n_views: int = 1) -> int:
     """Return how many landmarks are seen by `n_views` or more of the keyframes before `end`, and from `begin` on."""
     sides = ids[max(end - N_AROUND, 0) : end], ids[begin : begin + N_AROUND]
     before, after = (submap.n_views_among(side.tolist()) for side in sides)

@@ -57,6 +57,8 @@ def _told(event: dict[str, Any]) -> tuple[str, str] | None:
         return "its start, by reverse tracking", verdict
     if kind == "cut":
         left = len(event.get("left", ()))
+        if event.get("reason") == "scale_lost":
+            return "its scale", f"not handed on: parted off, {left} frames left without a pose in the main map"
         return "its start was wrong", f"cut off; {event['reposed']} frames posed again, {left} left without"
     if kind == "failed" and event.get("reason") == "scale_lost":
         return "its scale", f"not handed on: parted ({detail})"

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.core.chi_square import variance_by_median
 from dualslam.core.geometry import se3
-from dualslam.core.geometry.projection import project_points, projection_jacobians
+from dualslam.core.geometry.projection import projection_jacobians
 from dualslam.core.types import FloatArray
 from dualslam.map.landmark_views import landmark_covariances
+from dualslam.map.residual_noise import noise_excess
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking.gates import PIXEL_CHI2
 from dualslam.recovery.linking.scale_observability import scale_sigmas_between
@@ -26,14 +26,9 @@ sink, by a quarter with 6 (a room), since more of the map holds the scale: the i
 MIN_LANDMARKS = 6
 POSITION_INFLATION = 1.1
 """As `SCALE_INFLATION` (`recovery/scale_watch.py`), for positions."""
-USUAL_NOISE = 0.33
-"""Standard deviation of residuals, in the pixels' sigmas, for which the inflations are made: that of plain stretches.
-In blurred ones it is 0.4 to 0.7."""
 NEAR = 2
 """Keyframes before and after by whose residuals, too, a position is judged: it is one against what they hold. The first
 after a blurred stretch see sharply what the blurred ones have placed."""
-MIN_VIEWS, MIN_RESIDUALS = 3, 10
-"""What a keyframe's residuals are read from: landmarks of so many views, and so many of them. With less it is usual."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +50,7 @@ class Claim:
 
 def claims_of(submap: Submap) -> dict[int, Claim]:
     """Return what a submap claims of its keyframes."""
-    excess = _excess(submap)
+    excess = noise_excess(submap)
     ids = sorted(submap.keyframes)
     scale, covariances = _scale_sigmas(submap, excess), landmark_covariances(submap, np.arange(len(submap.landmarks)))
     claims = {}
@@ -63,28 +58,6 @@ def claims_of(submap: Submap) -> dict[int, Claim]:
         near = max(excess[other] for other in ids[max(n - NEAR, 0) : n + NEAR + 1])
         claims[k] = Claim(near * _position_sigma(submap, k, covariances), scale[k])
     return claims
-
-
-def _excess(submap: Submap) -> dict[int, float]:
-    """Return how many times larger than is usual each keyframe's residuals are, by their median; at least 1.
-
-    What a soft image adds to them, it adds to the errors that do not average out.
-    """
-    obs = submap.observations
-    n_views = np.bincount(obs["landmark"][obs["alive"]], minlength=len(submap.landmarks))
-    excess = dict.fromkeys(submap.keyframes, 1.0)
-    for k, keyframe in submap.keyframes.items():
-        feature = np.flatnonzero(submap.landmark_of[k] >= 0)
-        ids = submap.landmark_of[k][feature]
-        feature, ids = feature[n_views[ids] >= MIN_VIEWS], ids[n_views[ids] >= MIN_VIEWS]
-        uv, _ = project_points(submap.K, se3.inverse(submap.T_submap_kf[k]), submap.landmarks["xyz_mu"][ids])
-        features = keyframe.features
-        chi2 = ((uv - features.uv_rect_px[feature]) ** 2).sum(axis=1) / features.sigma_px[feature] ** 2
-        finite = np.isfinite(chi2)
-        if np.count_nonzero(finite) >= MIN_RESIDUALS:
-            variance = variance_by_median(chi2[finite], n_views[ids[finite]])
-            excess[k] = max(1.0, float(np.sqrt(variance)) / USUAL_NOISE)
-    return excess
 
 
 def _position_sigma(submap: Submap, keyframe_id: int, covariances: FloatArray) -> float:

@@ -13,11 +13,13 @@ from dualslam.health import count_signs
 from dualslam.map.atlas import Link
 from dualslam.map.connections import Connections
 from dualslam.map.endings import archive, hand_frames_over
+from dualslam.map.record import FrameStamp
 from dualslam.map.split import next_submap, submap_of, take_out
 from dualslam.map.submap import Submap
 from dualslam.places.sightings import Sightings
 from dualslam.recovery.bypass import drop_corrupted
 from dualslam.recovery.manager import Recoveries
+from dualslam.recovery.scale_parts import part_what_lost_its_scale
 from dualslam.recovery.scale_watch import ScaleLoss, ScaleWatch
 from dualslam.steps.state import State
 
@@ -150,6 +152,15 @@ class Endings:
             self._recoveries.start(submap, first)
             self._recoveries.collect(state.live, view)
         return True
+
+    def part_what_lost_its_scale(self, last: FrameStamp) -> None:
+        """Part this run's archived maps where no link holds what lies beyond a loss of scale, at the end of the run."""
+        state, record = self._state, self._state.record
+        if self._scale_watch is None or state.localises:
+            return
+        with record.timer.measure("audit"):
+            for m in sorted(record.atlas.submaps.keys() - self._earlier):
+                part_what_lost_its_scale(record, m, state.config.linking, last)
 
     # --- full
 

@@ -31,14 +31,17 @@ def test_verdicts_and_doubts_have_a_row_each(broken_run: RunData) -> None:
         {"event": "failed", "frame": 34, "submap": 1, "reason": "scale_lost", "detail": "known to 30%"},
         {"event": "linked", "frame": 35, "submap": 1, "tries": 3.0},
         {"event": "linked", "frame": 36, "submap": 1, "tries": 1.0},
+        {"event": "cut", "frame": 37, "submap": 1, "reason": "scale_lost", "reposed": 0, "left": [3, 4]},
     )
     told = cells(run)
-    assert [row[0] for row in told] == ["30", "31", "33", "34", "35"]
+    assert [row[0] for row in told] == ["30", "31", "33", "34", "35", "37"]
     assert told[0][3] == "confirmed"
     assert "7 frames posed again, 2 left" in told[1][3]
     assert "another explains 9" in told[2][3]
     assert told[3][2:] == ["its scale", "not handed on: parted (known to 30%)"]
     assert "try 3" in told[4][3]
+    assert told[5][2] == "its scale"
+    assert "2 frames" in told[5][3]
 
 
 def test_claims_are_drawn_and_what_is_not_handed_on_stands_highest(broken_run: RunData) -> None:
