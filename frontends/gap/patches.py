@@ -71,10 +71,11 @@ def sample(levels: Pyramid, uv_px: FloatArray, axes: FloatArray, half: int) -> N
         of_level = np.flatnonzero(level == n)
         for begin in range(0, len(of_level), REMAP_ROWS // side):
             rows = of_level[begin : begin + REMAP_ROWS // side]
-            right, down = axes[rows].transpose(2, 1, 0)[..., None, None]
-            at = uv_px[rows].T[..., None, None] + (right * grid + down * grid[:, None])
             # The middle of a level's first pixel is the middle of the image's.
-            u, v = np.asarray(at / 2.0**n, np.float32).reshape(2, len(rows) * side, side)
+            right, down = axes[rows].transpose(2, 1, 0)[..., None, None] / 2.0**n
+            at = np.empty((2, len(rows), side, side), np.float32)
+            np.add(uv_px[rows].T[..., None, None] / 2.0**n + right * grid, down * grid[:, None], out=at)
+            u, v = at.reshape(2, len(rows) * side, side)
             out = cv2.remap(levels[n], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             patches[rows] = out.reshape(len(rows), side, side)
     return patches
