@@ -26,7 +26,7 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.late_estimate import apply_late
 from dualslam.map.submap import Submap
 from dualslam.map.submap_delta import SubmapDelta, SubmapMirror
-from dualslam.workers.jobs import Desk, JobKind
+from dualslam.workers.jobs import Desk, JobKind, awaited
 
 log = logging.getLogger(__name__)
 
@@ -34,9 +34,6 @@ Window = Callable[[Submap, list[int]], GraphEstimate | Failure]
 """Adjusts some keyframes of a submap, the newest first, and what they see; the submap is not changed."""
 N_FREE, N_FREE_BEHIND = 3, 1
 """Keyframes that the window moves: those that the tracking goes on from; fewer while it has to catch up."""
-
-PAUSE_S = 1e-3
-"""Between two looks at whether a graph has been solved, where a run waits for it."""
 MAX_GRAPHS = 3
 """Graphs that a process keeps: the live one, and those that a merge or a map that was seen again may still ask for."""
 
@@ -223,13 +220,9 @@ class BesideGraphs:
 
     def wait(self, submaps: Mapping[int, Submap]) -> Iterator[Moved]:
         """Wait for what is under way, as a run does that has no clock to keep up with, and collect."""
-        while self._under_way is not None and self._desk.n_open(JobKind.GRAPH):
-            ended = self._desk.poll(JobKind.GRAPH)
-            for each in ended:
-                if (moved := self._take(each.result, submaps)) is not None:
-                    yield moved
-            if not ended:
-                time.sleep(PAUSE_S)
+        for ended in awaited(self._desk, JobKind.GRAPH):
+            if (moved := self._take(ended.result, submaps)) is not None:
+                yield moved
         yield from self.collect(submaps)
 
     def finish(self, submaps: Mapping[int, Submap]) -> Iterator[Moved]:

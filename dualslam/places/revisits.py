@@ -6,7 +6,7 @@ do not. What is believed becomes a link, and the atlas does the rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +35,7 @@ from dualslam.places.sightings import (
 )
 from dualslam.places.verification import PlaceMatch
 from dualslam.recovery.leaps import refuse_leaps
-from dualslam.workers.jobs import Desk, Ended, JobKind
+from dualslam.workers.jobs import Desk, Ended, JobKind, awaited
 
 ASK_EVERY = 2
 """Keyframes between two searches, where nothing is provisional: neighbours show the same."""
@@ -184,6 +184,10 @@ class Revisits:
         search = PlaceSearch(submap.id, keyframe_id, candidates, {m: submaps[m].copy() for m in sorted(named)})
         self._desk.submit(JobKind.LOOP, search)
 
+    def wait(self, live: VisualOdometry, now: FrameStamp) -> None:
+        """Wait for the search that is under way: without a clock none is left out for one that is not over."""
+        self._take_answers(awaited(self._desk, JobKind.LOOP), live, now)
+
     def take_solution(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
         """Let the maps follow what has been solved meanwhile.
 
@@ -218,7 +222,7 @@ class Revisits:
         self._take_answers(self._desk.drain(JobKind.LOOP), live, now)
         return self._link_believed(live, now) or report
 
-    def _take_answers(self, answers: list[Ended], live: VisualOdometry | None, now: FrameStamp) -> None:
+    def _take_answers(self, answers: Iterable[Ended], live: VisualOdometry | None, now: FrameStamp) -> None:
         for ended in answers:
             search: PlaceSearch = ended.work
             self._record.timer.add("loop search", ended.cpu_s)

@@ -84,6 +84,8 @@ class PlaceKeeping:
         if self._recoveries.is_under_way(live.submap):
             return
         with self._state.record.timer.measure("places"):
+            if not self._state.pace.in_real_time:
+                self._revisits.wait(live, view)
             self._revisits.note_keyframe(live, TAKEN_IN_A_FRAME if self._state.pace.in_real_time else None)
         self._link(view)
 

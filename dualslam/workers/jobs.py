@@ -9,8 +9,9 @@ the same run to the bit; `dualslam/workers/desk.py` has the one with processes. 
 
 from __future__ import annotations
 
+import time
 from collections import defaultdict
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Protocol, TypeVar
@@ -97,6 +98,19 @@ class Desk(Protocol):
     def close(self) -> None:
         """End the processes, and what they do."""
         ...
+
+
+PAUSE_S = 1e-3
+"""Between two looks at whether a job has ended, where a run waits for it."""
+
+
+def awaited(desk: Desk, kind: JobKind) -> Iterator[Ended]:
+    """Wait for all jobs of a kind, as a run does that has no clock to keep up with, and yield each as it ends."""
+    while desk.n_open(kind):
+        ended = desk.poll(kind)
+        yield from ended
+        if not ended:
+            time.sleep(PAUSE_S)
 
 
 class InlineDesk:
