@@ -5,9 +5,9 @@
 At each place of a sequence a clip is disturbed twice: ten black frames, and a gap (0.5, 1 and 1.5 s by turns in which
 no frame arrives). Each runs with `--realtime --workers 1`, and once more with recovery off: the same young map, the
 same frames, and nothing beside them. Printed are, for each loss, the seconds that the walk took which made the link,
-the seconds of the stream from the new map's start to the link, the attempts before it, and the median latency of the
-frames that came during recoveries over that of the same frames without. It says something only where nothing else
-computes.
+the seconds of the stream from the new map's start to the link, and from the first frame after the disturbance until
+the map is one again, by a link or as it was seen again; the attempts before it, and the median latency of the frames
+that came during recoveries over that of the same frames without. It says something only where nothing else computes.
 
 Without sequences: kitti_03 and 7scenes_1000 under the folder that DUALSLAM_DATA names. Places of the two halves differ.
 """
@@ -29,6 +29,8 @@ from dualslam.run.sources import open_source
 
 BEFORE, AFTER = 90, 90
 """Frames of a clip before its disturbance, and after it."""
+JOINED = ("linked", "merged", "relocalised")
+"""Events with which a lost map goes on."""
 BLACK_FRAMES = 10
 GAPS_S = (0.5, 1.0, 1.5)
 HALVES = {"development": 0.0, "reporting": 0.5}
@@ -37,13 +39,17 @@ HALVES = {"development": 0.0, "reporting": 0.5}
 
 @dataclass(frozen=True)
 class Loss:
-    """One disturbed clip, and what became of it; `walk_s` and `stream_s` are None where no link was made."""
+    """One disturbed clip, and what became of it.
+
+    `walk_s` and `stream_s` are None where no link was made; `joined_s` where none was, and the map was not seen again.
+    """
 
     kind: str
     at: int
     attempts: int
     walk_s: float | None
     stream_s: float | None
+    joined_s: float | None
     latency_ratio: float | None
     lost: bool
 
@@ -56,8 +62,8 @@ def main() -> None:
     parser.add_argument("--half", choices=tuple(HALVES), default="reporting")
     parser.add_argument("--out", type=Path, default=Path("runs/recoveries"))
     args = parser.parse_args()
-    print("| sequence | disturbance | at frame | attempts | walk s | after the new map's start, s | latency ratio |")
-    print("|---|---|---|---|---|---|---|")
+    print("| sequence | disturbance | at frame | attempts | walk s | after the new map's start, s", end=" ")
+    print("| one map after the disturbance, s | latency ratio |\n|---|---|---|---|---|---|---|---|")
     losses: list[Loss] = []
     for sequence in args.sequences or _default_sequences():
         losses += [_row(sequence, loss) for loss in _losses_of(sequence, args)]
@@ -98,7 +104,7 @@ def _measured(sequence: str, kind: str, at: int, script: dict[str, Any], out: Pa
     with_it, without = out / name, out / f"{name}_off"
     _run(sequence, with_it, options)
     _run(sequence, without, [*options, "--no-recovery"])
-    return _read(kind, at, with_it, without)
+    return _read(kind, at, script["length"], with_it, without)
 
 
 def _run(sequence: str, folder: Path, options: list[str]) -> None:
@@ -108,13 +114,14 @@ def _run(sequence: str, folder: Path, options: list[str]) -> None:
         sys.exit(done.returncode)
 
 
-def _read(kind: str, at: int, folder: Path, without: Path) -> Loss:
+def _read(kind: str, at: int, length: int, folder: Path, without: Path) -> Loss:
     events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
     started = [e for e in events if e["event"] == "recovery_started"]
     ended = [e for e in events if e["event"] == "recovery_ended"]
     linked = next((e for e in events if e["event"] == "linked"), None)
     walk = next((e for e in ended if e["linked"]), None)
     start = next((e for e in events if e["event"] == "reinitialised"), None)
+    joined = next((e for e in events if e["event"] in JOINED), None)
     during = {
         frame
         for first, last in zip(started, ended, strict=False)
@@ -126,9 +133,15 @@ def _read(kind: str, at: int, folder: Path, without: Path) -> Loss:
         attempts=len(ended),
         walk_s=None if linked is None or walk is None else float(walk["seconds"]),
         stream_s=None if linked is None or start is None else float(linked["timestamp_s"] - start["timestamp_s"]),
+        joined_s=None if joined is None else float(joined["timestamp_s"] - _time_of(folder, at + length)),
         latency_ratio=_latency_ratio(folder, without, during),
         lost=any(e["event"] == "failed" for e in events),
     )
+
+
+def _time_of(folder: Path, frame: int) -> float:
+    with (folder / "frames.csv").open() as file:
+        return next(float(row["timestamp_s"]) for row in csv.DictReader(file) if int(row["index"]) >= frame)
 
 
 def _latency_ratio(folder: Path, without: Path, during: set[int]) -> float | None:
@@ -147,8 +160,9 @@ def _latencies(folder: Path) -> dict[int, float]:
 
 def _row(sequence: str, loss: Loss) -> Loss:
     made = "not lost" if not loss.lost else loss.attempts
-    cells = (Path(sequence).name, loss.kind, loss.at, made, *map(_number, (loss.walk_s, loss.stream_s)))
-    print("| " + " | ".join(map(str, (*cells, _number(loss.latency_ratio)))) + " |", flush=True)
+    numbers = (loss.walk_s, loss.stream_s, loss.joined_s, loss.latency_ratio)
+    cells = (Path(sequence).name, loss.kind, loss.at, made, *map(_number, numbers))
+    print("| " + " | ".join(map(str, cells)) + " |", flush=True)
     return loss
 
 
@@ -158,6 +172,7 @@ def _print_medians(kind: str, losses: list[Loss]) -> None:
     for what, values in (
         ("walk s", [loss.walk_s for loss in linked]),
         ("after the new map's start, s", [loss.stream_s for loss in linked]),
+        ("one map after the disturbance, s", [loss.joined_s for loss in losses]),
         ("latency ratio", [loss.latency_ratio for loss in losses]),
     ):
         told = [value for value in values if value is not None]
