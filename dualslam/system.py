@@ -84,7 +84,7 @@ class System:
             components.adjust_bundle,
             components.desk,
             self._state.front_ends,
-            *([] if components.graphs is None else [components.graphs.forget]),
+            None if components.graphs is None else components.graphs.forget,
         )
         self._revisits = Revisits(
             record,

@@ -17,8 +17,7 @@ from dualslam.core.types import Failure
 from dualslam.frontends.registry import create_frontend
 from dualslam.frontends.tracking.map_readout import answer_readout
 from dualslam.lab.disturbances import FaultScript
-from dualslam.map.atlas_beside import answer_atlas
-from dualslam.map.edge_covariances import answer_edges
+from dualslam.map.atlas_beside import atlas_handlers
 from dualslam.map.graph_beside import GraphServer
 from dualslam.places import PlaceVerifier
 from dualslam.places.search import search_places
@@ -56,15 +55,6 @@ def place_handlers(verifier: PlaceVerifier) -> Handlers:
     return {JobKind.LOOP: lambda search: search_places(search, verifier)}
 
 
-def atlas_handlers(config: Config) -> Handlers:
-    """Build what solves the atlas, and gives the covariances that this needs."""
-    solver = atlas_solver(config)
-    return {
-        JobKind.EDGES: lambda question: answer_edges(question, solver.edge_covariances),
-        JobKind.ATLAS: lambda question: answer_atlas(question, solver.solve),
-    }
-
-
 READOUT_HANDLERS: Handlers = {JobKind.READOUT: answer_readout}
 """What tells how long images were read."""
 
@@ -72,7 +62,7 @@ READOUT_HANDLERS: Handlers = {JobKind.READOUT: answer_readout}
 def inline_handlers(config: Config, verifier: PlaceVerifier, new_graph: Callable[[], SubmapGraph]) -> Handlers:
     """Build what is done at once where there are no workers; reverse tracking has an executor of its own."""
     return {
-        **atlas_handlers(config),
+        **atlas_handlers(atlas_solver(config)),
         **SCALE_HANDLERS,
         **READOUT_HANDLERS,
         **calibration_handlers(config, new_graph),
@@ -102,7 +92,7 @@ def walk_handlers(config: Config, camera: Camera, n_threads: int) -> Handlers:
     verifier = place_parts(config, frontend, camera).verifier
     return {
         JobKind.WALK: lambda job: recover_in_steps(job, parts),
-        **atlas_handlers(config),
+        **atlas_handlers(atlas_solver(config)),
         **SCALE_HANDLERS,
         **READOUT_HANDLERS,
         **calibration_handlers(config),

@@ -15,14 +15,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from dualslam.core.atlas_problem import AtlasProblem, AtlasSolution
+from dualslam.core.atlas_problem import AtlasProblem, AtlasSolution, AtlasSolver
 from dualslam.core.errors import SolverError
-from dualslam.core.geometry import se3, sim3
+from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.atlas import Atlas, Link
-from dualslam.map.edge_covariances import SAME_TURN_RAD, SAME_WAY
+from dualslam.map.edge_covariances import answer_edges, much_alike
+from dualslam.map.propagation import follow_keyframes
 from dualslam.map.skeleton import Skeleton
 from dualslam.map.submap import Submap
+from dualslam.workers.jobs import Handlers, JobKind
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +42,14 @@ def answer_atlas(
         return tuple(solve(problem) for problem in question.problems)
     except SolverError as error:
         return Failure(FailureReason.SOLVER, str(error))
+
+
+def atlas_handlers(solver: AtlasSolver) -> Handlers:
+    """Return what solves the atlas, and gives the covariances that this needs."""
+    return {
+        JobKind.EDGES: lambda question: answer_edges(question, solver.edge_covariances),
+        JobKind.ATLAS: lambda question: answer_atlas(question, solver.solve),
+    }
 
 
 @dataclass(slots=True, eq=False)
@@ -143,8 +153,7 @@ def _much_as_it_was(submap: Submap, rows: list[int], knots: list[int], T_then: F
     if not submap.keyframes.keys() >= set(knots):
         return False
     then, now = (se3.inverse(T[:-1]) @ T[1:] for T in (T_then[rows], submap.keyframe_poses(knots)))
-    change, way = np.abs(now - then), np.linalg.norm(then[:, :3, 3], axis=1)
-    return bool((change[:, :3, :3] < SAME_TURN_RAD).all() and (change[:, :3, 3].max(axis=1) <= SAME_WAY * way).all())
+    return bool(much_alike(then, now).all())
 
 
 def _poses(atlas: Atlas, link: Link, ends: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
@@ -156,8 +165,5 @@ def _poses(atlas: Atlas, link: Link, ends: tuple[int, int]) -> tuple[FloatArray,
 def _followed(link: Link, then: tuple[FloatArray, FloatArray], now: tuple[FloatArray, FloatArray]) -> Link:
     if all(np.array_equal(a, b) for a, b in zip(then, now, strict=True)):
         return link
-    (a_then, b_then), (a_now, b_now) = then, now
-    moved = b_now @ se3.inverse(b_then)
-    Ad = sim3.adjoint(moved)
-    S_a_b = a_now @ se3.inverse(a_then) @ link.S_a_b @ se3.inverse(moved)
-    return replace(link, S_a_b=S_a_b, covariance=Ad @ link.covariance @ Ad.T)
+    S_a_b, covariance = follow_keyframes(link.S_a_b, link.covariance, then, now)
+    return replace(link, S_a_b=S_a_b, covariance=covariance)

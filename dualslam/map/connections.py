@@ -51,7 +51,7 @@ class Connections:
         Where solutions are computed, and covariances that they will need.
     front_ends : callable
         Gives those that go on, or may go on, in a submap of the atlas.
-    forget_graph : callable
+    forget_graph : callable, optional
         Told of each submap that has been bent: what its graph is solving is of before.
     """
 
@@ -63,7 +63,7 @@ class Connections:
         adjust: BundleAdjuster,
         desk: Desk,
         front_ends: Callable[[], Iterable[VisualOdometry]] = tuple,
-        forget_graph: Callable[[int], None] = lambda submap_id: None,
+        forget_graph: Callable[[int], None] | None = None,
     ) -> None:
         self._record = record
         self._solver = solver
@@ -104,7 +104,7 @@ class Connections:
             Falsy where the solver failed: the connections are not taken in then.
         """
         touched = {m for link in links for m in (link.a, link.b)}
-        if len(links) > 1 or any(touched <= set(component) for component in self._atlas.components()):
+        if len(links) > 1 or self._are_connected(touched):
             self._mover.complete()
             report = self._solve(touched, links, now)
         else:
@@ -122,9 +122,12 @@ class Connections:
         AtlasReport or None
             As for `connect`. None: `collect` will return it.
         """
-        if not any({link.a, link.b} <= set(component) for component in self._atlas.components()):
+        if not self._are_connected({link.a, link.b}):
             return self.connect([link], now)
         return self._ask({link.a, link.b}, [link], now)
+
+    def _are_connected(self, submap_ids: set[int]) -> bool:
+        return any(submap_ids <= set(component) for component in self._atlas.components())
 
     def _connect_sets(self, link: Link, now: FrameStamp) -> AtlasReport:
         touched = {link.a, link.b}

@@ -10,7 +10,7 @@ import numpy as np
 
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import Failure, FailureReason, FloatArray
+from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 from dualslam.map.submap import Submap
 from dualslam.map.warp import Warp
 from dualslam.workers.jobs import Desk, JobKind
@@ -23,6 +23,13 @@ SAME_TURN_RAD, SAME_WAY, SAME_SEEN = 0.02, 0.05, 0.2
 Covariances = Callable[[Submap, Sequence[tuple[int, int]], frozenset[int]], FloatArray]
 
 
+def much_alike(then: FloatArray, now: FloatArray) -> BoolArray:
+    """Return (...) for which edges (..., 4, 4) the covariance of before still holds."""
+    change, way = np.abs(now - then), np.linalg.norm(then[..., :3, 3], axis=-1)
+    turned_alike = change[..., :3, :3].max(axis=(-2, -1)) < SAME_TURN_RAD
+    return np.asarray(turned_alike & (change[..., :3, 3].max(axis=-1) < SAME_WAY * way))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Known:
     """The covariance of an edge, and the state of the two keyframes for which it was computed."""
@@ -33,10 +40,8 @@ class _Known:
 
     def holds(self, T_first_second: FloatArray, n_seen: tuple[int, int]) -> bool:
         """Whether the keyframes are much as they were."""
-        change = np.abs(T_first_second - self.T_first_second)
-        way = float(np.linalg.norm(self.T_first_second[:3, 3]))
         seen = all(abs(now - was) <= SAME_SEEN * was for now, was in zip(n_seen, self.n_seen, strict=True))
-        return seen and bool(change[:3, :3].max() < SAME_TURN_RAD and change[:3, 3].max() < SAME_WAY * way)
+        return seen and bool(much_alike(self.T_first_second, T_first_second))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,14 +90,19 @@ class EdgeCovariances:
     def __call__(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
         """Return (E, 7, 7)."""
         self._collect()
-        if new := self._missing(submap, pairs):
-            self._note(submap, new, self._compute(submap, new, held))
-        return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, 7, 7)
+        return self._completed(submap, pairs, self._missing(submap, pairs), held)
 
     def as_foreseen(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
         """Return (E, 7, 7), also where the keyframes are not quite as they were: they were asked about a moment ago."""
         self._collect()
-        if new := [pair for pair in pairs if (submap.id, *pair) not in self._known]:
+        unknown = [pair for pair in pairs if (submap.id, *pair) not in self._known]
+        return self._completed(submap, pairs, unknown, held)
+
+    def _completed(
+        self, submap: Submap, pairs: Sequence[tuple[int, int]], new: list[tuple[int, int]], held: frozenset[int]
+    ) -> FloatArray:
+        """Compute those that are `new`, and return all."""
+        if new:
             self._note(submap, new, self._compute(submap, new, held))
         return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, 7, 7)
 

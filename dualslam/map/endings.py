@@ -10,6 +10,7 @@ from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import SubmapGraph
 from dualslam.map.record import Record
+from dualslam.map.split import take_out
 from dualslam.map.submap import Submap
 
 log = logging.getLogger(__name__)
@@ -46,3 +47,13 @@ def hand_frames_over(record: Record, old: Submap, new: Submap) -> None:
             record.poses[i] = replace(pose, submap_id=new.id, keyframe_id=k, T_kf_cam=T_kf_cam)
             if i in record.rows:  # it may be another run's
                 record.rows[i].submap = new.id
+
+
+def part_off(record: Record, old: Submap, part: Submap, anchor: int) -> None:
+    """Take a submap into the atlas that was made of some keyframes of another, which gives them and their frames up.
+
+    `anchor`: the keyframe of the old one that they are anchored to there.
+    """
+    hand_frames_over(record, old, part)
+    take_out(old, list(part.keyframes), anchor)
+    record.atlas.add(part)

@@ -42,7 +42,7 @@ class Mover:
         covariances: EdgeCovariances,
         new_graph: Callable[[], SubmapGraph],
         front_ends: Callable[[], Iterable[VisualOdometry]],
-        forget_graph: Callable[[int], None],
+        forget_graph: Callable[[int], None] | None,
     ) -> None:
         self._record = record
         self._solver = solver
@@ -108,7 +108,8 @@ class Mover:
             if refits:
                 self._refit(m, np.arange(len(submap.landmarks)))
             self._covariances.bent(submap, warp)
-            self._forget_graph(m)
+            if self._forget_graph is not None:
+                self._forget_graph(m)
         for i, (link, attached) in enumerate(zip(atlas.links, ends, strict=True)):
             if link.a in warps or link.b in warps:
                 atlas.links[i] = bend_link(link, attached, warps)

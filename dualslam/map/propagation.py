@@ -71,6 +71,30 @@ def _propagate(
     return keyframe_ids[a], T_a @ se3.exp(share[:, None] * gap)
 
 
+def follow_keyframes(
+    S_a_b: FloatArray,
+    covariance: FloatArray,
+    then: tuple[FloatArray, FloatArray],
+    now: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Return a similarity between two submaps, and its covariance, as a keyframe of each has moved.
+
+    What holds is how the two keyframes lie to each other.
+
+    Parameters
+    ----------
+    S_a_b : (4, 4)
+    covariance : (7, 7)
+        In the frame of b.
+    then, now : ((4, 4), (4, 4))
+        Poses of the keyframes, that of a first, in their submaps.
+    """
+    (a_then, b_then), (a_now, b_now) = then, now
+    S = a_now @ se3.inverse(a_then) @ S_a_b @ b_then @ se3.inverse(b_now)
+    Ad = sim3.adjoint(b_now @ se3.inverse(b_then))
+    return S, Ad @ covariance @ Ad.T
+
+
 def propagate_links(atlas: Atlas, before: Submap, after: Submap) -> None:
     """Let the links of a submap follow a change of it, each as the keyframes moved that it stands on there."""
     for i, link in enumerate(atlas.links):

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure, FloatArray
+from dualslam.map.propagation import follow_keyframes
 from dualslam.map.submap import Submap
 from dualslam.places.recogniser import PlaceCandidate
 from dualslam.places.verification import PlaceMatch, PlaceVerifier
@@ -59,16 +59,12 @@ def follow_maps(
 ) -> PlaceMatch | None:
     """Return a match between submaps as they are now, which have been solved again since it was made.
 
-    What holds is how the two keyframes lie to each other. None where one of them is no more. `then`: their poses when
-    the match was made.
+    None where one of its keyframes is no more. `then`: their poses when the match was made.
     """
     now = poses_of(match, submaps)
     if now is None:
         return None
     if all(np.array_equal(a, b) for a, b in zip(now, then, strict=True)):
         return match
-    (place_now, query_now), (place_then, query_then) = now, then
-    S = place_now @ se3.inverse(place_then) @ match.S_place_query @ query_then @ se3.inverse(query_now)
-    # Of the covariance, which is in the query's frame, the same motion.
-    Ad = sim3.adjoint(query_now @ se3.inverse(query_then))
-    return replace(match, S_place_query=S, covariance=Ad @ match.covariance @ Ad.T)
+    S, covariance = follow_keyframes(match.S_place_query, match.covariance, then, now)
+    return replace(match, S_place_query=S, covariance=covariance)

@@ -16,10 +16,10 @@ from dualslam.config.settings import LinkingConfig
 from dualslam.core.events import EventKind
 from dualslam.core.types import IntArray
 from dualslam.map.atlas import Atlas
-from dualslam.map.endings import hand_frames_over
+from dualslam.map.endings import part_off
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.residual_noise import noise_excess
-from dualslam.map.split import submap_of, take_out
+from dualslam.map.split import submap_of
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking.scale_observability import N_AROUND, answer_scale
 from dualslam.recovery.scale_watch import FIRM_TIES, GROUP, SCALE_INFLATION, count_ties, lost_from, question_about
@@ -149,9 +149,7 @@ def _is_held(atlas: Atlas, submap_id: int, beyond: IntArray) -> bool:
 def _part_off(record: Record, submap: Submap, rest: list[int], anchor: int, sigma: float, now: FrameStamp) -> None:
     """Make the keyframes at one end of a map, and the frames that hang on them, a submap of their own."""
     part = submap_of(submap, len(record.atlas.submaps), rest)
-    hand_frames_over(record, submap, part)
-    take_out(submap, rest, anchor)
-    record.atlas.add(part)
+    part_off(record, submap, part, anchor)
     frames = sorted(pose.index for pose in record.own_poses() if pose.submap_id == part.id)
     told = {"reason": "scale_lost", "sigma_scale": sigma, "old_submap": part.id, "reposed": 0, "left": frames}
     record.event(EventKind.CUT, now, submap.id, **told)

@@ -12,9 +12,9 @@ from dualslam.core.types import Failure, FailureReason, View
 from dualslam.health import count_signs
 from dualslam.map.atlas import Link
 from dualslam.map.connections import Connections
-from dualslam.map.endings import archive, hand_frames_over
+from dualslam.map.endings import archive, part_off
 from dualslam.map.record import FrameStamp
-from dualslam.map.split import next_submap, submap_of, take_out
+from dualslam.map.split import next_submap, submap_of
 from dualslam.map.submap import Submap
 from dualslam.places.sightings import Sightings
 from dualslam.recovery.bypass import drop_corrupted
@@ -138,9 +138,7 @@ class Endings:
             sigma_scale=loss.sigma,
         )
         self.archive(live, "scale lost")
-        hand_frames_over(record, old, submap)
-        take_out(old, rest, max(old.keyframes.keys() - submap.keyframes.keys()))
-        record.atlas.add(submap)
+        part_off(record, old, submap, max(old.keyframes.keys() - submap.keyframes.keys()))
         n = int(submap.landmarks["alive"].sum())
         record.event(EventKind.REINITIALISED, view, submap.id, first_view=loss.first, n_points=float(n))
         state.live = state.parts.new_odometry(submap, graph)

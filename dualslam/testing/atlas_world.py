@@ -15,16 +15,15 @@ from dualslam.config.settings import GraphConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import BoolArray, FloatArray, FrameStatus, Keyframe
 from dualslam.map.atlas import Atlas, Link, LinkKind
-from dualslam.map.atlas_beside import answer_atlas
+from dualslam.map.atlas_beside import atlas_handlers
 from dualslam.map.connections import Connections
-from dualslam.map.edge_covariances import answer_edges
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.record import Record
 from dualslam.map.split import next_submap
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose, compose
 from dualslam.testing.point_world import CAMERA, SIZE_PX, make_features
-from dualslam.workers.jobs import InlineDesk, JobKind
+from dualslam.workers.jobs import InlineDesk
 
 N_SHARED = 8
 LINK_SIGMAS = np.array([2e-3] * 3 + [5e-3] * 3 + [5e-3])
@@ -75,12 +74,7 @@ class DriftingMap:
             solver,
             lambda: ISam2SubmapGraph(GraphConfig()),
             bundle_adjust_arrays,
-            InlineDesk(
-                {
-                    JobKind.EDGES: lambda question: answer_edges(question, solver.edge_covariances),
-                    JobKind.ATLAS: lambda question: answer_atlas(question, solver.solve),
-                }
-            ),
+            InlineDesk(atlas_handlers(solver)),
             lambda: self.front_ends,
         )
         self.front_ends: list[Any] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -25,6 +26,16 @@ ROLLING = {"graph": {"max_keyframes": 25, "rollover_keyframes": 6}}
 @cache
 def closed_lap() -> System:
     return run(lap())
+
+
+def late_lap(part: str, polls: int) -> System:
+    """The lap, not yet at its end, where what a part of the system asks for comes after so many polls."""
+    world = lap()
+    system = system_in(world)
+    attrgetter(part)(system)._desk = LateDesk(system._state.parts.desk, polls)
+    for frame in world.frames():
+        system.step(frame)
+    return system
 
 
 def errors(system: System) -> FloatArray:
@@ -183,11 +194,7 @@ def test_a_loop_whose_solution_comes_late_is_closed_when_it_has_come(polls: int,
 
 
 def test_a_loop_that_is_being_solved_when_the_run_ends_is_closed_then() -> None:
-    world = lap()
-    system = system_in(world)
-    system._connections._desk = LateDesk(system._state.parts.desk, 100_000)
-    for frame in world.frames():
-        system.step(frame)
+    system = late_lap("_connections", 100_000)
     assert not system.atlas.links
     system.finish()
     assert [link.kind for link in system.atlas.believed] == [LinkKind.LOOP]
@@ -196,11 +203,7 @@ def test_a_loop_that_is_being_solved_when_the_run_ends_is_closed_then() -> None:
 
 def test_without_a_clock_no_search_is_left_out_for_one_that_takes_long() -> None:
     """A film whose frames come faster than places are searched for loses no loop."""
-    world = lap()
-    system = system_in(world)
-    system._revisits._desk = LateDesk(system._state.parts.desk, 150)
-    for frame in world.frames():
-        system.step(frame)
+    system = late_lap("_revisits", 150)
     system.finish()
     first, loop = (each.events.of_kind(EventKind.LOOP_CLOSED)[0] for each in (closed_lap(), system))
     assert (loop.data["keyframe"], loop.data["other_frame"]) == (first.data["keyframe"], first.data["other_frame"])
@@ -234,11 +237,7 @@ def test_a_worker_that_dies_over_a_search_costs_that_search_alone() -> None:
 
 
 def test_a_loop_that_still_waits_when_the_run_ends_is_closed_then() -> None:
-    world = lap()
-    system = system_in(world)
-    system._connections._covariances._desk = LateDesk(system._state.parts.desk, 100_000)
-    for frame in world.frames():
-        system.step(frame)
+    system = late_lap("_connections._covariances", 100_000)
     assert not system.atlas.links
     system.finish()
     assert [link.kind for link in system.atlas.believed] == [LinkKind.LOOP]
