@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 
 from dualslam.backend.atlas_solver import GtsamAtlasSolver
 from dualslam.backend.local_ba import bundle_adjust, bundle_adjust_arrays
 from dualslam.backend.self_calibration import estimate_calibration
+from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.backend.window import NumpyWindowSolver
 from dualslam.calibration.lens import Calibration
 from dualslam.config.settings import Config
@@ -25,6 +26,11 @@ from dualslam.places import FaissRecogniser, PlaceVerifier
 from dualslam.places.sightings import PlaceParts
 
 ADJUST_ITERATIONS = 20
+
+
+def graph_maker(config: Config) -> Callable[[], ISam2SubmapGraph]:
+    """Build what makes the factor graph of a submap, each time anew."""
+    return partial(ISam2SubmapGraph, config.graph)
 
 
 def new_initialiser(config: Config, frontend: Frontend, size_px: tuple[int, int], K: FloatArray) -> Initialiser:

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
-from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.build.checks import check_config, check_given
 from dualslam.build.parts import (
     atlas_solver,
     bundle_adjuster,
+    graph_maker,
     new_calibration,
     new_initialiser,
     place_parts,
@@ -87,7 +87,7 @@ def build_system(
     check_given(camera, saved)
     if new_graph is not None and config.recovery.workers:
         raise InputError("new_graph: a graph of one's own cannot go into other processes; set recovery.workers to 0.")
-    new_graph = new_graph or partial(ISam2SubmapGraph, config.graph)
+    new_graph = new_graph or graph_maker(config)
     frontend = create_frontend(config.frontend)
     known = camera if saved is None else _camera_of(saved, camera)
     is_known = saved is not None and known is saved.camera

@@ -9,9 +9,8 @@ from functools import partial
 import numpy as np
 
 from dualslam.backend.self_calibration import find_preferred_camera
-from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.build.checks import auxiliary_config, naming_attempt
-from dualslam.build.parts import bundle_adjuster, window_solver
+from dualslam.build.parts import bundle_adjuster, graph_maker, window_solver
 from dualslam.config.settings import AttemptConfig, Config
 from dualslam.core.camera.base import Camera
 from dualslam.core.estimates import PreferredCamera
@@ -74,7 +73,7 @@ def recovery_parts(
     return RecoveryParts(
         attempts=_attempts(config, frontend, live, camera, n_threads),
         posing=Attempt("live", live),
-        new_graph=new_graph or partial(ISam2SubmapGraph, config.graph),
+        new_graph=new_graph or graph_maker(config),
         link=lambda old, new, onset: estimate_link(
             old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
         ),

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.build.parts import atlas_solver, new_calibration, new_initialiser, place_parts
+from dualslam.build.parts import atlas_solver, graph_maker, new_calibration, new_initialiser, place_parts
 from dualslam.build.walks import FEATURE_THREADS, recovery_parts
 from dualslam.calibration.lens import CalibrationAnswer, CalibrationJob, answer
 from dualslam.config.settings import Config, FrontendConfig
@@ -40,12 +39,11 @@ GRAPH_NICENESS, WALK_NICENESS = 3, 8
 where cores are short."""
 
 
-def calibration_handlers(config: Config, new_graph: Callable[[], SubmapGraph] | None = None) -> Handlers:
-    """Build what answers questions about the camera; `new_graph`: instead of `ISam2SubmapGraph`."""
+def calibration_handlers(config: Config, new_graph: Callable[[], SubmapGraph]) -> Handlers:
+    """Build what answers questions about the camera."""
 
     def answered(job: CalibrationJob) -> CalibrationAnswer | Failure:
-        calibration = new_calibration(config, job.camera, job.covariance)
-        return answer(job, calibration, new_graph or partial(ISam2SubmapGraph, config.graph))
+        return answer(job, new_calibration(config, job.camera, job.covariance), new_graph)
 
     return {JobKind.CALIBRATION: answered}
 
@@ -72,7 +70,7 @@ def inline_handlers(config: Config, verifier: PlaceVerifier, new_graph: Callable
 
 def graph_handlers(config: Config) -> Handlers:
     """Build what keeps and solves the graphs of submaps."""
-    return {JobKind.GRAPH: GraphServer(lambda: ISam2SubmapGraph(config.graph))}
+    return {JobKind.GRAPH: GraphServer(graph_maker(config))}
 
 
 def map_handlers(config: Config, size_px: tuple[int, int]) -> Handlers:
@@ -95,7 +93,7 @@ def walk_handlers(config: Config, camera: Camera, n_threads: int) -> Handlers:
         **atlas_handlers(atlas_solver(config)),
         **SCALE_HANDLERS,
         **READOUT_HANDLERS,
-        **calibration_handlers(config),
+        **calibration_handlers(config, graph_maker(config)),
         **place_handlers(verifier),
     }
 
