@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-EXIT_INTERRUPTED = 130
+from dualslam import exit_status
 
 
 def main() -> int:
@@ -15,7 +15,7 @@ def main() -> int:
         return command()
     except KeyboardInterrupt:
         sys.stderr.write("dualslam: interrupted\n")
-        return EXIT_INTERRUPTED
+        return exit_status.INTERRUPTED
 
 
 if __name__ == "__main__":

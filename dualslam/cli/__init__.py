@@ -1,8 +1,4 @@
-"""The command line (`dualslam run`, `eval`, `bench`, `render`, ...): it only words what the Python interface does.
-
-Exit status: 0 done, 1 no map could be made (or standard output not be written, or a bug of ours), 2 bad usage or bad
-input, 130 interrupted.
-"""
+"""The command line (`dualslam run`, `eval`, `bench`, `render`, ...): it only words what the Python interface does."""
 
 from __future__ import annotations
 
@@ -12,14 +8,13 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
+from dualslam import exit_status
 from dualslam.cli import logs
 from dualslam.cli.parser import parse
 from dualslam.cli.streams import lenient
 from dualslam.core.errors import ConfigError, DualSlamError, FrontendError, InputError, OutputError
 from dualslam.core.memory import keep_freed_memory
 from dualslam.core.threads import limit_threads
-
-EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,14 +27,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         out.flush()
         if out.problem is None or isinstance(out.problem, BrokenPipeError):  # `dualslam config | head` has enough
             return status
-        return _say(f"standard output cannot be written: {out.problem.strerror}", status or EXIT_FAILED)
+        return _say(f"standard output cannot be written: {out.problem.strerror}", status or exit_status.FAILED)
 
 
 def _run(arguments: list[str]) -> int:
     try:
         args = parse(arguments)
     except SystemExit as end:  # argparse has said what was wrong, or shown the help that was asked for
-        return end.code if isinstance(end.code, int) else EXIT_BAD_INPUT
+        return end.code if isinstance(end.code, int) else exit_status.BAD_INPUT
     logs.set_up(args.verbose, args.quiet)
     try:
         status = int(args.execute(args))
@@ -47,13 +42,13 @@ def _run(arguments: list[str]) -> int:
         return status
     except (ConfigError, InputError, OutputError, FrontendError) as error:
         logs.discard()
-        return _say(error, EXIT_BAD_INPUT)
+        return _say(error, exit_status.BAD_INPUT)
     except DualSlamError as error:
-        return _say(error, EXIT_FAILED)
+        return _say(error, exit_status.FAILED)
     except KeyboardInterrupt as stop:
-        return _say(". ".join(["interrupted", *getattr(stop, "__notes__", ())]), EXIT_INTERRUPTED)
+        return _say(". ".join(["interrupted", *getattr(stop, "__notes__", ())]), exit_status.INTERRUPTED)
     except Exception as error:  # the last resort: a bug must not reach the user as a stack trace
-        return _say(_report_bug(error, arguments, getattr(args, "out", None)), EXIT_FAILED)
+        return _say(_report_bug(error, arguments, getattr(args, "out", None)), exit_status.FAILED)
 
 
 def _say(sentence: object, status: int) -> int:

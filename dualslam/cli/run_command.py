@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from dualslam import exit_status
 from dualslam.build import check_config, fault_of_frontend
 from dualslam.cli import logs
 from dualslam.cli.configuration import config_of, naming_source
@@ -28,7 +29,6 @@ log = logging.getLogger(__name__)
 
 PAGE = "live_map.html"
 """In the run folder: the map as it stood when a person saved it in the live view."""
-EXIT_DONE, EXIT_NO_MAP, EXIT_INTERRUPTED = 0, 1, 130
 
 
 def execute(args: argparse.Namespace) -> int:
@@ -152,5 +152,5 @@ def conclude(outcome: Outcome, args: argparse.Namespace) -> int:
     if not args.quiet:
         print(final_line(outcome), flush=True)
     if outcome.report.interrupted:
-        return EXIT_INTERRUPTED
-    return EXIT_DONE if outcome.has_map else EXIT_NO_MAP
+        return exit_status.INTERRUPTED
+    return exit_status.DONE if outcome.has_map else exit_status.FAILED
