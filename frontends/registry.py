@@ -10,9 +10,9 @@ from typing import Any, Protocol, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from dualslam.config.problems import nearest_of, written
+from dualslam.config.problems import nearest_of
 from dualslam.config.settings import FrontendConfig
-from dualslam.core.errors import ConfigError
+from dualslam.core.errors import ConfigError, written
 from dualslam.core.interfaces import Frontend
 
 ENTRY_POINT_GROUP = "dualslam.frontends"
@@ -35,6 +35,9 @@ EXTRA_OPTIONS: Mapping[str, str] = {"kornia": "dualslam.frontends.features.korni
 FOR_WALKS = ("extract", "match_wide")
 FOR_MAPS = (*FOR_WALKS, "distance", "scale_factor", "n_octaves", "max_distance", "max_distance_strict")
 """What a front end must have: to pose the frames of reverse tracking as a further attempt, and to make maps."""
+
+NAME, OPTIONS = ("frontend", "name"), ("frontend", "options")
+"""Fields of the config: what a mistake is about."""
 
 OptionsT = TypeVar("OptionsT", bound=BaseModel)
 
@@ -66,7 +69,7 @@ def create_frontend(config: FrontendConfig, needs: Iterable[str] = FOR_MAPS) -> 
     frontend = _factory(config.name).from_options(config.n_features, config.options)
     lacking = [name for name in needs if not hasattr(frontend, name)]
     if lacking:
-        raise ConfigError(f"frontend.name: '{config.name}' is no front end: it has no {', '.join(lacking)}")
+        raise ConfigError(f"'{config.name}' is no front end: it has no {', '.join(lacking)}", NAME)
     return frontend
 
 
@@ -107,21 +110,21 @@ def parse_options(model: type[OptionsT], frontend: str, options: Mapping[str, An
     Raises
     ------
     ConfigError
-        Names each offending option and lists those that exist.
+        Of the first offending option; it tells the others too, and lists those that exist.
     """
     try:
         # By way of JSON, as the rest of the config: strict about types there, yet lists become tuples.
         return model.model_validate_json(json.dumps(dict(options)), strict=True)
     except ValidationError as error:
-        problems = "; ".join(
-            f"frontend.options.{written(each['loc']) or '*'}: "
-            f"{'there is no such option' if each['type'] == 'extra_forbidden' else each['msg']}"
+        (option, problem), *others = (
+            (each["loc"], "there is no such option" if each["type"] == "extra_forbidden" else each["msg"])
             for each in error.errors()
         )
+        problem += "".join(f"; {written(other)}: {of_it}" for other, of_it in others)
         known = ", ".join(model.model_fields)
-        raise ConfigError(f"front end '{frontend}': {problems} (its options: {known})") from error
+        raise ConfigError(f"{problem} (front end '{frontend}'; its options: {known})", (*OPTIONS, *option)) from error
     except TypeError as error:
-        raise ConfigError(f"front end '{frontend}': frontend.options holds what YAML cannot: {error}") from error
+        raise ConfigError(f"front end '{frontend}' is given what YAML cannot hold: {error}", OPTIONS) from error
 
 
 def _factory(name: str) -> FrontendFactory:
@@ -131,9 +134,9 @@ def _factory(name: str) -> FrontendFactory:
     except (ImportError, AttributeError, ValueError, SyntaxError) as error:
         missing_extra = isinstance(error, ModuleNotFoundError) and name in EXTRAS
         advice = f'; pip install -e ".[{EXTRAS[name]}]" in the checkout' if missing_extra else ""
-        raise ConfigError(f"frontend.name: '{name}' cannot be imported: {error}{advice}") from error
+        raise ConfigError(f"'{name}' cannot be imported: {error}{advice}", NAME) from error
     if not callable(getattr(found, "from_options", None)):
-        raise ConfigError(f"frontend.name: '{name}' is no front end: it has no from_options")
+        raise ConfigError(f"'{name}' is no front end: it has no from_options", NAME)
     factory: FrontendFactory = found
     return factory
 
@@ -142,11 +145,9 @@ def _import(name: str) -> Any:
     if name in BUILT_IN or ":" in name:
         module, _, attribute = BUILT_IN.get(name, name).partition(":")
         if not all(part.isidentifier() for part in (*module.split("."), attribute)):
-            raise ConfigError(f"frontend.name: '{name}' is not of the form module:Class")
+            raise ConfigError(f"'{name}' is not of the form module:Class", NAME)
         return getattr(importlib.import_module(module), attribute)
     for entry in entry_points(group=ENTRY_POINT_GROUP, name=name):
         return entry.load()
     known = known_frontends()
-    raise ConfigError(
-        f"frontend.name: no front end is called '{name}'{nearest_of(name, known)}; known: {', '.join(known)}"
-    )
+    raise ConfigError(f"no front end is called '{name}'{nearest_of(name, known)}; known: {', '.join(known)}", NAME)

@@ -71,6 +71,6 @@ def naming_attempt(number: int) -> Iterator[None]:
     try:
         yield
     except ConfigError as error:
-        where = f"recovery.attempts[{number}]"
-        named = str(error).replace("frontend.options", f"{where}.options").replace("frontend.name", f"{where}.frontend")
-        raise ConfigError(named if where in named else f"{where}: {named}") from error
+        place = error.field[1:]  # in the section `frontend`
+        inside = ("frontend",) if place == ("name",) else place
+        raise ConfigError(error.problem, ("recovery", "attempts", number, *inside)) from error

@@ -57,7 +57,8 @@ def naming_source(args: argparse.Namespace) -> Iterator[None]:
     try:
         yield
     except ConfigError as error:
-        source = next((o.source for o in reversed(args.overrides) if ".".join(o.path) in str(error)), args.config)
+        setting = (o.source for o in reversed(args.overrides) if error.field and o.sets(error.field))
+        source = next(setting, args.config)
         raise ConfigError(str(error) if source is None else f"{source}: {error}") from error
 
 

@@ -36,6 +36,10 @@ class Override:
     value: Any
     source: str
 
+    def sets(self, field: tuple[str | int, ...]) -> bool:
+        """Whether it sets a field, a part of it, or what it is a part of."""
+        return self.path[: len(field)] == field[: len(self.path)]
+
     @classmethod
     def parse(cls, text: str) -> Override:
         """Read ``key.path=value``, the value as YAML (``true``, ``null``, ``1e-3``, ``[1, 2]``, a word).
@@ -152,7 +156,7 @@ def _validate(data: dict[str, Any], source: str, overrides: list[Override], mode
     except ValidationError as error:
         path = tuple(error.errors(include_url=False)[0]["loc"])
         for override in overrides:
-            if override.path[: len(path)] == path or path[: len(override.path)] == override.path:
+            if override.sets(path):
                 source = override.source
         raise ConfigError(f"{source}: {sentence(error, model)}") from error
     except TypeError as error:

@@ -11,6 +11,7 @@ from typing import Any, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from dualslam.config.former import RENAMED, what_became_of
+from dualslam.core.errors import written
 
 _PLAIN_WORDS = {
     "must be an object": "must be a mapping of fields",
@@ -38,11 +39,6 @@ def sentence(error: ValidationError, root: type[BaseModel]) -> str:
     problems = error.errors(include_url=False)
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     return _of_one(problems[0], tuple(problems[0]["loc"]), root) + more
-
-
-def written(path: Iterable[str | int]) -> str:
-    """Return the path to a field as it is told: ``recovery.attempts[1].frontend``."""
-    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).removeprefix(".")
 
 
 def nearest_of(word: str, known: Iterable[str]) -> str:

@@ -2,13 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 
 class DualSlamError(Exception):
     """Base of every error that dualslam raises on purpose. Its message says what was wrong, where, and what to do."""
 
 
 class ConfigError(DualSlamError):
-    """A configuration file, `--set` override or config object is not valid. Names the field."""
+    """A configuration file, `--set` override or config object is not valid. Names the field.
+
+    Attributes
+    ----------
+    problem : str
+        What is wrong.
+    field : tuple of str or int
+        Path to the field, which the message then begins with; empty where it is of no single one, or where `problem`
+        says it.
+    """
+
+    def __init__(self, problem: str, field: tuple[str | int, ...] = ()) -> None:
+        super().__init__(problem, field)
+        self.problem = problem
+        self.field = field
+
+    def __str__(self) -> str:
+        return f"{written(self.field)}: {self.problem}" if self.field else self.problem
 
 
 class InputError(DualSlamError):
@@ -29,3 +48,8 @@ class FrontendError(DualSlamError):
 
 class SolverError(DualSlamError):
     """The factor graph cannot be solved, and could not be rebuilt either. Names the graph and the variable."""
+
+
+def written(path: Iterable[str | int]) -> str:
+    """Return the path to a field of the configuration as it is told: ``recovery.attempts[1].frontend``."""
+    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).removeprefix(".")

@@ -168,8 +168,8 @@ def nearest_search(frontend: Frontend) -> NearestSearch:
     """
     if not isinstance(frontend, NearestSearch):
         raise ConfigError(
-            f"initialiser.matching: gms takes a front end with binary descriptors, as orb, which '{frontend.name}' "
-            "is not; choose ratio"
+            f"gms takes a front end with binary descriptors, as orb, which '{frontend.name}' is not; choose ratio",
+            ("initialiser", "matching"),
         )
     return frontend
 

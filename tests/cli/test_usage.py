@@ -66,7 +66,14 @@ def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
         ("config --seed 18446744073709551616", "seed must be less than or equal to 18446744073709551615"),
         ("config --frontend sift9", "no front end is called 'sift9'"),
         ("config --frontend os:path", "--frontend os:path: frontend.name: 'os:path' is no front end"),
-        ("config --set frontend.options.octaves=8", "frontend.options.octaves: there is no such option"),
+        (
+            "config --set frontend.options.octaves=8",
+            "--set frontend.options.octaves=8: frontend.options.octaves: there is no such option",
+        ),
+        (
+            'config --set recovery.attempts=[{"frontend":"sift","options":{"ratios":1}}]',
+            ": recovery.attempts[0].options.ratios: there is no such option",
+        ),
         ("config --set recovery.attempts=[live,sift9]", "recovery.attempts[1].frontend: no front end is called"),
         ("config --frontend sift --set initialiser.matching=gms", "initialiser.matching: gms takes a front end with"),
         ("config --frontend obr", "--frontend obr: frontend.name: no front end is called 'obr', did you mean 'orb'?"),

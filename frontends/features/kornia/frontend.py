@@ -148,8 +148,8 @@ def choose_device(name: str) -> torch.device:
     """
     if name == "cuda" and not torch.cuda.is_available():
         raise ConfigError(
-            f"frontend.options.device: torch {torch.__version__} sees no CUDA device: install a torch built for CUDA, "
-            "or choose cpu or auto"
+            f"torch {torch.__version__} sees no CUDA device: install a torch built for CUDA, or choose cpu or auto",
+            ("frontend", "options", "device"),
         )
     device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
     if device.type == "cuda":  # read when cuBLAS starts: without it the sums of a product may change their order

@@ -46,8 +46,7 @@ class LightGlueMatcher:
         for layer in range(self._model.conf.n_layers):
             for block in ("self_attn", "cross_attn"):
                 rename[f"{block}.{layer}."] = f"transformers.{layer}.{block}."
-        field = "frontend.options.matcher_weights"
-        LIGHTGLUE[options.detector].load(field, options.matcher_weights, self._model, rename)
+        LIGHTGLUE[options.detector].load("matcher_weights", options.matcher_weights, self._model, rename)
         self._model.to(device)
 
     def __call__(self, a: Features, b: Features, of_a: torch.Tensor, of_b: torch.Tensor) -> IntArray:

@@ -11,7 +11,7 @@ import torch
 from dualslam.core.types import FloatArray
 from dualslam.frontends.features.kornia.weights import DETECTOR
 
-FIELD = "frontend.options.weights"
+OPTION = "weights"
 
 
 class Network:
@@ -30,7 +30,7 @@ class Network:
     def __init__(self, name: str, n_candidates: int, device: torch.device, weights: Path | None) -> None:
         self._name = name
         self._n = n_candidates
-        DETECTOR[name].find(FIELD, weights)  # before the network is made, which takes seconds
+        DETECTOR[name].find(OPTION, weights)  # before the network is made, which takes seconds
         self._model: Any
         if name == "xfeat":
             self._model = kf.XFeat(top_k=n_candidates)
@@ -38,7 +38,7 @@ class Network:
             self._model = kf.ALIKED("aliked-n16", max_num_keypoints=n_candidates)
         else:
             self._model = kf.DISK()
-        DETECTOR[name].load(FIELD, weights, self._model.net if name == "xfeat" else self._model)
+        DETECTOR[name].load(OPTION, weights, self._model.net if name == "xfeat" else self._model)
         self._model.eval().to(device)
 
     def __call__(self, image: torch.Tensor) -> tuple[FloatArray, FloatArray, torch.Tensor]:

@@ -34,31 +34,32 @@ class Checkpoint:
     url: str
     key: str = ""
 
-    def find(self, field: str, path: Path | None) -> Path:
+    def find(self, option: str, path: Path | None) -> Path:
         """Return the file: `path`, or the one of this name in that folder; None: in torch's cache.
 
         Raises
         ------
         ConfigError
-            It is not there: the message says where it was sought and where it is published. `field` is the option.
+            It is not there: the message says where it was sought and where it is published. `option` names it.
         """
         folder = Path(torch.hub.get_dir()) / "checkpoints" if path is None else path
         file = folder / self.file if path is None or path.is_dir() else path
         if not file.is_file():
             raise ConfigError(
-                f"{field}: {file} is not there. Nothing is downloaded: {self.part} is published at {self.url}; put "
-                "it there, or name the file by this option"
+                f"{file} is not there. Nothing is downloaded: {self.part} is published at {self.url}; put it there, or "
+                "name the file by this option",
+                _field(option),
             )
         return file
 
     def load(
-        self, field: str, path: Path | None, module: torch.nn.Module, rename: Mapping[str, str] | None = None
+        self, option: str, path: Path | None, module: torch.nn.Module, rename: Mapping[str, str] | None = None
     ) -> None:
         """Find the file and put it into a module, which is then ready to be used.
 
         Parameters
         ----------
-        field, path
+        option, path
             See `find`.
         module : torch.nn.Module
         rename : mapping, optional
@@ -69,35 +70,42 @@ class Checkpoint:
         ConfigError
             It is not there, cannot be read, or does not fit.
         """
-        file = self.find(field, path)
-        state = self._read(field, file)
+        file = self.find(option, path)
+        state = self._read(option, file)
         for old, new in (rename or {}).items():
             state = {new + name[len(old) :] if name.startswith(old) else name: each for name, each in state.items()}
-        misfit = f"{field}: {file} does not fit {self.part}"
+        misfit = f"{file} does not fit {self.part}"
         try:
             missing = module.load_state_dict(state, strict=False).missing_keys
         except RuntimeError as error:
             # torch's text: a heading, then a line for each tensor of another shape.
-            raise ConfigError(f"{misfit}: {str(error).splitlines()[-1].strip()}") from error
+            raise ConfigError(f"{misfit}: {str(error).splitlines()[-1].strip()}", _field(option)) from error
         # What a module derives from its options (thresholds, fixed filters) is not in every publisher's file.
         learned = {name for name, _ in module.named_parameters()}
         absent = [name for name in missing if name in learned or name.endswith(("running_mean", "running_var"))]
         if absent:
-            raise ConfigError(f"{misfit}: {len(absent)} of its {len(learned)} tensors are missing, first {absent[0]}")
+            missed = f"{len(absent)} of its {len(learned)} tensors are missing, first {absent[0]}"
+            raise ConfigError(f"{misfit}: {missed}", _field(option))
         module.eval()
 
-    def _read(self, field: str, file: Path) -> dict[str, Any]:
+    def _read(self, option: str, file: Path) -> dict[str, Any]:
         """Read the state from a file, bare or as it is published."""
         try:
             content = torch.load(file, map_location="cpu", weights_only=True)
         except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
             reason = str(error).strip().splitlines() or [type(error).__name__]
-            raise ConfigError(f"{field}: {file} cannot be read as a checkpoint of torch: {reason[0]}") from error
+            problem = f"{file} cannot be read as a checkpoint of torch: {reason[0]}"
+            raise ConfigError(problem, _field(option)) from error
         if isinstance(content, dict) and isinstance(content.get(self.key), dict):
             content = content[self.key]
         if not isinstance(content, dict) or not all(isinstance(name, str) for name in content):
-            raise ConfigError(f"{field}: {file} holds no named tensors, so it is no checkpoint of {self.part}")
+            problem = f"{file} holds no named tensors, so it is no checkpoint of {self.part}"
+            raise ConfigError(problem, _field(option))
         return content
+
+
+def _field(option: str) -> tuple[str, ...]:
+    return ("frontend", "options", option)
 
 
 _HUB = "https://huggingface.co/kornia"
