@@ -117,10 +117,8 @@ def estimate_link(
     # 2. Which keyframes may be trusted: those older than what is suspected, by others or by a discontinuity in the old
     #    map. The new map must be one piece there (but for its newest keyframe, the oldest, which may hang by
     #    little yet).
-    discontinuities_old = find_discontinuities(
-        old, _look_back(old, int(pairs.keyframes[0]), config), max(old.keyframes), config
-    )
-    discontinuities_new = find_discontinuities(new, int(pairs.keyframes[0]), int(pairs.keyframes[-1]), config)
+    discontinuities_old = find_discontinuities(old, _look_back(old, int(pairs.keyframes[0])), max(old.keyframes))
+    discontinuities_new = find_discontinuities(new, int(pairs.keyframes[0]), int(pairs.keyframes[-1]))
     onset = min([*discontinuities_old.tolist(), *([] if suspected_onset is None else [suspected_onset])], default=None)
     trusted = pairs.count_by_keyframe(np.ones(len(pairs.view_pair), bool)) >= MIN_PAIRS_PER_KEYFRAME
     if onset is not None:
@@ -210,7 +208,7 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
     newer = later.can_vote & (all_pairs.keyframes > agreeing[-1])
     parted = all_pairs.keyframes[newer & ~later.agrees & (all_pairs.keyframes < (np.inf if onset is None else onset))]
     if len(parted) >= config.min_keyframes:
-        refused = verify.check_parting(whole, consensus.estimate.S_dst_src, old, new, agreeing, parted, config)
+        refused = verify.check_parting(whole, consensus.estimate.S_dst_src, old, new, agreeing, parted)
         if refused is not None:
             return refused
     # How far the maps' shapes differ beyond it: that is part of what is not known.
@@ -246,7 +244,7 @@ class _Consensus:
         return float(self.inliers.sum() / self.seen.sum())
 
 
-def _look_back(old: Submap, keyframe_id: int, config: LinkingConfig) -> int:
+def _look_back(old: Submap, keyframe_id: int) -> int:
     """Return the id of the keyframe that stands `LOOK_BACK` before one of the old map's."""
     ids = sorted(old.keyframes)
     return ids[max(ids.index(keyframe_id) - LOOK_BACK, 0)]
@@ -336,9 +334,9 @@ def _verify(
         return Failure(FailureReason.AGREEMENT, f"{n_agreeing} keyframes agree, {config.min_keyframes} needed")
     views = keyframes[model.pairs.view_keyframe]
     refusals = (
-        verify.check_own_pixels(model, views, config),
-        verify.check_reprojection(model, S, views, config),
-        verify.check_spread(model, old, inliers, keyframes, config),
+        verify.check_own_pixels(model, views),
+        verify.check_reprojection(model, S, views),
+        verify.check_spread(model, old, inliers, keyframes),
         verify.check_sigmas(model, S, covariance, config),
         verify.check_shape(shape, config),
     )

@@ -96,7 +96,7 @@ def leading_run(agrees: BoolArray, max_misfits: int) -> int:
     return end
 
 
-def find_discontinuities(submap: Submap, oldest: int, newest: int, config: LinkingConfig) -> IntArray:
+def find_discontinuities(submap: Submap, oldest: int, newest: int) -> IntArray:
     """Return the ids of the keyframes before which a map is torn, ascending: its parts there are not held together.
 
     A wrong pose either ends the tracks, or leaves their observations wrong on one side of it. So a place between two
@@ -109,7 +109,6 @@ def find_discontinuities(submap: Submap, oldest: int, newest: int, config: Linki
     submap : Submap
     oldest, newest : int
         Keyframe ids; the places after `oldest` up to before `newest` are searched.
-    config : LinkingConfig
     """
     w = TIE_WINDOW
     ids = np.array(sorted(submap.keyframes))

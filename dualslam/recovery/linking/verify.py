@@ -23,7 +23,7 @@ from dualslam.recovery.linking.scale_observability import scale_sigma_between
 from dualslam.recovery.linking.shape import Shape
 
 
-def check_own_pixels(model: PairModel, views: BoolArray, config: LinkingConfig) -> Failure | None:
+def check_own_pixels(model: PairModel, views: BoolArray) -> Failure | None:
     """Refuse where either map's points do not lie on that map's own pixels: mirrored or bent copies give way here."""
     in_old, in_new = model.own_reprojection2()
     for name, chi2 in (("old", in_old), ("new", in_new)):
@@ -34,9 +34,7 @@ def check_own_pixels(model: PairModel, views: BoolArray, config: LinkingConfig) 
     return None
 
 
-def check_reprojection(
-    model: PairModel, S_old_new: FloatArray, views: BoolArray, config: LinkingConfig
-) -> Failure | None:
+def check_reprojection(model: PairModel, S_old_new: FloatArray, views: BoolArray) -> Failure | None:
     """Refuse where the points of one map do not fall on the pixels of the other, in either direction."""
     in_old, in_new = model.reprojection2(S_old_new)
     for name, chi2 in (("old", in_old), ("new", in_new)):
@@ -47,9 +45,7 @@ def check_reprojection(
     return None
 
 
-def check_spread(
-    model: PairModel, old: Submap, pair_mask: BoolArray, keyframes: BoolArray, config: LinkingConfig
-) -> Failure | None:
+def check_spread(model: PairModel, old: Submap, pair_mask: BoolArray, keyframes: BoolArray) -> Failure | None:
     """Refuse where the agreeing landmarks cover too little of the image, along either axis, or of depth."""
     c = model.pairs
     views = pair_mask[c.view_pair] & keyframes[c.view_keyframe]
@@ -78,7 +74,6 @@ def check_parting(
     new: Submap,
     agreeing: IntArray,
     parted: IntArray,
-    config: LinkingConfig,
 ) -> Failure | None:
     """Refuse where maps that agree at some keyframes (ids) part at newer ones, unless it is the old one that gave way.
 

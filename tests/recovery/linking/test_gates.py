@@ -51,7 +51,7 @@ def test_leading_run(agrees, length):
 def test_healthy_maps_are_not_torn(layout, seed):
     case = make_case(layout, seed)
     for submap in (case.old, case.new):
-        assert len(find_discontinuities(submap, min(submap.keyframes), max(submap.keyframes), CONFIG)) == 0
+        assert len(find_discontinuities(submap, min(submap.keyframes), max(submap.keyframes))) == 0
 
 
 @pytest.mark.parametrize("ties", [0.0, 0.3])
@@ -59,7 +59,7 @@ def test_healthy_maps_are_not_torn(layout, seed):
 @pytest.mark.parametrize("seed", range(8))
 def test_a_wrong_pose_tears_a_map_where_it_stands(layout, seed, ties):
     old = corrupted_tail(layout, seed, 6, ties).old
-    discontinuities = find_discontinuities(old, min(old.keyframes), max(old.keyframes), CONFIG)
+    discontinuities = find_discontinuities(old, min(old.keyframes), max(old.keyframes))
     assert len(discontinuities) >= 1
     # A change of scale about the first wrong camera leaves that camera right.
     assert discontinuities[0] in (ONSET_ID, ONSET_ID + 3)
@@ -160,13 +160,13 @@ def test_spread_gate_refuses_a_corner_of_the_image():
     case = make_case("street", 0)
     model = model_of(case)
     inliers, keyframes = everything(model, case.S_old_new)
-    assert verify.check_spread(model, case.old, inliers, keyframes, CONFIG) is None
+    assert verify.check_spread(model, case.old, inliers, keyframes) is None
     c = model.pairs
     in_corner = (c.uv_old[:, 0] < 250) & (c.uv_old[:, 1] > 200)
     corner = np.zeros(len(c), bool)
     corner[c.view_pair[in_corner]] = True
     corner[c.view_pair[~in_corner]] = False
-    refused = verify.check_spread(model, case.old, inliers & corner, keyframes, CONFIG)
+    refused = verify.check_spread(model, case.old, inliers & corner, keyframes)
     assert refused is not None
     assert refused.reason is FailureReason.SPREAD
 
@@ -189,11 +189,11 @@ def test_own_pixels_gate_refuses_a_map_that_does_not_lie_on_its_images():
     case = make_case("street", 0)
     model = model_of(case)
     views = np.ones(len(model.pairs.view_pair), bool)
-    assert verify.check_own_pixels(model, views, CONFIG) is None
+    assert verify.check_own_pixels(model, views) is None
     model.pairs.xyz_new[:] += 0.1 * np.std(model.pairs.xyz_new, axis=0)
-    refused = verify.check_own_pixels(model, views, CONFIG)
+    refused = verify.check_own_pixels(model, views)
     assert refused is not None
     assert refused.reason is FailureReason.REPROJECTION
-    refused = verify.check_reprojection(model, case.S_old_new, views, CONFIG)
+    refused = verify.check_reprojection(model, case.S_old_new, views)
     assert refused is not None
     assert refused.reason is FailureReason.REPROJECTION

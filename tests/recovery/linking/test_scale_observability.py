@@ -178,7 +178,7 @@ AGREEING, PARTED = FRAME_STEP * np.arange(8), FRAME_STEP * np.arange(13, 19)
 
 def blame(case: Case, old: Submap, new: Submap) -> Failure | None:
     model = PairModel(propose_correspondences(old, new, MATCHER), old, new, CONFIG.deformation_sigma)
-    return check_parting(model, case.S_old_new, old, new, AGREEING, PARTED, CONFIG)
+    return check_parting(model, case.S_old_new, old, new, AGREEING, PARTED)
 
 
 def test_the_old_map_is_to_blame_where_it_hangs_loose() -> None:
