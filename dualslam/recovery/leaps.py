@@ -216,12 +216,7 @@ class LeapWatch:
     """Asks, a moment after tracking has found its place again beyond a gap, whether the camera can have moved so."""
 
     def __init__(self) -> None:
-        self._first_beyond: FrameStamp | None = None
-
-    @property
-    def first_beyond(self) -> FrameStamp | None:
-        """The first frame beyond the gap that is looked at."""
-        return self._first_beyond
+        self._first_beyond: FrameStamp | None = None  # the gap that is looked at
 
     def begin(self, at: FrameStamp) -> None:
         """Look at the gap before a frame that was posed after a loss."""

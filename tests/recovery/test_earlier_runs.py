@@ -64,7 +64,7 @@ def test_what_an_earlier_run_saw_at_this_time_of_its_clock_makes_no_leap(earlier
         pose_frames(record, range(i, i + 1), 4.5 + times_s[n : n + 1], places[n : n + 1] - [5, 0, 0], 0)
         enter(record, range(i, i + 1))
         said.append(watch.judge(record.rows[i], False, record, submap))
-    assert watch.first_beyond is None, "it has come to an end"
+    assert watch._first_beyond is None, "it has come to an end"
     assert any(verdict is not None for verdict in said) is not earlier
 
 

@@ -44,8 +44,6 @@ class Correspondences:
         Each in its submap's frame and unit.
     covariance_old, covariance_new : (M, 3, 3)
         Of the points given the poses, from all observations of each landmark in its map; finite for every pair.
-    first_keyframe : (M,) int64
-        Oldest shared keyframe in which the pair was matched.
     shared_pixel : (M,) bool
         Whether both maps use the same keypoint of the same frame somewhere. The two points then share part of their
         noise. With C their cross-covariance the residual's covariance is ``P_old + A P_new A' - C A' - A C'``;
@@ -56,7 +54,6 @@ class Correspondences:
         Shared keyframes with views, ascending: in order of time.
     view_pair, view_keyframe : (V,) int64
         Row of the pair, row of `keyframes`.
-    view_feature_old, view_feature_new : (V,) int64
     uv_old, uv_new : (V, 2)
         Rectified pixels of the pair in either map's keyframe.
     sigma_old, sigma_new : (V,)
@@ -68,13 +65,10 @@ class Correspondences:
     xyz_new: FloatArray
     covariance_old: FloatArray
     covariance_new: FloatArray
-    first_keyframe: IntArray
     shared_pixel: BoolArray
     keyframes: IntArray
     view_pair: IntArray
     view_keyframe: IntArray
-    view_feature_old: IntArray
-    view_feature_new: IntArray
     uv_old: FloatArray
     uv_new: FloatArray
     sigma_old: FloatArray
@@ -176,10 +170,7 @@ def place_pairs(old: Submap, new: Submap, matched: MatchedLandmarks, old_before:
     rows = rows[fixed[pair_of_vote[rows]]]
     view_pair = row[pair_of_vote[rows]]
     keyframes, view_keyframe = np.unique(votes.keyframe[rows], return_inverse=True)
-    n = int(fixed.sum())
-    first = np.full(n, np.iinfo(np.int64).max)
-    np.minimum.at(first, view_pair, votes.keyframe[rows])
-    shared = np.zeros(n, bool)
+    shared = np.zeros(int(fixed.sum()), bool)
     shared[view_pair[votes.identical[rows]]] = True
     uv_old, sigma_old = _pixels(old, votes.keyframe[rows], votes.feature_old[rows])
     uv_new, sigma_new = _pixels(new, votes.keyframe[rows], votes.feature_new[rows])
@@ -190,13 +181,10 @@ def place_pairs(old: Submap, new: Submap, matched: MatchedLandmarks, old_before:
         xyz_new=xyz_new[fixed],
         covariance_old=covariance_old[fixed],
         covariance_new=covariance_new[fixed],
-        first_keyframe=first,
         shared_pixel=shared,
         keyframes=keyframes,
         view_pair=view_pair,
         view_keyframe=view_keyframe,
-        view_feature_old=votes.feature_old[rows],
-        view_feature_new=votes.feature_new[rows],
         uv_old=uv_old,
         uv_new=uv_new,
         sigma_old=sigma_old,

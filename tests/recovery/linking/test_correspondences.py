@@ -80,14 +80,12 @@ def test_pairs_are_one_to_one_and_views_belong_to_them(case):
     assert np.bincount(pairs.view_pair, minlength=len(pairs)).min() >= 1
     assert np.bincount(pairs.view_pair).max() > 3  # several keyframes, one pair
     ids = pairs.keyframes[pairs.view_keyframe]
-    for v in range(len(ids), 37):
+    sides = (case.old, pairs.landmark_old, pairs.uv_old), (case.new, pairs.landmark_new, pairs.uv_new)
+    for v in range(0, len(ids), 37):
         k, pair = int(ids[v]), pairs.view_pair[v]
-        assert case.old.landmark_of[k][pairs.view_feature_old[v]] == pairs.landmark_old[pair]
-        assert case.new.landmark_of[k][pairs.view_feature_new[v]] == pairs.landmark_new[pair]
-        assert np.array_equal(case.old.keyframes[k].features.uv_rect_px[pairs.view_feature_old[v]], pairs.uv_old[v])
-    first = np.full(len(pairs), 10**9)
-    np.minimum.at(first, pairs.view_pair, ids)
-    assert np.array_equal(first, pairs.first_keyframe)
+        for submap, landmark, uv in sides:
+            pixel = submap.keyframes[k].features.uv_rect_px[submap.landmark_of[k] == landmark[pair]]
+            np.testing.assert_array_equal(pixel, uv[v : v + 1])
     assert set(pairs.keyframes.tolist()) <= set(shared_keyframes(case.old, case.new))
 
 
