@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 from dualslam.core.atlas_problem import AtlasSolution, AtlasSolver
 from dualslam.core.bundle import BundleAdjuster
@@ -18,15 +17,15 @@ from dualslam.core.errors import SolverError
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
-from dualslam.map.atlas import Atlas, Link, LinkKind, joined
+from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.atlas_beside import AskedSolution
+from dualslam.map.atlas_problems import AtlasProblems
 from dualslam.map.atlas_report import AtlasReport, Solved, tell, together
-from dualslam.map.edge_covariances import Covariances, EdgeCovariances
 from dualslam.map.moving import Mover
 from dualslam.map.overlap_sides import OverlapRefinement, apply_overlap, overlap_problem
 from dualslam.map.propagation import propagate_anchors, propagate_links, propagate_poses
 from dualslam.map.record import FrameStamp, Record
-from dualslam.map.skeleton import Skeleton, build_skeleton, foresee_skeleton, skeleton_knots
+from dualslam.map.skeleton import Skeleton, build_skeleton
 from dualslam.map.submap import Submap
 from dualslam.workers.jobs import Desk, JobKind
 
@@ -71,12 +70,11 @@ class Connections:
         self._adjust = adjust
         self._front_ends = front_ends
         self._desk = desk
-        self._covariances = EdgeCovariances(solver.edge_covariances, desk)
-        self._mover = Mover(record, solver, self._covariances, new_graph, front_ends, forget_graph)
+        self._problems = AtlasProblems(record, solver, desk)
+        self._mover = Mover(record, solver, self._problems.covariances, new_graph, front_ends, forget_graph)
         self._asked: AskedSolution | None = None  # what is being solved beside the tracking
         self._due: set[int] = set()  # submaps whose linked sets are to be solved next
         self._is_due_foreseen = False
-        self._newest: dict[int, int] = {}  # by submap: its newest keyframe when it was foreseen what is to be solved
         self._changes: dict[int, int] = {}  # by submap: how many times others than its graph have changed it
         self._is_over = False
 
@@ -111,7 +109,7 @@ class Connections:
             report = self._connect_sets(links[0], now)
         for link in links if report else ():
             if link.kind is LinkKind.ROLLOVER:
-                self._foresee_rollover(link.a)
+                self._problems.foresee_rollover(link.a)
         return report
 
     def connect_later(self, link: Link, now: FrameStamp) -> AtlasReport | None:
@@ -132,7 +130,7 @@ class Connections:
     def _connect_sets(self, link: Link, now: FrameStamp) -> AtlasReport:
         touched = {link.a, link.b}
         if not (busy := self.is_solving or self.foreseeing):
-            self._foresee(touched, [link])
+            self._problems.foresee(touched, [link])
             busy = self.foreseeing
         if busy:
             self._count_change(self._join(link))
@@ -169,7 +167,7 @@ class Connections:
         if not self._due or self.is_solving or self.foreseeing:
             return
         if not self._is_due_foreseen:
-            self._foresee(self._due, ())
+            self._problems.foresee(self._due, ())
             self._is_due_foreseen = True
         if not self.foreseeing:
             touched, self._due, self._is_due_foreseen = self._due, set(), False
@@ -189,18 +187,12 @@ class Connections:
 
     def foresee(self, link: Link) -> None:
         """Have computed beside the tracking what the solution with a connection to come needs of the submaps."""
-        self._foresee({link.a, link.b}, [link])
-
-    def _foresee(self, touched: set[int], new: Sequence[Link]) -> None:
-        for component, links in self._touched(touched, new):
-            foresee_skeleton(self._atlas, component, links, self._covariances)
-        # What has come by the time that they are there goes with the keyframes that were asked about.
-        self._newest = {m: max(submap.keyframes) for m, submap in self._atlas.submaps.items()}
+        self._problems.foresee({link.a, link.b}, [link])
 
     @property
     def foreseeing(self) -> bool:
         """Whether that is still being computed."""
-        return self._covariances.foreseeing
+        return self._problems.foreseeing
 
     def follow(self, before: Submap, after: Submap, now: FrameStamp) -> None:
         """Let all that is known against a submap follow a change that its own graph has made.
@@ -252,7 +244,9 @@ class Connections:
             raise SolverError(f"submaps {a[0]} and {b[0]} are not connected: keyframes in them have no relative pose")
         links = [link for link in self._atlas.believed if link.a in component]
         more = {m: {k for n, k in (a, b) if n == m} for m in (a[0], b[0])}
-        skeleton = build_skeleton(self._atlas, component, links, self._covariances, lambda link: True, more, True)
+        skeleton = build_skeleton(
+            self._atlas, component, links, self._problems.covariances, lambda link: True, more, True
+        )
         first, second = (skeleton.nodes.index(node) for node in (a, b))
         S = skeleton.problem.S_world_node
         return sim3.inverse(S[first]) @ S[second], self._solver.relative_covariance(skeleton.problem, first, second)
@@ -306,34 +300,14 @@ class Connections:
 
     # --- solving
 
-    def _touched(self, touched: set[int], new: Sequence[Link]) -> Iterator[tuple[list[int], list[Link]]]:
-        """Give the linked sets that new connections make of what they touch, each with its connections."""
-        links = [*self._atlas.links, *new]
-        for component in joined(self._atlas.submaps, links):
-            if touched & set(component):
-                yield component, [link for link in links if link.a in component]
-
-    def _problems(self, touched: set[int], new: Sequence[Link], covariances: Covariances) -> list[Skeleton]:
-        """Make the problems of all linked sets that are touched."""
-        fresh = set(map(id, new))
-
-        def known(link: Link) -> bool:
-            return id(link) not in fresh and not link.rejected
-
-        return [
-            build_skeleton(self._atlas, component, links, covariances, known, newest=self._newest)
-            for component, links in self._touched(touched, new)
-        ]
-
     def _ask(self, touched: set[int], new: Sequence[Link], now: FrameStamp, tries: int = 0) -> AtlasReport | None:
         """Have what is touched solved; return None where that is not done at once."""
         if self._is_over or tries >= MAX_TRIES:
             return self._solve(touched, new, now)
         try:
-            skeletons = self._problems(touched, new, self._covariances if tries else self._covariances.as_foreseen)
+            skeletons = self._problems.foreseen(touched, new, again=tries > 0)
         except SolverError as error:
             return _failed(str(error))
-        self._newest = {}
         self._asked = AskedSolution.of(self._atlas, touched, skeletons, list(new), self._changes, tries)
         self._desk.submit(JobKind.ATLAS, self._asked.question())
         for ended in self._desk.poll(JobKind.ATLAS):
@@ -359,9 +333,9 @@ class Connections:
 
     def _solve(self, touched: set[int], new: Sequence[Link], now: FrameStamp) -> AtlasReport:
         """Solve what is touched here and now."""
-        started, self._newest = time.perf_counter(), {}
+        started = time.perf_counter()
         try:
-            skeletons = self._problems(touched, new, self._covariances)
+            skeletons = self._problems.now(touched, new)
             solutions = [self._solver.solve(skeleton.problem) for skeleton in skeletons]
         except SolverError as error:
             return _failed(str(error))
@@ -398,12 +372,6 @@ class Connections:
     def _count_change(self, submap_ids: Iterable[int]) -> None:
         for m in submap_ids:
             self._changes[m] = self._changes.get(m, 0) + 1
-
-    def _foresee_rollover(self, submap_id: int) -> None:
-        """Ask a full submap for its covariances now: the first loop of a long run would wait for those of all."""
-        submap = self._atlas.submaps[submap_id]
-        pairs = list(pairwise(skeleton_knots(submap)))
-        self._covariances.foresee(submap, pairs, self._atlas.held.get(submap_id, frozenset()))
 
     # --- the transaction
 

@@ -308,15 +308,15 @@ def test_a_solver_that_fails_leaves_all_as_it_is() -> None:
 
 def test_with_late_covariances_nothing_is_computed_in_between() -> None:
     world, desk, _ = late()
-    world.connections._covariances._desk = desk
+    world.connections._problems.covariances._desk = desk
     computed: list[int] = []
-    compute = world.connections._covariances._compute
+    compute = world.connections._problems.covariances._compute
 
     def count(submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> FloatArray:
         computed.append(submap.id)
         return compute(submap, pairs, held)
 
-    world.connections._covariances._compute = count
+    world.connections._problems.covariances._compute = count
     before = rms(world.errors())
     link = world.loop(*CLOSED)
     world.connections.foresee(link)

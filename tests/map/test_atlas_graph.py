@@ -74,8 +74,8 @@ def test_a_tree_is_laid_out_along_its_links_and_nothing_bends() -> None:
 
 def would_accept(world: DriftingMap, link: Link) -> bool:
     """Whether a solution with the connection would believe it."""
-    doubted, covariances = replace(link, doubtful=True), world.connections._covariances
-    (skeleton,) = world.connections._problems({link.a, link.b}, (doubted,), covariances)
+    doubted = replace(link, doubtful=True)
+    (skeleton,) = world.connections._problems.now({link.a, link.b}, (doubted,))
     return bool(world.connections._solver.solve(skeleton.problem).believed[-1])
 
 

@@ -153,7 +153,7 @@ def test_frames_without_a_map_are_found_in_any_submap(loops: bool) -> None:
 def test_a_loop_whose_covariances_come_late_is_closed_when_they_have_come(polls: int) -> None:
     world = lap()
     system = system_in(world)
-    system._connections._covariances._desk = desk = LateDesk(system._state.parts.desk, polls)
+    system._connections._problems.covariances._desk = desk = LateDesk(system._state.parts.desk, polls)
     closed_at = None
     for frame in world.frames():
         system.step(frame)
@@ -237,7 +237,7 @@ def test_a_worker_that_dies_over_a_search_costs_that_search_alone() -> None:
 
 
 def test_a_loop_that_still_waits_when_the_run_ends_is_closed_then() -> None:
-    system = late_lap("_connections._covariances", 100_000)
+    system = late_lap("_connections._problems.covariances", 100_000)
     assert not system.atlas.links
     system.finish()
     assert [link.kind for link in system.atlas.believed] == [LinkKind.LOOP]
@@ -246,7 +246,7 @@ def test_a_loop_that_still_waits_when_the_run_ends_is_closed_then() -> None:
 def test_while_a_believed_place_waits_no_other_takes_its_place() -> None:
     world = lap()
     system = system_in(world)
-    system._connections._covariances._desk = LateDesk(system._state.parts.desk, 100_000)
+    system._connections._problems.covariances._desk = LateDesk(system._state.parts.desk, 100_000)
     waits = None
     for frame in world.frames():
         system.step(frame)
