@@ -211,7 +211,9 @@ class System:
         # 1. What was found beside the tracking meanwhile comes into the map between two frames.
         self._graphs.collect(frame)
         self._places.collect(frame)
-        self._calibrations.collect(state.live, frame, self._recoveries.waiting)
+        in_map = state.relocaliser.relocaliser if state.live is None else state.live
+        if self._calibrations.collect(in_map, frame, self._recoveries.waiting) and state.live is None:
+            self._starting.begin_again()
         self._recoveries.collect(state.live, frame)
         self.buffer.settle(SETTLED_A_FRAME)
         # 2. Features, into the buffer that reverse tracking will read.
@@ -335,6 +337,9 @@ class System:
         state.lost.append(view)
         if len(state.lost) == 1:
             self.buffer.freeze()
+            # A map whose end is suspected is no witness.
+            if all(frame.failed for frame in state.health.suspected()):
+                self._calibrations.ask_at_loss(live, view, self._recoveries.waiting)
         if len(state.lost) > state.config.tracking.max_lost_frames or failure.reason is FailureReason.SOLVER:
             self._endings.give_up(live, view, failure)
             self._begin_anew()

@@ -76,18 +76,33 @@ class Calibrations:
 
         `lost`: the submaps that are to be linked with it, and must have the same camera.
         """
-        if self._desk.n_open(JobKind.CALIBRATION) or not self._calibration.is_due(live.submap):
+        if self._calibration.is_due(live.submap):
+            self._ask(live, now, lost)
+
+    def ask_at_loss(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int]) -> None:
+        """Ask the live submap as its track is lost, so that the next map has its camera from the first frame on."""
+        if self._calibration.is_due_at_loss(live.submap):
+            self._ask(live, now, lost)
+
+    def _ask(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int]) -> None:
+        if self._desk.n_open(JobKind.CALIBRATION):
             return
         with self._record.timer.measure("calibration"):
             job = self._calibration.ask(live.submap, {m: self._record.atlas.submaps[m] for m in lost})
             self._desk.submit(JobKind.CALIBRATION, job)
         self.collect(live, now, lost)
 
-    def collect(self, live: VisualOdometry | None, now: FrameStamp, lost: Collection[int]) -> None:
-        """Take in what was answered meanwhile; `live` goes on in its submap as it is after that."""
+    def collect(self, live: VisualOdometry | None, now: FrameStamp, lost: Collection[int]) -> bool:
+        """Take in what was answered meanwhile; `live` goes on in its submap as it is after that.
+
+        It may be the front end that looks for a submap which was lost since it was asked. Returns whether the frames to
+        come have another camera.
+        """
+        before = self._calibration.camera
         for ended in self._desk.poll(JobKind.CALIBRATION):
             with self._record.timer.measure("calibration"):
                 self._take(ended.work, ended.result, live, now, lost)
+        return self._calibration.camera is not before
 
     def _take(
         self,

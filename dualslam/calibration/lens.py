@@ -26,6 +26,9 @@ UPDATE_SIGMA_RATIO = 0.7
 """A camera that was changed on an answer that was not even sure by `max_sigma_ratio` is changed again, however little,
 where the new sigma of the focal length is below this share of that answer's: twice the information. One that was
 sure stays, until another is significantly different."""
+AT_LOSS = 1.05
+"""A map that may be at its end is asked once more, where it has so many times the keyframes of when it was asked: the
+next one begins with what it says. Lower, single frames without a pose would each cost a question."""
 SURE_SIGMA = 0.01
 """Of the log focal length: an answer that is no surer than this is not the last, however little was known before."""
 
@@ -126,6 +129,7 @@ class Calibration:
         self._estimate = estimate
         self._adjust = adjust
         self._due_at: dict[int, int] = {}
+        self._asked_with: dict[int, int] = {}
         self._refined_in: int | None = None
         self._covariance = covariance
 
@@ -151,6 +155,12 @@ class Calibration:
         due_at = self._due_at.get(submap.id, self._config.first_keyframes)
         return self._config.refine and len(submap.keyframes) >= due_at
 
+    def is_due_at_loss(self, submap: Submap) -> bool:
+        """Whether it is time to ask a submap that may be at its end: as long as none has told what the camera is."""
+        n, config = len(submap.keyframes), self._config
+        has_grown = n >= AT_LOSS * self._asked_with.get(submap.id, 0)
+        return config.refine and self._refined_in is None and n >= config.first_keyframes and has_grown
+
     def ask(self, submap: Submap, lost: dict[int, Submap]) -> CalibrationJob:
         """Return the question to a submap, on copies of it and of those that are to change with it.
 
@@ -170,7 +180,7 @@ class Calibration:
         self._camera, self._refined_in, self._covariance = answer.camera, answer.submap.id, answer.covariance
 
     def _asked(self, submap_id: int, n: int) -> None:
-        self._due_at[submap_id] = int(np.ceil(GROWTH * n))
+        self._due_at[submap_id], self._asked_with[submap_id] = int(np.ceil(GROWTH * n)), n
 
     def _said_nothing(self, submap_id: int, n: int) -> None:
         self._due_at[submap_id] = n + max(RETRY_KEYFRAMES, int(RETRY_SHARE * n))

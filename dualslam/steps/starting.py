@@ -44,6 +44,11 @@ class Starting:
         for view in lost:
             self._starter.collect(view)
 
+    def begin_again(self) -> None:
+        """Look for the next map's start anew, as the pixels of the frames that are buffered have changed."""
+        waiting, rows = self._state.buffer.newest(START_REACH), self._state.record.rows
+        self.begin_anew([view for view in waiting if rows[view.index].submap is None])
+
     # --- a map that is there
 
     def find_again(self, view: View) -> Track | None:

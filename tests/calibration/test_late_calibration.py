@@ -25,12 +25,12 @@ from tests.calibration.test_lens import WRONG, CalibrationWorld
 N_FRAMES = 60
 
 
-def late_system(polls: int) -> tuple[System, CalibrationWorld]:
+def late_system(polls: int, recovery: bool = False) -> tuple[System, CalibrationWorld]:
     settings = {
         "calibration": {"first_keyframes": 12, "max_observations": 6000},
         "keyframes": {"max_parallax_deg": 1.0},
         "mapping": {"redundant_ratio": 1.0},
-        "recovery": {"enabled": False},
+        "recovery": {"enabled": recovery},
     }
     system, world = build_system(Config.model_validate(settings), wrong_camera(WRONG)), CalibrationWorld()
     system._calibrations._desk = LateDesk(system._state.parts.desk, polls)
@@ -115,6 +115,38 @@ def test_a_next_start_has_the_pixels_of_a_camera_that_was_found_while_the_map_wa
     assert begun[0].index < found.frame < begun[-1].index
     for view in begun:
         np.testing.assert_allclose(view.features.uv_rect_px, calibration.camera.rectify(view.features.uv_px)[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("polls", [0, 12])
+def test_a_map_is_asked_as_it_is_lost_and_the_next_begins_with_its_camera(polls: int) -> None:
+    """It is not its time to be asked. An answer after twelve frames finds the map archived, and none yet live."""
+    system, world = late_system(polls, recovery=True)
+    calibration, blind = system._state.parts.calibration, range(40, 55)
+    calibration.is_due = lambda _: False  # type: ignore[method-assign]
+
+    def view_of(frame: Frame) -> View:
+        view = world.view(frame, calibration)
+        return replace(view, features=view.features.take(np.arange(0))) if frame.index in blind else view
+
+    system._state.parts = replace(system._state.parts, view_of=view_of)
+    for i in range(N_FRAMES):
+        system.step(Frame(i, i / 30, None))
+        if i > blind[-1] and system.live is not None:
+            break
+    (found,), (failed,) = (system.events.of_kind(kind) for kind in (EventKind.CALIBRATED, EventKind.FAILED))
+    assert found.frame == blind[0] + polls
+    assert (found.frame > failed.frame) is (polls > 0)
+    camera = calibration.camera
+    assert abs(np.log(camera.K[0, 0] / TRUE.fx)) < 0.25 * np.log(WRONG)
+    for submap in system.atlas.submaps.values():
+        np.testing.assert_array_equal(submap.K, camera.K)
+        for keyframe in submap.keyframes.values():
+            np.testing.assert_allclose(keyframe.features.uv_rect_px, camera.rectify(keyframe.features.uv_px)[0])
+    assert system.live is not None
+    assert not system.events.of_kind(EventKind.LINK_REFUSED)
+    system.finish()
+    assert len(trajectories_of(system).main.index) > N_FRAMES / 2
 
 
 def test_what_has_come_since_follows() -> None:

@@ -160,6 +160,22 @@ class TestRefine:
         calibration.refine(submap, new_graph())
         assert not calibration.is_due(submap)
 
+    def test_at_a_loss_it_is_due_once_more_until_a_map_has_told(self) -> None:
+        camera = wrong_camera(WRONG)
+        young, submap, grown = (make_submap(camera, turning=True, n=n) for n in (29, 30, 32))
+        calibration = calibration_that_finds(estimate_of(RIGHT_AGAIN, accepted=False))
+        assert not calibration.is_due_at_loss(young)
+        assert calibration.is_due_at_loss(submap)
+        calibration.refine(submap, new_graph())
+        assert not calibration.is_due_at_loss(submap)
+        assert calibration.is_due_at_loss(grown)
+        assert not calibration.is_due(grown)
+        told = calibration_that_finds(estimate_of(RIGHT_AGAIN, accepted=True))
+        assert told.refine(submap, new_graph())
+        assert not told.is_due_at_loss(grown)
+        off = Calibration(camera, CalibrationConfig(refine=False), lambda *_: Failure(FailureReason.SOLVER), print)
+        assert not off.is_due_at_loss(submap)
+
 
 def test_frames_between_keyframes_follow_a_map_that_bends() -> None:
     before = make_submap(TRUE, turning=True, n=11)
