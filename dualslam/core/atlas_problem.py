@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, overload
 
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 
@@ -43,6 +43,44 @@ class AtlasEdge:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class AtlasEdges(Sequence[AtlasEdge]):
+    """Many edges, as arrays: each is made when it is asked for. See `AtlasEdge`.
+
+    They go to another process ten times as fast as so many objects.
+
+    Attributes
+    ----------
+    first, second : (E,) int64
+    S_first_second : (E, 4, 4)
+    covariance : (E, 7, 7)
+    kind : tuple of str
+    doubtful, known : (E,) bool
+    """
+
+    first: IntArray
+    second: IntArray
+    S_first_second: FloatArray
+    covariance: FloatArray
+    kind: tuple[str, ...]
+    doubtful: BoolArray
+    known: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    def __iter__(self) -> Iterator[AtlasEdge]:
+        first, second, doubtful, known = (a.tolist() for a in (self.first, self.second, self.doubtful, self.known))
+        return map(AtlasEdge, first, second, self.S_first_second, self.covariance, self.kind, doubtful, known)
+
+    @overload
+    def __getitem__(self, at: int) -> AtlasEdge: ...
+    @overload
+    def __getitem__(self, at: slice) -> tuple[AtlasEdge, ...]: ...
+    def __getitem__(self, at: int | slice) -> AtlasEdge | tuple[AtlasEdge, ...]:
+        return tuple(self)[at]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class AtlasProblem:
     """A connected piece of the atlas; plain arrays, so that it can be solved in another process.
 
@@ -52,13 +90,13 @@ class AtlasProblem:
         Initial similarities: keyframe, in its submap's unit, to world.
     fixed : int
         The node that stays where it is: the gauge.
-    edges : tuple of AtlasEdge
+    edges : sequence of AtlasEdge
         Connections in the order in which they arrived.
     """
 
     S_world_node: FloatArray
     fixed: int
-    edges: tuple[AtlasEdge, ...]
+    edges: Sequence[AtlasEdge]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

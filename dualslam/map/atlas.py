@@ -199,7 +199,8 @@ def joined(submap_ids: Iterable[int], links: Iterable[Link]) -> list[list[int]]:
     component = {m: m for m in ids}
     for link in links:
         old, new = sorted((component[link.a], component[link.b]), reverse=True)
-        component = {m: new if c == old else c for m, c in component.items()}
+        if old != new:
+            component = {m: new if c == old else c for m, c in component.items()}
     roots = sorted(set(component.values()))
     return [[m for m in ids if component[m] == root] for root in roots]
 

@@ -8,6 +8,7 @@ from itertools import pairwise
 from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.map.atlas import Link, joined
 from dualslam.map.edge_covariances import Covariances, EdgeCovariances
+from dualslam.map.node_views import NodeViews
 from dualslam.map.record import Record
 from dualslam.map.skeleton import Skeleton, build_skeleton, foresee_skeleton, skeleton_knots
 from dualslam.workers.jobs import Desk
@@ -27,18 +28,21 @@ class AtlasProblems:
     ----------
     covariances : EdgeCovariances
         What the submaps say of their own edges.
+    views : NodeViews
+        What their nodes see.
     """
 
     def __init__(self, record: Record, solver: AtlasSolver, desk: Desk) -> None:
         self._record = record
         self.covariances = EdgeCovariances(solver.edge_covariances, desk)
+        self.views = NodeViews()
         self._newest: dict[int, int] = {}  # by submap: its newest keyframe when it was foreseen what is to be solved
 
     def foresee(self, touched: set[int], new: Sequence[Link]) -> None:
         """Have computed beside the tracking what the solution with connections to come needs of the submaps."""
         atlas = self._record.atlas
         for component, links in self._touched(touched, new):
-            foresee_skeleton(atlas, component, links, self.covariances)
+            foresee_skeleton(atlas, component, links, self.covariances, self.views)
         # What has come by the time that they are there goes with the keyframes that were asked about.
         self._newest = {m: max(submap.keyframes) for m, submap in atlas.submaps.items()}
 
@@ -84,7 +88,7 @@ class AtlasProblems:
             return id(link) not in fresh and not link.rejected
 
         return [
-            build_skeleton(self._record.atlas, component, links, covariances, known, newest=self._newest)
+            build_skeleton(self._record.atlas, component, links, covariances, self.views, known, newest=self._newest)
             for component, links in self._touched(touched, new)
         ]
 

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain, compress, repeat
 
 import numpy as np
 
-from dualslam.core.atlas_problem import AtlasEdge, AtlasSolution
+from dualslam.core.atlas_problem import AtlasSolution
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure
 from dualslam.map.atlas import Link
 from dualslam.map.bending import Move
 from dualslam.map.record import FrameStamp, Record
-from dualslam.map.skeleton import Skeleton
+from dualslam.map.skeleton import WITHIN, Skeleton
 from dualslam.map.warp import Warp
 
 STILL = 1e-4
@@ -88,15 +90,20 @@ class Solved:
         return [move for move in self.moves or () if move.bent]
 
     @property
-    def edges(self) -> tuple[AtlasEdge, ...]:
-        """Of the problem."""
-        return self.skeleton.problem.edges
+    def n_within(self) -> int:
+        """Edges within submaps: the first of the problem, before the connections."""
+        return len(self.skeleton.problem.edges) - len(self.skeleton.links)
 
     @property
     def believed(self) -> list[bool]:
-        """Of the connections, which are the last edges."""
-        n = len(self.skeleton.links)
-        return [bool(kept) for kept in self.solution.believed[len(self.edges) - n :]]
+        """Of the connections."""
+        return [bool(kept) for kept in self.solution.believed[self.n_within :]]
+
+    @property
+    def kinds(self) -> Iterator[str]:
+        """Of the edges that are believed."""
+        kinds = chain(repeat(WITHIN, self.n_within), (str(link.kind) for link in self.skeleton.links))
+        return compress(kinds, self.solution.believed.tolist())
 
     @property
     def newest_chi2(self) -> float | None:
@@ -110,7 +117,7 @@ class Solved:
             rejected=tuple(link for link in links if link.rejected and link.a in self.skeleton.component),
             newly_rejected=tuple(links[i] for i in newly_rejected),
             readmitted=tuple(links[i] for i in readmitted),
-            factors=count_kinds(e for e, kept in zip(self.edges, self.solution.believed, strict=True) if kept),
+            factors=count_kinds(self.kinds),
             cost_before=self.solution.cost_before,
             cost_after=self.solution.cost_after,
             drift=self.solution.drift,
@@ -173,12 +180,9 @@ def together(reports: Sequence[AtlasReport]) -> AtlasReport:
     )
 
 
-def count_kinds(edges: Iterable[AtlasEdge]) -> dict[str, int]:
+def count_kinds(kinds: Iterable[str]) -> dict[str, int]:
     """Return how many edges there are of each kind, in the order of their first."""
-    counts: dict[str, int] = {}
-    for e in edges:
-        counts[e.kind] = counts.get(e.kind, 0) + 1
-    return counts
+    return dict(Counter(kinds))
 
 
 def named(link: Link) -> dict[str, object]:

@@ -245,7 +245,14 @@ class Connections:
         links = [link for link in self._atlas.believed if link.a in component]
         more = {m: {k for n, k in (a, b) if n == m} for m in (a[0], b[0])}
         skeleton = build_skeleton(
-            self._atlas, component, links, self._problems.covariances, lambda link: True, more, True
+            self._atlas,
+            component,
+            links,
+            self._problems.covariances,
+            self._problems.views,
+            lambda link: True,
+            more,
+            True,
         )
         first, second = (skeleton.nodes.index(node) for node in (a, b))
         S = skeleton.problem.S_world_node

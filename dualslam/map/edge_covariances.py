@@ -10,7 +10,7 @@ import numpy as np
 
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
+from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
 from dualslam.map.warp import Warp
 from dualslam.workers.jobs import Desk, JobKind
@@ -35,13 +35,8 @@ class _Known:
     """The covariance of an edge, and the state of the two keyframes for which it was computed."""
 
     T_first_second: FloatArray
-    n_seen: tuple[int, int]
+    n_seen: IntArray
     covariance: FloatArray
-
-    def holds(self, T_first_second: FloatArray, n_seen: tuple[int, int]) -> bool:
-        """Whether the keyframes are much as they were."""
-        seen = all(abs(now - was) <= SAME_SEEN * was for now, was in zip(n_seen, self.n_seen, strict=True))
-        return seen and bool(much_alike(self.T_first_second, T_first_second))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,12 +114,16 @@ class EdgeCovariances:
         return self._desk.n_open(JobKind.EDGES) > 0
 
     def _missing(self, submap: Submap, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-        new = []
-        for pair, state in zip(pairs, _states(submap, pairs), strict=True):
-            known = self._known.get((submap.id, *pair))
-            if known is None or not known.holds(*state):
-                new.append(pair)
-        return new
+        known = [self._known.get((submap.id, *pair)) for pair in pairs]
+        old = [i for i, one in enumerate(known) if one is not None]
+        missing = np.ones(len(pairs), bool)
+        if old:
+            then = [one for one in known if one is not None]
+            T, n_seen = _states(submap, [pairs[i] for i in old])
+            was = np.array([one.n_seen for one in then])
+            seen_alike = (np.abs(n_seen - was) <= SAME_SEEN * was).all(axis=1)
+            missing[old] = ~(seen_alike & much_alike(np.array([one.T_first_second for one in then]), T))
+        return [pairs[i] for i in np.flatnonzero(missing).tolist()]
 
     def _collect(self) -> None:
         for ended in self._desk.poll(JobKind.EDGES):
@@ -132,8 +131,8 @@ class EdgeCovariances:
                 self._note(ended.work.submap, ended.work.pairs, ended.result)
 
     def _note(self, submap: Submap, pairs: Sequence[tuple[int, int]], covariances: FloatArray) -> None:
-        for pair, state, C in zip(pairs, _states(submap, pairs), covariances, strict=True):
-            self._known[(submap.id, *pair)] = _Known(*state, C)
+        for pair, T, n_seen, C in zip(pairs, *_states(submap, pairs), covariances, strict=True):
+            self._known[(submap.id, *pair)] = _Known(T, n_seen, C)
 
     def bent(self, submap: Submap, warp: Warp) -> None:
         """Take in that a submap stands otherwise by a solution of the atlas: its own factors say what they said."""
@@ -144,18 +143,17 @@ class EdgeCovariances:
             else:
                 del self._known[m, first, second]
         scales = sim3.scale(warp.at([second for _, second in kept]))
-        for pair, state, scale in zip(kept, _states(submap, kept), scales.tolist(), strict=True):
+        for pair, T, n_seen, scale in zip(kept, *_states(submap, kept), scales.tolist(), strict=True):
             units = np.ones(7)
             units[3:6] = scale
             covariance = self._known[(submap.id, *pair)].covariance
-            self._known[(submap.id, *pair)] = _Known(*state, units[:, None] * covariance * units)
+            self._known[(submap.id, *pair)] = _Known(T, n_seen, units[:, None] * covariance * units)
 
 
-def _states(submap: Submap, pairs: Sequence[tuple[int, int]]) -> list[tuple[FloatArray, tuple[int, int]]]:
-    """Return for each pair of keyframes the pose between them, and how many landmarks they see."""
-    if not pairs:
-        return []
-    first, second = np.array(pairs, np.int64).T
-    T = se3.inverse(submap.keyframe_poses(first)) @ submap.keyframe_poses(second)
-    n = {k: int(np.count_nonzero(submap.landmark_of[k] >= 0)) for k in {k for pair in pairs for k in pair}}
-    return [(T_pair, (n[a], n[b])) for T_pair, (a, b) in zip(T, pairs, strict=True)]
+def _states(submap: Submap, pairs: Sequence[tuple[int, int]]) -> tuple[FloatArray, IntArray]:
+    """Return for each pair of keyframes the pose between them (E, 4, 4), and how many landmarks they see (E, 2)."""
+    keyframes, at = np.unique(np.array(pairs, np.int64).reshape(-1, 2), return_inverse=True)
+    first, second = at.reshape(-1, 2).T
+    T = submap.keyframe_poses(keyframes)
+    n_seen = np.array([np.count_nonzero(submap.landmark_of[k] >= 0) for k in keyframes.tolist()], np.int64)
+    return se3.inverse(T)[first] @ T[second], n_seen[at.reshape(-1, 2)]

@@ -13,20 +13,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.core.atlas_problem import AtlasEdge, AtlasProblem
+from dualslam.core.atlas_problem import AtlasEdges, AtlasProblem
 from dualslam.core.chi_square import CHI2_999, squared_distances
 from dualslam.core.geometry import se3, sim3, so3
-from dualslam.core.types import BoolArray, FloatArray
+from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.atlas import Atlas, Link, joined
 from dualslam.map.edge_covariances import Covariances, EdgeCovariances
+from dualslam.map.node_views import NodeView, NodeViews
 from dualslam.map.submap import Submap
 
 WITHIN = "within"
 """The kind of an edge between keyframes of one submap."""
 STRIDE = 10
 """Keyframes from one node to the next."""
-MIN_SHARED, MAX_ACROSS = 30, 2
-"""Landmarks that two nodes which are no neighbours share at least to be tied; so many such ties a node looks for."""
 DRIFT, MODEL_SHARE = 2.0, 0.01
 """What a submap's factors say of its inner similarities is not all: pixels know nothing of a lens that is not quite the
 one that was assumed, or of a shutter. Sigmas are taken `DRIFT` times, and to them comes a share of the motion (turn in
@@ -49,6 +48,8 @@ class Skeleton:
     problem : AtlasProblem
     nodes : list of (int, int)
         Submap and keyframe of each row.
+    rows : dict of int to range
+        Where the nodes of each submap are.
     reference : dict of int to int
         For each submap the row of the keyframe that its frame goes by.
     links : list of Link
@@ -64,6 +65,7 @@ class Skeleton:
     component: list[int]
     problem: AtlasProblem
     nodes: list[Node]
+    rows: dict[int, range]
     reference: dict[int, int]
     links: list[Link]
     is_tree: bool
@@ -72,7 +74,7 @@ class Skeleton:
 
     def knots(self, submap_id: int) -> tuple[list[int], list[int]]:
         """Return rows and keyframes of a submap's nodes, ascending."""
-        rows = [row for row, (m, _) in enumerate(self.nodes) if m == submap_id]
+        rows = list(self.rows[submap_id])
         return rows, [self.nodes[row][1] for row in rows]
 
 
@@ -81,6 +83,7 @@ def build_skeleton(
     component: list[int],
     links: Sequence[Link],
     covariances: Covariances,
+    views: NodeViews,
     known: Callable[[Link], bool],
     more_nodes: Mapping[int, set[int]] | None = None,
     with_covariances: bool = False,
@@ -97,6 +100,8 @@ def build_skeleton(
         All between them, also those that are rejected so far, in the order in which they arrived.
     covariances : callable
         See `EdgeCovariances`.
+    views : NodeViews
+        What is remembered of the submaps.
     known : callable
         Whether an earlier solution has believed a link.
     more_nodes : mapping of int to set of int, optional
@@ -109,37 +114,34 @@ def build_skeleton(
     knots_of = _knots_of(atlas, component, links, more_nodes or {}, newest or {})
     S_world_submap = _initial(atlas, component, links)
     is_tree = _is_tree(atlas, component, links)
+    by_own_factors = with_covariances or not is_tree
     nodes: list[Node] = []
-    S_world_node: list[FloatArray] = []
-    T_submap_node: list[FloatArray] = []
-    edges: list[AtlasEdge] = []
-    steps: dict[int, FloatArray] = {}
+    rows: dict[int, range] = {}
     reference: dict[int, int] = {}
-    for m in component:
-        submap = atlas.submaps[m]
-        knots = knots_of[m]
-        first = len(nodes)
-        reference[m] = first + knots.index(_reference(submap))
+    of_submap: dict[int, NodeView] = {}
+    for m, knots in knots_of.items():
+        rows[m] = range(len(nodes), len(nodes) + len(knots))
+        reference[m] = len(nodes) + knots.index(_reference(atlas.submaps[m]))
         nodes += [(m, k) for k in knots]
-        T = submap.keyframe_poses(knots)
-        S_world_node += list(S_world_submap[m] @ T)
-        T_submap_node += list(T)
-        within, steps[m] = _within(
-            atlas, submap, knots, first, None if is_tree and not with_covariances else covariances
-        )
-        edges += within
-    edges += _across(atlas, links, knots_of, {node: i for i, node in enumerate(nodes)}, known)
-    problem = AtlasProblem(np.array(S_world_node), reference[component[0]], tuple(edges))
-    return Skeleton(component, problem, nodes, reference, list(links), is_tree, np.array(T_submap_node), steps)
+        if by_own_factors:
+            of_submap[m] = views(atlas.submaps[m], knots, atlas.warps.get(m))
+    T = np.concatenate([atlas.submaps[m].keyframe_poses(knots) for m, knots in knots_of.items()])
+    S_world_node = np.concatenate([S_world_submap[m] @ T[rows[m].start : rows[m].stop] for m in component])
+    within, steps = _within(atlas, of_submap, rows, T, covariances) if by_own_factors else _along(rows, T)
+    across = _across(atlas, links, knots_of, {node: i for i, node in enumerate(nodes)}, known)
+    problem = AtlasProblem(S_world_node, reference[component[0]], _joined_edges(within, across))
+    return Skeleton(component, problem, nodes, rows, reference, list(links), is_tree, T, steps)
 
 
-def foresee_skeleton(atlas: Atlas, component: list[int], links: Sequence[Link], covariances: EdgeCovariances) -> None:
+def foresee_skeleton(
+    atlas: Atlas, component: list[int], links: Sequence[Link], covariances: EdgeCovariances, views: NodeViews
+) -> None:
     """Have computed beside the tracking what `build_skeleton` would ask for."""
     if _is_tree(atlas, component, links):
         return
     for m, knots in _knots_of(atlas, component, links, {}, {}).items():
         submap = atlas.submaps[m]
-        pairs = [(knots[i], knots[j]) for i, j in _places(submap, knots)]
+        pairs = [(knots[i], knots[j]) for i, j in views(submap, knots, atlas.warps.get(m)).places]
         covariances.foresee(submap, pairs, atlas.held.get(m, frozenset()))
 
 
@@ -167,7 +169,8 @@ def _initial(atlas: Atlas, component: list[int], links: Sequence[Link]) -> dict[
     """Return where each submap stands, links that are new followed too."""
     trial = Atlas()
     trial.submaps = {m: atlas.submaps[m] for m in component}
-    home = joined(component, [link for link in links if not link.rejected and link in atlas.links])[0]
+    taken_in = set(map(id, atlas.links))
+    home = joined(component, [link for link in links if not link.rejected and id(link) in taken_in])[0]
     trial.placement = {m: atlas.placement[m] for m in home if m in atlas.placement}
     trial.links = [link for link in links if not link.rejected]
     return trial.S_world_submap(component)
@@ -193,34 +196,59 @@ def _reference(submap: Submap) -> int:
 
 
 def _within(
-    atlas: Atlas, submap: Submap, knots: list[int], first: int, covariances: Covariances | None
-) -> tuple[list[AtlasEdge], FloatArray]:
-    """Tie a submap's nodes to each other, as it says itself; return also what its factors say from node to node."""
-    places = _neighbours(knots) if covariances is None else _places(submap, knots)
-    pairs = [(knots[i], knots[j]) for i, j in places]
-    if covariances is None:  # in a tree no edge pulls at another, whatever they are
-        own_C = C = np.broadcast_to(np.eye(7), (len(pairs), 7, 7))
-    else:
-        own_C = covariances(submap, pairs, atlas.held.get(submap.id, frozenset()))
-        C = _inflated(submap, pairs, own_C)
-    i, j = np.array(places, np.int64).reshape(-1, 2).T
-    T = submap.keyframe_poses(knots)
-    S = sim3.inverse(atlas.warps[submap.id].at(knots)) @ T if submap.id in atlas.warps else T
-    own, now = (sim3.inverse(at[i]) @ at[j] for at in (S, T))
-    kept = (j == i + 1) | ~_are_torn(own, now, C)
-    edges = [
-        AtlasEdge(first + int(i[n]), first + int(j[n]), own[n], C[n], WITHIN) for n in np.flatnonzero(kept).tolist()
-    ]
-    return edges, own_C[: len(knots) - 1]
+    atlas: Atlas, views: Mapping[int, NodeView], rows: Mapping[int, range], T: FloatArray, covariances: Covariances
+) -> tuple[AtlasEdges, dict[int, FloatArray]]:
+    """Tie the nodes of submaps to each other, as these say themselves; also what their factors say from node to node.
+
+    All submaps at once: many short arrays would take longer than the numbers in them.
+    """
+    S, depth = T.copy(), np.empty(len(T))
+    steps: dict[int, FloatArray] = {}
+    all_own_C: list[FloatArray] = []
+    ends: list[IntArray] = []
+    for m, view in views.items():
+        here, places = slice(rows[m].start, rows[m].stop), view.places
+        pairs = [(view.knots[i], view.knots[j]) for i, j in places]
+        own_C = covariances(atlas.submaps[m], pairs, atlas.held.get(m, frozenset()))
+        steps[m] = own_C[: len(view.knots) - 1]
+        all_own_C.append(own_C)
+        ends.append(np.array(places, np.int64).reshape(-1, 2) + here.start)
+        depth[here] = view.depth
+        if view.unbend is not None:
+            S[here] = view.unbend @ T[here]
+    i, j = np.concatenate(ends).T
+    C = _inflated(se3.inverse(T)[i] @ T[j], depth[j], np.concatenate(all_own_C))
+    own = sim3.inverse(S)[i] @ S[j]
+    kept = np.ones(len(i), bool)
+    across = np.flatnonzero(j != i + 1)
+    now = sim3.inverse(T)[i[across]] @ T[j[across]]
+    kept[across] = ~_are_torn(own[across], now, C[across])
+    return _edges_within(i[kept], j[kept], own[kept], C[kept]), steps
 
 
-def _neighbours(knots: list[int]) -> list[tuple[int, int]]:
-    return [(i, i + 1) for i in range(len(knots) - 1)]
+def _along(rows: Mapping[int, range], T: FloatArray) -> tuple[AtlasEdges, dict[int, FloatArray]]:
+    """Tie the nodes of submaps along the frames: in a tree no edge pulls at another, whatever covariances they have."""
+    i = np.concatenate([np.arange(here.start, here.stop - 1) for here in rows.values()])
+    C = np.broadcast_to(np.eye(7), (len(i), 7, 7))
+    steps = {m: np.broadcast_to(np.eye(7), (len(here) - 1, 7, 7)) for m, here in rows.items()}
+    return _edges_within(i, i + 1, sim3.inverse(T)[i] @ T[i + 1], C), steps
 
 
-def _places(submap: Submap, knots: list[int]) -> list[tuple[int, int]]:
-    """Return which of a submap's nodes are tied, by their places among them: the neighbours first."""
-    return _neighbours(knots) + _across_knots(submap, knots)
+def _edges_within(i: IntArray, j: IntArray, S: FloatArray, C: FloatArray) -> AtlasEdges:
+    none = np.zeros(len(i), bool)
+    return AtlasEdges(i, j, S, C, (WITHIN,) * len(i), none, none)
+
+
+def _joined_edges(a: AtlasEdges, b: AtlasEdges) -> AtlasEdges:
+    return AtlasEdges(
+        np.concatenate([a.first, b.first]),
+        np.concatenate([a.second, b.second]),
+        np.concatenate([a.S_first_second, b.S_first_second]),
+        np.concatenate([a.covariance, b.covariance]),
+        a.kind + b.kind,
+        np.concatenate([a.doubtful, b.doubtful]),
+        np.concatenate([a.known, b.known]),
+    )
 
 
 def _are_torn(own: FloatArray, now: FloatArray, covariances: FloatArray) -> BoolArray:
@@ -233,42 +261,22 @@ def _are_torn(own: FloatArray, now: FloatArray, covariances: FloatArray) -> Bool
     return squared_distances(off, covariances) > CHI2_999[7]
 
 
-def _inflated(submap: Submap, pairs: list[tuple[int, int]], covariances: FloatArray) -> FloatArray:
-    """Return the covariances of edges with what the factors do not know."""
-    if not pairs:
-        return covariances
-    first, second = np.array(pairs).T.tolist()
-    T = se3.inverse(submap.keyframe_poses(first)) @ submap.keyframe_poses(second)
-    depth_of, distance_mu = {}, submap.landmarks["distance_mu"]
-    for k in set(second):
-        ids = submap.landmark_of[k]
-        ids = ids[ids >= 0]
-        depth_of[k] = float(np.median(distance_mu[ids])) if len(ids) else 1.0
-    depth = np.array([depth_of[k] for k in second])
+def _inflated(T: FloatArray, depth: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return the covariances of edges with what the factors do not know.
+
+    Parameters
+    ----------
+    T : (E, 4, 4)
+        From the second keyframe to the first.
+    depth : (E,)
+        Of the scene at the second.
+    covariances : (E, 7, 7)
+    """
     motion = np.linalg.norm(so3.log(T[:, :3, :3]), axis=1) + np.linalg.norm(T[:, :3, 3], axis=1) / depth
-    units = np.ones((len(pairs), 7))
+    units = np.ones((len(T), 7))
     units[:, 3:6] = depth[:, None]
     model: FloatArray = (MODEL_SHARE * motion[:, None] * units) ** 2
     return DRIFT**2 * covariances + model[:, :, None] * np.eye(7)
-
-
-def _across_knots(submap: Submap, knots: list[int]) -> list[tuple[int, int]]:
-    """Return pairs of nodes that are no neighbours and yet see the same landmarks."""
-    seen = [ids[ids >= 0] for ids in (submap.landmark_of[k] for k in knots)]
-    any_sees = np.zeros(len(submap.landmarks), bool)
-    any_sees[np.concatenate(seen)] = True
-    column = np.cumsum(any_sees) - 1
-    sees = np.zeros((len(knots), np.count_nonzero(any_sees)), np.float32)
-    for i, ids in enumerate(seen):
-        sees[i, column[ids]] = 1
-    shared = sees @ sees.T
-    place = np.arange(len(knots))
-    shared[np.abs(place[:, None] - place) <= 1] = 0
-    found: set[tuple[int, int]] = set()
-    for i, row in enumerate(shared):
-        best = np.argsort(-row, kind="stable")[:MAX_ACROSS]
-        found |= {(min(i, j), max(i, j)) for j in best[row[best] >= MIN_SHARED].tolist()}
-    return sorted(found)
 
 
 def _across(
@@ -277,10 +285,10 @@ def _across(
     knots_of: Mapping[int, list[int]],
     row: Mapping[Node, int],
     known: Callable[[Link], bool],
-) -> list[AtlasEdge]:
+) -> AtlasEdges:
     """Make the factors of connections."""
     if not links:
-        return []
+        return _edges_within(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros((0, 7, 7)))
     ends: list[tuple[Node, Node]] = []
     for link in links:
         k_a, k_b = link.attached(atlas)
@@ -292,7 +300,12 @@ def _across(
     Ad = sim3.adjoint(sim3.inverse(T_b))
     C = Ad @ np.array([link.covariance for link in links]) @ Ad.transpose(0, 2, 1)
     C = 0.5 * (C + C.transpose(0, 2, 1))
-    return [
-        AtlasEdge(row[a], row[b], S_ka_kb[i], C[i], str(link.kind), link.doubtful, known(link))
-        for i, (link, (a, b)) in enumerate(zip(links, ends, strict=True))
-    ]
+    return AtlasEdges(
+        np.array([row[a] for a, _ in ends], np.int64),
+        np.array([row[b] for _, b in ends], np.int64),
+        S_ka_kb,
+        C,
+        tuple(str(link.kind) for link in links),
+        np.array([link.doubtful for link in links], bool),
+        np.array([known(link) for link in links], bool),
+    )
