@@ -203,6 +203,12 @@ def optimise_batch(
         before = float(graph.error(values))
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
         result = optimizer.optimize()
+        if optimizer.iterations() == 0 and optimizer.lambda_() >= params.getlambdaUpperBound():
+            # No step was good. Where the baseline that fixes the scale must turn, its factor (1e-4 of its length) bears
+            # small steps alone, and its poses have 1e8 and more on the diagonal, beside which no damping counted.
+            params.setDiagonalDamping(True)
+            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+            result = optimizer.optimize()
         T, xyz = convert.poses_of(result), convert.points_of(result)
         after, iterations = float(optimizer.error()), int(optimizer.iterations())
     except GTSAM_ERRORS as error:

@@ -77,7 +77,17 @@ class AtlasEdges(Sequence[AtlasEdge]):
     @overload
     def __getitem__(self, at: slice) -> tuple[AtlasEdge, ...]: ...
     def __getitem__(self, at: int | slice) -> AtlasEdge | tuple[AtlasEdge, ...]:
-        return tuple(self)[at]
+        if isinstance(at, slice):
+            return tuple(self)[at]
+        return AtlasEdge(
+            int(self.first[at]),
+            int(self.second[at]),
+            self.S_first_second[at],
+            self.covariance[at],
+            self.kind[at],
+            bool(self.doubtful[at]),
+            bool(self.known[at]),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

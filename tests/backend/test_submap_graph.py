@@ -11,7 +11,7 @@ from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.backend.window import NumpyWindowSolver
 from dualslam.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
-from dualslam.core.geometry import se3
+from dualslam.core.geometry import se3, so3
 from dualslam.map.anchors import RelativePose
 from dualslam.testing.graph_scene import Feeder, make_scene, pose_errors
 
@@ -91,6 +91,24 @@ def test_estimate_is_near_the_batch_optimum_and_the_newest_fit():
     by_id = np.argsort(batch.keyframe_ids)
     t, r = pose_errors(e.T_submap_kf, batch.result.T_submap_kf[by_id])
     assert t.max() < 2 * OPTIMUM_MU
+
+
+@pytest.mark.parametrize("turn_rad", [0.05, 0.2])
+def test_the_baseline_that_fixes_the_scale_is_turned_back(turn_rad):
+    """It bears small steps alone, and holds up no others: of 0.2 rad, a solution once took none at all."""
+    feeder, graph, rest = start(first=2)
+    grow(feeder, graph, rest)
+    submap = feeder.submap
+    apply(submap, graph.full_estimate(submap))
+    askew, (first, second) = submap.copy(), submap.gauge
+    centre, T = submap.T_submap_kf[first][:3, 3], submap.T_submap_kf[second].copy()
+    baseline = T[:3, 3] - centre
+    across = np.cross(baseline, [0.0, 0.0, 1.0])
+    T[:3, 3] = centre + so3.exp(turn_rad * across / np.linalg.norm(across)) @ baseline
+    askew.T_submap_kf[second] = T
+    e = ISam2SubmapGraph(GraphConfig(**EVERY_FACTOR)).rebuild(askew)
+    t, _ = pose_errors(e.T_submap_kf, submap.keyframe_poses(e.keyframe_ids))
+    assert t.max() < 0.1 * np.linalg.norm(baseline)
 
 
 def test_window_is_read_each_time_and_all_each_nth_time(monkeypatch):
