@@ -6,6 +6,7 @@ Most submaps of a long run are full: between two solutions of the atlas none of 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -86,7 +87,12 @@ class NodeView:
     @property
     def places(self) -> list[tuple[int, int]]:
         """Which nodes are tied, by their places among them: the neighbours first."""
-        return neighbours(self.knots) + self.across
+        return [*pairwise(range(len(self.knots))), *self.across]
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """The same by their keyframes."""
+        return [(self.knots[i], self.knots[j]) for i, j in self.places]
 
 
 class NodeViews:
@@ -101,11 +107,6 @@ class NodeViews:
         view = NodeView.of(submap, knots, warp) if known is None else known.now(submap, knots, warp)
         self._known[submap.id] = view
         return view
-
-
-def neighbours(knots: list[int]) -> list[tuple[int, int]]:
-    """Return the places of nodes that follow each other."""
-    return [(i, i + 1) for i in range(len(knots) - 1)]
 
 
 def _across(seen: list[IntArray], n_landmarks: int) -> list[tuple[int, int]]:

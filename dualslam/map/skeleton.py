@@ -141,7 +141,7 @@ def foresee_skeleton(
         return
     for m, knots in _knots_of(atlas, component, links, {}, {}).items():
         submap = atlas.submaps[m]
-        pairs = [(knots[i], knots[j]) for i, j in views(submap, knots, atlas.warps.get(m)).places]
+        pairs = views(submap, knots, atlas.warps.get(m)).pairs
         covariances.foresee(submap, pairs, atlas.held.get(m, frozenset()))
 
 
@@ -207,12 +207,11 @@ def _within(
     all_own_C: list[FloatArray] = []
     ends: list[IntArray] = []
     for m, view in views.items():
-        here, places = slice(rows[m].start, rows[m].stop), view.places
-        pairs = [(view.knots[i], view.knots[j]) for i, j in places]
-        own_C = covariances(atlas.submaps[m], pairs, atlas.held.get(m, frozenset()))
+        here = slice(rows[m].start, rows[m].stop)
+        own_C = covariances(atlas.submaps[m], view.pairs, atlas.held.get(m, frozenset()))
         steps[m] = own_C[: len(view.knots) - 1]
         all_own_C.append(own_C)
-        ends.append(np.array(places, np.int64).reshape(-1, 2) + here.start)
+        ends.append(np.array(view.places, np.int64).reshape(-1, 2) + here.start)
         depth[here] = view.depth
         if view.unbend is not None:
             S[here] = view.unbend @ T[here]

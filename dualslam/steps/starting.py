@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from dualslam.calibration.shutter_watch import correct_views
@@ -46,7 +48,10 @@ class Starting:
 
     def begin_again(self) -> None:
         """Look for the next map's start anew, as the pixels of the frames that are buffered have changed."""
-        waiting, rows = self._state.buffer.newest(START_REACH), self._state.record.rows
+        self._begin_from(self._state.buffer.newest(START_REACH))
+
+    def _begin_from(self, waiting: Iterable[View]) -> None:
+        rows = self._state.record.rows
         self.begin_anew([view for view in waiting if rows[view.index].submap is None])
 
     # --- a map that is there
@@ -140,7 +145,7 @@ class Starting:
         correct_views(state.buffer, shutter, state.parts.calibration.camera)
         state.relocaliser.end()  # it is of the pixels of before
         *waiting, newest = state.buffer.newest(START_REACH + 1)
-        self.begin_anew([earlier for earlier in waiting if state.record.rows[earlier.index].submap is None])
+        self._begin_from(waiting)
         return newest
 
     def begin(self, start: Start) -> Track | Failure:
