@@ -170,8 +170,11 @@ class MapStarter(Protocol):
         """Keep a view as a possible first view, without trying to start from it."""
         ...
 
-    def add(self, view: View, briefly: bool = False) -> Start | Failure:
-        """Take a view in and try to start a map that ends with it; `briefly`: with a part of what could be tried."""
+    def add(self, view: View, waited_s: float = 0.0, briefly: bool = False) -> Start | Failure:
+        """Take a view in and try to start a map that ends with it.
+
+        `waited_s`: for how long there has been no map; `briefly`: with a part of what could be tried.
+        """
         ...
 
 

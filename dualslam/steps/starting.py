@@ -39,6 +39,7 @@ class Starting:
         self._sightings = sightings
         self._starter = state.parts.new_starter()
         self._n_without_map = 0  # frames
+        self._since_s: float | None = None  # stamp of the first of them for which a start was looked for
 
     def begin_anew(self, lost: list[View]) -> None:
         """Look for the next map's start from these frames on."""
@@ -76,7 +77,7 @@ class Starting:
             return None
         state.live = relocaliser
         state.relocaliser.end()
-        self._n_without_map = 0
+        self._end_wait()
         state.record.event(EventKind.RELOCALISED, view, relocaliser.submap.id, n_inliers=track.n_inliers)
         self._go_on(relocaliser.submap, view)
         return track
@@ -95,7 +96,7 @@ class Starting:
             return None
         state.live, submap = found.odometry, found.odometry.submap
         state.relocaliser.end()
-        self._n_without_map = 0
+        self._end_wait()
         state.begin_health()
         for track, T_kf_cam in (*found.earlier, (found.track, state.live.relative_pose(found.track))):
             at = track.view
@@ -114,6 +115,9 @@ class Starting:
             self._go_on(submap, first.view)
         return found.track
 
+    def _end_wait(self) -> None:
+        self._n_without_map, self._since_s = 0, None
+
     def _go_on(self, submap: Submap, since: View) -> None:
         """Go on in a submap that was found again, and doubt it until the camera's velocity has agreed."""
         self._state.leaps.begin(since)
@@ -125,6 +129,8 @@ class Starting:
     def find_start(self, view: View) -> Start | Failure:
         """Look for the start of a map that ends at this frame, or at one before it if it was looked for meanwhile."""
         state, shutter = self._state, self._state.parts.shutter
+        if self._since_s is None:
+            self._since_s = view.timestamp_s
         with state.record.timer.measure("shutter"):
             readout_s = shutter.readout_s
             may_start = shutter.may_start(view, state.parts.calibration.camera)
@@ -133,7 +139,7 @@ class Starting:
         if not may_start:
             return Failure(FailureReason.DOUBTFUL_INITIALISATION, "a fast turn before the shutter is known")
         with state.record.timer.measure("initialisation"):
-            start = self._starter.add(view, briefly=state.pace.in_real_time)
+            start = self._starter.add(view, view.timestamp_s - self._since_s, briefly=state.pace.in_real_time)
         if isinstance(start, Failure) and start.reason is FailureReason.DOUBTFUL_INITIALISATION:
             state.record.event(EventKind.INITIALISATION_REFUSED, view, None, reason=start.detail, **start.numbers)
         return start
@@ -182,7 +188,7 @@ class Starting:
         state.live = state.parts.new_odometry(submap, graph)
         state.relocaliser.end()
         state.live.start_at(view.index)
-        self._n_without_map = 0
+        self._end_wait()
         state.begin_health()
         self._recoveries.start(submap, view)
         self._recoveries.collect(state.live, view)

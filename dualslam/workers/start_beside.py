@@ -30,11 +30,14 @@ class StartQuestion:
         Intrinsics of the frames.
     views : tuple of View
         Those that the search does not know yet, without their images.
+    waited_s : float
+        For how long there has been no map.
     """
 
     session: int
     K: FloatArray
     views: tuple[View, ...]
+    waited_s: float
 
 
 class StartServer:
@@ -58,7 +61,7 @@ class StartServer:
         *earlier, newest = question.views
         for view in earlier:
             self._starter.collect(view)
-        return self._starter.add(newest)
+        return self._starter.add(newest, question.waited_s)
 
 
 class StartBeside:
@@ -89,16 +92,17 @@ class StartBeside:
         self._starter.collect(view)
         self._note(view)
 
-    def add(self, view: View, briefly: bool = False) -> Start | Failure:
+    def add(self, view: View, waited_s: float = 0.0, briefly: bool = False) -> Start | Failure:
         """Take a view in; return what was found for one that has been tried meanwhile."""
         if not briefly:
             self._note(view)
-            return self._starter.add(view)
+            return self._starter.add(view, waited_s)
         self.collect(view)
         found = self._found()
         if not found and not self._desk.n_open(JobKind.START):
             views = list(self._views)[-self._n_new :]
-            question = StartQuestion(self._session, self._K, tuple(replace(v, image=None) for v in views))
+            sent = tuple(replace(v, image=None) for v in views)
+            question = StartQuestion(self._session, self._K, sent, waited_s)
             self._desk.submit(JobKind.START, question)
             self._n_new = 0
         return found

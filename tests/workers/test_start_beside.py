@@ -10,7 +10,7 @@ import pytest
 
 from dualslam.build import create_frontend, new_initialiser
 from dualslam.core.events import EventKind
-from dualslam.core.types import Failure, FailureReason, FrameStatus, Start
+from dualslam.core.types import Failure, FailureReason, FrameStatus, Start, View
 from dualslam.frontends.tracking.initialiser import Initialiser
 from dualslam.system import System
 from dualslam.testing.late_desk import LateDesk
@@ -109,3 +109,35 @@ def test_without_haste_it_searches_here(world: PointWorld) -> None:
             np.testing.assert_array_equal(mine.xyz, theirs.xyz)
             return
     pytest.fail("no start")
+
+
+class Waiting:
+    """A search that never finds a start, and notes for how long it has been waited for one."""
+
+    def __init__(self) -> None:
+        self.waited_s: list[float] = []
+
+    def collect(self, view: View) -> None: ...
+
+    def add(self, view: View, waited_s: float = 0.0, briefly: bool = False) -> Failure:
+        self.waited_s.append(waited_s)
+        return Failure(FailureReason.LOW_PARALLAX, "")
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_how_long_there_has_been_no_map_is_told_though_the_search_begins_anew(world: PointWorld, there: bool) -> None:
+    system, waiting = system_in(world), Waiting()
+    desk = InlineDesk({JobKind.START: StartServer(lambda K: waiting)})
+    system._state.parts = replace(
+        system._state.parts, new_starter=lambda: StartBeside(desk, waiting, CAMERA.K) if there else waiting
+    )
+    system._starting.begin_again()
+    if there:
+        system.pace.note(0.0)
+    frames = list(world.frames())
+    for n, frame in enumerate(frames):
+        if n == N // 2:
+            system._starting.begin_again()
+        system.step(frame)
+    expected = np.array([frame.timestamp_s - frames[0].timestamp_s for frame in frames])
+    np.testing.assert_allclose(waiting.waited_s, expected, atol=1e-9)

@@ -194,6 +194,25 @@ def test_direction_is_known_as_well_as_is_said() -> None:
     assert "direction of translation" in refusal.detail
 
 
+@pytest.mark.parametrize(("worse", "starts"), [(1.2, True), (1.5, False)])
+def test_after_a_long_wait_a_direction_may_be_known_a_third_less_well(worse: float, starts: bool) -> None:
+    world = PointWorld(cloud(), path(9, np.array([0.06, 0, 0.02]), np.zeros(3)), noise_px=1.0)
+    *earlier, newest = world.views()
+    usual = _fed(initialiser(), earlier).add(newest)
+    assert isinstance(usual, Start)
+    bound = usual.numbers["direction_sigma_deg"] / worse
+    for waited_s, expected in ((0.0, False), (9.0, False), (15.0, starts), (100.0, starts)):
+        found = _fed(initialiser(max_direction_sigma_deg=bound), earlier).add(newest, waited_s)
+        assert bool(found) is expected
+        assert found or "direction of translation" in found.detail
+
+
+def _fed(starter: Initialiser, views: list[View]) -> Initialiser:
+    for view in views:
+        starter.collect(view)
+    return starter
+
+
 @pytest.mark.parametrize(("noise_of_sigma", "worth"), [(1.0, 1.0), (0.6, 1.0), (0.02, 2 / 3)])
 def test_direction_is_known_better_where_pixels_are_calmer_than_usual(noise_of_sigma: float, worth: float) -> None:
     """The bound is for residuals of 0.3 sigmas; what is calmer is taken as it is, down to what drawn pictures have."""
@@ -277,7 +296,7 @@ def test_pairs_far_enough_apart_are_tried_and_no_nearer_ones_in_vain(
 
     monkeypatch.setattr(starter, "try_pair", judge)
     for view in PointWorld(cloud(), path(110, np.array([0.01, 0, 0]), np.zeros(3))).views():
-        starter.add(view, briefly)
+        starter.add(view, briefly=briefly)
     late = tried[len(tried) // 2 :]
     assert late.count(8) + late.count(16) > 0.45 * len(late)
     assert {8, 16, 32} <= set(late), "farther ones are asked again: the camera may stand still meanwhile"
