@@ -183,8 +183,8 @@ def _optimise(problem: BundleProblem, start: FloatArray, prior: FloatArray | Non
     params.setLinearSolverType("SEQUENTIAL_CHOLESKY")
     params.setOrdering(gtsam.Ordering(ordering))
     with without_gtsam_output():  # the factor prints each point that a step puts behind a camera
-        before = float(graph.error(values))
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+        before = float(optimizer.error())
         result = optimizer.optimize()
     T, xyz = convert.poses_of(result), convert.points_of(result)
     vector = np.asarray((camera if prior is None else result.atCal3DS2(CALIBRATION_KEY)).vector())

@@ -153,7 +153,7 @@ class FactorIndex:
         gate = np.where(known | (not strict), INSERT_SIGMAS, ENTER_SIGMAS)
         fits, certain = self._judge(submap, poses, xyz_mu, row, inside, known, known & ~lost, gate, caution)
 
-        leaving = died | (inside & known[lm] & ~certain[lm] & lost[lm])
+        leaving = died | (inside & (known & ~certain & lost)[lm])
         candidate = ~inside[row]
         entering = np.zeros(len(lm), bool)
         entering[row[candidate & fits & certain[lm[row]]]] = True

@@ -200,8 +200,8 @@ def optimise_batch(
     params.setLinearSolverType("SEQUENTIAL_CHOLESKY")
     params.setOrdering(gtsam.Ordering(landmarks.tolist() + convert.pose_keys(keyframes)))
     try:
-        before = float(graph.error(values))
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
+        before = float(optimizer.error())
         result = optimizer.optimize()
         if optimizer.iterations() == 0 and optimizer.lambda_() >= params.getlambdaUpperBound():
             # No step was good. Where the baseline that fixes the scale must turn, its factor (1e-4 of its length) bears

@@ -97,9 +97,8 @@ class NumpyWindowSolver:
         row, keyframes, window = _window(submap, free, ids)
         if len(keyframes) == len(free):
             return Failure(FailureReason.TOO_FEW_MATCHES, f"nothing but its neighbours holds keyframe {newest}")
-        before = _evaluate(window, window.T_submap_kf, window.xyz_mu, self._robust_k)
         after = adjust_window(window, self._robust_k)
-        if not (np.isfinite(after.T).all() and after.cost <= before.cost):
+        if not (np.isfinite(after.T).all() and np.isfinite(after.cost)):
             return Failure(FailureReason.SOLVER, "the window has no optimum")
         n_views = np.bincount(window.point, minlength=len(ids))[window.point]
         noise2 = residual_variance(after.chi2, n_views, LEAST_NOISE**2)
