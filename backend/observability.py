@@ -83,6 +83,28 @@ def reproject(
     return xyz_cam, front, uv_px
 
 
+def projection_jacobian(
+    K: FloatArray, R_submap_kf: FloatArray, xyz_cam: FloatArray, sigma_px: FloatArray
+) -> FloatArray:
+    """Return (2, 3, R): the whitened derivative of pixels by points in the submap, coordinate by coordinate.
+
+    Parameters
+    ----------
+    K : (3, 3)
+    R_submap_kf : (R, 3, 3)
+    xyz_cam : (R, 3)
+        In front of the camera.
+    sigma_px : (R,)
+    """
+    x, y, z = xyz_cam.T
+    w = 1 / (z * sigma_px)
+    R = np.ascontiguousarray(R_submap_kf.transpose(2, 1, 0))  # column, row
+    J = np.empty((2, 3, len(z)))
+    J[0] = (K[0, 0] * w) * R[0] + (K[0, 1] * w) * R[1] - ((K[0, 0] * x + K[0, 1] * y) * w / z) * R[2]
+    J[1] = (K[1, 1] * w) * R[1] - (K[1, 1] * y * w / z) * R[2]
+    return J
+
+
 def compute_depth_sigmas(
     K: FloatArray,
     T_submap_kf: FloatArray,
@@ -108,17 +130,12 @@ def compute_depth_sigmas(
     (n_points,) float64
         Largest standard deviation of the point relative to its least depth; infinite with fewer than two views.
     """
-    x, y, z = xyz_cam.T
-    # Rows of the projection's derivative by the point, whitened: coordinate by coordinate, as in `reproject`.
-    R = T_submap_kf[:, :3, :3].transpose(2, 1, 0).reshape(9, -1).take(pose, axis=1).reshape(3, 3, -1)  # column, row
-    w = 1 / (z * sigma_px)
-    J_u = (K[0, 0] * w) * R[0] + (K[0, 1] * w) * R[1] - ((K[0, 0] * x + K[0, 1] * y) * w / z) * R[2]
-    J_v = (K[1, 1] * w) * R[1] - (K[1, 1] * y * w / z) * R[2]
+    J_u, J_v = projection_jacobian(K, T_submap_kf.take(pose, axis=0)[:, :3, :3], xyz_cam, sigma_px)
     information = np.zeros((n_points, 3, 3))
     for i, j in ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)):  # `eigvalsh` reads the lower triangle
         information[:, i, j] = np.bincount(point, J_u[i] * J_u[j] + J_v[i] * J_v[j], n_points)
     depth = np.full(n_points, np.inf)
-    np.minimum.at(depth, point, z)
+    np.minimum.at(depth, point, xyz_cam[:, 2])
     smallest = np.linalg.eigvalsh(information)[:, 0]
     views = np.bincount(point, minlength=n_points)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dualslam.backend.observability import MIN_DEPTH_MU, reproject
-from dualslam.core.sums import sum_by
+from dualslam.backend.observability import MIN_DEPTH_MU, projection_jacobian, reproject
 from dualslam.core.types import FloatArray, IntArray
 
 STEPS = 2
@@ -14,26 +13,15 @@ DAMPING = 1e-6
 """Relative to the trace of a point's information: keeps the depth of one seen along a single line where it is."""
 
 
-def projection_jacobian(
-    K: FloatArray, R_submap_kf: FloatArray, xyz_cam: FloatArray, sigma_px: FloatArray
-) -> FloatArray:
-    """Return (R, 2, 3): the whitened derivative of pixels by points in the submap.
-
-    Parameters
-    ----------
-    K : (3, 3)
-    R_submap_kf : (R, 3, 3)
-    xyz_cam : (R, 3)
-        In front of the camera.
-    sigma_px : (R,)
-    """
-    x, y, z = xyz_cam.T
-    w = 1 / (z * sigma_px)
-    J = np.zeros((len(z), 2, 3))
-    J[:, 0, 0], J[:, 0, 1] = K[0, 0] * w, K[0, 1] * w
-    J[:, 0, 2] = -(K[0, 0] * x + K[0, 1] * y) * w / z
-    J[:, 1, 1], J[:, 1, 2] = K[1, 1] * w, -K[1, 1] * y * w / z
-    return np.asarray(J @ R_submap_kf.transpose(0, 2, 1), np.float64)
+def normal_equations(
+    J: FloatArray, weight: FloatArray, residuals: FloatArray, point: IntArray, n: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return J'WJ (n, 3, 3) and J'Wr (n, 3) of each point, for J (2, 3, R), weights (R,) and residuals (R, 2)."""
+    weighted, H = J * weight, np.empty((n, 3, 3))
+    for i, j in ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)):
+        H[:, i, j] = H[:, j, i] = np.bincount(point, weighted[0, i] * J[0, j] + weighted[1, i] * J[1, j], n)
+    Jr = weighted[0] * residuals[:, 0] + weighted[1] * residuals[:, 1]
+    return H, np.column_stack([np.bincount(point, row, n) for row in Jr])
 
 
 def huber(chi2: FloatArray, k: float) -> tuple[FloatArray, FloatArray]:
@@ -89,9 +77,7 @@ def refine_points(
             break
         weight[~front] = 0.0
         J = projection_jacobian(K, R, safe, sigma_px)
-        weighted = J * weight[:, None, None]
-        H = sum_by(point, weighted.transpose(0, 2, 1) @ J, n)
-        b = sum_by(point, np.einsum("rai,ra->ri", weighted, r), n)
+        H, b = normal_equations(J, weight, r, point, n)
         H += (DAMPING * np.trace(H, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
         xyz = xyz - np.linalg.solve(H, b[:, :, None])[:, :, 0]
     return best
@@ -116,7 +102,8 @@ def triangulation_covariances(
     xyz_cam = np.einsum("rji,rj->ri", R, xyz_mu[point] - t)
     front = xyz_cam[:, 2] > MIN_DEPTH_MU
     J = projection_jacobian(K, R[front], xyz_cam[front], sigma_px[front])
-    information = sum_by(point[front], J.transpose(0, 2, 1) @ J, len(xyz_mu))
+    ones = np.ones(J.shape[2])
+    information, _ = normal_equations(J, ones, np.zeros((len(ones), 2)), point[front], len(xyz_mu))
     covariances = np.full((len(xyz_mu), 3, 3), np.nan)
     values = np.linalg.eigvalsh(information)
     known = values[:, 0] > 1e-9 * values[:, 2]

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.backend.noise import LEAST_NOISE, OUTLIER_CHI2, residual_variance
-from dualslam.backend.observability import reproject
-from dualslam.backend.point_refinement import huber, projection_jacobian
+from dualslam.backend.observability import projection_jacobian, reproject
+from dualslam.backend.point_refinement import huber, normal_equations
 from dualslam.backend.selection import rank_in_runs, spread_evenly
 from dualslam.core.estimates import GraphEstimate
 from dualslam.core.geometry import se3, so3
@@ -150,23 +150,24 @@ def adjust_window(window: Window, robust_k: float, iterations: int = ITERATIONS)
     mine = np.flatnonzero(window.pose < n_free)
     pose, point = window.pose[mine], window.point[mine]
     pair = pose * n_points + point  # a keyframe sees a point once
+    views = [np.flatnonzero(pose == f) for f in range(n_free)]
     state = _evaluate(window, window.T_submap_kf, window.xyz_mu, robust_k)
     damping = FIRST_DAMPING
     for _ in range(iterations):
         safe = np.where(np.isfinite(state.chi2)[:, None], state.xyz_cam, [0.0, 0.0, 1.0])
         R = state.T.take(window.pose, axis=0)[:, :3, :3]
         J = projection_jacobian(window.K, R, safe, window.sigma_px)
-        weighted = J * state.weight[:, None, None]
-        V = sum_by(window.point, weighted.transpose(0, 2, 1) @ J, n_points)
-        g_point = sum_by(window.point, np.einsum("rai,ra->ri", weighted, state.residuals), n_points)
+        V, g_point = normal_equations(J, state.weight, state.residuals, window.point, n_points)
         # By the pose: in the camera, a point moves by [p]x omega - v.
-        J_cam = J[mine] @ R[mine]
+        J_point = J[:, :, mine].transpose(2, 0, 1)
+        J_cam = J_point @ R[mine]
         J_pose = np.concatenate((J_cam @ so3.hat(safe[mine]), -J_cam), axis=2)
         J_pose_w = J_pose * state.weight[mine, None, None]
-        U = sum_by(pose, J_pose_w.transpose(0, 2, 1) @ J_pose, n_free)
-        g_pose = sum_by(pose, np.einsum("rai,ra->ri", J_pose_w, state.residuals[mine]), n_free)
+        residuals = state.residuals[mine]
+        U = np.array([np.tensordot(J_pose_w[v], J_pose[v], 2 * [[0, 1]]) for v in views])
+        g_pose = np.array([np.tensordot(J_pose_w[v], residuals[v], 2 * [[0, 1]]) for v in views])
         W = np.zeros((n_free * n_points, 6, 3))
-        W[pair] = J_pose_w.transpose(0, 2, 1) @ J[mine]
+        W[pair] = J_pose_w.transpose(0, 2, 1) @ J_point
         W = W.reshape(n_free, n_points, 6, 3).transpose(1, 0, 2, 3).reshape(n_points, 6 * n_free, 3)
         moved = _step(state, U, V, W, g_pose, g_point, damping)
         new = _evaluate(window, *moved, robust_k)
