@@ -21,6 +21,7 @@ from dualslam.frontends.gap.uncertainty import track_uncertainty
 from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like
 from dualslam.frontends.tracking.mapper import Mapper
 from dualslam.frontends.tracking.tracker import GivenPose, Tracker
+from dualslam.frontends.tracking.unmapped import passes_unmapped
 from dualslam.map.anchors import RelativePose
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
@@ -61,6 +62,7 @@ class VisualFrontEnd:
     ) -> None:
         self.submap = submap
         self.graph = graph
+        self._frontend = frontend
         self._config = config
         self._tracker = Tracker(
             frontend,
@@ -221,7 +223,13 @@ class VisualFrontEnd:
 
     def _shows_other(self, track: Track) -> bool:
         """Whether a frame shows other things than its reference keyframe, or from elsewhere."""
-        return keyframe_due(track, self.submap, self._reference_id, self._config.keyframes, self._first_id)
+        config, last = self._config, self._reference_id
+        if keyframe_due(track, self.submap, last, config.keyframes, self._first_id):
+            return True
+        if track.view.index in self.submap.keyframes:
+            return False
+        parallax_deg, n = config.keyframes.max_parallax_deg, config.tracking.min_inliers
+        return passes_unmapped(track, self.submap, last, self._frontend, parallax_deg, n)
 
     def _known(self, track: Track) -> int | None:
         """Return the keyframe of an earlier run that shows the same."""

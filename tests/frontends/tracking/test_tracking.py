@@ -406,6 +406,28 @@ class TestKeyframing:
         assert not due(np.concatenate([near[:8], far]))
         assert due(np.concatenate([near[:2], far]))
 
+    def test_what_is_not_mapped_and_passes_by_makes_one(self) -> None:
+        """A bench below the camera, of which a map of the wall behind it has nothing; the wall hardly moves."""
+        rng = np.random.default_rng(0)
+        wall = rng.uniform([-40, -22, 45], [40, 2, 55], (400, 3))
+        bench = rng.uniform([-2, 0.5, 2], [2, 1.5, 3], (400, 3))
+        points = np.stack([wall, bench], axis=1).reshape(-1, 3)
+        still, turn, step = path(9, [0.02, 0, 0], [0, 0, 0]), np.array([0, 0.01, 0]), np.array([0.05, 0, 0])
+
+        def due(step_m: FloatArray, turn_rad: FloatArray, every: int) -> list[int]:
+            T = np.concatenate([still, still[-1] @ path(6, step_m, turn_rad)[1:]])
+            live = front_end(PointWorld(points, T), [0, 4, 8], start_at=8, every=every)
+            tracks = [tracked(live, view) for view in PointWorld(points, T).views()[9:]]
+            assert all(parallax_deg(track, live.submap, 8) < 0.5 for track in tracks) or every == 1
+            return [track.view.index for track in tracks if live.keyframe_due(track)]
+
+        nothing = np.zeros(3)
+        assert 9 not in due(step, nothing, every=2)
+        assert due(step, nothing, every=2), "only the wall is in the map"
+        assert not due(step, nothing, every=1), "the bench is in the map, too"
+        assert not due(nothing, turn, every=2), "a turn shows nothing of how far it is"
+        assert not due(nothing, nothing, every=2)
+
     def test_parallax_is_the_angle_of_the_baseline(self, world: PointWorld) -> None:
         live = front_end(world, [0, 4, 8], start_at=8)
         track = tracked(live, world.view(12))

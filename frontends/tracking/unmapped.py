@@ -1,0 +1,68 @@
+"""What an image shows and the map lacks: whether the camera has moved past it, and a keyframe would map it.
+
+Parallax is told by what is known. Beside a far wall a bench that comes into view, on which nothing is mapped yet, moves
+by a quarter of the image while the wall hardly does, and has gone, or has come too close, when the wall asks for a
+keyframe.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dualslam.core.interfaces import Frontend
+from dualslam.core.types import BoolArray, Features, FloatArray, Track
+from dualslam.map.submap import NO_LANDMARK, Submap
+
+MIN_SHARE = 0.4
+"""Of the image that must be unmapped before it is looked at, as that takes a matching: more than in any of 400 frames
+of a road and 300 of a room. From a quarter on, the room has a tenth more keyframes."""
+CELLS_ACROSS, MIN_IN_CELL = 8, 5  # the image's cells, and how many features make one that shows something
+
+
+def passes_unmapped(
+    track: Track, submap: Submap, keyframe_id: int, frontend: Frontend, parallax_deg: float, n: int
+) -> bool:
+    """Whether what is not mapped, neither here nor in a keyframe, has moved between the two by more than a turn does.
+
+    Parameters
+    ----------
+    track : Track
+        Of a frame.
+    submap : Submap
+    keyframe_id : int
+        Of the submap: the last keyframe.
+    frontend : Frontend
+    parallax_deg : float
+        At which a keyframe is due if what is mapped shows it. At the angle from which on a match could be a landmark,
+        1 degree, keyframes came in turns on the spot as well, and broke maps of `tum_fr1_rpy`.
+    n : int
+        So many matches must show it.
+    """
+    features, keyframe = track.view.features, submap.keyframes[keyframe_id].features
+    rows = np.flatnonzero(_unmapped(features, track.landmark_ids >= 0))
+    if len(rows) == 0:
+        return False
+    free = np.flatnonzero(submap.landmark_of[keyframe_id] == NO_LANDMARK)
+    matches = frontend.match_wide(features.take(rows), keyframe.take(free)).index
+    if len(matches) < n:
+        return False
+    here = _rays(features.uv_rect_px[rows[matches[:, 0]]], submap.K) @ track.T_cam_submap[:3, :3]
+    there = _rays(keyframe.uv_rect_px[free[matches[:, 1]]], submap.K) @ submap.T_submap_kf[keyframe_id][:3, :3].T
+    sine = np.linalg.norm(np.cross(here, there), axis=1)
+    return int((sine > np.sin(np.radians(parallax_deg))).sum()) >= n
+
+
+def _unmapped(features: Features, has_landmark: BoolArray) -> BoolArray:
+    """Return which features lie in cells without a landmark; none where these are a small share of the image."""
+    uv_px = features.uv_rect_px
+    cell_px = max(float(np.ptp(uv_px[:, 0])), 1.0) / CELLS_ACROSS
+    cell = np.unique(np.floor(uv_px / cell_px), axis=0, return_inverse=True)[1].reshape(-1)
+    shows = np.bincount(cell) >= MIN_IN_CELL
+    bare = shows & (np.bincount(cell, has_landmark) == 0)
+    return np.asarray(bare[cell] & (bare.sum() > MIN_SHARE * shows.sum()))
+
+
+def _rays(uv_px: FloatArray, K: FloatArray) -> FloatArray:
+    """Return unit vectors (N, 3) in the camera's frame."""
+    rays = np.column_stack([uv_px, np.ones(len(uv_px))]) @ np.linalg.inv(K).T
+    return np.asarray(rays / np.linalg.norm(rays, axis=1)[:, None])
