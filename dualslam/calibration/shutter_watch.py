@@ -125,7 +125,7 @@ class ShutterWatch:
         if isinstance(answer, Failure) or not _is_sure(answer):
             return
         readout_s = self._shutter.readout_s + answer.more_s
-        if readout_s <= 0 or not self._change(submap, answer.more_s, now, live):
+        if not self._change(submap, answer.more_s, now, live):
             return
         self._due_at[submap.id] = SOON * len(submap.keyframes)
         submaps = self._record.atlas.submaps

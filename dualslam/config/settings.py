@@ -29,10 +29,11 @@ class CameraConfig(StrictModel):
     model_sigma_px: float = Field(0.8, ge=0, le=100)
     """Error of the camera model itself at a pixel (one sigma), beside the noise of the features: chequerboard
     calibrations and rectified data sets are off by half a pixel to a pixel towards the rim of the image."""
-    readout_s: float | None = Field(None, ge=0, le=0.1)
+    readout_s: float | None = Field(None, ge=-0.1, le=0.1)
     """Time between reading the first and the last row of an image: 0 for a global shutter, about 0.03 for webcams and
-    the first Kinect. None: the frames in which there is no map are asked for it, and where one that
-    rolls is likely, no map starts from a fast turn until it is known."""
+    the first Kinect, negative where images were turned upside down since, so that the last row was read first. None:
+    the frames in which there is no map are asked for it, and where one that rolls is likely, no map starts from a fast
+    turn until it is known."""
 
 
 class InitialiserConfig(StrictModel):

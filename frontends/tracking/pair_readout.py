@@ -64,7 +64,8 @@ class ReadoutEstimator:
         self._seed = seed
         self._min_evidence = min_evidence
         self._recent: list[tuple[View, FloatArray | None]] = []
-        self._chi2 = np.zeros(len(READOUTS_S))
+        self._direction = 1.0  # -1: rows are read from the last to the first
+        self._chi2, self._chi2_turned = np.zeros(len(READOUTS_S)), 0.0
         self._n_pairs = 0
         self.suspects = self.is_done = False
         self._n_frames = 0
@@ -88,8 +89,15 @@ class ReadoutEstimator:
         if len(matches) < MIN_MATCHES:
             return None
         of_a, of_b = a.features.take(matches.index[:, 0]), b.features.take(matches.index[:, 1])
-        self._chi2 += self._misfits(of_a, rate_a, of_b, rate_b, camera)
+        misfits, turned = self._misfits(of_a, rate_a, of_b, rate_b, camera)
+        self._chi2 += misfits
+        self._chi2_turned += turned
         self._n_pairs += 1
+        if self._chi2.min() - self._chi2_turned > SUSPICION * self._min_evidence:
+            # Images that were turned upside down: begin anew, from the last row to the first.
+            self._direction *= -1.0
+            self._chi2, self._chi2_turned, self._n_pairs = np.zeros(len(READOUTS_S)), 0.0, 0
+            return None
         best = int(np.argmin(self._chi2))
         evidence = self._chi2[0 if best else TYPICAL] - self._chi2[best]
         self.suspects = best > 0 and evidence > SUSPICION * self._min_evidence
@@ -100,8 +108,8 @@ class ReadoutEstimator:
         )
         self.is_done |= self._n_pairs >= ENOUGH_PAIRS
         if known:
-            return _minimum(self._chi2, best)
-        return _mean(self._chi2) if self._n_pairs >= MAX_PAIRS else None
+            return self._direction * _minimum(self._chi2, best)
+        return self._direction * _mean(self._chi2) if self._n_pairs >= MAX_PAIRS else None
 
     def _at(self, n: int, to_rad_s: FloatArray, from_rad_s: FloatArray) -> FloatArray:
         """Return the turn at a frame: between the turns to it and from it, which are those half-way between frames."""
@@ -113,8 +121,11 @@ class ReadoutEstimator:
         left, middle, right = self._chi2[best - 1 : best + 2]
         return float(left - 2 * middle + right)
 
-    def _misfits(self, a: Features, rate_a: FloatArray, b: Features, rate_b: FloatArray, camera: Camera) -> FloatArray:
-        """Return the robust chi-square (T,) of the best relative pose of two views for each readout time.
+    def _misfits(
+        self, a: Features, rate_a: FloatArray, b: Features, rate_b: FloatArray, camera: Camera
+    ) -> tuple[FloatArray, float]:
+        """Return the robust chi-square of the best relative pose of two views for each readout time (T,), and for a
+        typical one with the rows read the other way round.
 
         Poses come from RANSAC with the shortest and with the longest time, and from there each time's is refined from
         that of the time before it, upwards and downwards: RANSAC's own scatter would drown what the times differ by,
@@ -124,26 +135,23 @@ class ReadoutEstimator:
         lens = poselib_camera(camera.K, camera.size_px)
         gate_px = CHI2_95[1] ** 0.5 * float(np.median(sigma_px))
         straight = [
-            tuple(correct_shutter(x, camera, s * rate).uv_rect_px for x, rate in ((a, rate_a), (b, rate_b)))
-            for s in READOUTS_S
+            [correct_shutter(x, camera, s * rate).uv_rect_px for x, rate in ((a, rate_a), (b, rate_b))]
+            for s in self._direction * np.append(READOUTS_S, -READOUTS_S[TYPICAL])
         ]
-        ransac = {"max_epipolar_error": gate_px, "max_iterations": 500, "min_iterations": 50, "seed": self._seed}
         converged = {"step_tol": STEP_TOLERANCE}
+        ransac = {"max_epipolar_error": gate_px, "max_iterations": 500, "min_iterations": 50, "seed": self._seed}
         refine = {"loss_type": "CAUCHY", "loss_scale": gate_px, "max_iterations": 25, **converged}
+        times = range(len(READOUTS_S))
         misfits = np.full(len(straight), np.inf)
-        upwards = range(len(straight))
-        for way in (upwards, reversed(upwards)):
-            pose = None
+        for way in (times, (*reversed(times), -1)):
+            pose = poselib.estimate_relative_pose(*straight[way[0]], lens, lens, ransac, converged)[0]
             for n in way:
-                uv_a, uv_b = straight[n]
-                if pose is None:
-                    pose = poselib.estimate_relative_pose(uv_a, uv_b, lens, lens, ransac, converged)[0]
-                pose = poselib.refine_relative_pose(uv_a, uv_b, pose, lens, lens, refine)[0]
+                pose = poselib.refine_relative_pose(*straight[n], pose, lens, lens, refine)[0]
                 T_b_a = np.eye(4)
                 T_b_a[:3] = pose.Rt
-                error2 = sampson_error(fundamental_from_pose(camera.K, T_b_a), uv_a, uv_b) / sigma_px**2
+                error2 = sampson_error(fundamental_from_pose(camera.K, T_b_a), *straight[n]) / sigma_px**2
                 misfits[n] = min(misfits[n], float((CHI2_95[1] * np.log1p(error2 / CHI2_95[1])).sum()))
-        return misfits
+        return misfits[:-1], float(misfits[-1])
 
 
 def is_fast(rate_rad_s: FloatArray, camera: Camera) -> bool:

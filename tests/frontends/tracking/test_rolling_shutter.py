@@ -80,6 +80,15 @@ def test_readout_is_found_from_pixels(seed: int) -> None:
     assert all(started[-20:])
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_images_turned_upside_down_are_read_from_their_last_row_on(seed: int) -> None:
+    world = PointWorld(cloud(seed=seed), shaken(120), seed=seed)
+    shutter = RollingShutter(OrbFrontend(), CameraConfig(), 0)
+    for i in range(120):
+        shutter.may_start(shutter.shutter_corrected(read_row_by_row(world, i, -READOUT_S), CAMERA), CAMERA)
+    assert shutter.readout_s == pytest.approx(-READOUT_S, abs=0.005)
+
+
 @pytest.mark.parametrize("dropped", [(), (7, 8), (20, 41, 42, 43, 77), tuple(range(5, 160, 11))], ids=str)
 def test_readout_gets_better_while_no_map_starts_whichever_frames_are_missing(dropped: tuple[int, ...]) -> None:
     world = PointWorld(cloud(seed=2), shaken(180), seed=2)
