@@ -12,7 +12,7 @@ from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import VisualOdometry
-from dualslam.core.types import Failure, FailureReason, Frame, FrameStatus, Track, View
+from dualslam.core.types import Failure, FailureReason, Frame, FrameStatus, Start, Track, View
 from dualslam.health import HealthMonitor
 from dualslam.io.map_store import StoredMap
 from dualslam.map.connections import Connections
@@ -212,8 +212,11 @@ class System:
         self._graphs.collect(frame)
         self._places.collect(frame)
         in_map = state.relocaliser.relocaliser if state.live is None else state.live
-        if self._calibrations.collect(in_map, frame, self._recoveries.waiting) and state.live is None:
-            self._starting.begin_again()
+        if self._calibrations.collect(in_map, frame, self._recoveries.waiting):
+            if state.live is None:
+                self._starting.begin_again()
+            elif state.lost:
+                self._begin_anew()
         self._recoveries.collect(state.live, frame)
         self.buffer.settle(SETTLED_A_FRAME)
         # 2. Features, into the buffer that reverse tracking will read.
@@ -265,8 +268,10 @@ class System:
         if self._state.localises:
             return Failure(FailureReason.TOO_FEW_MATCHES, "the saved map does not show this place")
         start = self._starting.find_start(view)
-        if isinstance(start, Failure):
-            return start
+        return start if isinstance(start, Failure) else self._begin(start, view)
+
+    def _begin(self, start: Start, view: View) -> Track | Failure:
+        """Go on in a new map."""
         outcome = self._starting.begin(start)
         # A search beside the tracking finds a start that ends some frames back: go on from there.
         for later in [v for v in self.buffer if start.views[-1].index < v.index <= view.index]:
@@ -295,6 +300,7 @@ class System:
         if broken is not None:
             self._endings.break_at(live, view, broken.first, broken.failure)
             self._begin_anew()
+            state.lost = []
             return broken.failure
         if (found := self._places.seen_from(live, track)) is not None:
             return self._go_over(found, live, view)
@@ -327,8 +333,8 @@ class System:
         if self.saved is None and not under_way:
             self._shutter_watch.ask_if_due(live, view, self._recoveries.waiting)
 
-    def _lose(self, live: VisualOdometry, view: View, failure: Failure) -> Failure:
-        """Count a frame that was not posed; after some in a row the map is given up, and the next one starts."""
+    def _lose(self, live: VisualOdometry, view: View, failure: Failure) -> Track | Failure:
+        """Take a frame that was not posed: the map may be seen again until the next one starts, or it is given up."""
         state = self._state
         self.rows[view.index].status = FrameStatus.LOST
         if state.localises:
@@ -336,20 +342,32 @@ class System:
             return failure
         state.lost.append(view)
         if len(state.lost) == 1:
-            self.buffer.freeze()
-            # A map whose end is suspected is no witness.
-            if all(frame.failed for frame in state.health.suspected()):
-                self._calibrations.ask_at_loss(live, view, self._recoveries.waiting)
-        if len(state.lost) > state.config.tracking.max_lost_frames or failure.reason is FailureReason.SOLVER:
+            view = self._begin_to_lose(live, view)
+        shutter, readout_s = state.parts.shutter, state.parts.shutter.readout_s
+        start = self._starting.find_start_instead(view)
+        # A map of the pixels of before is not looked for.
+        hopeless = failure.reason is FailureReason.SOLVER or shutter.readout_s != readout_s
+        waited_s = abs(view.timestamp_s - state.lost[0].timestamp_s)
+        if start or hopeless or waited_s >= state.config.tracking.max_lost_s:
             self._endings.give_up(live, view, failure)
-            self._begin_anew()
-        return failure
+            if hopeless:
+                state.relocaliser.end()
+            state.lost = []
+        return failure if isinstance(start, Failure) else self._begin(start, view)
+
+    def _begin_to_lose(self, live: VisualOdometry, view: View) -> View:
+        """Keep what is buffered, and ask the map about its camera; return the view under the camera of now."""
+        self.buffer.freeze()
+        # A map whose end is suspected is no witness.
+        if all(frame.failed for frame in self._state.health.suspected()):
+            self._calibrations.ask_at_loss(live, view, self._recoveries.waiting)
+        self._starting.begin_anew([])
+        return self.buffer.newest(1)[0]
 
     def _begin_anew(self) -> None:
         """Look for the next map's start from the frames since the loss on, rectified by the camera of now."""
         lost = {view.index for view in self._state.lost}
         self._starting.begin_anew([view for view in self.buffer if view.index in lost])
-        self._state.lost = []
 
     # --- records
 

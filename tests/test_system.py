@@ -14,8 +14,9 @@ from dualslam.core.types import FloatArray, FrameStatus, Track, View
 from dualslam.lab.bench.measure import breakages
 from dualslam.places.sightings import Relocalised, Sightings
 from dualslam.run.results import frame_rows, trajectories_of
+from dualslam.steps.starting import EARLY_FRAMES
 from dualslam.system import System
-from dualslam.testing.point_world import PointWorld, cloud, hand_held, path, pose_errors, system_in
+from dualslam.testing.point_world import RATE_HZ, PointWorld, cloud, hand_held, path, pose_errors, system_in
 
 POSITION_M, ROTATION_RAD = 0.06, 0.01
 
@@ -139,6 +140,39 @@ def test_a_short_loss_is_bridged(world: PointWorld) -> None:
     assert not system.events.of_kind(EventKind.FAILED)
     indices, T = main_trajectory(system)
     assert_right(indices, T, world)
+
+
+@pytest.mark.parametrize("max_lost_s", [0.125, 0.225])
+def test_how_long_a_loss_may_be_is_told_in_seconds(world: PointWorld, max_lost_s: float) -> None:
+    covered = PointWorld(world.xyz, world.T_world_cam, covered=frozenset(range(35, 50)))
+    system = run(covered, tracking={"max_lost_s": max_lost_s})
+    (failed,) = system.events.of_kind(EventKind.FAILED)
+    assert failed.frame == 35 + int(np.ceil(max_lost_s * RATE_HZ))
+
+
+def test_a_map_that_is_seen_again_in_time_goes_on(world: PointWorld) -> None:
+    covered = PointWorld(world.xyz, world.T_world_cam, covered=frozenset(range(35, 50)))
+    system = run(covered, tracking={"max_lost_s": 1.0})
+    assert not system.events.of_kind(EventKind.FAILED)
+    (again,) = system.events.of_kind(EventKind.GAP_RELOCALISED)
+    assert again.frame == 50
+    assert_right(*main_trajectory(system), world)
+
+
+@pytest.mark.parametrize("is_firm", [True, False])
+def test_a_map_that_starts_meanwhile_ends_the_wait(is_firm: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From one frame to the next the camera looks the other way, and goes on. Only a firm start may come early."""
+    monkeypatch.setattr("dualslam.steps.starting.FIRM_SIGMA_DEG", np.inf if is_firm else 0.0)
+    before, after = path(20, np.array([0.08, 0, 0]), np.zeros(3)), path(20, np.array([0.08, 0, 0.02]), np.zeros(3))
+    turned = path(2, np.zeros(3), np.array([0, np.pi, 0]))[1]
+    both_sides = np.concatenate([cloud(), cloud(seed=1) * (1, 1, -1)])
+    world = PointWorld(both_sides, np.concatenate([before, turned @ after]))
+    system = run(world, tracking={"max_lost_s": 1.0})
+    (failed,) = system.events.of_kind(EventKind.FAILED)
+    (started,) = system.events.of_kind(EventKind.REINITIALISED)
+    assert failed.frame == started.frame < 20 + 1.0 * RATE_HZ
+    assert (started.frame < 20 + EARLY_FRAMES) == is_firm
+    assert {i: row.submap for i, row in system.rows.items()} == {i: int(i >= 20) for i in range(40)}
 
 
 def test_frames_since_a_loss_wait_for_the_next_map_however_short_the_buffer() -> None:

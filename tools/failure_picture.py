@@ -26,7 +26,7 @@ OUT = Path(__file__).resolve().parent.parent / "docs" / "failure.svg"
 COVERED = range(60, 67)
 SETTINGS = (
     f"corruptions=[{{kind: blackout, start: {COVERED.start}, length: {len(COVERED)}}}]",
-    "tracking.max_lost_frames=3",
+    "tracking.max_lost_s=0.25",
     "calibration.refine=false",
 )
 FIRST, LAST = 30, 94

@@ -94,6 +94,8 @@ def what_became_of(path: str) -> str | None:
         return f"{path} is no setting any more: it follows from {FOLLOWS[path]}"
     if path in CONSTANTS:
         return f"{path} is no setting any more but a constant, {CONSTANTS[path]}; remove it from the configuration"
+    if path == "tracking.max_lost_frames":
+        return f"{path} is no setting any more: tracking.max_lost_s says it in seconds"
     if path == "graph.extra_iterations":
         return f"{path} is no setting any more: a keyframe has two updates; remove it from the configuration"
     return None

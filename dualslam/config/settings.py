@@ -64,8 +64,9 @@ class TrackingConfig(StrictModel):
     """Search radius about a landmark's predicted pixel, at the finest octave, when the motion model is trusted."""
     min_inliers: int = Field(20, ge=6)
     """Landmarks that must agree with a pose for it to be taken at all."""
-    max_lost_frames: int = Field(8, ge=0)
-    """Frames in a row that wide matching may fail on before the submap is given up."""
+    max_lost_s: float = Field(0.75, ge=0)
+    """Seconds, by the frames' times, from the first frame that is not posed, after which the submap is given up. Until
+    then wide matching may find it again, unless the next one starts first: its start is looked for meanwhile."""
 
 
 class KeyframeConfig(StrictModel):

@@ -17,6 +17,8 @@ from dualslam.system import System
 CAMERA = PinholeCamera(640, 480, 450.0, 450.0, 319.5, 239.5)
 SIZE_PX = (CAMERA.width, CAMERA.height)
 RATE_HZ = 20.0
+GIVEN_UP_S = 0.375
+"""With the ninth frame without a pose a map is given up, if not otherwise told."""
 SCALE_FACTOR = 1.2
 UNIT_DISTANCE_M = 12.0
 """A patch at this distance is seen at the finest octave, a nearer one at a coarser."""
@@ -114,6 +116,7 @@ def system_in(world: PointWorld, **settings: object) -> System:
     """Build the real system, with the world's features instead of those of an image; no other ones are to be had."""
     recovery: Any = settings.get("recovery", {"enabled": False})
     fixed = {"camera": {"model_sigma_px": 0.0}, "calibration": {"refine": False}}
+    fixed["tracking"] = {"max_lost_s": GIVEN_UP_S}
     config = Config.model_validate(fixed | settings | {"recovery": {"attempts": ["live"]} | recovery})
     system = build_system(config, CAMERA)
 

@@ -210,6 +210,7 @@ def test_every_former_setting_is_where_it_is_said_to_be() -> None:
             "linking.max_scale_sigma=0.1",
             "linking.max_scale_sigma is no setting any more: it follows from linking.wrong_scale",
         ),
+        ("tracking.max_lost_frames=3", "no setting any more: tracking.max_lost_s says it in seconds"),
         ("health.majority=0.4", "no setting any more but a constant, dualslam.health.MAJORITY; remove it"),
         ("recovery.attempts=[leap]", "the attempt `leap` is now called `gap`"),
     ],

@@ -171,7 +171,8 @@ def test_tracking_goes_on_with_no_jump_that_the_motion_model_could_not_explain(w
 
 def miscalibrated(f: float, covered: range, settings: dict[str, object]) -> tuple[System, CalibrationWorld]:
     """Build a system that is told a focal length `f` times too long, before a lens that is covered for a while."""
-    system, world = build_system(Config.model_validate(settings), wrong_camera(f)), CalibrationWorld()
+    config = Config.model_validate({"tracking": {"max_lost_s": 0.25}} | settings)
+    system, world = build_system(config, wrong_camera(f)), CalibrationWorld()
     calibration, rng = system._state.parts.calibration, np.random.default_rng(0)
 
     def view_of(frame: Frame) -> View:
