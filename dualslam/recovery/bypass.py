@@ -84,14 +84,9 @@ def absorb(
         The submaps that have gone.
     """
     found = {frame.pose.index: frame.pose for frame in recovered_frames}
-    components = record.atlas.components()
-    own = next(c for c in components if new_id in c)
-    n_own = sum(pose.submap_id in own for pose in record.poses.values())
-    gone = []
-    for component in components:
-        frames = {i for i, pose in record.poses.items() if pose.submap_id in component}
-        is_covered = 0 < len(frames) < n_own and frames <= found.keys()
-        if component == own or not is_covered or set(lost).isdisjoint(component):
+    n_own, gone = n_frames(record, new_id), list[int]()
+    for component, frames in covered(record, recovered_frames, new_id, lost):
+        if len(frames) >= n_own:
             continue
         for i in frames:
             record.pose(found[i])
@@ -101,3 +96,21 @@ def absorb(
             record.atlas.submaps[m].condemn(record.atlas.submaps[m].keyframes)
         record.event(EventKind.ABSORBED, now, new_id, old_submaps=component, frames=len(frames))
     return gone
+
+
+def covered(
+    record: Record, recovered_frames: Collection[RecoveredFrame], new_id: int, lost: Collection[int]
+) -> list[tuple[list[int], set[int]]]:
+    """Return the lost maps, with what they are linked to, of which a walk has posed every frame; and these frames."""
+    found, maps = {frame.pose.index for frame in recovered_frames}, []
+    for component in record.atlas.components():
+        frames = {i for i, pose in record.poses.items() if pose.submap_id in component}
+        if new_id not in component and frames and frames <= found and not set(lost).isdisjoint(component):
+            maps.append((component, frames))
+    return maps
+
+
+def n_frames(record: Record, submap_id: int) -> int:
+    """Count the frames that a submap, and what it is linked to, have posed."""
+    own = next(c for c in record.atlas.components() if submap_id in c)
+    return sum(pose.submap_id in own for pose in record.poses.values())

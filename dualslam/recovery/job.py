@@ -104,7 +104,8 @@ class RecoveryResult:
     looks_alike : bool
         Whether beyond a gap two poses explained as much: no later walk over it would tell them apart.
     needs_camera : bool
-        Whether a link was refused as the map's pixels contradict the camera: no later walk does better under it.
+        Whether no later walk does better under this camera: the map's pixels contradict it, or all keyframes of the
+        lost maps leave the scale open.
     tries : LinkTries
         The job's, with the tries of this walk.
     """

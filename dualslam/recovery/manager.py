@@ -25,7 +25,7 @@ from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 from dualslam.map.trajectory import Path
 from dualslam.recovery.audits import Audits
-from dualslam.recovery.bypass import absorb
+from dualslam.recovery.bypass import absorb, covered, n_frames
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.fusion import fuse
@@ -97,6 +97,7 @@ class Recoveries:
         self._under_way: dict[int, _UnderWay] = {}  # by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
         self._retries = RetrySchedule(config.retry_keyframes)
+        self._outgrown_at: dict[int, int] = {}  # by the submap that has posed all frames of a lost one: how many
         self._tries = LinkTries()  # at linking lost submaps
         self._audits = Audits(record, buffer, calibration, audits and config.enabled)
 
@@ -153,7 +154,8 @@ class Recoveries:
         """
         if submap.id in self._under_way:
             return
-        if not self._retries.take_if_due(submap, now.index, self._calibration.camera, last_chance):
+        due = self._retries.take_if_due(submap, now.index, self._calibration.camera, last_chance)
+        if not (due or self._outgrows(submap.id)):
             return
         lost = {k for m in self._lost for k in self._record.atlas.submaps[m].keyframes}
         own = [view for view in self._buffer if view.index in submap.keyframes]
@@ -162,6 +164,13 @@ class Recoveries:
             self.start(submap, min(own, key=lambda view: (abs(view.index - first), view.index)), now)
         elif way := self._way_to_gaps(submap):
             self._submit(submap, way[0], way[1:], {}, now)
+
+    def _outgrows(self, submap_id: int) -> bool:
+        """Whether a submap has come to hold more than a lost one of which a walk has posed every frame: told once."""
+        outgrows = submap_id in self._outgrown_at and n_frames(self._record, submap_id) > self._outgrown_at[submap_id]
+        if outgrows:
+            del self._outgrown_at[submap_id]
+        return outgrows
 
     def audit_if_due(self, submap: Submap, now: FrameStamp) -> None:
         """Track in reverse over the start of a map that has matured, as long as the buffer holds it: once a map."""
@@ -350,6 +359,9 @@ class Recoveries:
             )
         for gone in absorb(self._record, recovered_frames, submap.id, self._lost.keys(), now):
             self._lost.pop(gone, None)
+        if job.onsets:
+            rest = covered(self._record, recovered_frames, submap.id, self._lost.keys())
+            self._outgrown_at |= {submap.id: min(len(frames) for _, frames in rest)} if rest else {}
         return True
 
     def _rectifier(self, job: RecoveryJob, submap: Submap) -> Callable[[Keyframe], Keyframe]:

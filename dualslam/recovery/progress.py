@@ -29,6 +29,7 @@ class Progress:
     given_up: bool = False
     needs_camera: bool = False  # no other walk would do better, before the camera is calibrated
     needs_live_end: bool = False  # nor before the live end has grown, from which all of them set out
+    needs_old_map: bool = False  # nor ever: all keyframes of the lost maps leave the scale open
     looks_alike: bool = False  # beyond a gap: what one front end cannot tell apart another may not even notice
     before_gap: int | None = None  # the frame from which the first gap was crossed
     walk_sigma: float = 0.0  # of the scale that the walk hands on, as the last link that was tried says

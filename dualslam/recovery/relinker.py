@@ -72,6 +72,11 @@ class Relinker:
         """Keyframes of the lost submaps."""
         return {k for old in self._old for k in old.keyframes}
 
+    @property
+    def holds_all(self) -> bool:
+        """Whether the growing submap holds all keyframes of the lost ones."""
+        return self.keyframe_ids <= self._submap.keyframes.keys()
+
     def attempts(self, keyframe_id: int) -> Iterator[LinkTry]:
         """Try each lost submap that holds the newest keyframe of the walk, the latest lost one first."""
         for old in reversed(self._old):

@@ -110,11 +110,12 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
             problem = progress
             continue
         events += progress.events
-        looks_alike, needs_camera = looks_alike or progress.looks_alike, progress.needs_camera
+        looks_alike = looks_alike or progress.looks_alike
+        needs_camera = progress.needs_camera or progress.needs_old_map
         came_as_far = best is not None and len(progress.frames) >= len(best.frames)
         if best is None or progress.link is not None or (attempt is thorough and came_as_far):
             best, way = progress, attempt
-        if progress.link is not None or progress.needs_camera or progress.needs_live_end or progress.looks_alike:
+        if progress.link is not None or needs_camera or progress.needs_live_end or progress.looks_alike:
             break
         if progress.took_short_cut and attempt.thorough is not None:
             thorough = attempt.thorough
@@ -218,6 +219,9 @@ def _make_attempt(
             progress.why_not_linked = found.detail
             progress.walk_sigma = found.numbers.get("sigma_scale_reverse", 0.0)
             progress.needs_camera |= found.reason is FailureReason.CAMERA
+            # A lost map of few keyframes hardly knows its scale: another way over the same ones knows it no better.
+            at_overlap = isinstance(tried.result, Failure) and tried.result.reason is FailureReason.SCALE
+            progress.needs_old_map |= at_overlap and relinker.holds_all
             # What was lost across a gap the others lose as well: they cross it by the same matches, or by fewer. Only
             # where a short cut was taken there are more.
             was_lost = found.reason is FailureReason.SCALE_LOST and progress.n_gaps > 0

@@ -21,7 +21,7 @@ class RetrySchedule:
     That is when the submap has grown at its live end, or its camera has been calibrated: it knows depths better then,
     and more of what there is to see. A walk whose link its own pixels refuse, as they contradict the camera, waits for
     another camera: in two clips, five that were made after mere growth were refused so again, and three after the
-    calibration were linked.
+    calibration were linked. So does one that held all keyframes of the lost maps, and these left the scale open.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class RetrySchedule:
     def leave_open(self, submap_id: int, n_live: int, camera: Camera, needs_camera: bool = False) -> None:
         """Note that a walk which knew so many live keyframes, and this camera, has left something to find.
 
-        `needs_camera`: as the camera is contradicted.
+        `needs_camera`: no later one does better under this camera.
         """
         self._tried[submap_id] = n_live, camera, needs_camera
 

@@ -126,6 +126,21 @@ class TestOrder:
         if not links:
             assert attempts[1].data["gaps"] == 0
 
+    @pytest.mark.parametrize(("buffer_s", "made"), [(10.0, ["live"]), (1.4, ["live", "gap (sift)", "gap (sift)"])])
+    def test_where_all_of_the_lost_map_leaves_the_scale_open_no_other_way_is_tried(
+        self, monkeypatch: pytest.MonkeyPatch, buffer_s: float, made: list[str]
+    ) -> None:
+        monkeypatch.setattr(LinkingConfig, "max_scale_sigma", 1e-6)
+        world = PointWorld(cloud(), hand_held(60), covered=COVERED)
+        recovery = {"attempts": ["live", "gap"], "retry_keyframes": []}
+        system = system_in(world, recovery=recovery, buffer={"duration_s": buffer_s})
+        for frame in world.frames():
+            system.step(frame)
+        refused = system.events.of_kind(EventKind.LINK_REFUSED)
+        assert {event.data["reason"] for event in refused} == {"scale"}
+        attempts = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)
+        assert [attempt.data["attempt"] for attempt in attempts] == made
+
     def test_nothing_is_kept_from_beyond_a_gap_across_which_the_scale_was_lost(
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
