@@ -51,9 +51,8 @@ class Starting:
 
     def begin_anew(self, lost: list[View]) -> None:
         """Look for the next map's start from these frames on."""
-        self._starter = self._state.parts.new_starter()
-        for view in lost:
-            self._starter.collect(view)
+        self._since_s = None
+        self._collect(lost)
 
     def begin_again(self) -> None:
         """Look for the next map's start anew, as the pixels of the frames that are buffered have changed."""
@@ -61,7 +60,12 @@ class Starting:
 
     def _begin_from(self, waiting: Iterable[View]) -> None:
         rows = self._state.record.rows
-        self.begin_anew([view for view in waiting if rows[view.index].submap is None])
+        self._collect([view for view in waiting if rows[view.index].submap is None])
+
+    def _collect(self, views: list[View]) -> None:
+        self._starter = self._state.parts.new_starter()
+        for view in views:
+            self._starter.collect(view)
 
     # --- a map that is there
 
@@ -85,7 +89,7 @@ class Starting:
             return None
         state.live = relocaliser
         state.relocaliser.end()
-        self._end_wait()
+        self._n_without_map = 0
         state.record.event(EventKind.RELOCALISED, view, relocaliser.submap.id, n_inliers=track.n_inliers)
         self._go_on(relocaliser.submap, view)
         return track
@@ -104,7 +108,7 @@ class Starting:
             return None
         state.live, submap = found.odometry, found.odometry.submap
         state.relocaliser.end()
-        self._end_wait()
+        self._n_without_map = 0
         state.begin_health()
         for track, T_kf_cam in (*found.earlier, (found.track, state.live.relative_pose(found.track))):
             at = track.view
@@ -122,9 +126,6 @@ class Starting:
         if not state.localises:
             self._go_on(submap, first.view)
         return found.track
-
-    def _end_wait(self) -> None:
-        self._n_without_map, self._since_s = 0, None
 
     def _go_on(self, submap: Submap, since: View) -> None:
         """Go on in a submap that was found again, and doubt it until the camera's velocity has agreed."""
@@ -209,7 +210,7 @@ class Starting:
         state.live = state.parts.new_odometry(submap, graph)
         state.relocaliser.end()
         state.live.start_at(view.index)
-        self._end_wait()
+        self._n_without_map = 0
         state.begin_health()
         self._recoveries.start(submap, view)
         self._recoveries.collect(state.live, view)
