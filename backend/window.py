@@ -164,8 +164,8 @@ def adjust_window(window: Window, robust_k: float, iterations: int = ITERATIONS)
         J_pose = np.concatenate((J_cam @ so3.hat(safe[mine]), -J_cam), axis=2)
         J_pose_w = J_pose * state.weight[mine, None, None]
         residuals = state.residuals[mine]
-        U = np.array([np.tensordot(J_pose_w[v], J_pose[v], 2 * [[0, 1]]) for v in views])
-        g_pose = np.array([np.tensordot(J_pose_w[v], residuals[v], 2 * [[0, 1]]) for v in views])
+        U = np.array([np.tensordot(J_pose_w[v], J_pose[v], ((0, 1), (0, 1))) for v in views])
+        g_pose = np.array([np.tensordot(J_pose_w[v], residuals[v], ((0, 1), (0, 1))) for v in views])
         W = np.zeros((n_free * n_points, 6, 3))
         W[pair] = J_pose_w.transpose(0, 2, 1) @ J_point
         W = W.reshape(n_free, n_points, 6, 3).transpose(1, 0, 2, 3).reshape(n_points, 6 * n_free, 3)
