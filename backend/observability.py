@@ -105,6 +105,14 @@ def projection_jacobian(
     return J
 
 
+def sum_products(weighted: FloatArray, J: FloatArray, point: IntArray, n_points: int) -> FloatArray:
+    """Return (n_points, 3, 3): the sum of J'WJ over the views of each point, for WJ and J (2, 3, R)."""
+    H = np.empty((n_points, 3, 3))
+    for i, j in ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)):
+        H[:, i, j] = H[:, j, i] = np.bincount(point, weighted[0, i] * J[0, j] + weighted[1, i] * J[1, j], n_points)
+    return H
+
+
 def compute_depth_sigmas(
     K: FloatArray,
     T_submap_kf: FloatArray,
@@ -130,10 +138,8 @@ def compute_depth_sigmas(
     (n_points,) float64
         Largest standard deviation of the point relative to its least depth; infinite with fewer than two views.
     """
-    J_u, J_v = projection_jacobian(K, T_submap_kf.take(pose, axis=0)[:, :3, :3], xyz_cam, sigma_px)
-    information = np.zeros((n_points, 3, 3))
-    for i, j in ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)):  # `eigvalsh` reads the lower triangle
-        information[:, i, j] = np.bincount(point, J_u[i] * J_u[j] + J_v[i] * J_v[j], n_points)
+    J = projection_jacobian(K, T_submap_kf.take(pose, axis=0)[:, :3, :3], xyz_cam, sigma_px)
+    information = sum_products(J, J, point, n_points)
     depth = np.full(n_points, np.inf)
     np.minimum.at(depth, point, xyz_cam[:, 2])
     smallest = np.linalg.eigvalsh(information)[:, 0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dualslam.backend.observability import MIN_DEPTH_MU, projection_jacobian, reproject
+from dualslam.backend.observability import MIN_DEPTH_MU, projection_jacobian, reproject, sum_products
 from dualslam.core.types import FloatArray, IntArray
 
 STEPS = 2
@@ -17,11 +17,9 @@ def normal_equations(
     J: FloatArray, weight: FloatArray, residuals: FloatArray, point: IntArray, n: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return J'WJ (n, 3, 3) and J'Wr (n, 3) of each point, for J (2, 3, R), weights (R,) and residuals (R, 2)."""
-    weighted, H = J * weight, np.empty((n, 3, 3))
-    for i, j in ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)):
-        H[:, i, j] = H[:, j, i] = np.bincount(point, weighted[0, i] * J[0, j] + weighted[1, i] * J[1, j], n)
+    weighted = J * weight
     Jr = weighted[0] * residuals[:, 0] + weighted[1] * residuals[:, 1]
-    return H, np.column_stack([np.bincount(point, row, n) for row in Jr])
+    return sum_products(weighted, J, point, n), np.column_stack([np.bincount(point, row, n) for row in Jr])
 
 
 def huber(chi2: FloatArray, k: float) -> tuple[FloatArray, FloatArray]:
@@ -102,8 +100,7 @@ def triangulation_covariances(
     xyz_cam = np.einsum("rji,rj->ri", R, xyz_mu[point] - t)
     front = xyz_cam[:, 2] > MIN_DEPTH_MU
     J = projection_jacobian(K, R[front], xyz_cam[front], sigma_px[front])
-    ones = np.ones(J.shape[2])
-    information, _ = normal_equations(J, ones, np.zeros((len(ones), 2)), point[front], len(xyz_mu))
+    information = sum_products(J, J, point[front], len(xyz_mu))
     covariances = np.full((len(xyz_mu), 3, 3), np.nan)
     values = np.linalg.eigvalsh(information)
     known = values[:, 0] > 1e-9 * values[:, 2]

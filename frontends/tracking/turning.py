@@ -29,7 +29,7 @@ def turn_between(K: FloatArray, uv_a_px: FloatArray, uv_b_px: FloatArray) -> Flo
     """
     if len(uv_a_px) < MIN_PIXELS:
         return None
-    rays_a, rays_b = (_rays(K, uv) for uv in (uv_a_px, uv_b_px))
+    rays_a, rays_b = (unit_rays(K, uv) for uv in (uv_a_px, uv_b_px))
     R_a_b, gate = np.eye(3), np.inf
     for _ in range(ROUNDS):
         off_px = _off_px(K, rays_a, rays_b, R_a_b)
@@ -53,8 +53,8 @@ def _off_px(K: FloatArray, rays_a: FloatArray, rays_b: FloatArray, R_a_b: FloatA
     return np.asarray(K[0, 0] * np.sqrt(x * x + y * y + z * z))
 
 
-def _rays(K: FloatArray, uv_px: FloatArray) -> FloatArray:
-    """Return unit rays, as columns."""
+def unit_rays(K: FloatArray, uv_px: FloatArray) -> FloatArray:
+    """Return unit vectors (3, N) in the camera's frame, for pixels (N, 2)."""
     rays = np.ones((3, len(uv_px)))
     rays[:2] = ((uv_px - K[:2, 2]) / np.diag(K)[:2]).T
     return np.asarray(rays / np.sqrt((rays * rays).sum(axis=0)), np.float64)

@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.core.interfaces import Frontend
-from dualslam.core.types import BoolArray, Features, FloatArray, Track
+from dualslam.core.types import BoolArray, Features, Track
+from dualslam.frontends.tracking.turning import unit_rays
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 MIN_SHARE = 0.4
@@ -46,9 +47,10 @@ def passes_unmapped(
     matches = frontend.match_wide(features.take(rows), keyframe.take(free)).index
     if len(matches) < n:
         return False
-    here = _rays(features.uv_rect_px[rows[matches[:, 0]]], submap.K) @ track.T_cam_submap[:3, :3]
-    there = _rays(keyframe.uv_rect_px[free[matches[:, 1]]], submap.K) @ submap.T_submap_kf[keyframe_id][:3, :3].T
-    sine = np.linalg.norm(np.cross(here, there), axis=1)
+    uv_px, uv_kf_px = features.uv_rect_px[rows[matches[:, 0]]], keyframe.uv_rect_px[free[matches[:, 1]]]
+    here = track.T_cam_submap[:3, :3].T @ unit_rays(submap.K, uv_px)
+    there = submap.T_submap_kf[keyframe_id][:3, :3] @ unit_rays(submap.K, uv_kf_px)
+    sine = np.linalg.norm(np.cross(here, there, axis=0), axis=0)
     return int((sine > np.sin(np.radians(parallax_deg))).sum()) >= n
 
 
@@ -60,9 +62,3 @@ def _unmapped(features: Features, has_landmark: BoolArray) -> BoolArray:
     shows = np.bincount(cell) >= MIN_IN_CELL
     bare = shows & (np.bincount(cell, has_landmark) == 0)
     return np.asarray(bare[cell] & (bare.sum() > MIN_SHARE * shows.sum()))
-
-
-def _rays(uv_px: FloatArray, K: FloatArray) -> FloatArray:
-    """Return unit vectors (N, 3) in the camera's frame."""
-    rays = np.column_stack([uv_px, np.ones(len(uv_px))]) @ np.linalg.inv(K).T
-    return np.asarray(rays / np.linalg.norm(rays, axis=1)[:, None])
