@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 import traceback
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 from dualslam import exit_status
 from dualslam.cli import logs
 from dualslam.cli.parser import parse
-from dualslam.cli.streams import lenient
+from dualslam.cli.streams import lenient, without_libraries
 from dualslam.core.errors import ConfigError, DualSlamError, FrontendError, InputError, OutputError
 from dualslam.core.memory import keep_freed_memory
 from dualslam.core.threads import limit_threads
@@ -35,6 +37,11 @@ def _run(arguments: list[str]) -> int:
         args = parse(arguments)
     except SystemExit as end:  # argparse has said what was wrong, or shown the help that was asked for
         return end.code if isinstance(end.code, int) else exit_status.BAD_INPUT
+    with nullcontext() if args.verbose else without_libraries():
+        return _execute(args, arguments)
+
+
+def _execute(args: argparse.Namespace, arguments: list[str]) -> int:
     logs.set_up(args.verbose, args.quiet)
     try:
         status = int(args.execute(args))

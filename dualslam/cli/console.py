@@ -79,10 +79,19 @@ def final_line(outcome: Outcome) -> str:
         sigma_px = refined["focal_px"] * refined["log_focal_sigma"]
         parts.append(f"focal length {refined['focal_px']:.0f} ± {sigma_px:.0f} px")
     parts.append(f"{s['fps']:.1f} frames/s")
-    nothing = "not found in the saved map: " if s["first_id"] else "no map: "
-    lead = "interrupted: " if s["interrupted"] else "" if outcome.has_map else nothing
+    lead = "interrupted: " if s["interrupted"] else "" if outcome.has_map else f"{_nothing(outcome)}: "
     why = f"; {s['no_map']}" if s.get("no_map") else ""
     return f"{lead}{', '.join(parts)}{why}; results in {outcome.out}"
+
+
+def no_map_line(outcome: Outcome) -> str:
+    """Return in one line why a run has no map: an error, which is told where nothing else is (``--quiet``)."""
+    why = outcome.summary.get("no_map")
+    return f"{_nothing(outcome)}{f': {why}' if why else ''}; results in {outcome.out}"
+
+
+def _nothing(outcome: Outcome) -> str:
+    return "not found in the saved map" if outcome.summary["first_id"] else "no map"
 
 
 def stage_table(outcome: Outcome) -> str:

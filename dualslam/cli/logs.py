@@ -19,6 +19,9 @@ def set_up(verbose: int, quiet: bool) -> None:
     stream.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
     _held = None if verbose else MemoryHandler(_CAPACITY, logging.CRITICAL, stream, flushOnClose=False)
     logging.basicConfig(level=level, handlers=[_held or stream], force=True)
+    logging.captureWarnings(True)
+    if not verbose:  # of an overflow, or of what a package gives up: nothing that a user could act upon
+        logging.getLogger("py.warnings").setLevel(logging.ERROR)
     if verbose < 2:
         logging.getLogger("matplotlib").setLevel(logging.WARNING)
         # OpenCV writes to stderr by itself, and so does its decoder of videos; they read this when they begin.

@@ -130,7 +130,7 @@ def _late(name: str) -> Callable[[argparse.Namespace], int]:
 
 def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser, talk = _command(commands, "run", "Run on a source of frames and write a run folder.")
-    parser.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
+    parser.add_argument("source", metavar="SOURCE", type=_source, help=SOURCE_HELP)
     _add_output(parser)
     talk.add_argument("--profile", action="store_true", help="print where the time went, stage by stage")
     _add_configuration(parser)
@@ -178,7 +178,7 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
 def _add_eval(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser, _ = _command(commands, "eval", "Score a run against ground truth: coverage first, then ATE and RPE.")
     parser.add_argument("run", metavar="RUN", type=_path, help="a run folder, or a trajectory in TUM format")
-    parser.add_argument("sequence", metavar="SEQUENCE", help="the sequence with its ground truth")
+    parser.add_argument("sequence", metavar="SEQUENCE", type=_source, help="the sequence with its ground truth")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -325,6 +325,12 @@ def _path(text: str) -> Path:
     if not text:
         raise argparse.ArgumentTypeError("is empty; name a file or a folder")
     return Path(text)
+
+
+def _source(text: str) -> str:
+    if not text:
+        raise argparse.ArgumentTypeError("is empty; name a folder, a video file or another source")
+    return text
 
 
 def _integer(text: str, at_least: int) -> int:

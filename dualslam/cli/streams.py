@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from typing import Any, TextIO, cast
+
+STDERR = 2
 
 
 class Lenient:
@@ -31,6 +34,11 @@ class Lenient:
     def flush(self) -> None:
         """Hand on what is held back, or drop it."""
         self._do(self._stream.flush)
+
+    def end(self) -> None:
+        """Hand on what is held back; from now on all is dropped."""
+        self.flush()
+        self.problem = self.problem or OSError(errno.EBADF, os.strerror(errno.EBADF))
 
     def _do(self, act: Callable[[], object]) -> None:
         if self.problem is not None:
@@ -62,3 +70,37 @@ def lenient() -> Iterator[Lenient]:
             yield out
             out.flush()
             err.flush()
+
+
+@contextmanager
+def without_libraries() -> Iterator[None]:
+    """Drop what C libraries write to the process's standard error by themselves; what Python writes goes there still.
+
+    Decoders of images do (libjpeg, libpng), and name neither the file nor the frame, as our own sentences do. Nothing
+    but the exit status tells of a crash in them then: with ``--verbose`` this is not used.
+    """
+    stream = sys.stderr
+    try:
+        is_own = stream.fileno() == STDERR
+    except (AttributeError, OSError, ValueError):  # none, or one that is no file
+        is_own = False
+    if not is_own:
+        yield
+        return
+    stream.flush()
+    kept = os.dup(STDERR)
+    with (
+        open(
+            kept, "w", encoding=stream.encoding or "utf-8", errors="backslashreplace", buffering=1, closefd=False
+        ) as text,
+        open(os.devnull, "wb") as nothing,
+    ):
+        own = Lenient(text)
+        os.dup2(nothing.fileno(), STDERR)
+        try:
+            with redirect_stderr(cast(TextIO, own)):
+                yield
+        finally:
+            own.end()
+            os.dup2(kept, STDERR)
+    os.close(kept)

@@ -14,13 +14,14 @@ from dualslam.viewer.window import has_display, open_viewer
 
 def execute(args: argparse.Namespace) -> int:
     """Write the recording of a run, or open the viewer with it."""
-    if args.save is None and not has_display():
-        raise InputError("there is no display to open a viewer on; write the recording with --save FILE.")
     if args.save is not None:
         check_free(args.save, args.overwrite, "another with --save")
         save_recording(args.run, args.save, args.quiet)
-    else:
-        open_viewer(_record(read_run(args.run)))
+        return 0
+    run = read_run(args.run)
+    if not has_display():
+        raise InputError("there is no display to open a viewer on; write the recording with --save FILE.")
+    open_viewer(_record(run))
     return 0
 
 

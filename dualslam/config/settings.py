@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -171,7 +171,7 @@ class RecoveryConfig(StrictModel):
     again; null: never. A map that starts sooner is better linked, by all that reverse tracking finds: most start within
     2 to 5 frames, unless the camera turns in place, and then it may come back to what the lost map shows before any can
     start."""
-    retry_keyframes: tuple[int, ...] = (5, 15)
+    retry_keyframes: tuple[Annotated[int, Field(ge=1)], ...] = (5, 15)
     """Keyframes of the new map, from its start on, at which reverse tracking that has found no link, or left buffered
     frames without a pose, is made again: the map knows depths better then, and more of the scene. It is too when the
     camera has been calibrated since, and, if any number stands here, when the run ends and the map has grown by half.
@@ -207,7 +207,7 @@ class GraphConfig(StrictModel):
 
     robust_k: float = Field(0.8, gt=0)
     """Huber threshold in sigmas: 1.345 keeps 95 % efficiency under Gaussian noise, 0.8 does where residuals are at
-    `least_noise` of their sigmas, and 88 % where the sigmas are right."""
+    0.6 of their sigmas, and 88 % where the sigmas are right."""
     max_keyframes: int = Field(150, ge=20, le=1000)
     """Keyframes at which a submap rolls over into the next: an update's cost grows with the map (on a road 65 ms on
     average with this cap, 140 ms without), and the solver's Cholesky rejects chains of more than about 1,000."""

@@ -176,7 +176,15 @@ def check_numbers(numbers: list[float], where: str) -> None:
 
 
 class _FileStorageLoader(yaml.SafeLoader):
-    """YAML as OpenCV writes it, with its own tag for matrices."""
+    """YAML as OpenCV writes it, with its own tag for matrices. A key that stands there twice is a slip."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [key.value for key, _ in node.value]
+        for position, key in enumerate(keys):
+            if key in keys[:position]:
+                problem = f"the key {key!r} stands there twice"
+                raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.value[position][0].start_mark)
+        return super().construct_mapping(node, deep)
 
 
 def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> Any:
@@ -192,8 +200,9 @@ def parse_yaml(path: Path, text: str) -> dict[str, Any]:
     try:
         content = yaml.load("\n".join(lines), _FileStorageLoader)  # a SafeLoader
     except yaml.YAMLError as e:
-        where = getattr(e, "problem_mark", None)
-        raise InputError(f"{path}{f', line {where.line + 1}' if where else ''} is not valid YAML; correct it.") from e
+        where, problem = getattr(e, "problem_mark", None), getattr(e, "problem", None)
+        line = f", line {where.line + 1}" if where else ""
+        raise InputError(f"{path}{line} is not valid YAML{f': {problem}' if problem else ''}; correct it.") from e
     if not isinstance(content, dict):
         raise InputError(f"{path} is not a camera file: it should hold fields such as fx, fy, cx, cy, width, height.")
     return content
@@ -256,7 +265,8 @@ def _from_orb_slam(content: Mapping[str, Any], where: str) -> Camera:
     if model in _FISHEYE:
         names = ("k1", "k2", "k3", "k4")
         return distorted_camera("fisheye", fxycxy, [_number(fields, n, where) for n in names], size, where)
-    distortion = [float(fields.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2", "k3")]
+    fields = dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0) | fields
+    distortion = [_number(fields, name, where) for name in ("k1", "k2", "p1", "p2", "k3")]
     return radtan_camera(fxycxy, distortion, size, where)
 
 

@@ -33,6 +33,8 @@ log = logging.getLogger(__name__)
 # Going backwards means decoding forwards from an earlier place: this many frames at a time.
 _BLOCK = 32
 _LIVE_QUEUE = 2
+WHOLE_SHARE = 0.95
+"""Of the frames that a file announces: with fewer it was cut off. One that counts by duration and rate is a few off."""
 LOG_CROP, CROP_SIGMA = 0.12, 0.08
 """By how much longer a video's focal length is than the equivalent that its container tells, and how sure that is: the
 logarithm's mean and sigma. A telephone reads a part of its sensor and keeps a rim for stabilisation: from nothing (an
@@ -178,13 +180,15 @@ def _open(path: Path) -> Capture:
 def _scan(path: Path) -> FloatArray:
     """Return the presentation time of every frame that can be decoded; the file's own count is often wrong."""
     capture = _open(path)
-    fps = capture.get(cv2.CAP_PROP_FPS)
+    fps, announced = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
     found = []
     while capture.grab():
         found.append(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3)
     capture.release()
     if not found:
         raise InputError(f"{path} holds no frame that can be decoded; check the file, or convert it to another codec.")
+    if len(found) < WHOLE_SHARE * announced:
+        log.warning("%s ends early: %d of the %d frames that it announces are there", path, len(found), announced)
     times = np.array(found)
     if np.isfinite(times).all() and (np.diff(times) > 0).all():
         return times

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from dualslam.cli.console import final_line, progress, waiting
+from dualslam.cli.console import final_line, no_map_line, progress, waiting
 from dualslam.core.types import Frame, FrameStatus
 from dualslam.map.frame_records import FrameResult
 from dualslam.run.sources import open_source
@@ -88,6 +88,7 @@ def test_frames_that_the_saved_map_does_not_show_are_told(tmp_path: Path) -> Non
     line = final_line(outcome)  # type: ignore[arg-type]
     assert line.startswith("no map: ")
     assert line.endswith(f"; nothing moves; results in {tmp_path}")
+    assert no_map_line(outcome) == f"no map: nothing moves; results in {tmp_path}"  # type: ignore[arg-type]
 
 
 def test_what_a_run_found_again_and_linked_is_told(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 from unittest.mock import Mock
 
+import cv2
 import numpy as np
 import pytest
 
@@ -122,6 +123,37 @@ def test_a_torn_video_is_one_sentence_and_no_word_of_its_decoder(tmp_path: Path)
     assert done.returncode == 2
     assert done.stderr.splitlines() == [done.stderr.rstrip()]
     assert done.stderr.startswith(f"dualslam: {tmp_path / 'torn.mp4'} is no video that OpenCV can open")
+
+
+def test_damaged_images_are_told_by_our_sentences_alone(folder: Path, tmp_path: Path) -> None:
+    """A process of its own: decoders write to stderr past Python, and so does numpy of a calibration gone wild."""
+    images = sorted((folder / "images").iterdir())[:4]
+    copy = tmp_path / "images"
+    copy.mkdir()
+    for name, image in zip(("0.png", "1.png", "2.jpg", "3.png"), images, strict=True):
+        data = cv2.imencode(Path(name).suffix, cv2.imread(str(image)))[1].tobytes()
+        middle = len(data) // 2
+        damaged = data if name in ("0.png", "3.png") else data[:middle] + bytes(60) + data[middle + 60 :]
+        (copy / name).write_bytes(damaged)
+    (copy / "times.txt").write_text("0.0\n0.1\n0.2\n0.3\n")
+    command = [sys.executable, "-m", "dualslam.cli", "run", copy, "--fov", "70", "--out", tmp_path / "run"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stderr == (
+        f"WARNING dualslam.io.sequence: frame 1: {copy / '1.png'} cannot be decoded: it is damaged or no image.\n"
+    )
+    done = subprocess.run([*command, "--overwrite", "-v"], capture_output=True, text=True, check=False)
+    assert "libpng" in done.stderr, "with -v all is told"
+
+
+def test_a_quiet_run_without_a_map_says_why(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fake(lost=tuple(range(N_FRAMES)))
+    out = tmp_path / "run"
+    assert main(["run", str(folder), "--out", str(out), "--quiet"]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err == f"dualslam: no map; results in {out}\n"
 
 
 def test_letters_that_the_locale_lacks_stop_nothing(tmp_path: Path) -> None:

@@ -58,6 +58,7 @@ def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
         ("run synthetic:street --out there --set frontend.n_feature=3", "did you mean frontend.n_features?"),
         ("run synthetic:street --out there --config none.yaml", "none.yaml: the configuration cannot be read"),
         ("config --set seed=x", "seed must be a whole number"),
+        ("config --set recovery.retry_keyframes=[5,0]", "retry_keyframes[1] must be greater than or equal to 1, not 0"),
         ("config --set camera.model_sigma_px=.inf", "camera.model_sigma_px must be less than or equal to 100"),
         (
             "config --set calibration.log_focal_sigma=1e-300",
@@ -115,6 +116,12 @@ def test_bad_usage_is_one_sentence_and_status_2(
     assert main(arguments.split()) == 2
     assert expected in one_sentence(capsys)
     assert {path.name for path in tmp_path.iterdir()} == set(files)
+
+
+@pytest.mark.parametrize("command", [["run", "", "--out", "there"], ["eval", "run", ""]])
+def test_an_empty_source_is_not_the_working_directory(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command) == 2
+    assert "is empty; name a folder, a video file or another source" in one_sentence(capsys)
 
 
 @pytest.mark.parametrize("command", ["", "run ", "eval ", "view ", "render ", "config ", "demo "])

@@ -214,6 +214,8 @@ def test_field_of_view() -> None:
         ({"fx": 0.0}, "fx"),
         ({"fy": -1.0}, "fy"),
         ({"fx": math.nan}, "fx"),
+        ({"fx": 1e300}, "fx is 1e.300, for images of 640 x 480 it must be 32 to 64000 pixels"),
+        ({"fy": 4.2}, "fy is 4.2, for images of 640 x 480 it must be 32 to 64000 pixels"),
         ({"width": 0}, "width"),
         ({"cx": 641.0}, "cx"),
         ({"cy": -2.0}, "cy"),

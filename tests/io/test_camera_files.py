@@ -19,6 +19,11 @@ RADTAN = RadTanCamera(640, 480, 500.0, 501.0, 320.0, 240.0, k1=-0.1, k2=0.02, p1
 FISHEYE = KannalaBrandtCamera(640, 480, 300.0, 301.0, 320.0, 240.0, k1=0.01, k2=-0.002, k3=0.0003, k4=-0.0001)
 FOV = FovCamera(640, 480, 300.0, 301.0, 320.0, 240.0, omega=0.9)
 
+ORB_SLAM = "".join(
+    f"Camera.{name}: {value}\n"
+    for name, value in {"fx": 500, "fy": 501, "cx": 320, "cy": 240, "width": 640, "height": 480}.items()
+)
+
 
 @pytest.mark.parametrize("camera", [PINHOLE, RADTAN, FISHEYE, FOV], ids=lambda c: c.model)
 @pytest.mark.parametrize("suffix", [".yaml", ".yml", ".json"])
@@ -67,6 +72,21 @@ def test_ros_camera_info(tmp_path: Path, model: str, distortion: str, expected) 
         assert camera.k4 == -0.0001
     else:
         assert camera == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("model: pinhole\nfx: 500\nfx: 700\n", "line 3 is not valid YAML: the key 'fx' stands there twice; correct it"),
+        (f"{ORB_SLAM}Camera.k1: none\n", "k1 is 'none', not a number"),
+        (f"{ORB_SLAM}Camera.p2: .nan\n", "p2 holds a number that is not finite"),
+    ],
+)
+def test_a_slip_is_named(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_camera_file(path)
 
 
 def test_a_camera_of_another_kind_is_refused(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ def folder(tmp_path: Path) -> Path:
     [(640, 480, 1), (2048, 1536, 1), (2704, 1520, 2), (2160, 3840, 2), (3840, 2160, 2), (5999, 4000, 3), (8192, 4, 4)],
 )
 def test_images_are_reduced_no_further_than_they_must(width: int, height: int, factor: int) -> None:
-    camera = PinholeCamera(width=width, height=height, fx=1.0, fy=1.0, cx=0.0, cy=0.0)
+    camera = PinholeCamera(width=width, height=height, fx=width, fy=width, cx=0.0, cy=0.0)
     assert reduction(camera, MAX_SIDE_PX) == factor
     small = reduced_camera(camera, factor)
     # Whoever names the size of the small ones gets the same again: an export, of a run's images.

@@ -67,6 +67,18 @@ def test_video_colour_and_own_times(video: Path) -> None:
     assert frame.timestamp_s == 5.0
 
 
+def test_a_video_that_ends_early_says_so(video: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    data = video.read_bytes()
+    torn = tmp_path / "torn.avi"
+    torn.write_bytes(data[: len(data) // 2])
+    n = len(open_sequence(torn, fov_degrees=70))
+    assert 0 < n < N
+    assert f"{torn} ends early: {n} of the {N} frames that it announces are there" in caplog.text
+    caplog.clear()
+    assert len(open_sequence(video, fov_degrees=70)) == N
+    assert not caplog.records
+
+
 def test_bad_videos(video: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no calibration"):
         open_sequence(video)

@@ -22,6 +22,10 @@ from dualslam.core.types import BoolArray, FloatArray
 MAX_RECTIFIED_ANGLE_RAD = math.radians(80.0)
 """Rays farther from the axis have no useful place in a pinhole image: `Camera.rectify` makes them NaN."""
 
+FOCAL_OVER_LONGER_SIDE = (0.05, 100.0)
+"""What a focal length in pixels may be: a fisheye of 220 degrees has 0.26, a field of half a degree 100. Outside are
+focal lengths in millimetres or of normalised coordinates, and slips of an exponent."""
+
 
 @dataclass(frozen=True)
 class Camera(ABC):
@@ -184,6 +188,13 @@ class Camera(ABC):
         for name in ("width", "height", "fx", "fy"):
             if getattr(self, name) <= 0:
                 raise InputError(f"camera: {name} is {getattr(self, name)}, it must be positive")
+        for name in ("fx", "fy"):
+            low, high = (share * max(self.size_px) for share in FOCAL_OVER_LONGER_SIDE)
+            if not low <= getattr(self, name) <= high:
+                raise InputError(
+                    f"camera: {name} is {getattr(self, name):g}, for images of {self.width} x {self.height} it must be "
+                    f"{low:g} to {high:g} pixels"
+                )
         for name, size in (("cx", self.width), ("cy", self.height)):
             if not -0.5 <= getattr(self, name) <= size - 0.5:
                 raise InputError(f"camera: {name} is {getattr(self, name)}, outside of the image of {size} pixels")
