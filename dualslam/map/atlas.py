@@ -155,6 +155,10 @@ class Atlas:
         """Return the linked sets of submaps, each ascending, in order of their first submap."""
         return joined(self.submaps, self.believed)
 
+    def component_of(self, submap_id: int) -> list[int]:
+        """Return the linked set of a submap, ascending."""
+        return next(component for component in self.components() if submap_id in component)
+
     def S_world_submap(self, component: list[int]) -> dict[int, FloatArray]:
         """Return the transform of each submap of a linked set into the frame of its first one.
 

@@ -16,7 +16,7 @@ from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
-from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
+from dualslam.core.types import Failure, FailureReason, IntArray
 from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.atlas_beside import AskedSolution
 from dualslam.map.atlas_problems import AtlasProblems
@@ -25,7 +25,7 @@ from dualslam.map.moving import Mover
 from dualslam.map.overlap_sides import OverlapRefinement, apply_overlap, overlap_problem
 from dualslam.map.propagation import propagate_anchors, propagate_links, propagate_poses
 from dualslam.map.record import FrameStamp, Record
-from dualslam.map.skeleton import Skeleton, build_skeleton
+from dualslam.map.skeleton import Skeleton
 from dualslam.map.submap import Submap
 from dualslam.workers.jobs import Desk, JobKind
 
@@ -229,35 +229,6 @@ class Connections:
             if component[0] in self._atlas.placement:
                 self._solve(set(component), (), now)
 
-    def relative(self, a: tuple[int, int], b: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-        """Return ``S_ka_kb`` between two keyframes, each a submap and an id there, and its (7, 7) covariance.
-
-        It goes through the whole atlas, by connections that are believed, also across submaps.
-
-        Raises
-        ------
-        SolverError
-            If the two are not connected, or the solver cannot tell.
-        """
-        component = next(c for c in self._atlas.components() if a[0] in c)
-        if b[0] not in component:
-            raise SolverError(f"submaps {a[0]} and {b[0]} are not connected: keyframes in them have no relative pose")
-        links = [link for link in self._atlas.believed if link.a in component]
-        more = {m: {k for n, k in (a, b) if n == m} for m in (a[0], b[0])}
-        skeleton = build_skeleton(
-            self._atlas,
-            component,
-            links,
-            self._problems.covariances,
-            self._problems.views,
-            lambda link: True,
-            more,
-            True,
-        )
-        first, second = (skeleton.nodes.index(node) for node in (a, b))
-        S = skeleton.problem.S_world_node
-        return sim3.inverse(S[first]) @ S[second], self._solver.relative_covariance(skeleton.problem, first, second)
-
     def refine_overlap(self, link: Link, landmark_pairs: IntArray) -> OverlapRefinement | Failure:
         """Refine keyframes and landmarks about a connection together, on both of its sides, live or archived.
 
@@ -274,7 +245,7 @@ class Connections:
             `TOO_FEW_MATCHES` where too few points are seen from both sides; nothing has changed then.
         """
         sides = self._atlas.submaps[link.a], self._atlas.submaps[link.b]
-        component = next(c for c in self._atlas.components() if link.a in c)
+        component = self._atlas.component_of(link.a)
         S_world = self._atlas.S_world_submap(component)
         S_a_b = sim3.inverse(S_world[link.a]) @ S_world[link.b]
         refinement = overlap_problem(sides, link.attached(self._atlas), S_a_b, landmark_pairs)

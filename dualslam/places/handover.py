@@ -133,7 +133,7 @@ class Handover:
             self._sighting = self._asked_at = self._search = None
 
     def _joined(self, submap_id: int) -> set[int]:
-        return set(next(c for c in self._record.atlas.components() if submap_id in c))
+        return set(self._record.atlas.component_of(submap_id))
 
     def _has(self, track: Track, live: VisualOdometry, sighting: Sighting, other: Track) -> bool:
         """Whether the other submap needs no keyframe of a frame, and puts it where the live one does."""

@@ -23,6 +23,7 @@ from dualslam.map.split import next_submap
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose, compose
 from dualslam.testing.point_world import CAMERA, SIZE_PX, make_features
+from dualslam.testing.relative import relative_similarity
 from dualslam.workers.jobs import InlineDesk
 
 N_SHARED = 8
@@ -68,13 +69,13 @@ class DriftingMap:
             T.append(T[-1] @ steps[k] @ se3.inverse(self.T_true[k - 1]) @ self.T_true[k])
         self.S_drifted = np.array(T)
         self.record = Record()
-        solver = GtsamAtlasSolver(self.robust, 0.8)
+        self.solver = GtsamAtlasSolver(self.robust, 0.8)
         self.connections = Connections(
             self.record,
-            solver,
+            self.solver,
             lambda: ISam2SubmapGraph(GraphConfig()),
             bundle_adjust_arrays,
-            InlineDesk(atlas_handlers(solver)),
+            InlineDesk(atlas_handlers(self.solver)),
             lambda: self.front_ends,
         )
         self.front_ends: list[Any] = []
@@ -88,6 +89,10 @@ class DriftingMap:
     def atlas(self) -> Atlas:
         """The atlas of the record."""
         return self.record.atlas
+
+    def relative(self, a: tuple[int, int], b: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+        """Return the similarity between two keyframes as the atlas has it, and its covariance."""
+        return relative_similarity(self.atlas, self.solver, a, b)
 
     def _new_submap(self, submap_id: int) -> Submap:
         submap = Submap(submap_id, CAMERA.K, np.zeros(1, np.uint8))

@@ -160,7 +160,7 @@ def test_keyframes_and_a_rollover_that_come_meanwhile_go_along() -> None:
         np.testing.assert_allclose(now[:3, :3], was[:3, :3], atol=2e-3)
         np.testing.assert_allclose(now[:3, 3], was[:3, 3] * (now[2, 3] / was[2, 3]), atol=2e-3)
     assert len(reference.atlas.submaps) == 3
-    S, C = world.connections.relative(*CLOSED)
+    S, C = world.relative(*CLOSED)
     off = sim3.log(sim3.inverse(world.true_S(*CLOSED)) @ S)
     assert off @ np.linalg.solve(C, off) < 24.3  # 0.999 quantile, 7 degrees of freedom
 
@@ -200,7 +200,7 @@ def test_a_map_that_is_joined_meanwhile_comes_along() -> None:
     (report,) = wait(world)
     assert report.factors["loop"] == 1
     assert len(desk.asked) == 2
-    S, C = world.connections.relative((1, 65), (3, 65))
+    S, C = world.relative((1, 65), (3, 65))
     off = sim3.log(sim3.inverse(world.true_S((1, 65), (3, 65))) @ S)
     assert off @ np.linalg.solve(C, off) < 24.3
     assert rms(world.errors()) < 1.2 * rms(immediate().errors())

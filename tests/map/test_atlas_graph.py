@@ -112,7 +112,7 @@ def test_a_loop_takes_the_drift_out_of_every_submap(seed: int) -> None:
     change = np.array([after[node] - pixels[node] for node in pixels])
     assert np.abs(np.median(change)) < 0.1
     assert np.quantile(change, 0.9) < 1.0
-    (S, C) = world.connections.relative(*CLOSED)
+    (S, C) = world.relative(*CLOSED)
     off = sim3.log(sim3.inverse(world.true_S(*CLOSED)) @ S)
     assert off @ np.linalg.solve(C, off) < 24.3  # 0.999 quantile, 7 degrees of freedom
 
@@ -392,9 +392,9 @@ def test_the_report_says_how_far_the_newest_connection_lies_from_all_others(doub
 
 def test_covariance_across_submaps_shrinks_with_a_loop() -> None:
     world = lap_in_submaps(seed=1)
-    _, before = world.connections.relative((0, 10), (2, 120))
+    _, before = world.relative((0, 10), (2, 120))
     world.connections.connect([world.loop(*CLOSED)], world.now)
-    S, after = world.connections.relative((0, 10), (2, 120))
+    S, after = world.relative((0, 10), (2, 120))
     assert np.trace(after) < 0.2 * np.trace(before)
     np.testing.assert_allclose(after, after.T)
     assert (np.linalg.eigvalsh(after) > 0).all()
@@ -405,7 +405,7 @@ def test_covariance_across_submaps_shrinks_with_a_loop() -> None:
     world.begin_anew()
     world.add(60)
     with pytest.raises(SolverError, match="not connected"):
-        world.connections.relative((0, 10), (3, 60))
+        world.relative((0, 10), (3, 60))
 
 
 # --- overlaps, opened graphs

@@ -115,9 +115,12 @@ def contradict(system: System, off: FloatArray) -> AtlasReport:
     """Connect the first and the last submap by what is false, and sure of itself."""
     last = max(system.atlas.submaps)
     a, b = (0, sorted(system.atlas.submaps[0].keyframes)[10]), (last, max(system.atlas.submaps[last].keyframes))
-    S, _ = system._connections.relative(a, b)
+    S_world = system.atlas.S_world_submap(system.atlas.component_of(last))
+    S_world_ka, S_world_kb = (S_world[m] @ system.atlas.submaps[m].T_submap_kf[k] for m, k in (a, b))
     C = np.diag(np.full(7, 1e-18))
-    link = Link.of_keyframes(system.atlas, a, b, S @ sim3.exp(off), C, LinkKind.LOOP)
+    link = Link.of_keyframes(
+        system.atlas, a, b, sim3.inverse(S_world_ka) @ S_world_kb @ sim3.exp(off), C, LinkKind.LOOP
+    )
     return system._connections.connect([link], list(system.rows.values())[-1])
 
 
