@@ -1,13 +1,60 @@
-"""Frames of a lost map that change to the map that has tracked over them in reverse, or stay without a pose."""
+"""Frames that take their pose from the map that has tracked over them in reverse, or stay without one."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
 from dualslam.core.events import EventKind
-from dualslam.core.types import FrameStatus
+from dualslam.core.geometry import sim3
+from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.map.propagation import propagate_poses
 from dualslam.map.record import FrameStamp, Record
+from dualslam.map.submap import Submap
 from dualslam.recovery.job import RecoveredFrame
+from dualslam.recovery.merge import Merged
+
+
+@dataclass(frozen=True, slots=True)
+class Absorption:
+    """What becomes of the lost maps of which a walk has posed every frame.
+
+    Attributes
+    ----------
+    gone : list of int
+        The submaps that have gone.
+    outgrown_at : int or None
+        The smallest number of frames of those that hold no fewer than the new map, and stay; None where none does.
+    """
+
+    gone: list[int]
+    outgrown_at: int | None
+
+
+def pose_frames(
+    record: Record, frames: Sequence[RecoveredFrame], merged: Merged, submap: Submap
+) -> list[RecoveredFrame]:
+    """Carry the frames of a walk into the submap that has taken it in, and enter those that had no pose.
+
+    Parameters
+    ----------
+    record : Record
+    frames : sequence of RecoveredFrame
+        As the walk posed them.
+    merged : Merged
+        The submap with what the walk added, in its unit, not solved.
+    submap : Submap
+        The same, solved.
+    """
+    scale = float(sim3.scale(merged.S_live_grown))
+    scaled = [replace(frame.pose, T_kf_cam=_scaled(frame.pose.T_kf_cam, scale)) for frame in frames]
+    carried = {pose.index: pose for pose in propagate_poses(scaled, merged.moved, submap)}
+    recovered_frames = []
+    for frame, pose in zip(frames, scaled, strict=True):
+        recovered_frames.append(replace(frame, pose=carried.get(pose.index, pose)))
+        if pose.index not in record.poses:
+            record.pose(recovered_frames[-1].pose, frame.n_matches, frame.n_inliers)
+    return recovered_frames
 
 
 def bypass(record: Record, recovered_frames: Collection[RecoveredFrame], new_id: int, handover: int) -> int:
@@ -61,7 +108,7 @@ def condemn_tail(
 
 def absorb(
     record: Record, recovered_frames: Collection[RecoveredFrame], new_id: int, lost: Collection[int], now: FrameStamp
-) -> list[int]:
+) -> Absorption:
     """Let lost maps go of which the new one has posed every frame, where it holds more frames besides.
 
     A map of a few frames hardly knows its own scale, so that no similarity to it is sure. None is needed: what it saw
@@ -80,13 +127,17 @@ def absorb(
 
     Returns
     -------
-    list of int
-        The submaps that have gone.
+    Absorption
     """
     found = {frame.pose.index: frame.pose for frame in recovered_frames}
-    n_own, gone = n_frames(record, new_id), list[int]()
-    for component, frames in covered(record, recovered_frames, new_id, lost):
+    n_own, gone, n_stay = n_frames(record, new_id), list[int](), list[int]()
+    for component in record.atlas.components():
+        frames = {i for i, pose in record.poses.items() if pose.submap_id in component}
+        is_covered = bool(frames) and frames <= found.keys()
+        if new_id in component or not is_covered or set(lost).isdisjoint(component):
+            continue
         if len(frames) >= n_own:
+            n_stay.append(len(frames))
             continue
         for i in frames:
             record.pose(found[i])
@@ -95,22 +146,16 @@ def absorb(
         for m in component:
             record.atlas.submaps[m].condemn(record.atlas.submaps[m].keyframes)
         record.event(EventKind.ABSORBED, now, new_id, old_submaps=component, frames=len(frames))
-    return gone
-
-
-def covered(
-    record: Record, recovered_frames: Collection[RecoveredFrame], new_id: int, lost: Collection[int]
-) -> list[tuple[list[int], set[int]]]:
-    """Return the lost maps, with what they are linked to, of which a walk has posed every frame; and these frames."""
-    found, maps = {frame.pose.index for frame in recovered_frames}, []
-    for component in record.atlas.components():
-        frames = {i for i, pose in record.poses.items() if pose.submap_id in component}
-        if new_id not in component and frames and frames <= found and not set(lost).isdisjoint(component):
-            maps.append((component, frames))
-    return maps
+    return Absorption(gone, min(n_stay, default=None))
 
 
 def n_frames(record: Record, submap_id: int) -> int:
     """Count the frames that a submap, and what it is linked to, have posed."""
-    own = next(c for c in record.atlas.components() if submap_id in c)
+    own = record.atlas.component_of(submap_id)
     return sum(pose.submap_id in own for pose in record.poses.values())
+
+
+def _scaled(T: FloatArray, scale: float) -> FloatArray:
+    scaled = T.copy()
+    scaled[:3, 3] *= scale
+    return scaled

@@ -15,9 +15,8 @@ from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
-from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe, View
+from dualslam.core.types import Failure, FailureReason, Keyframe, View
 from dualslam.map.connections import Connections
-from dualslam.map.propagation import propagate_poses
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.solving import solve
 from dualslam.map.split import sound_copy
@@ -25,14 +24,14 @@ from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 from dualslam.map.trajectory import Path
 from dualslam.recovery.audits import Audits
-from dualslam.recovery.bypass import absorb, covered, n_frames
+from dualslam.recovery.bypass import absorb, n_frames, pose_frames
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.fusion import fuse
-from dualslam.recovery.job import RecoveredFrame, RecoveryJob, RecoveryResult
+from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.leaps import refuse_leaps
 from dualslam.recovery.link_tries import LinkTries
-from dualslam.recovery.merge import Merged, merge_recovery
+from dualslam.recovery.merge import merge_recovery
 from dualslam.recovery.overlap_refinement import gauge_at_overlap
 from dualslam.recovery.schedule import RetrySchedule, as_far_as_it_leads, way_to_gaps
 
@@ -208,7 +207,7 @@ class Recoveries:
 
     def _way_to_gaps(self, submap: Submap) -> list[View]:
         """Return the buffered frames without a pose, and what leads to them from the submap; the latest first."""
-        poses, own = self._record.poses, next(c for c in self._record.atlas.components() if submap.id in c)
+        poses, own = self._record.poses, self._record.atlas.component_of(submap.id)
         views = as_far_as_it_leads(reversed(tuple(self._buffer)), poses, submap, own)
         return way_to_gaps(tuple(views), poses.keys(), submap.keyframes.keys())
 
@@ -337,7 +336,7 @@ class Recoveries:
         for event in result.events:
             data = event.data | (told if event.event is EventKind.RECOVERY_ATTEMPT else {})
             self._record.events.add(event.event, event.frame, event.timestamp_s, event.submap, **data)
-        recovered_frames = self._pose_frames(result, merged, submap)
+        recovered_frames = pose_frames(self._record, result.frames, merged, submap)
         seconds = time.perf_counter() - started_s
         linked = False
         if result.link is not None:
@@ -357,11 +356,11 @@ class Recoveries:
                 recovery_s=result.seconds,
                 seconds=seconds,
             )
-        for gone in absorb(self._record, recovered_frames, submap.id, self._lost.keys(), now):
+        absorbed = absorb(self._record, recovered_frames, submap.id, self._lost.keys(), now)
+        for gone in absorbed.gone:
             self._lost.pop(gone, None)
-        if job.onsets:
-            rest = covered(self._record, recovered_frames, submap.id, self._lost.keys())
-            self._outgrown_at |= {submap.id: min(len(frames) for _, frames in rest)} if rest else {}
+        if job.onsets and absorbed.outgrown_at is not None:
+            self._outgrown_at[submap.id] = absorbed.outgrown_at
         return True
 
     def _rectifier(self, job: RecoveryJob, submap: Submap) -> Callable[[Keyframe], Keyframe]:
@@ -375,31 +374,13 @@ class Recoveries:
 
         return rectify
 
-    def _pose_frames(self, result: RecoveryResult, merged: Merged, submap: Submap) -> list[RecoveredFrame]:
-        """Carry the frames of the walk into the solved submap, and enter those that had no pose."""
-        scale = float(sim3.scale(merged.S_live_grown))
-        scaled = [replace(frame.pose, T_kf_cam=_scaled(frame.pose.T_kf_cam, scale)) for frame in result.frames]
-        carried = {pose.index: pose for pose in propagate_poses(scaled, merged.moved, submap)}
-        recovered_frames = []
-        for frame, pose in zip(result.frames, scaled, strict=True):
-            recovered_frames.append(replace(frame, pose=carried.get(pose.index, pose)))
-            if pose.index not in self._record.poses:
-                self._record.pose(recovered_frames[-1].pose, frame.n_matches, frame.n_inliers)
-        return recovered_frames
-
     def _settle(self, old_id: int, live: VisualOdometry | None) -> None:
         """Let no walk look any more for what is linked: the old submap, and all that is one map with the live one."""
         settled = {old_id}
         if live is not None:
-            settled.update(next(c for c in self._record.atlas.components() if live.submap.id in c))
+            settled.update(self._record.atlas.component_of(live.submap.id))
         self._lost = {m: loss for m, loss in self._lost.items() if m not in settled}
 
 
 def _same_camera(job: RecoveryJob, submap: Submap) -> bool:
     return bool((submap.K == job.submap.K).all())
-
-
-def _scaled(T: FloatArray, scale: float) -> FloatArray:
-    scaled = T.copy()
-    scaled[:3, 3] *= scale
-    return scaled
