@@ -9,12 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-import numpy as np
-
 from dualslam.config.settings import Config
 from dualslam.core.chi_square import MEDIAN_CHI2
 from dualslam.core.events import EventKind
-from dualslam.core.geometry import se3, sim3
 from dualslam.core.interfaces import Seeker, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.atlas import Link, LinkKind
@@ -22,19 +19,10 @@ from dualslam.map.atlas_report import AtlasReport
 from dualslam.map.connections import Connections
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import compose
+from dualslam.places.plausibility import agree, contradict, plausible
 from dualslam.places.search import PlaceSearch, follow_maps, poses_of
-from dualslam.places.sightings import (
-    N_SECONDS,
-    SAME_WITHIN,
-    PlaceParts,
-    Sightings,
-    record_refusal,
-    same_pose,
-    turn_between,
-)
+from dualslam.places.sightings import N_SECONDS, PlaceParts, Sightings, record_refusal
 from dualslam.places.verification import PlaceMatch
-from dualslam.recovery.leaps import refuse_leaps
 from dualslam.workers.jobs import Desk, Ended, JobKind, awaited
 
 ASK_EVERY = 2
@@ -47,34 +35,8 @@ REST, MAX_REST = 10, 40
 """Keyframes after a loop before the map that it lies in is searched again. Each loop that finds no more drift than the
 map claims doubles them: beside one that was closed a moment ago it tells next to nothing, and costs more the larger the
 map is. At most so many that each submap still comes by a few."""
-MAX_DRIFT, MAX_DRIFT_DEG, MAX_DRIFT_LOG_SCALE = 0.5, 60.0, float(np.log(3.0))
-"""What a map that was never lost between two places can have drifted at most: a share of the way, a turn, a scale. Half
-the way is what lies between two copies of a thing that stand next to each other; the largest drift that was seen on a
-real sequence is 47 % in scale."""
-MAX_SLIP = 0.1
-"""Share of the way that a map can have lost beyond what its drift in turn and scale explains: what these have undone
-again. Right loops lost 3 % in all at most, and none of it beyond (32 on HoloLens, TUM, 7-Scenes and a phone); the copy
-of a thing lies at a whole period, turned and scaled as the thing itself."""
 _SILENT = (FailureReason.TOO_FEW_MATCHES, FailureReason.TOO_FEW_INLIERS)
 """Refusals of what only looked alike to the recogniser: they are no events."""
-
-
-def can_have_drifted(share_of_way: float, turn_deg: float, log_scale: float) -> bool:
-    """Whether a map that was never lost can have drifted by so much between two places.
-
-    A place is displaced by the turn and the scale that were lost before it: at most by what was lost in the end, as if
-    that had been so all the way.
-
-    Parameters
-    ----------
-    share_of_way : float
-        Distance between where the map and where the pixels put a place, over the length of the way.
-    turn_deg, log_scale : float
-        Between the two, as well.
-    """
-    if share_of_way > MAX_DRIFT or turn_deg > MAX_DRIFT_DEG or abs(log_scale) > MAX_DRIFT_LOG_SCALE:
-        return False
-    return share_of_way <= MAX_SLIP + float(np.radians(turn_deg) + np.expm1(abs(log_scale)))
 
 
 @dataclass(slots=True)
@@ -241,7 +203,7 @@ class Revisits:
                 followed = None if then is None else follow_maps(match, then, self._record.atlas.submaps)
                 if followed is None:
                     continue
-                match = self._plausible(followed)
+                match = plausible(self._record, followed)
             if not isinstance(match, Failure):
                 found.append(match)
             elif match.reason not in _SILENT and refused is None:
@@ -252,7 +214,7 @@ class Revisits:
             return None
         best = max(found, key=lambda m: m.n_inliers)
         for other in found:
-            if other is not best and self._contradict(best, other):
+            if other is not best and contradict(self._record.atlas, best, other):
                 detail = f"keyframes {best.place[1]} and {other.place[1]} show the place as well, elsewhere"
                 why = Failure(FailureReason.AMBIGUOUS_MODEL, detail)
                 record_refusal(self._record, now, search.submap_id, best.place[0], best.place[1], why)
@@ -267,7 +229,7 @@ class Revisits:
         arrived = sorted({k for m in self._record.atlas.submaps.values() for k in m.keyframes})
         at = arrived.index(keyframe_id)
         recent = {*arrived[max(at - RECENT, 0) : at + RECENT + 1], *seen_now}
-        joined = set(self._component(submap.id))
+        joined = set(self._record.atlas.component_of(submap.id))
         rests = self._n_asked < self._rests_until
 
         def may_be(m: int, k: int) -> bool:
@@ -290,7 +252,7 @@ class Revisits:
                     record_refusal(self._record, now, submap.id, *waiting.match.place, why)
                     self._provisional = None
             return
-        if waiting is None or match.place[0] != waiting.match.place[0] or not self._agree(waiting.match, match):
+        if waiting is None or not agree(self._record.atlas, waiting.match, match):
             self._provisional = _Provisional(match)
             return
         waiting.match = match
@@ -374,88 +336,3 @@ class Revisits:
         current = submap.current_ids(match.landmark_pairs.ravel()).reshape(-1, 2)
         current = current[(current >= 0).all(axis=1)]
         submap.merge_landmarks(current[:, 0], current[:, 1])
-
-    def _agree(self, first: PlaceMatch, second: PlaceMatch) -> bool:
-        """Whether two matches between the same submaps put the newer keyframe at one place."""
-        submap = self._record.atlas.submaps[second.query[0]]
-        T_q = submap.T_submap_kf[second.query[1]]
-        place = self._record.atlas.submaps[second.place[0]]
-        ids = place.landmark_of[second.place[1]]
-        T_place = place.T_submap_kf[second.place[1]]
-        depth = float(np.median(place.depths(ids[ids >= 0], se3.inverse(T_place))))
-        poses = [sim3.act_on_pose(match.S_place_query, T_q) for match in (first, second)]
-        return same_pose(poses[0], poses[1], SAME_WITHIN * depth)
-
-    def _contradict(self, one: PlaceMatch, other: PlaceMatch) -> bool:
-        """Whether two matches of one keyframe put it at two places of one map."""
-        if one.place[0] == other.place[0]:
-            return not self._agree(one, other)
-        atlas = self._record.atlas
-        component = self._component(one.place[0])
-        if other.place[0] not in component:
-            return False  # two maps that are not joined may well show one place
-        S_world = atlas.S_world_submap(component)
-        T_q = atlas.submaps[one.query[0]].T_submap_kf[one.query[1]]
-        centres = [sim3.act_on_pose(S_world[m.place[0]] @ m.S_place_query, T_q)[:3, 3] for m in (one, other)]
-        place = atlas.submaps[one.place[0]]
-        ids = place.landmark_of[one.place[1]]
-        depth = float(np.median(place.depths(ids[ids >= 0], se3.inverse(place.T_submap_kf[one.place[1]]))))
-        return bool(np.linalg.norm(centres[0] - centres[1]) > float(sim3.scale(S_world[one.place[0]])) * depth)
-
-    def _plausible(self, match: PlaceMatch) -> PlaceMatch | Failure:
-        """Refuse a place that no drift explains: the map that leads to it cannot have lost that much.
-
-        These are the bounds of what drift can be at all, and not of what the chain says of its own: pixels that prove
-        the place are believed over any chi-square. A street of identical houses is refused here, as each house is a
-        whole way off from the next, or off by much of it, and yet neither turned nor of another size.
-        """
-        (a, k_a), (b, k_b) = match.place, match.query
-        component = self._component(b)
-        if a not in component:
-            return self._reachable(match)
-        submaps, S_world = self._record.atlas.submaps, self._record.atlas.S_world_submap(component)
-        S_a_b = sim3.inverse(S_world[a]) @ S_world[b]
-        T_b_cam = submaps[b].T_submap_kf[k_b]
-        by_chain, by_pixels = sim3.act_on_pose(S_a_b, T_b_cam), sim3.act_on_pose(match.S_place_query, T_b_cam)
-        log_scale = float(np.log(sim3.scale(match.S_place_query) / sim3.scale(S_a_b)))
-        way = self._way(component, S_world, k_a, k_b) / float(sim3.scale(S_world[a]))
-        apart = float(np.linalg.norm(by_chain[:3, 3] - by_pixels[:3, 3]))
-        numbers = {"drift_rot_deg": float(np.degrees(turn_between(by_chain, by_pixels))), "drift_log_scale": log_scale}
-        numbers |= {"drift": apart / max(way, 1e-12)}
-        match.numbers.update(numbers)
-        if not can_have_drifted(numbers["drift"], numbers["drift_rot_deg"], log_scale):
-            detail = (
-                f"the map would have drifted by {numbers['drift']:.0%} of the way, {numbers['drift_rot_deg']:.0f} deg"
-                f" and {np.expm1(log_scale):+.0%} in scale"
-            )
-            return Failure(FailureReason.CONTRADICTION, detail, match.numbers)
-        return match
-
-    def _reachable(self, match: PlaceMatch) -> PlaceMatch | Failure:
-        """Refuse to join two maps of this run where the camera cannot have come from the one to the other meanwhile."""
-        a, b = match.place[0], match.query[0]
-        record = self._record
-        known = compose(record.own_poses(), record.atlas, {a: np.eye(4)}).in_time_order()
-        both = compose(record.own_poses(), record.atlas, {a: np.eye(4), b: match.S_place_query}).in_time_order()
-        refused = refuse_leaps(
-            both.timestamps_s,
-            both.T_world_cam[:, :3, 3],
-            known.timestamps_s,
-            known.T_world_cam[:, :3, 3],
-            record.are_refound(known.index.tolist()),
-        )
-        return match if refused is None else refused
-
-    def _component(self, submap_id: int) -> list[int]:
-        return next(c for c in self._record.atlas.components() if submap_id in c)
-
-    def _way(self, component: list[int], S_world: dict[int, FloatArray], first: int, last: int) -> float:
-        """Return the length of the path between two keyframes, in the unit of the world."""
-        first, last = min(first, last), max(first, last)
-        centres: dict[int, FloatArray] = {}
-        for m in component:
-            for k, T in self._record.atlas.submaps[m].T_submap_kf.items():
-                if first <= k <= last and k not in centres:
-                    centres[k] = sim3.act(S_world[m], T[None, :3, 3])[0]
-        ordered = np.array([centres[k] for k in sorted(centres)])
-        return float(np.linalg.norm(np.diff(ordered, axis=0), axis=1).sum())

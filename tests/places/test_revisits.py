@@ -11,7 +11,7 @@ import pytest
 from dualslam.core.events import EventKind
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
 from dualslam.map.atlas import LinkKind
-from dualslam.places.revisits import can_have_drifted
+from dualslam.places.plausibility import can_have_drifted
 from dualslam.places.search import PlaceSearch
 from dualslam.run.results import trajectories_of
 from dualslam.system import System

@@ -16,7 +16,7 @@ from dualslam.map.frame_records import FrameRow
 from dualslam.map.record import Record
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
-from dualslam.places.revisits import Revisits
+from dualslam.places.plausibility import reachable
 from dualslam.recovery.bypass import drop_corrupted
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.job import RecoveryJob
@@ -81,7 +81,7 @@ def test_a_map_of_this_run_may_show_what_an_earlier_one_saw_moments_before_by_it
     if not earlier:
         enter(record, range(N_EARLIER))
     match = Fake(place=(0, 3), query=(1, 3), S_place_query=np.eye(4))
-    answer: object = Revisits._reachable(Fake(_record=record), match)  # type: ignore[arg-type]
+    answer: object = reachable(record, match)  # type: ignore[arg-type]
     if earlier:
         assert answer is match
     else:
