@@ -99,6 +99,9 @@ class EdgeCovariances:
         """Compute those that are `new`, and return all."""
         if new:
             self._note(submap, new, self._compute(submap, new, held))
+        return self._remembered(submap, pairs)
+
+    def _remembered(self, submap: Submap, pairs: Sequence[tuple[int, int]]) -> FloatArray:
         return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, 7, 7)
 
     def foresee(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> None:
@@ -142,12 +145,10 @@ class EdgeCovariances:
                 kept.append((first, second))
             else:
                 del self._known[m, first, second]
-        scales = sim3.scale(warp.at([second for _, second in kept]))
-        for pair, T, n_seen, scale in zip(kept, *_states(submap, kept), scales.tolist(), strict=True):
-            units = np.ones(7)
-            units[3:6] = scale
-            covariance = self._known[(submap.id, *pair)].covariance
-            self._known[(submap.id, *pair)] = _Known(T, n_seen, units[:, None] * covariance * units)
+        units = np.ones((len(kept), 7))
+        units[:, 3:6] = sim3.scale(warp.at([second for _, second in kept]))[:, None]
+        then = self._remembered(submap, kept)
+        self._note(submap, kept, units[:, :, None] * then * units[:, None, :])
 
 
 def _states(submap: Submap, pairs: Sequence[tuple[int, int]]) -> tuple[FloatArray, IntArray]:

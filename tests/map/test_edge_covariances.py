@@ -9,9 +9,11 @@ import pytest
 
 from dualslam.backend.edge_covariance import edge_covariances
 from dualslam.core.errors import SolverError
+from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FloatArray
 from dualslam.map.edge_covariances import EdgeCovariances, answer_edges
 from dualslam.map.submap import Submap
+from dualslam.map.warp import Warp
 from dualslam.testing.atlas_world import DriftingMap
 from dualslam.testing.late_desk import LateDesk
 from dualslam.workers.jobs import InlineDesk, JobKind
@@ -81,3 +83,18 @@ def test_an_answer_for_a_map_that_has_moved_meanwhile_is_not_taken(submap: Subma
     assert covariances.foreseeing
     covariances(moved, PAIRS[:1], frozenset())
     assert here.n == 1
+
+
+def test_a_submap_that_is_bent_says_the_same_in_its_new_unit(submap: Submap) -> None:
+    here = Counted()
+    covariances = EdgeCovariances(here, late(Counted()))
+    covariances(submap, PAIRS, frozenset())
+    scale, T = 1.7, se3.exp([0.3, -0.2, 0.1, 2.0, 0.0, -1.0])
+    bent = submap.copy()
+    bent.transform(scale, T)
+    S = sim3.from_parts(scale, T[:3, :3], T[:3, 3])
+    covariances.bent(bent, Warp(np.array([0]), S[None]))
+    np.testing.assert_allclose(
+        covariances(bent, PAIRS, frozenset()), edge_covariances(bent, PAIRS, 0.8), rtol=1e-3, atol=1e-9
+    )
+    assert here.n == len(PAIRS), "it is not asked again"
