@@ -108,7 +108,6 @@ class Initialiser:
         self._size_px = size_px
         self._seed = seed
         self._views: list[View] = []
-        self._lenience = 1.0  # by how much the bound of the direction's sigma is widened
         self._turn = self._top = len(LAGS) - 1  # of `LAGS`: the next, and the one that the turn began with
 
     def collect(self, view: View) -> None:
@@ -122,7 +121,7 @@ class Initialiser:
         parallax those nearer show no more, and the turn begins anew, one farther back if there is one.
         """
         self.collect(view)
-        self._lenience = float(np.clip(waited_s / PATIENCE_S, 1.0, MAX_LENIENCE))
+        lenience = float(np.clip(waited_s / PATIENCE_S, 1.0, MAX_LENIENCE))
         best = Failure(FailureReason.TOO_FEW_MATCHES, "one view")
         if len(view.features) < self._config.min_matches:
             return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image")
@@ -131,7 +130,7 @@ class Initialiser:
             if farthest < 0:
                 break
             at = min(self._turn, farthest)
-            start = self.try_pair(len(self._views) - 1 - LAGS[at], len(self._views) - 1)
+            start = self.try_pair(len(self._views) - 1 - LAGS[at], len(self._views) - 1, lenience)
             if start:
                 return start
             assert isinstance(start, Failure)
@@ -146,10 +145,11 @@ class Initialiser:
                 self._turn = at - 1
         return best
 
-    def try_pair(self, first: int, last: int) -> Start | Failure:
+    def try_pair(self, first: int, last: int, lenience: float = 1.0) -> Start | Failure:
         """Try to start from two of the collected views (positions in the list).
 
-        Where they show too little parallax, the failure's numbers hold by how much the image has moved all the same.
+        `lenience`: how many times less well than asked for the direction may be known. Where they show too little
+        parallax, the failure's numbers hold by how much the image has moved all the same.
         """
         a, b = self._views[first], self._views[last]
         matches = self._match(a.features, b.features)
@@ -157,6 +157,10 @@ class Initialiser:
             return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(matches)} matches, {self._config.min_matches} needed")
         pair = self._best_pose(a, b, matches)
         start = self._verify(pair, [a, *self._witnesses(first, last), b]) if isinstance(pair, _Pair) else pair
+        if isinstance(start, Start):
+            direction = start.numbers["direction_sigma_deg"]
+            if not direction < lenience * self._config.max_direction_sigma_deg:
+                start = _direction_unknown(direction, start.numbers)
         if isinstance(start, Failure) and start.reason is FailureReason.LOW_PARALLAX:
             return replace(start, numbers={**start.numbers, "shift_px": _shift_px(a, b, matches)})
         return start
@@ -342,8 +346,6 @@ class Initialiser:
             return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers)
         if not numbers["chi2"] < MAX_CHI2:
             return Failure(FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {numbers['chi2']:.1f}", numbers)
-        if not direction < self._lenience * self._config.max_direction_sigma_deg:
-            return _direction_unknown(direction, numbers)
         feature = feature.copy()
         feature[view_of[~inlier], point_of[~inlier]] = -1
         depth = float(np.median(result.xyz_mu[proven, 2]))

@@ -259,9 +259,9 @@ def test_in_a_hurry_one_pair_is_tried_at_a_time_and_the_map_that_starts_is_right
     starter, lags = initialiser(), []
     try_pair = starter.try_pair
 
-    def noted(first: int, last: int) -> Start | Failure:
+    def noted(first: int, last: int, lenience: float) -> Start | Failure:
         lags.append(last - first)
-        return try_pair(first, last)
+        return try_pair(first, last, lenience)
 
     starter.try_pair = noted  # type: ignore[method-assign]
     starts = []
@@ -287,7 +287,7 @@ def test_pairs_far_enough_apart_are_tried_and_no_nearer_ones_in_vain(
     """Too little in common 30 frames back and more, too little parallax up to 5 frames back: 8 and 16 are tried."""
     starter, tried = initialiser(), []
 
-    def judge(first: int, last: int) -> Failure:
+    def judge(first: int, last: int, lenience: float) -> Failure:
         lag = last - first
         tried.append(lag)
         if lag > 30:
@@ -306,7 +306,7 @@ def test_pairs_far_enough_apart_are_tried_and_no_nearer_ones_in_vain(
 def test_while_nothing_moves_no_pair_is_tried_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     starter, tried = initialiser(), []
 
-    def judge(first: int, last: int) -> Failure:
+    def judge(first: int, last: int, lenience: float) -> Failure:
         tried.append((first, last))
         return Failure(FailureReason.LOW_PARALLAX, "")
 
