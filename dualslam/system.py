@@ -343,15 +343,13 @@ class System:
         state.lost.append(view)
         if len(state.lost) == 1:
             view = self._begin_to_lose(live, view)
-        shutter, readout_s = state.parts.shutter, state.parts.shutter.readout_s
+        readout_s = state.parts.shutter.readout_s
         start = self._starting.find_start_instead(view)
-        # A map of the pixels of before is not looked for.
-        hopeless = failure.reason is FailureReason.SOLVER or shutter.readout_s != readout_s
+        # A graph that has failed, and a map of the pixels of before, are not found again.
+        may_return = failure.reason is not FailureReason.SOLVER and state.parts.shutter.readout_s == readout_s
         waited_s = abs(view.timestamp_s - state.lost[0].timestamp_s)
-        if start or hopeless or waited_s >= state.config.tracking.max_lost_s:
-            self._endings.give_up(live, view, failure)
-            if hopeless:
-                state.relocaliser.end()
+        if start or not may_return or waited_s >= state.config.tracking.max_lost_s:
+            self._endings.give_up(live, view, failure, may_return)
             state.lost = []
         return failure if isinstance(start, Failure) else self._begin(start, view)
 

@@ -65,8 +65,11 @@ class Endings:
 
     # --- with the track
 
-    def give_up(self, live: VisualOdometry, view: View, failure: Failure) -> None:
-        """Declare the track failed: archive the submap whole. It may be found again, or linked by reverse tracking."""
+    def give_up(self, live: VisualOdometry, view: View, failure: Failure, may_return: bool) -> None:
+        """Declare the track failed: archive the submap whole. Reverse tracking may link it.
+
+        `may_return`: tracking may find it again before, too.
+        """
         state, lost = self._state, self._state.lost
         suspected = state.health.suspected()
         onset = min([lost[0].index, *(frame.index for frame in suspected)])
@@ -86,12 +89,11 @@ class Endings:
         self._recoveries.declare_lost(live.submap.id, onset, str(failure.reason), lost[0].index)
         state.live = None
         state.begin_health()
-        # Not where its graph has failed, where two poses stood, or where reverse tracking is about to change it.
+        # Not where two poses stood, or where reverse tracking is about to change it.
         doubtful = failure.reason in (FailureReason.LOOK_ALIKE, FailureReason.LEAP)
         if doubtful:
             self._sightings.avoid(live.submap.id)
-        hopeless = doubtful or failure.reason is FailureReason.SOLVER
-        if not hopeless and not self._recoveries.is_under_way(live.submap):
+        if may_return and not doubtful and not self._recoveries.is_under_way(live.submap):
             state.relocaliser.begin(live)
 
     def break_at(self, live: VisualOdometry, view: View, first: int, failure: Failure) -> None:
@@ -101,7 +103,7 @@ class Endings:
         state.buffer.freeze()
         drop_corrupted(state.record, live.submap.id, first)
         live.submap.condemn({k for k in live.submap.keyframes if k >= first})
-        self.give_up(live, view, failure)
+        self.give_up(live, view, failure, may_return=False)
 
     # --- where it has lost its scale
 
