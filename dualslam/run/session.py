@@ -222,6 +222,12 @@ def run_to_folder(
                 if report.bug is None:
                     raise
                 raise report.bug from error  # the map of a system that broke may be in pieces
+    _raise_what_ended(report, interrupts, out)
+    return Outcome(Path(out), summary, report, system)
+
+
+def _raise_what_ended(report: RunReport, interrupts: Interrupts, out: str | Path) -> None:
+    """Raise what has broken a run, or interrupted it too late to end it, now that its results are written."""
     if not report.interrupted:
         try:
             interrupts.act_late()
@@ -233,7 +239,6 @@ def run_to_folder(
         raise report.bug
     if report.error is not None:
         raise type(report.error)(f"{report.error} What was found until then is in {out}.")
-    return Outcome(Path(out), summary, report, system)
 
 
 def check_out(out: str | Path, *, overwrite: bool = False, saved_map: str | Path | None = None) -> None:
