@@ -25,7 +25,7 @@ from itertools import pairwise
 import numpy as np
 
 from dualslam.backend.calibration_bundle import CalibratedOptimum, optimise_with_camera
-from dualslam.backend.observability import compute_depth_sigmas, compute_residuals
+from dualslam.backend.observability import compute_depth_sigmas, compute_residuals, take_mask
 from dualslam.backend.solver import GTSAM_ERRORS, SolverFailure
 from dualslam.config.calibration_config import CalibrationConfig
 from dualslam.core.bundle import BundleProblem
@@ -34,7 +34,7 @@ from dualslam.core.camera.corrected import LensCorrection, correction_of, given_
 from dualslam.core.chi_square import CHI2_999
 from dualslam.core.estimates import CalibrationEstimate, PreferredCamera
 from dualslam.core.geometry import so3
-from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
 
 PRINCIPAL_POINT_SIGMA = 0.015
@@ -306,7 +306,7 @@ def make_problem(
     good = np.flatnonzero((n_views >= MIN_VIEWS) & (depth_sigmas < MAX_DEPTH_SIGMA))
     good = np.random.default_rng(seed).permutation(good)
     good = np.sort(good[np.cumsum(n_views[good]) <= max_observations])
-    chosen = np.flatnonzero(ok & _mask(good, n_landmarks)[landmark])
+    chosen = np.flatnonzero(ok & take_mask(good, n_landmarks)[landmark])
     given = given_camera(camera)
     raw = np.concatenate([submap.keyframes[k].features.uv_px for k in window.tolist()])
     offset = np.cumsum([0, *(len(submap.keyframes[k].features) for k in window.tolist())])
@@ -337,9 +337,3 @@ def prior_sigmas(problem: BundleProblem, width_px: int, config: CalibrationConfi
 def _rotation_steps(submap: Submap, ids: IntArray) -> FloatArray:
     R = submap.keyframe_poses(ids)[:, :3, :3]
     return np.array([np.linalg.norm(so3.log(a.T @ b)) for a, b in pairwise(R)])
-
-
-def _mask(ids: IntArray, size: int) -> BoolArray:
-    mask = np.zeros(size, bool)
-    mask[ids] = True
-    return mask

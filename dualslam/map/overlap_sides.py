@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.core.bundle import BundleProblem, BundleResult
+from dualslam.core.firsts import is_first
 from dualslam.core.geometry import sim3
-from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
 
 N_FREE, N_FIXED = 8, 12
@@ -167,7 +168,7 @@ def _points(
         return [of_first, of_first], xyz, len(joined)
     of_second = np.full(len(second.landmarks), -1, np.int64)
     joined = pairs[np.isin(pairs[:, 1], seen[1])]
-    joined = joined[_first_of_each(joined[:, 0]) & _first_of_each(joined[:, 1])]
+    joined = joined[is_first(joined[:, 0]) & is_first(joined[:, 1])]
     of_second[joined[:, 1]] = of_first[joined[:, 0]]
     alone = seen[1][of_second[seen[1]] < 0]
     of_second[alone] = len(chosen) + np.arange(len(alone))
@@ -183,12 +184,6 @@ def _same_features(first: Submap, second: Submap, shared: set[int]) -> IntArray:
         both = np.stack((first.landmark_of[k][:n], second.landmark_of[k][:n]), 1)
         pairs.append(both[(both >= 0).all(1)])
     return np.concatenate(pairs)
-
-
-def _first_of_each(values: IntArray) -> BoolArray:
-    first = np.zeros(len(values), bool)
-    first[np.unique(values, return_index=True)[1]] = True
-    return first
 
 
 def _observations(

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.core.firsts import is_first
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe
 from dualslam.map.anchors import Anchor
@@ -145,7 +146,7 @@ def _new_rows(merged: Submap, base: Submap, moved: Submap, id_of: IntArray) -> t
         here = np.flatnonzero(free & (kf == k))
         there = merged.landmark_of[k]
         ok = (there[feature[here]] == NO_LANDMARK) & ~np.isin(ids[here], there)
-        ok &= _is_first(ids[here]) & _is_first(feature[here])
+        ok &= is_first(ids[here]) & is_first(feature[here])
         free[here] = ok
     return kf[free], feature[free], ids[free]
 
@@ -174,9 +175,3 @@ def _rows_with_a_place(merged: Submap, base: Submap, moved: Submap) -> tuple[Int
 
 def _held_by(submap: Submap, kf: IntArray) -> BoolArray:
     return np.isin(kf, np.fromiter(submap.keyframes, np.int64, len(submap.keyframes)))
-
-
-def _is_first(values: IntArray) -> BoolArray:
-    first = np.zeros(len(values), bool)
-    first[np.unique(values, return_index=True)[1]] = True
-    return first
