@@ -21,7 +21,8 @@ from dualslam.export.metric import by_distance
 from dualslam.io.atomic import write_text
 from dualslam.io.map_store import StoredMap
 from dualslam.io.metric_scale import read_scale
-from dualslam.io.run_folder import TRAJECTORY, TRAJECTORY_KITTI, read_numbers
+from dualslam.io.run_folder import TRAJECTORY, TRAJECTORY_KITTI
+from dualslam.io.run_reading import read_numbers
 from dualslam.io.trajectory_files import read_kitti, read_text, read_tum, write_tum
 from dualslam.run.sources import open_images_of_run
 

@@ -9,7 +9,7 @@ from dualslam.core.errors import InputError
 from dualslam.export.exported_map import flatten, read_stored
 from dualslam.export.metric import MetricScale, by_distance, by_height, by_marker
 from dualslam.io.metric_scale import read_scale, write_scale
-from dualslam.io.run_folder import read_numbers
+from dualslam.io.run_reading import read_numbers
 from dualslam.run.sources import open_images_of_run
 
 NOTABLE = 0.05

@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import logging
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -17,14 +16,12 @@ from typing import IO, Any
 
 import yaml
 
-from dualslam.core.errors import InputError, OutputError
+from dualslam.core.errors import OutputError
 from dualslam.core.events import Event
-from dualslam.core.types import FrameStatus
 from dualslam.io.atomic import atomic_file, write_text
 from dualslam.io.folder_lock import FolderLock
 from dualslam.io.map_files import METADATA, to_plain
-from dualslam.io.trajectory_files import Trajectory, read_text, write_kitti, write_tum
-from dualslam.map.frame_numbers import FrameNumbers
+from dualslam.io.trajectory_files import Trajectory, write_kitti, write_tum
 from dualslam.map.frame_records import FrameRow as FrameRow  # a row of frames.csv
 
 log = logging.getLogger(__name__)
@@ -47,8 +44,6 @@ FRAME_COLUMNS = (
     *("index", "timestamp_s", "status", "submap", "in_main_map", "n_matches", "n_inliers", "latency_ms"),
     *("sigma_position_rel", "sigma_scale"),
 )
-OLD_FRAME_COLUMNS = FRAME_COLUMNS[:8]
-"""Of runs made before the map told what it claims."""
 _FILES = (
     TRAJECTORY,
     TRAJECTORY_KITTI,
@@ -64,39 +59,8 @@ _FILES = (
 _RESULTS = (CONFIG, EVENTS, FRAMES, TRAJECTORY, f"{SUBMAPS}/", SUMMARY, GROUND_TRUTH, f"{MAP}/", MAP_PAGE, REPORT)
 """In the order in which a person is told of them."""
 _NOT_OF_EVERY_RUN = frozenset({f"{SUBMAPS}/", GROUND_TRUTH, MAP_PAGE})
-_Kinds = Mapping[str, tuple[tuple[type, ...], str]]
-"""Of values by their names: the types that one may have, and what they are called."""
-_SUMMARY_KINDS: _Kinds = {
-    **dict.fromkeys(("frames", "posed", "failures", "recoveries", "submaps", "first_id"), ((int,), "a whole number")),
-    "coverage": ((int, float), "a number"),
-    **dict.fromkeys(("camera", "versions", "latency_ms", "stages_cpu_s"), ((dict,), "a mapping")),
-    "first_index": ((int, type(None)), "a whole number"),
-    "sequence": ((str,), "a word"),
-}
-"""Of what others build on in a summary: an earlier version may have written less."""
-_EVENT_KINDS: _Kinds = {
-    "event": ((str,), "a word"),
-    "frame": ((int,), "a whole number"),
-    "timestamp_s": ((int, float), "a number"),
-    "submap": ((int, type(None)), "a whole number"),
-    **dict.fromkeys(
-        ("first_view", "keyframe", "lost_since", "old_submap", "other_frame", "other_submap", "suspected_since"),
-        ((int, type(None)), "a whole number"),
-    ),
-    **dict.fromkeys(
-        ("cost_after", "cost_before", "drift_log_scale", "frames", "inliers", "largest_bend", "largest_move", "matches")
-        + ("n_agreeing_keyframes", "n_inliers", "n_matches", "n_pairs", "n_shared_keyframes", "scale", "seconds")
-        + ("shared_keyframes", "sigma_rot_deg", "sigma_scale", "sigma_trans_mu", "skipped_frames", "tries"),
-        ((int, float, type(None)), "a number"),
-    ),
-    **dict.fromkeys(
-        ("agreeing_keyframes", "left", "lost", "old_submaps", "rejected", "submaps"), ((list, type(None)), "a list")
-    ),
-    "factors": ((dict,), "a mapping"),
-}
-"""Of what pages are made of; what else belongs to an event is shown as it is."""
 _SUBMAP_NAME = re.compile(r"\d+\.txt")
-_SAMPLE_NAME = re.compile(r"\d+\.jpg")
+SAMPLE_NAME = re.compile(r"\d+\.jpg")
 _MAP_NAME = re.compile(r"[\w.-]+\.(npz|json)")
 
 
@@ -257,7 +221,7 @@ class RunFolder:
             write_tum(folder / f"{submap_id:02d}.txt", ordered)
         # A submap that was written earlier in the run may be linked by now.
         kept = {f"{submap_id:02d}.txt" for submap_id in unlinked}
-        for file in _named(folder, _SUBMAP_NAME):
+        for file in files_named(folder, _SUBMAP_NAME):
             if file.name not in kept:
                 file.unlink()
 
@@ -317,132 +281,19 @@ def _not_writable(path: Path, error: OSError) -> OutputError:
     return OutputError(f"{path} cannot be written to: {error.strerror or error}; choose another folder.")
 
 
-# --- reading
-
-
-def read_frames(path: str | Path) -> list[FrameRow]:
-    """Read a ``frames.csv``."""
-    rows = []
-    reader = csv.DictReader(io.StringIO(read_text(path)))
-    if tuple(reader.fieldnames or ()) not in (FRAME_COLUMNS, OLD_FRAME_COLUMNS):
-        raise InputError(f"{path} is not a frames.csv: its columns should be {','.join(FRAME_COLUMNS)}.")
-    for number, row in enumerate(reader, 2):
-        try:
-            rows.append(
-                FrameRow(
-                    index=int(row["index"]),
-                    timestamp_s=_finite(row["timestamp_s"]),
-                    status=FrameStatus(row["status"]),
-                    submap=int(row["submap"]) if row["submap"] else None,
-                    in_main_map=row["in_main_map"] == "1",
-                    n_matches=int(row["n_matches"]),
-                    n_inliers=int(row["n_inliers"]),
-                    latency_ms=_finite(row["latency_ms"]),
-                    sigma_position_rel=_sigma(row.get("sigma_position_rel")),
-                    sigma_scale=_sigma(row.get("sigma_scale")),
-                )
-            )
-        except (TypeError, ValueError) as e:
-            raise InputError(f"{path}, line {number}: not a row of frames.csv ({e}).") from None
-    return rows
-
-
-def _finite(cell: str) -> float:
-    value = float(cell)
-    if not math.isfinite(value):
-        raise ValueError(f"{cell} is no finite number")
-    return value
-
-
-def _sigma(cell: str | None) -> float | None:
-    if not cell:
-        return None
-    value = float(cell)
-    if not value >= 0:
-        raise ValueError(f"{cell} is no standard deviation")
-    return value
-
-
-def read_summary(run: Path) -> dict[str, Any]:
-    """Read ``summary.json`` of a run folder.
-
-    Raises
-    ------
-    InputError
-        If the folder is none of a run, or the file is damaged.
-    """
-    path = run / SUMMARY
-    if not path.is_file():
-        raise InputError(f"{run} is no run folder: there is no {SUMMARY}.")
-    try:
-        summary = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path} is no valid JSON: {error}.") from None
-    if not isinstance(summary, dict):
-        raise InputError(f"{path} is no summary of a run.")
-    if (misfit := _misfit(summary, _SUMMARY_KINDS)) is not None:
-        raise InputError(f"{path} is damaged: {misfit}. Give another run, or run it again.")
-    return summary
-
-
-def read_numbers(run: Path) -> dict[int, int]:
-    """Return the number that each frame of a run has in the run's map, by its index in the source.
-
-    Raises
-    ------
-    InputError
-        If the folder is none of a run, or a file is damaged.
-    """
-    summary = read_summary(run)
-    numbers = FrameNumbers(summary.get("first_id", 0), summary.get("first_index"))
-    return {row.index: numbers.number(row.index) for row in read_frames(run / FRAMES)}
-
-
-def _misfit(values: Mapping[str, Any], kinds: _Kinds) -> str | None:
-    """Return which value is of another type than a run writes, if one is."""
-    for name, (types, what) in kinds.items():
-        if name in values and not isinstance(values[name], types):
-            return f"{name} is not {what}"
-    return None
-
-
-def read_events(path: str | Path) -> list[dict[str, Any]]:
-    """Read an ``events.jsonl``; a last line that a crash cut off is left out."""
-    lines = [line for line in read_text(path).splitlines() if line.strip()]
-    events = []
-    for number, line in enumerate(lines, 1):
-        try:
-            event = json.loads(line)
-        except json.JSONDecodeError:
-            if number < len(lines):
-                raise InputError(f"{path}, line {number} is not valid JSON.") from None
-            log.warning("%s: the last line is cut off and was left out", path)
-            break
-        if not isinstance(event, dict) or "event" not in event:
-            raise InputError(f"{path}, line {number} is not an event.")
-        if (misfit := _misfit(event, _EVENT_KINDS)) is not None:
-            raise InputError(f"{path}, line {number}: {misfit}.")
-        events.append(event)
-    return events
-
-
 def unlinked_submaps(run: str | Path) -> dict[int, Path]:
     """Return the trajectory files of a run's unlinked submaps, by submap id."""
-    return {int(file.stem): file for file in sorted(_named(Path(run) / SUBMAPS, _SUBMAP_NAME))}
-
-
-def read_samples(run: str | Path) -> dict[int, bytes]:
-    """Return the small pictures that a run kept, as JPEG, by frame index."""
-    return {int(file.stem): file.read_bytes() for file in _named(Path(run) / SAMPLES, _SAMPLE_NAME)}
+    return {int(file.stem): file for file in sorted(files_named(Path(run) / SUBMAPS, _SUBMAP_NAME))}
 
 
 def _run_files(folder: Path) -> list[Path]:
     found = [folder / name for name in _FILES if (folder / name).exists()]
-    named = ((SUBMAPS, _SUBMAP_NAME), (SAMPLES, _SAMPLE_NAME), (MAP, _MAP_NAME))
-    return found + [file for name, pattern in named for file in _named(folder / name, pattern)]
+    named = ((SUBMAPS, _SUBMAP_NAME), (SAMPLES, SAMPLE_NAME), (MAP, _MAP_NAME))
+    return found + [file for name, pattern in named for file in files_named(folder / name, pattern)]
 
 
-def _named(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
+def files_named(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
+    """Return the files of a folder whose whole name is of a pattern, in order; none where there is no folder."""
     if not folder.is_dir():
         return []
     return sorted(file for file in folder.iterdir() if file.is_file() and pattern.fullmatch(file.name))

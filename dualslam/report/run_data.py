@@ -17,7 +17,8 @@ from dualslam.core.types import BoolArray, FloatArray, FrameStatus, IntArray
 from dualslam.io import run_folder
 from dualslam.io.map_files import METADATA, load_arrays
 from dualslam.io.map_store import load_joints, submap_path
-from dualslam.io.run_folder import FrameRow, read_events, read_frames, unlinked_submaps
+from dualslam.io.run_folder import FrameRow, unlinked_submaps
+from dualslam.io.run_reading import read_events, read_frames, read_samples, read_summary
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate, read_text, read_tum
 from dualslam.map.atlas import joined
 
@@ -132,14 +133,14 @@ def read_run(path: str | Path) -> RunData:
         path=path,
         rows=rows,
         events=events,
-        summary=run_folder.read_summary(path),
+        summary=read_summary(path),
         config=_settings(config_file, config_text),
         config_text=config_text,
         main=_on_rows(path / run_folder.TRAJECTORY, times),
         unlinked={m: _on_rows(file, times) for m, file in unlinked_submaps(path).items()},
         truth=_truth_on_rows(read_tum(truth_file, allow_empty=True), times) if truth_file.exists() else _no_rows(),
         points=_map_points(path / run_folder.MAP, {row.submap for row in rows if row.in_main_map}),
-        samples=run_folder.read_samples(path),
+        samples=read_samples(path),
     )
 
 

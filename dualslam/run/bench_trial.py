@@ -17,7 +17,7 @@ from dualslam.core.memory import keep_freed_memory
 from dualslam.core.threads import limit_threads
 from dualslam.core.types import Failure
 from dualslam.io.atomic import write_text
-from dualslam.io.run_folder import read_frames
+from dualslam.io.run_reading import read_frames
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.lab.audits.link_audit import audit_links, truth_by_frame
 from dualslam.lab.bench.measure import (

@@ -23,7 +23,8 @@ from dualslam.core.errors import OutputError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.types import Frame
 from dualslam.io.map_store import load_atlas, save_atlas
-from dualslam.io.run_folder import RunFolder, read_events
+from dualslam.io.run_folder import RunFolder
+from dualslam.io.run_reading import read_events
 from dualslam.lab.synthetic import SyntheticSequence
 from dualslam.run.results import versions
 from dualslam.run.session import run_to_folder

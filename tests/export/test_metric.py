@@ -18,7 +18,8 @@ from dualslam.core.types import FloatArray, Frame
 from dualslam.export.exported_map import ExportedMap
 from dualslam.export.metric import DICTIONARIES, by_distance, by_height, by_marker
 from dualslam.io.metric_scale import SCALE, read_scale, write_scale
-from dualslam.io.run_folder import FRAME_COLUMNS, read_numbers
+from dualslam.io.run_folder import FRAME_COLUMNS
+from dualslam.io.run_reading import read_numbers
 from dualslam.testing.point_world import CAMERA
 from tests.cli.conftest import _own_environment  # noqa: F401 (used by every test)
 from tests.cli.test_usage import one_sentence

@@ -14,7 +14,8 @@ from dualslam.core.errors import InputError, OutputError
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.types import FrameStatus
 from dualslam.io import FrameRow, RunFolder, RunRecord, Trajectory, read_kitti, read_tum
-from dualslam.io.run_folder import check_vacant, read_events, read_frames, unlinked_submaps
+from dualslam.io.run_folder import check_vacant, unlinked_submaps
+from dualslam.io.run_reading import read_events, read_frames
 
 ROWS = [
     FrameRow(0, 0.1, FrameStatus.INITIALISING, None, False, 0, 0, 12.3456),

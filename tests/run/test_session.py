@@ -15,7 +15,7 @@ from dualslam.core.errors import OutputError
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import FloatArray, Frame
 from dualslam.io.map_store import load_atlas
-from dualslam.io.run_folder import read_frames
+from dualslam.io.run_reading import read_frames
 from dualslam.io.trajectory_files import read_tum
 from dualslam.map.frame_records import FrameResult
 from dualslam.run.session import run_to_folder

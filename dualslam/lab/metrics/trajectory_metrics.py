@@ -14,7 +14,8 @@ import numpy as np
 
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, IntArray
-from dualslam.io.run_folder import SUMMARY, TRAJECTORY, read_summary, unlinked_submaps
+from dualslam.io.run_folder import SUMMARY, TRAJECTORY, unlinked_submaps
+from dualslam.io.run_reading import read_summary
 from dualslam.io.trajectory_files import MAX_BEGIN_GAP_S, MAX_DT_S, Trajectory, associate, nearest_in_time, read_tum
 from dualslam.lab.audits.silent_breaks import find_silent_breaks
 from dualslam.lab.metrics.alignment import align_points
