@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -211,8 +212,15 @@ def parse_yaml(path: Path, text: str) -> dict[str, Any]:
 def _parse(path: Path, text: str) -> dict[str, Any]:
     if path.suffix.lower() != ".json":
         return parse_yaml(path, text)
+
+    def each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        for key, n in Counter(key for key, _ in pairs).items():
+            if n > 1:
+                raise InputError(f"{path}: the key {key!r} stands there twice; correct it.")
+        return dict(pairs)
+
     try:
-        content = json.loads(text)
+        content = json.loads(text, object_pairs_hook=each_once)
     except json.JSONDecodeError as e:
         raise InputError(f"{path}, line {e.lineno} is not valid JSON; correct it.") from e
     if not isinstance(content, dict):

@@ -77,13 +77,14 @@ def test_ros_camera_info(tmp_path: Path, model: str, distortion: str, expected) 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        ('{"model": "pinhole", "fx": 500, "fx": 700}', r"camera.json: the key 'fx' stands there twice; correct it"),
         ("model: pinhole\nfx: 500\nfx: 700\n", "line 3 is not valid YAML: the key 'fx' stands there twice; correct it"),
         (f"{ORB_SLAM}Camera.k1: none\n", "k1 is 'none', not a number"),
         (f"{ORB_SLAM}Camera.p2: .nan\n", "p2 holds a number that is not finite"),
     ],
 )
 def test_a_slip_is_named(tmp_path: Path, text: str, words: str) -> None:
-    path = tmp_path / "camera.yaml"
+    path = tmp_path / ("camera.json" if text.startswith("{") else "camera.yaml")
     path.write_text(text)
     with pytest.raises(InputError, match=words):
         read_camera_file(path)
