@@ -1,0 +1,59 @@
+"""A walk's additions and refusals come into the map as it is by then, and its frames into that map's unit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.types import FrameStatus
+from dualslam.map.frame_records import FrameRow
+from dualslam.map.record import Record
+from dualslam.map.submap import Submap
+from dualslam.map.trajectory import FramePose
+from dualslam.recovery.bypass import pose_frames
+from dualslam.recovery.job import RecoveredFrame
+from dualslam.recovery.merge import Merged, merge_recovery
+from dualslam.testing.graph_scene import guessed_submap, make_scene
+
+SCALE, T = 2.5, se3.exp([0.3, -0.2, 0.1, 2.0, 0.0, -1.0])
+S_LIVE_GROWN = sim3.from_parts(SCALE, T[:3, :3], T[:3, 3])
+
+
+def merged() -> tuple[Merged, Submap, np.ndarray]:
+    """A walk that has refused three observations, in a map that has another frame and unit since; and their rows."""
+    base = guessed_submap(make_scene(6), pose_noise=0.0)
+    grown, live = base.copy(), base.copy()
+    refused = np.flatnonzero(base.observations["alive"] & (base.observations["kf"] == 3))[[4, 40, 70]]
+    grown.remove_observations(refused)
+    live.transform(SCALE, T)
+    return merge_recovery(live, base, grown, lambda keyframe: keyframe), grown, refused
+
+
+def test_what_the_walk_has_refused_is_no_observation_any_more_and_all_else_is() -> None:
+    result, grown, refused = merged()
+    np.testing.assert_allclose(result.S_live_grown, S_LIVE_GROWN, atol=1e-9)
+    alive = result.submap.observations["alive"]
+    assert not alive[refused].any()
+    seen_still = result.submap.landmarks["alive"][result.submap.observations["landmark"]]
+    others = np.setdiff1d(np.flatnonzero(grown.observations["alive"] & seen_still), refused)
+    assert alive[others].all()
+
+
+def test_frames_of_the_walk_are_posed_in_the_unit_of_the_map_and_only_where_they_had_no_pose() -> None:
+    result, grown, _ = merged()
+    record = Record()
+    record.atlas.add(result.submap)
+    T_kf_cam = se3.exp([0.0, 0.1, 0.0, 0.05, 0.0, 0.1])
+    frames = [RecoveredFrame(FramePose(i, 0.1 * i, grown.id, 2, T_kf_cam), 90, 80) for i in (100, 101)]
+    for i in (100, 101):
+        record.rows[i] = FrameRow(i, 0.1 * i, FrameStatus.INITIALISING)
+    known = FramePose(101, 10.1, 7, 0, np.eye(4))
+    record.pose(known)
+    posed = pose_frames(record, frames, result, result.submap)
+    in_grown = grown.resolve_anchor(2, T_kf_cam)
+    for frame in posed:
+        in_map = result.submap.resolve_anchor(frame.pose.keyframe_id, frame.pose.T_kf_cam)
+        np.testing.assert_allclose(in_map, sim3.act_on_pose(S_LIVE_GROWN, in_grown), atol=1e-9)
+    assert record.poses[100] is posed[0].pose
+    assert record.rows[100].status is FrameStatus.TRACKED
+    assert record.poses[101] is known
