@@ -63,6 +63,9 @@ class LinkAudit:
         where the new map has no frames beyond the old one.
     frames_live : (int, int) or None
         The first and the last frame of that end.
+    shared_scale : float or None
+        Relative error of scale over the frames of the overlap that both maps pose, and over no others: the link's own,
+        without what either map drifts beside its overlap; none where they are fewer than five.
     """
 
     old: int
@@ -80,6 +83,7 @@ class LinkAudit:
     live_scale: float | None = None
     live_scale_sigma: float | None = None
     frames_live: tuple[int, int] | None = None
+    shared_scale: float | None = None
 
     @property
     def position(self) -> float:
@@ -173,6 +177,7 @@ def audit_link(
         n_new=len(b.ids),
         frames_old=a.span,
         frames_new=b.span,
+        shared_scale=_shared_scale(link, known, truth),
         **({} if isinstance(live, Failure) else _at_the_live_end(a, live[0], S_link)),
     )
 
@@ -249,6 +254,15 @@ def _at_the_live_end(old: Side, live: Side, S_link: FloatArray) -> dict[str, Any
     error = float(sim3.scale(S_link) / sim3.scale(S_true)) - 1.0
     sigma = math.hypot(old.scale_sigma, live.scale_sigma)
     return {"live_scale": error, "live_scale_sigma": sigma, "frames_live": live.span}
+
+
+def _shared_scale(link: Link, known: list[dict[int, FloatArray]], truth: Mapping[int, FloatArray]) -> float | None:
+    """Return the error of a link's scale over the frames of its overlap that both maps pose, if they are enough."""
+    span = min(link.keyframes), max(link.keyframes)
+    shared = known[0].keys() & known[1].keys()
+    sides = [_lay_upon_truth({i: T[i] for i in shared}, truth, span, "of the overlap") for T in known]
+    old, new = (None if isinstance(side, Failure) else float(sim3.scale(side.S_world_submap)) for side in sides)
+    return None if old is None or new is None else float(sim3.scale(link.S_a_b)) * old / new - 1.0
 
 
 def _truth_about(

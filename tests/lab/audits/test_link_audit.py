@@ -79,6 +79,7 @@ def test_a_wrong_scale_is_named_in_full() -> None:
     wrong = S_OLD_NEW @ sim3.from_parts(1.08, np.eye(3), np.zeros(3))
     found = audit(wrong, world())
     assert found.scale == pytest.approx(0.08)
+    assert found.shared_scale == pytest.approx(0.08)
     assert found.wrong
 
 
@@ -107,6 +108,8 @@ def test_a_scale_that_was_lost_on_the_way_to_the_live_end_makes_the_link_wrong()
     assert found.wrong
     assert found.surely_wrong
     assert found.worst_scale == pytest.approx(0.2)
+    assert found.shared_scale is not None
+    assert abs(found.shared_scale) < 1e-9  # and over what both maps posed
 
 
 def test_what_drifts_after_the_start_is_not_the_links_fault() -> None:
