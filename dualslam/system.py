@@ -360,6 +360,7 @@ class System:
         if all(frame.failed for frame in self._state.health.suspected()):
             self._calibrations.ask_at_loss(live, view, self._recoveries.waiting)
         self._starting.begin_anew([])
+        self._starting.foresee()
         return self.buffer.newest(1)[0]
 
     def _begin_anew(self) -> None:

@@ -25,6 +25,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import CorrectedCamera
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Frontend, SubmapGraph
+from dualslam.core.types import View
 from dualslam.frontends.frame_reader import FrameReader
 from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.registry import create_frontend
@@ -41,7 +42,7 @@ from dualslam.recovery.walk_news import WalkWatch
 from dualslam.steps.components import Components
 from dualslam.system import System
 from dualslam.workers.desk import WorkerDesk
-from dualslam.workers.jobs import InlineDesk
+from dualslam.workers.jobs import Desk, InlineDesk, JobKind
 from dualslam.workers.start_beside import StartBeside
 
 log = logging.getLogger(__name__)
@@ -114,6 +115,7 @@ def build_system(
         else InlineDesk(inline_handlers(config, places.verifier, new_graph))
     )
     graphs = BesideGraphs(desk, window_solver(config)) if workers else None
+    foresees = workers and recovery is None and config.recovery.enabled
     if recovery is None:
         recovery = DeskExecutor(desk) if workers else faults.around_inline(InlineExecutor(parts, watch))
 
@@ -134,6 +136,7 @@ def build_system(
             graphs=graphs,
             places=places,
             open_features=partial(features_beside, desk, config.frontend) if isinstance(desk, WorkerDesk) else None,
+            foresee=partial(_foresee, desk if foresees else None),
         ),
         config,
         saved,
@@ -190,6 +193,13 @@ def _camera_of(saved: StoredMap, camera: Camera) -> Camera:
         return known
     log.warning("the saved map was made with another camera: single frames cannot be posed in it")
     return camera
+
+
+def _foresee(desk: Desk | None, view: View) -> None:
+    """Have a worker, which has nothing else to do, look at a frame."""
+    if desk is not None:
+        desk.poll(JobKind.FORESIGHT)  # what it has found stays there
+        desk.submit(JobKind.FORESIGHT, view)
 
 
 def _starter_beside(desk: WorkerDesk, live: LiveParts) -> StartBeside:

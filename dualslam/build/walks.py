@@ -16,12 +16,12 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.estimates import PreferredCamera
 from dualslam.core.interfaces import Frontend, SubmapGraph
 from dualslam.core.support import judge_track
-from dualslam.core.types import IntArray
+from dualslam.core.types import IntArray, View
 from dualslam.frontends.features.image_features import ImageFeatures
 from dualslam.frontends.gap.auxiliary_features import Auxiliary, BufferedFeatures, OwnFeatures
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry
 from dualslam.frontends.gap.refinding import Refinder
-from dualslam.frontends.gap.route import Route
+from dualslam.frontends.gap.route import Route, find_lack
 from dualslam.frontends.registry import FOR_WALKS, create_frontend
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.map.submap import Submap
@@ -69,9 +69,16 @@ def recovery_parts(
         n_covering = 0 if job.lost else config.recovery.covering_keyframes
         return VisualFrontEnd(frontend, config, submap, graph, camera, refinder, n_covering, window_solver(config))
 
+    auxiliaries: dict[str, ImageFeatures] = {}  # of the attempts, by their settings
+
+    def foresee(view: View) -> None:
+        images = next(iter(auxiliaries.values()), None)
+        if images is not None and view.image is not None and find_lack(view, config.tracking.min_inliers) is None:
+            images.of(view.image)
+
     matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, DESCRIPTOR_RADIUS_PX)
     return RecoveryParts(
-        attempts=_attempts(config, frontend, live, camera, n_threads),
+        attempts=_attempts(config, frontend, live, camera, n_threads, auxiliaries),
         posing=Attempt("live", live),
         new_graph=new_graph or graph_maker(config),
         link=lambda old, new, onset: estimate_link(
@@ -85,6 +92,7 @@ def recovery_parts(
         judge=lambda track: judge_track(track, config.health),
         config=config.recovery,
         fusion=config.fusion,
+        foresee=foresee,
         budget_s=budget_s,
     )
 
@@ -95,9 +103,9 @@ def _attempts(
     live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
     camera: Camera,
     n_threads: int,
+    auxiliaries: dict[str, ImageFeatures],
 ) -> tuple[Attempt, ...]:
-    """Build the attempts; those with the same auxiliary front end share what it finds in the images."""
-    auxiliaries: dict[str, ImageFeatures] = {}  # by their settings
+    """Build the attempts; those with the same auxiliary front end share what it finds in the images: `auxiliaries`."""
     own = Auxiliary(frontend, OwnFeatures())
     attempts = []
     for number, attempt in enumerate(config.recovery.attempts):

@@ -90,6 +90,7 @@ def walk_handlers(config: Config, camera: Camera, n_threads: int) -> Handlers:
     verifier = place_parts(config, frontend, camera).verifier
     return {
         JobKind.WALK: lambda job: recover_in_steps(job, parts),
+        JobKind.FORESIGHT: parts.foresee,
         **atlas_handlers(atlas_solver(config)),
         **SCALE_HANDLERS,
         **READOUT_HANDLERS,
@@ -118,6 +119,7 @@ def worker_desk(config: Config, camera: Camera, faults: FaultScript, watch: Walk
             JobKind.CALIBRATION,
             JobKind.LOOP,
             JobKind.WALK,
+            JobKind.FORESIGHT,
         ),
         partial(walk_handlers, config, camera, n_threads),
         recovery.workers,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from dualslam.core.types import Failure
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking import LinkEstimate
+from dualslam.recovery.linking.gates import TIE_WINDOW
 
 MIN_SHARED_KEYFRAMES = 4
 """Keyframes that both maps must hold before a link is tried."""
@@ -48,7 +49,8 @@ class Relinker:
     Attributes
     ----------
     has_seen_enough : bool
-        Whether the walk has met so many keyframes of a lost submap's healthy part that the next ones change nothing.
+        Whether the next keyframes change nothing: the walk has met so many of a lost submap's healthy part, or so many
+        beyond a place where its own map is torn that all which could hold it together there is seen.
     """
 
     def __init__(
@@ -77,6 +79,11 @@ class Relinker:
         """Whether the growing submap holds all keyframes of the lost ones."""
         return self.keyframe_ids <= self._submap.keyframes.keys()
 
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether the growing submap holds all keyframes of the lost ones, and these are too few for any link."""
+        return self.holds_all and all(len(old.keyframes) < MIN_SHARED_KEYFRAMES for old in self._old)
+
     def attempts(self, keyframe_id: int) -> Iterator[LinkTry]:
         """Try each lost submap that holds the newest keyframe of the walk, the latest lost one first."""
         for old in reversed(self._old):
@@ -85,7 +92,14 @@ class Relinker:
                 continue
             n_healthy = sum(k < self._onsets[old.id] for k in shared)
             self.has_seen_enough |= n_healthy >= self._max_shared
-            yield LinkTry(old.id, len(shared), self._linker(old, self._submap, self._onsets[old.id]))
+            result = self._linker(old, self._submap, self._onsets[old.id])
+            self.has_seen_enough |= isinstance(result, Failure) and self._stays_torn(result)
+            yield LinkTry(old.id, len(shared), result)
+
+    def _stays_torn(self, refused: Failure) -> bool:
+        """Whether the growing submap is torn where all keyframes are there that are asked about the place."""
+        torn = refused.numbers.get("torn")
+        return torn is not None and sum(k < torn for k in self._submap.keyframes) >= TIE_WINDOW
 
     def _is_due(self, old_id: int, n_shared: int) -> bool:
         if n_shared < MIN_SHARED_KEYFRAMES:

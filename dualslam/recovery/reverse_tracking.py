@@ -64,6 +64,7 @@ class RecoveryParts:
 
     `posing`: the way back where there is no lost map, but frames without a pose.
     `max_scale_sigma`: of a link, at the live end.
+    `foresee`: finds beforehand what a walk over a gap may ask for in a frame.
     `budget_s`: wall time after which it comes to an end with what it has, where it does not run inline.
     """
 
@@ -77,6 +78,7 @@ class RecoveryParts:
     judge: Judge
     config: RecoveryConfig
     fusion: FusionConfig
+    foresee: Callable[[View], None] = lambda view: None
     budget_s: float | None = None
 
 
@@ -217,7 +219,8 @@ def _make_attempt(
                 break
             tries.note_try(tried.old_id, found.reason)
             progress.why_not_linked = found.detail
-            progress.walk_sigma = found.numbers.get("sigma_scale_reverse", 0.0)
+            nothing_held = np.inf if "torn" in found.numbers else 0.0
+            progress.walk_sigma = found.numbers.get("sigma_scale_reverse", nothing_held)
             progress.needs_camera |= found.reason is FailureReason.CAMERA
             # A lost map of few keyframes hardly knows its scale: another way over the same ones knows it no better.
             at_overlap = isinstance(tried.result, Failure) and tried.result.reason is FailureReason.SCALE
@@ -233,6 +236,7 @@ def _make_attempt(
         progress.given_up |= relinker.has_seen_enough
         if progress.link is not None or progress.given_up:
             break
+    progress.needs_old_map |= bool(job.lost) and relinker.is_hopeless
     if job.lost:
         progress.events.append(_event_of(job, progress, attempt.name, time.perf_counter() - started))
     return progress

@@ -26,7 +26,8 @@ class Components:
     `walk_watch`: hears of reverse tracking that is under way. `desk`: does the work beside the tracking; reverse
     tracking has an executor of its own, which may use the same desk. `graphs`: carries changes to submaps' graphs in
     another process and back, if they are solved there. `open_features`: starts one more process, and returns a function
-    that has the features of a frame found there.
+    that has the features of a frame found there. `foresee`: has found beside the tracking what reverse tracking may ask
+    for in a frame.
     """
 
     view_of: Callable[[Frame], View | Failure]
@@ -44,6 +45,7 @@ class Components:
     desk: Desk
     graphs: BesideGraphs | None = None
     open_features: Callable[[], Callable[[Frame], Frame]] | None = None
+    foresee: Callable[[View], None] = lambda view: None
 
     @property
     def K(self) -> FloatArray:

@@ -27,6 +27,9 @@ FIRM_SIGMA_DEG = 0.25
 later one: over 1 to 1.5 s without frames (`kitti_03`, three places) the link's scale was known to 0.6 to 1.0 % from
 starts of 0.20 to 0.27 degrees, to 1.1 to 1.6 % up to 0.38; of 0.45 and more to 1.7 % at best, after tries in vain."""
 
+FORESEEN = 3
+"""Frames before a loss that reverse tracking over it asks for: two that cross the gap, and one to go on from there."""
+
 
 class Starting:
     """Finds a map again, or starts one.
@@ -48,6 +51,7 @@ class Starting:
         self._starter = state.parts.new_starter()
         self._n_without_map = 0  # frames
         self._since_s: float | None = None  # stamp of the first of them for which a start was looked for
+        self._foresees = False  # the first frame after a loss that shows something
 
     def begin_anew(self, lost: list[View]) -> None:
         """Look for the next map's start from these frames on."""
@@ -137,6 +141,7 @@ class Starting:
 
     def find_start(self, view: View) -> Start | Failure:
         """Look for the start of a map that ends at this frame, or at one before it if it was looked for meanwhile."""
+        self._foresee_from(view)
         state, shutter = self._state, self._state.parts.shutter
         if self._since_s is None:
             self._since_s = view.timestamp_s
@@ -153,11 +158,27 @@ class Starting:
             state.record.event(EventKind.INITIALISATION_REFUSED, view, None, reason=start.detail, **start.numbers)
         return start
 
+    def foresee(self) -> None:
+        """Let what the next walk may ask for on either side of a loss be found while no map has started to walk from.
+
+        On this side it is the first frame that shows something.
+        """
+        *before, _ = self._state.buffer.newest(FORESEEN + 1)
+        for view in reversed(before):
+            self._state.parts.foresee(view)
+        self._foresees = True
+
+    def _foresee_from(self, view: View) -> None:
+        if self._foresees and len(view.features) >= self._state.config.tracking.min_inliers:
+            self._state.parts.foresee(view)
+            self._foresees = False
+
     def find_start_instead(self, view: View) -> Start | Failure:
         """Look for the start of the next map while the present one is lost and may still be seen again.
 
         One that comes early rests on frames close together, and must be firm: it is to be tracked back from.
         """
+        self._foresee_from(view)
         if self._state.parts.desk.n_open(JobKind.CALIBRATION):  # what the present one says of its camera is for both
             self._starter.collect(view)
             return Failure(FailureReason.BUSY, "the camera is being asked for")

@@ -34,6 +34,7 @@ class JobKind(StrEnum):
     CALIBRATION = "calibration"
     LOOP = "loop search"
     WALK = "walk back"
+    FORESIGHT = "foresight"
 
 
 Handler = Callable[[Any], Any]

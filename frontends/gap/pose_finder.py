@@ -197,7 +197,10 @@ class PoseFinder:
         """
         posed = self._map.posed
         keyframes = [k for k in posed if k in self._submap.keyframes][-SEED_KEYFRAMES:]
-        features = self._look_at(view, list(dict.fromkeys([*keyframes, *posed[-FOLLOW_FRAMES:]])), ahead)
+        near = list(dict.fromkeys([*keyframes, *posed[-FOLLOW_FRAMES:]]))
+        # As many as points are made of have their features where a gap was crossed just now: the rest would add little.
+        is_known = sum(self._map.has_features(index) for index in near) >= POINT_FRAMES
+        features = self._look_at(view, posed[-FOLLOW_FRAMES:] if is_known else near, ahead)
         if isinstance(features, Failure):
             return features
         frames = self._map.frames[-POINT_FRAMES:]

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dualslam.build import build_system, recovery_parts
 from dualslam.config.corruption import Corruption
@@ -16,7 +17,9 @@ from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.errors import ConfigError, SolverError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import Failure, FailureReason
+from dualslam.core.grey_image import GreyImage
+from dualslam.core.types import Failure, FailureReason, Features, View
+from dualslam.frontends.features.sift import SiftFrontend
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry
 from dualslam.lab.audits.link_audit import LinkAudit, audit_links
 from dualslam.lab.synthetic import make_sequence
@@ -29,7 +32,7 @@ from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
-from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
+from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, random_features, system_in
 from tests.workers.test_worker import assert_same
 
 COVERED = frozenset(range(35, 50))
@@ -352,3 +355,21 @@ def test_missing_frames_lead_to_no_wrong_link() -> None:
     crossed = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)[-1]
     assert (crossed.data["verdict"] == "linked") == bool(links)
     assert crossed.data["gaps"] == bool(links)  # over the gap no walk goes but by a gap relocalisation
+
+
+def test_what_was_foreseen_in_an_image_is_not_looked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked_at: list[int] = []
+    extract = SiftFrontend.extract
+
+    def count(self: SiftFrontend, image: NDArray[np.uint8]) -> Features:
+        looked_at.append(int(image[0, 0]))
+        return extract(self, image)
+
+    monkeypatch.setattr(SiftFrontend, "extract", count)
+    features = random_features(np.random.default_rng(0))
+    grey = np.random.default_rng(1).integers(0, 256, (120, 160), np.uint8)
+    shows, blank = (View(i, float(i), features, GreyImage.of(image)) for i, image in enumerate((grey, 0 * grey)))
+    parts = recovery_parts(Config(), CAMERA)
+    for view in (shows, blank, replace(shows, index=2)):
+        parts.foresee(view)
+    assert looked_at == [int(grey[0, 0])]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
-from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.core.types import Failure, FloatArray, Frame, FrameStatus, View
 from dualslam.lab.audits.link_audit import LinkAudit, audit_links
 from dualslam.map.atlas import LinkKind
 from dualslam.run.results import frame_rows, trajectories_of
@@ -182,3 +184,23 @@ def test_a_sequence_that_is_read_backwards_is_linked_where_its_old_map_is_health
     recovered = [index_of(i) for i, row in system.rows.items() if row.status is FrameStatus.RECOVERED]
     assert recovered
     assert index_of(started.frame) < min(recovered) <= max(recovered) < min(COVERED)
+
+
+def test_what_a_walk_may_ask_for_about_a_loss_is_foreseen() -> None:
+    world, foreseen = PointWorld(cloud(), hand_held(55), covered=COVERED), list[int]()
+    system = system_in(world, recovery={"enabled": True})
+    parts = system._state.parts
+
+    def view_of(frame: Frame) -> View | Failure:
+        view = parts.view_of(frame)
+        shows_nothing = isinstance(view, View) and frame.index in COVERED
+        return replace(view, features=view.features.take(np.zeros(0, np.int64))) if shows_nothing else view
+
+    def note(view: View) -> None:
+        foreseen.append(view.index)
+
+    system._state.parts = replace(parts, view_of=view_of, foresee=note)
+    for frame in world.frames():
+        system.step(frame)
+    first, last = min(COVERED), max(COVERED)
+    assert foreseen == [first - 1, first - 2, first - 3, last + 1]

@@ -5,8 +5,11 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
+
 from dualslam.core.types import Failure, FailureReason
 from dualslam.map.submap import Submap
+from dualslam.recovery.linking.gates import TIE_WINDOW
 from dualslam.recovery.relinker import Relinker
 
 ONSET = 190
@@ -77,3 +80,31 @@ def test_over_keyframes_that_an_earlier_walk_has_left_it_tries_once() -> None:
         new.keyframes[k] = None  # type: ignore[assignment]
         list(relinker.attempts(k))
     assert asked == [12, 14]  # then at new ones, as ever
+
+
+def test_a_map_that_is_torn_stays_so_once_all_is_there_that_is_asked_about_the_place() -> None:
+    old, new = holding(0, range(200)), holding(1, range(200, 210))
+
+    def refuse(old: Submap, new: Submap, onset: int | None) -> Failure:
+        return Failure(FailureReason.DEFORMED, "torn", {"torn": 198.0})
+
+    relinker = Relinker(new, {0: old}, {0: ONSET}, refuse)
+    enough = []
+    for k in range(199, 191, -1):
+        new.keyframes[k] = None  # type: ignore[assignment]
+        list(relinker.attempts(k))
+        enough.append(relinker.has_seen_enough)
+    n_beyond = np.arange(1, 9) - 2  # of 198 and later are two
+    assert enough == (n_beyond >= TIE_WINDOW).tolist()
+
+
+def test_lost_maps_of_too_few_keyframes_are_hopeless_once_all_are_held() -> None:
+    def never(old: Submap, new: Submap, onset: int | None) -> Failure:
+        raise AssertionError
+
+    for n in (3, 4):
+        new = holding(1, range(n, 20))
+        relinker = Relinker(new, {0: holding(0, range(n))}, {0: ONSET}, never)
+        assert not relinker.is_hopeless
+        new.keyframes |= dict.fromkeys(range(n))  # type: ignore[arg-type]
+        assert relinker.is_hopeless == (n < 4)
