@@ -247,6 +247,7 @@ class Recoveries:
                 self._failed(job, now, refused, time.perf_counter() - walk.began_s)
                 if result.link is not None:
                     self._tries.note_try(result.link.old_id, refused.reason)
+                self._retries.leave_open(job.submap.id, walk.n_live, job.camera)  # grown, it knows its velocity better
                 continue
             if not isinstance(result, Failure):
                 with self._record.timer.measure("merging"):

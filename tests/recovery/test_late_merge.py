@@ -281,6 +281,17 @@ def test_a_link_that_leaps_must_hold_anew(world: PointWorld, monkeypatch: pytest
     assert tries.judge(0, 0.024, 0.025) is not None
 
 
+def test_a_link_that_leaps_is_tried_again_as_its_map_grows(world: PointWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    leaps = [Failure(FailureReason.LEAP, "a leap 9 times further off than velocities lead elsewhere")]
+    monkeypatch.setattr("dualslam.recovery.manager.refuse_leaps", lambda *_: leaps.pop() if leaps else None)
+    system = late_system(world, 1, recovery={"enabled": True, "retry_keyframes": [4]})
+    for frame in world.frames():
+        system.step(frame)
+    first, again = system.events.of_kind(EventKind.RECOVERY_STARTED)
+    assert (first.data["again"], again.data["again"]) == (False, True)
+    assert system.events.of_kind(EventKind.LINKED)
+
+
 def test_a_recovery_that_fails_costs_its_link_only(world: PointWorld) -> None:
     system = system_in(world, recovery={"enabled": True})
     system._recoveries._executor = FailingExecutor(system._recoveries._executor, 5)

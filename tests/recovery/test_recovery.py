@@ -9,7 +9,7 @@ import pytest
 
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
-from dualslam.core.types import Failure, FloatArray, Frame, FrameStatus, View
+from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, View
 from dualslam.lab.audits.link_audit import LinkAudit, audit_links
 from dualslam.map.atlas import LinkKind
 from dualslam.run.results import frame_rows, trajectories_of
@@ -204,3 +204,17 @@ def test_what_a_walk_may_ask_for_about_a_loss_is_foreseen() -> None:
         system.step(frame)
     first, last = min(COVERED), max(COVERED)
     assert foreseen == [first - 1, first - 2, first - 3, last + 1]
+
+
+def test_a_walk_ends_at_a_tear_and_leaves_nothing_beyond_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def torn(*_: object) -> Failure:
+        return Failure(FailureReason.DEFORMED, "the new map is torn", {"torn": float(max(COVERED) + 1)})
+
+    monkeypatch.setattr("dualslam.build.walks.estimate_link", torn)
+    world = PointWorld(cloud(), hand_held(60), covered=COVERED)
+    system = system_in(world, recovery={"enabled": True, "retry_keyframes": []})
+    for frame in world.frames():
+        system.step(frame)
+    n_shared = [event.data["shared_keyframes"] for event in system.events.of_kind(EventKind.LINK_REFUSED)]
+    assert n_shared in ([4], [4, 5])  # of eight: with five keyframes beyond the tear no more would tell
+    assert min(system.atlas.submaps[1].keyframes) > max(COVERED)
