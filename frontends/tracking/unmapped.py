@@ -56,9 +56,10 @@ def passes_unmapped(
 
 def _unmapped(features: Features, has_landmark: BoolArray) -> BoolArray:
     """Return which features lie in cells without a landmark; none where these are a small share of the image."""
-    uv_px = features.uv_rect_px
-    cell_px = max(float(np.ptp(uv_px[:, 0])), 1.0) / CELLS_ACROSS
-    cell = np.unique(np.floor(uv_px / cell_px), axis=0, return_inverse=True)[1].reshape(-1)
+    u, v = features.uv_rect_px.T
+    cell_px = max(float(np.ptp(u)), 1.0) / CELLS_ACROSS
+    column, row = (np.floor(x / cell_px).astype(np.int64) for x in (u, v))
+    cell = (row - row.min()) * (CELLS_ACROSS + 2) + column - column.min()
     shows = np.bincount(cell) >= MIN_IN_CELL
     bare = shows & (np.bincount(cell, has_landmark) == 0)
     return np.asarray(bare[cell] & (bare.sum() > MIN_SHARE * shows.sum()))
