@@ -51,6 +51,7 @@ class TurnMeter:
     def __init__(self, frontend: Frontend) -> None:
         self._frontend = frontend
         self._last: View | None = None
+        self._seen: Features | None = None  # its largest
         self._gap_s = 0.0
         self.between_rad_s: FloatArray | None = None
 
@@ -59,11 +60,11 @@ class TurnMeter:
 
         Matches tell the turn half-way between two frames; half a frame more is carried on from the two last turns.
         """
-        last, before, gap_s = self._last, self.between_rad_s, self._gap_s
-        self._last, self.between_rad_s = view, None
-        if last is None:
+        last, seen, before, gap_s = self._last, self._seen, self.between_rad_s, self._gap_s
+        sees = _largest(view.features)
+        self._last, self._seen, self.between_rad_s = view, sees, None
+        if last is None or seen is None:
             return np.zeros(3)
-        seen, sees = _largest(last.features), _largest(view.features)
         matches = self._frontend.match_wide(seen, sees)
         uv_a, uv_b = seen.uv_rect_px[matches.index[:, 0]], sees.uv_rect_px[matches.index[:, 1]]
         turn = turn_between(K, uv_a, uv_b)
