@@ -58,9 +58,8 @@ def straighten(uv_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> Float
     return uv_px + _at_mid_row(uv_rect_px, uv_px[:, 1], camera, turn_rad) - uv_rect_px
 
 
-def find_as_read(uv_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
-    """Return where an image shows what features have at pixels (N, 2): the inverse of `straighten`."""
-    uv_rect_px, _ = camera.rectify(uv_px)
+def find_as_read(uv_px: FloatArray, uv_rect_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
+    """Return where an image shows what features have at pixels (N, 2), and rectified: inverse of `straighten`."""
     read_px = uv_px
     # Each was read in a row that is known once it is put back: a second time, it is.
     for _ in range(2):

@@ -143,9 +143,9 @@ def test_pixels_are_put_back_to_where_they_were_read() -> None:
     rng = np.random.default_rng(0)
     uv = rng.uniform([0, 0], [CAMERA.width, CAMERA.height], (200, 2))
     turn_rad = np.array([0.02, -0.05, 0.03])
-    straight = straighten(uv, CAMERA, turn_rad)
+    straight = straighten(uv, CAMERA, turn_rad)  # rectified as well: there is no lens
     assert np.linalg.norm(straight - uv, axis=1).max() > 5
-    assert np.linalg.norm(find_as_read(straight, CAMERA, turn_rad) - uv, axis=1).max() < 0.1
+    assert np.linalg.norm(find_as_read(straight, straight, CAMERA, turn_rad) - uv, axis=1).max() < 0.1
 
 
 def run_of(world: PointWorld, true_readout_s: float, **camera: object) -> System:
