@@ -136,7 +136,7 @@ def build_system(
             graphs=graphs,
             places=places,
             open_features=partial(features_beside, desk, config.frontend) if isinstance(desk, WorkerDesk) else None,
-            foresee=partial(_foresee, desk if foresees else None),
+            foresee=partial(_foresee, desk) if foresees else None,
         ),
         config,
         saved,
@@ -195,11 +195,10 @@ def _camera_of(saved: StoredMap, camera: Camera) -> Camera:
     return camera
 
 
-def _foresee(desk: Desk | None, view: View) -> None:
+def _foresee(desk: Desk, view: View) -> None:
     """Have a worker, which has nothing else to do, look at a frame."""
-    if desk is not None:
-        desk.poll(JobKind.FORESIGHT)  # what it has found stays there
-        desk.submit(JobKind.FORESIGHT, view)
+    desk.poll(JobKind.FORESIGHT)  # what it has found stays there
+    desk.submit(JobKind.FORESIGHT, view)
 
 
 def _starter_beside(desk: WorkerDesk, live: LiveParts) -> StartBeside:

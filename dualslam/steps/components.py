@@ -27,7 +27,7 @@ class Components:
     tracking has an executor of its own, which may use the same desk. `graphs`: carries changes to submaps' graphs in
     another process and back, if they are solved there. `open_features`: starts one more process, and returns a function
     that has the features of a frame found there. `foresee`: has found beside the tracking what reverse tracking may ask
-    for in a frame.
+    for in a frame; none where nothing is done beside it.
     """
 
     view_of: Callable[[Frame], View | Failure]
@@ -45,7 +45,7 @@ class Components:
     desk: Desk
     graphs: BesideGraphs | None = None
     open_features: Callable[[], Callable[[Frame], Frame]] | None = None
-    foresee: Callable[[View], None] = lambda view: None
+    foresee: Callable[[View], None] | None = None
 
     @property
     def K(self) -> FloatArray:

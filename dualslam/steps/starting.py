@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class Starting:
         self._starter = state.parts.new_starter()
         self._n_without_map = 0  # frames
         self._since_s: float | None = None  # stamp of the first of them for which a start was looked for
-        self._foresees = False  # the first frame after a loss that shows something
+        self._foresee: Callable[[View], None] | None = None  # for the first frame after a loss that shows something
 
     def begin_anew(self, lost: list[View]) -> None:
         """Look for the next map's start from these frames on."""
@@ -163,15 +163,17 @@ class Starting:
 
         On this side it is the first frame that shows something.
         """
+        self._foresee = foresee = self._state.parts.foresee
+        if foresee is None:
+            return
         *before, _ = self._state.buffer.newest(FORESEEN + 1)
         for view in reversed(before):
-            self._state.parts.foresee(view)
-        self._foresees = True
+            foresee(view)
 
     def _foresee_from(self, view: View) -> None:
-        if self._foresees and len(view.features) >= self._state.config.tracking.min_inliers:
-            self._state.parts.foresee(view)
-            self._foresees = False
+        if self._foresee is not None and len(view.features) >= self._state.config.tracking.min_inliers:
+            self._foresee(view)
+            self._foresee = None
 
     def find_start_instead(self, view: View) -> Start | Failure:
         """Look for the start of the next map while the present one is lost and may still be seen again.

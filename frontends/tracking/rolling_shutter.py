@@ -50,8 +50,7 @@ class TurnMeter:
 
     def __init__(self, frontend: Frontend) -> None:
         self._frontend = frontend
-        self._last: View | None = None
-        self._seen: Features | None = None  # its largest
+        self._last: tuple[float, Features] | None = None  # stamp of the last view, and its largest features
         self._gap_s = 0.0
         self.between_rad_s: FloatArray | None = None
 
@@ -60,15 +59,16 @@ class TurnMeter:
 
         Matches tell the turn half-way between two frames; half a frame more is carried on from the two last turns.
         """
-        last, seen, before, gap_s = self._last, self._seen, self.between_rad_s, self._gap_s
+        last, before, gap_s = self._last, self.between_rad_s, self._gap_s
         sees = _largest(view.features)
-        self._last, self._seen, self.between_rad_s = view, sees, None
-        if last is None or seen is None:
+        self._last, self.between_rad_s = (view.timestamp_s, sees), None
+        if last is None:
             return np.zeros(3)
+        last_s, seen = last
         matches = self._frontend.match_wide(seen, sees)
         uv_a, uv_b = seen.uv_rect_px[matches.index[:, 0]], sees.uv_rect_px[matches.index[:, 1]]
         turn = turn_between(K, uv_a, uv_b)
-        self._gap_s = view.timestamp_s - last.timestamp_s
+        self._gap_s = view.timestamp_s - last_s
         goes_back = before is not None and self._gap_s * gap_s < 0  # its stamp says nothing of how fast that was
         if turn is None or self._gap_s == 0 or goes_back:
             return np.zeros(3) if before is None else before

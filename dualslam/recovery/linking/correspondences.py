@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.columns import concatenate
+from dualslam.core.firsts import is_first
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray
 from dualslam.map.landmark_views import landmark_covariances, triangulate_landmarks
 from dualslam.map.submap import Submap
@@ -269,10 +270,7 @@ def _first_in_both(a: IntArray, b: IntArray) -> IntArray:
     rows = np.arange(len(a))
     kept: list[IntArray] = []
     while len(rows):
-        is_first_a, is_first_b = np.zeros(len(rows), bool), np.zeros(len(rows), bool)
-        is_first_a[np.unique(a[rows], return_index=True)[1]] = True
-        is_first_b[np.unique(b[rows], return_index=True)[1]] = True
-        chosen = rows[is_first_a & is_first_b]
+        chosen = rows[is_first(a[rows]) & is_first(b[rows])]
         kept.append(chosen)
         rows = rows[~np.isin(a[rows], a[chosen]) & ~np.isin(b[rows], b[chosen])]
     return np.sort(np.concatenate(kept)) if kept else rows
