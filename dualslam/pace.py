@@ -66,6 +66,10 @@ class Pace:
         self._late_s = late_s
         self.statistics.behind += self.behind
 
+    def hold_up(self, seconds: float) -> None:
+        """Note by how much more a frame is late, since what was found beside the tracking came in before it."""
+        self._late_s += seconds
+
     def may_lag(self, n_keyframes: int) -> bool:
         """Note how many keyframes the graph beside does not know yet; return whether the tracking may go on meanwhile.
 

@@ -218,7 +218,9 @@ class System:
             elif state.lost:
                 self._begin_anew()
         self._recoveries.collect(state.live, frame)
-        self.buffer.settle(SETTLED_A_FRAME)
+        state.pace.hold_up(time.perf_counter() - started)
+        if not state.pace.behind:
+            self.buffer.settle(SETTLED_A_FRAME)
         # 2. Features, into the buffer that reverse tracking will read.
         with self.timer.measure("features"):
             view = state.parts.view_of(source)

@@ -31,6 +31,34 @@ def test_a_keyframe_is_put_off_while_frames_are_late_and_no_longer_than_that() -
     assert pace.statistics.behind == 1
 
 
+def test_what_comes_in_before_a_frame_makes_it_late_as_well() -> None:
+    pace = Pace()
+    pace.hold_up(1.0)
+    assert not pace.behind
+    pace.note(0.5 * BEHIND_S)
+    pace.hold_up(0.8 * BEHIND_S)
+    assert pace.puts_off(MANY, WEAK)
+    pace.note(0.0)
+    assert not pace.behind
+
+
+@pytest.mark.parametrize("late_s", [None, 0.0, 2 * BEHIND_S], ids=["inline", "in time", "late"])
+def test_buffered_views_follow_a_change_while_frames_come_in_time(late_s: float | None) -> None:
+    world = PointWorld(cloud(), hand_held(40))
+    system = system_in(world)
+    changed: list[int] = []
+    for frame in world.frames():
+        if frame.index == 30:
+            system.buffer.map_later(lambda view: changed.append(view.index) or view, "test")  # type: ignore[func-returns-value]
+        if late_s is not None:
+            system.pace.note(late_s)
+        system.step(frame)
+    if late_s == 2 * BEHIND_S:
+        assert not changed
+    list(system.buffer)  # whoever looks at them sees them changed
+    assert sorted(changed) == list(range(30))
+
+
 def test_nor_while_the_graph_has_much_to_learn() -> None:
     pace = Pace()
     pace.note(0.0)
