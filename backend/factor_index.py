@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.backend.observability import MIN_DEPTH_MU, compute_depth_sigmas, compute_residuals, take_mask
+from dualslam.backend.observability import MIN_DEPTH_MU, compute_depth_sigmas, compute_residuals, numbered, take_mask
 from dualslam.backend.selection import Candidates, choose_factors
 from dualslam.config.settings import GraphConfig
 from dualslam.core.types import BoolArray, FloatArray, IntArray
@@ -248,7 +248,7 @@ class FactorIndex:
         caution: float,
     ) -> tuple[BoolArray, BoolArray]:
         """Return which of the rows fit, and which landmarks are certain enough (`trusted` ones are not asked)."""
-        ids, pose = np.unique(submap.observations["kf"][row], return_inverse=True)
+        ids, pose = numbered(submap.observations["kf"][row])
         T = np.array([poses[k] for k in ids.tolist()]).reshape(-1, 4, 4)
         point = submap.observations["landmark"][row]
         sigma = self.rows["sigma_px"][row]
@@ -258,7 +258,7 @@ class FactorIndex:
         fits = np.where(inside[row], res.depth_mu > MIN_DEPTH_MU, res.chi2 < gate_sigmas[point] ** 2)
         asked = fits & ~trusted[point]
         certain = trusted.copy()
-        names, index = np.unique(point[asked], return_inverse=True)
+        names, index = numbered(point[asked])
         sigmas = compute_depth_sigmas(submap.K, T, pose[asked], res.xyz_cam[asked], sigma[asked], index, len(names))
         limit = MAX_DEPTH_SIGMA / caution * np.where(known[names], LEAVE_RATIO, 1.0)
         # Two views of a point fit whatever the poses are along their epipolar lines: only the third tests them.

@@ -154,11 +154,20 @@ def find_components(kf: IntArray, landmark: IntArray) -> tuple[IntArray, IntArra
 
     Two keyframes are connected where they share a landmark. Pieces count from 0, by their first keyframe.
     """
-    ids, k = np.unique(kf, return_inverse=True)
-    landmarks, j = np.unique(landmark, return_inverse=True)
+    ids, k = numbered(kf)
+    landmarks, j = numbered(landmark)
     nodes = len(ids) + len(landmarks)
     seen = coo_matrix((np.ones(len(k), bool), (k, len(ids) + j)), shape=(nodes, nodes))
     return ids, connected_components(seen, directed=False)[1][: len(ids)].astype(np.int64)
+
+
+def numbered(values: IntArray) -> tuple[IntArray, IntArray]:
+    """Return which ids occur, ascending, and the place of each value among them: `numpy.unique`, without sorting.
+
+    Ids are small whole numbers, such as those of keyframes and landmarks.
+    """
+    seen = take_mask(values, int(values.max(initial=-1)) + 1)
+    return np.flatnonzero(seen), (np.cumsum(seen) - 1)[values]
 
 
 def take_mask(ids: IntArray, size: int) -> BoolArray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.backend.observability import take_mask
+from dualslam.backend.observability import numbered, take_mask
 from dualslam.backend.point_refinement import triangulation_covariances
 from dualslam.core.geometry import so3
 from dualslam.core.types import BoolArray, FloatArray, IntArray
@@ -38,7 +38,7 @@ def views_of(submap: Submap, ids: IntArray, inside: IntArray, poses: Mapping[int
     obs = submap.observations
     row = inside[take_mask(ids, len(submap.landmarks))[obs["landmark"][inside]]]
     row = row[obs["alive"][row]]
-    keyframes, pose = np.unique(obs["kf"][row], return_inverse=True)
+    keyframes, pose = numbered(obs["kf"][row])
     T = [poses[k] if k in poses else submap.T_submap_kf[k] for k in keyframes.tolist()]
     return Views(row, np.array(T).reshape(-1, 4, 4), pose, np.searchsorted(ids, obs["landmark"][row]))
 

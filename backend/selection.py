@@ -95,22 +95,24 @@ def choose_factors(
     # Only what keyframes that are short see is looked at closer: the tables are long.
     n_known = np.bincount(landmark[admitted], minlength=n_landmarks)
     free = admitted & ~chosen & ((views > 0) | (n_known >= min_views))[landmark]
+    if min(per_keyframe, max_views) >= len(kf):
+        return chosen | free  # nothing is ever full
     size = max(int(kf.max(initial=-1)), int(keyframes.max(initial=-1))) + 1
     has = np.bincount(kf[chosen], minlength=size)[keyframes]
     short = keyframes[(has < per_keyframe) & (np.bincount(kf[free], minlength=size)[keyframes] > 0)]
     if len(short) == 0:
         return chosen
-    row = np.flatnonzero(free & take_mask(short, size)[kf])
-    row = row[np.argsort(kf[row], kind="stable")]
+    is_short = take_mask(short, size)
+    row, starts, ends = _by_keyframe(np.flatnonzero(free & is_short[kf]), kf, short)
+    of_short, firsts, lasts = _by_keyframe(np.flatnonzero(admitted & is_short[kf]), kf, short)
     by_landmark = np.flatnonzero(admitted & take_mask(landmark[row], n_landmarks)[landmark])
     by_landmark = by_landmark[np.lexsort((kf[by_landmark], landmark[by_landmark]))]
     first_of = np.concatenate(([0], np.cumsum(np.bincount(landmark[by_landmark], minlength=n_landmarks))))
     span = _spans(kf[by_landmark], first_of)
-    starts, ends = np.searchsorted(kf[row], short, "left"), np.searchsorted(kf[row], short, "right")
-    for i, k in enumerate(short.tolist()):
-        here = row[starts[i] : ends[i]]
+    for start, end, first, last in zip(starts, ends, firsts, lasts, strict=True):
+        here, all_here = row[start:end], of_short[first:last]
         here = here[~chosen[here]]
-        cells = _Cells(candidates, np.flatnonzero(chosen & (kf == k)))
+        cells = _Cells(candidates, all_here[chosen[all_here]])
         for stage in range(3):
             wanted = per_keyframe - len(cells)
             if wanted <= 0:
@@ -123,12 +125,22 @@ def choose_factors(
             else:
                 able = views[of] > 0
             taken = cells.take(here[able], span[of[able]], wanted)
-            if stage == 1:
-                taken = _with_views(taken, landmark, by_landmark, first_of, max_views)
             chosen[taken] = True
+            if stage == 1:
+                others = _spread_views(taken, landmark, by_landmark, first_of, max_views)
+                others = others[~chosen[others]]
+                chosen[others] = True
+                taken = np.concatenate((taken, others))
             np.add.at(views, landmark[taken], 1)
             here = here[~chosen[here]]
     return chosen
+
+
+def _by_keyframe(rows: IntArray, kf: IntArray, keyframes: IntArray) -> tuple[IntArray, list[int], list[int]]:
+    """Return rows sorted by keyframe, and where in them those of each of some keyframes begin and end."""
+    rows = rows[np.argsort(kf[rows], kind="stable")]
+    begin, end = (np.searchsorted(kf[rows], keyframes, side).tolist() for side in ("left", "right"))
+    return rows, begin, end
 
 
 class _Cells:
@@ -201,12 +213,11 @@ def _spans(kf: IntArray, first_of: IntArray) -> IntArray:
     return spans
 
 
-def _with_views(taken: IntArray, landmark: IntArray, by_landmark: IntArray, first_of: IntArray, n: int) -> IntArray:
-    """Return the rows taken and, of the same landmarks, views spread evenly over the track, `n` or one more in all."""
+def _spread_views(taken: IntArray, landmark: IntArray, by_landmark: IntArray, first_of: IntArray, n: int) -> IntArray:
+    """Return, of the landmarks of some rows, the rows of `n` views each, spread evenly over the track."""
     ids = landmark[taken]
     lengths = first_of[ids + 1] - first_of[ids]
     owner = np.repeat(np.arange(len(ids)), lengths)
     rank = np.arange(len(owner)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
     rows = by_landmark[first_of[ids][owner] + rank]
-    spread = spread_evenly(rank, lengths[owner], np.full(len(owner), n))
-    return np.union1d(taken, rows[spread])
+    return np.asarray(rows[spread_evenly(rank, lengths[owner], np.full(len(owner), n))])

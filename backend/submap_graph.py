@@ -20,7 +20,7 @@ from dualslam.backend.bayes_tree import BayesTree, UpdateStatistics
 from dualslam.backend.factor_index import INSERT_SIGMAS, FactorIndex, Plan
 from dualslam.backend.factors import insert_projections
 from dualslam.backend.noise import LEAST_NOISE, OUTLIER_CHI2, PixelNoise, residual_variance
-from dualslam.backend.observability import compute_residuals
+from dualslam.backend.observability import compute_residuals, take_mask
 from dualslam.backend.point_refinement import refine_points
 from dualslam.backend.points_beside import landmarks_beside, triangulated_covariances, views_of
 from dualslam.backend.reading import READ_ALL, READ_WINDOW, choose_part
@@ -309,7 +309,8 @@ class ISam2SubmapGraph:
         xyz = (submap.landmarks["xyz_mu"] if optimum is None else optimum.xyz_mu).copy()
         xyz[landmarks] = xyz_graph
         xyz[beside] = self._refined(submap, poses, xyz, beside, inside)
-        landmarks = np.union1d(landmarks, beside)
+        told = take_mask(landmarks, len(xyz)) | take_mask(beside, len(xyz))
+        landmarks = np.flatnonzero(told)
 
         pose = np.searchsorted(keyframes, kf[row])
         uv_px, sigma_px = rows["uv_px"].take(row, axis=0), rows["sigma_px"][row]
@@ -317,7 +318,7 @@ class ISam2SubmapGraph:
         chi2 = res.chi2
         # The solver threw these points away. Linearised there, they would be the death of it: they go before that.
         self._suspects = np.unique(lm[row[np.isinf(chi2) | (res.depth_mu > FAR_MU)]])
-        fresh = chi2[np.isin(row, entering, assume_unique=True)]
+        fresh = chi2[take_mask(entering, len(rows))[row]]
         chi2_newest = float(np.minimum(fresh, INSERT_SIGMAS**2).mean() / 2) if len(fresh) else float("nan")
         self._misfit = chi2_newest > MISFIT_CHI2
         n_views = np.bincount(lm[inside])[lm[row]]

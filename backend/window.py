@@ -149,7 +149,6 @@ def adjust_window(window: Window, robust_k: float, iterations: int = ITERATIONS)
     n_free, n_points = window.n_free, len(window.xyz_mu)
     mine = np.flatnonzero(window.pose < n_free)
     pose, point = window.pose[mine], window.point[mine]
-    pair = pose * n_points + point  # a keyframe sees a point once
     views = [np.flatnonzero(pose == f) for f in range(n_free)]
     state = _evaluate(window, window.T_submap_kf, window.xyz_mu, robust_k)
     damping = FIRST_DAMPING
@@ -166,10 +165,9 @@ def adjust_window(window: Window, robust_k: float, iterations: int = ITERATIONS)
         residuals = state.residuals[mine]
         U = np.array([np.tensordot(J_pose_w[v], J_pose[v], ((0, 1), (0, 1))) for v in views])
         g_pose = np.array([np.tensordot(J_pose_w[v], residuals[v], ((0, 1), (0, 1))) for v in views])
-        W = np.zeros((n_free * n_points, 6, 3))
-        W[pair] = J_pose_w.transpose(0, 2, 1) @ J_point
-        W = W.reshape(n_free, n_points, 6, 3).transpose(1, 0, 2, 3).reshape(n_points, 6 * n_free, 3)
-        moved = _step(state, U, V, W, g_pose, g_point, damping)
+        W = np.zeros((n_points, n_free, 6, 3))
+        W[point, pose] = J_pose_w.transpose(0, 2, 1) @ J_point  # a keyframe sees a point once
+        moved = _step(state, U, V, W.reshape(n_points, 6 * n_free, 3), g_pose, g_point, damping)
         new = _evaluate(window, *moved, robust_k)
         if new.cost < state.cost:
             gain, state = state.cost - new.cost, new

@@ -383,8 +383,7 @@ class Submap:
         twin.anchors = dict(self.anchors)
         twin.relative_poses = dict(self.relative_poses)
         twin.gauge, twin.condemned = self.gauge, set(self.condemned)
-        twin.landmarks = Table.from_columns(self.landmarks.columns())
-        twin.observations = Table.from_columns(self.observations.columns())
+        twin.landmarks, twin.observations = self.landmarks.copy(), self.observations.copy()
         return twin
 
     def take_over(self, changed: Submap) -> None:

@@ -51,6 +51,12 @@ class Table:
         """Return copies of all columns: what is needed to make the same table again with `from_columns`."""
         return {name: self[name].copy() for name in self._data}
 
+    def copy(self) -> Table:
+        """Return a table of its own that holds the same."""
+        twin = Table(**self._spec)
+        twin._data, twin._n = self.columns(), self._n
+        return twin
+
     @classmethod
     def from_columns(cls, columns: dict[str, NDArray[Any]]) -> Table:
         """Make a table that holds `columns`."""

@@ -53,21 +53,15 @@ class Pairs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Looks:
-    """What was looked for: the place's landmarks in the query's images and in its own; the resulting pairs."""
+    """What was looked for: each side's landmarks in the images of the other; the resulting pairs."""
 
     in_query: list[Sighting]
-    in_place: list[Sighting]
     pairs: list[tuple[IntArray, IntArray]]
 
     @property
     def found(self) -> float:
         """Share of what the place should show that the query's images show: of the middle one of them."""
         return float(np.median([look.share for look in self.in_query]))
-
-    @property
-    def own_found(self) -> float:
-        """The same in the place's own images, where it is as much as can be had."""
-        return float(np.median([look.share for look in self.in_place]))
 
 
 def side_of(submap: Submap, keyframe_id: int) -> Side:

@@ -154,7 +154,7 @@ class PlaceVerifier:
         """
         place = side_of(submap, keyframe_id)
         look = self._matcher.look(submap, place.landmarks, T_cam_submap, submap.K, features, SEARCH_RADIUS_PX)
-        own = float(np.median([self._look(place, submap, k, np.eye(4)).share for k in place.keyframes]))
+        own = self._own_found(place)
         numbers = {"found": look.share, "own_found": own, "n_visible": float(len(look.feature))}
         if look.share < MIN_FOUND * own:
             detail = f"{look.share:.0%} of what the place should show is there, {own:.0%} in its own keyframes"
@@ -226,12 +226,15 @@ class PlaceVerifier:
         S_query_place = sim3.inverse(S_place_query)
         in_query = [self._look(place, query.submap, q, S_place_query) for q in query.keyframes]
         in_place = [self._look(query, place.submap, k, S_query_place) for k in place.keyframes]
-        own = [self._look(place, place.submap, k, np.eye(4)) for k in place.keyframes]
         pairs = [seen_as(look, query.submap.landmark_of[q]) for look, q in zip(in_query, query.keyframes, strict=True)]
         for look, k in zip(in_place, place.keyframes, strict=True):
             theirs, ours = seen_as(look, place.submap.landmark_of[k])
             pairs.append((ours, theirs))
-        return Looks(in_query, own, pairs)
+        return Looks(in_query, pairs)
+
+    def _own_found(self, place: Side) -> float:
+        """Share of what a place should show that its own images show, where it is as much as can be had: the middle."""
+        return float(np.median([self._look(place, place.submap, k, np.eye(4)).share for k in place.keyframes]))
 
     def _look(self, seen: Side, looking: Submap, keyframe_id: int, S_seen_looking: FloatArray) -> Sighting:
         T_seen_cam = sim3.act_on_pose(S_seen_looking, looking.T_submap_kf[keyframe_id])
@@ -245,7 +248,7 @@ class PlaceVerifier:
     ) -> PlaceMatch | Failure:
         S, inliers = estimate.S_dst_src, estimate.inliers
         n = int(inliers.sum())
-        found, own = looks.found, looks.own_found
+        found, own = looks.found, self._own_found(place)
         sigmas = sigmas_at_pairs(pairs.xyz_query[inliers], S, estimate.covariance, place)
         keyframes_place = keyframes_seeing(place, pairs.place[inliers], MIN_PAIRS_PER_KEYFRAME)
         keyframes_query = keyframes_seeing(query, pairs.query[inliers], MIN_PAIRS_PER_KEYFRAME)

@@ -60,7 +60,7 @@ from dualslam.frontends.features.corners import (
     share_out,
     stand_out,
 )
-from dualslam.frontends.features.groups import consistent_rotation, mutual_best
+from dualslam.frontends.features.groups import NO_MATCHES, consistent_rotation, mutual, nearest_by_parts
 from dualslam.frontends.features.hamming import hamming_distance, hamming_matrix
 from dualslam.frontends.features.image_noise import estimate_noise, noise_of_levels
 from dualslam.frontends.features.images import to_grey
@@ -182,11 +182,14 @@ class OrbFrontend(OptionedFrontend):
 
     def match_wide(self, a: Features, b: Features) -> Matches:
         """Compare all with all: mutually nearest, clearly so, within `max_distance_strict`, turned alike."""
-        found = mutual_best(
-            hamming_matrix(a.descriptors, b.descriptors),
+        in_a, in_b = a.descriptors, b.descriptors
+        if not len(in_a) or not len(in_b):
+            return NO_MATCHES
+        found = mutual(
+            nearest_by_parts(len(in_a), lambda rows: hamming_matrix(in_a[rows], in_b)),
             self.options.ratio,
             self.max_distance_strict,
-            lambda columns: hamming_matrix(b.descriptors[columns], a.descriptors),
+            lambda columns: hamming_matrix(in_b[columns], in_a).argmin(axis=1),
         )
         kept = consistent_rotation(b.angle_rad[found.index[:, 1]] - a.angle_rad[found.index[:, 0]])
         return Matches(found.index[kept], found.distance[kept])

@@ -11,7 +11,7 @@ from dualslam.core.geometry.two_view import fundamental_from_pose, sampson_error
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Features, FloatArray, View
 from dualslam.frontends.tracking.resection import poselib_camera
-from dualslam.frontends.tracking.row_shifts import correct_shutter
+from dualslam.frontends.tracking.row_shifts import at_mid_row
 
 INFLATION = 4.0
 """How much larger errors are taken to be than they seem, as neighbouring pixels err alike."""
@@ -134,10 +134,10 @@ class ReadoutEstimator:
         sigma_px = np.sqrt(0.5 * (a.sigma_px**2 + b.sigma_px**2))
         lens = poselib_camera(camera.K, camera.size_px)
         gate_px = CHI2_95[1] ** 0.5 * float(np.median(sigma_px))
-        straight = [
-            [correct_shutter(x, camera, s * rate).uv_rect_px for x, rate in ((a, rate_a), (b, rate_b))]
-            for s in self._direction * np.append(READOUTS_S, -READOUTS_S[TYPICAL])
-        ]
+        readouts_s = self._direction * np.append(READOUTS_S, -READOUTS_S[TYPICAL])
+        views = ((a, rate_a), (b, rate_b))
+        moved = [at_mid_row(x.uv_rect_px, x.uv_px[:, 1], camera, *(s * rate for s in readouts_s)) for x, rate in views]
+        straight = list(zip(*moved, strict=True))
         converged = {"step_tol": STEP_TOLERANCE}
         ransac = {"max_epipolar_error": gate_px, "max_iterations": 500, "min_iterations": 50, "seed": self._seed}
         refine = {"loss_type": "CAUCHY", "loss_scale": gate_px, "max_iterations": 25, **converged}

@@ -27,7 +27,7 @@ def correct_shutter(
         Rows in which the features were read, where `features` does not tell.
     """
     read_v_px = features.uv_px[:, 1] if read_v_px is None else read_v_px
-    uv_rect_px = _at_mid_row(features.uv_rect_px, read_v_px, camera, turn_rad)
+    (uv_rect_px,) = at_mid_row(features.uv_rect_px, read_v_px, camera, turn_rad)
     # The found pixels move alike, so that the same features can be rectified again by a better camera.
     return replace(features, uv_px=features.uv_px + uv_rect_px - features.uv_rect_px, uv_rect_px=uv_rect_px)
 
@@ -43,19 +43,26 @@ def _turned(rays: FloatArray, share: FloatArray, turn_rad: FloatArray) -> FloatA
     return np.asarray(rays + np.sin(by)[:, None] * across + (2 * np.sin(0.5 * by) ** 2)[:, None] * inwards, np.float64)
 
 
-def _at_mid_row(uv_rect_px: FloatArray, read_v_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
-    """Return rectified pixels (N, 2), read in rows (N,), as they would be at the time of the middle row."""
+def at_mid_row(
+    uv_rect_px: FloatArray, read_v_px: FloatArray, camera: Camera, *turns_rad: FloatArray
+) -> list[FloatArray]:
+    """Return rectified pixels (N, 2), read in rows (N,), as they would be at the time of the middle row.
+
+    For each of several turns (3,) of the camera while an image is read, in its own axes.
+    """
     K = camera.K
     f, c = np.diag(K)[:2], K[:2, 2]
     rays = np.column_stack([(uv_rect_px - c) / f, np.ones(len(uv_rect_px))])
-    rays = _turned(rays, read_v_px / camera.height - 0.5, turn_rad)
-    return np.asarray(f * rays[:, :2] / rays[:, 2:] + c, np.float64)
+    share = read_v_px / camera.height - 0.5
+    turned = (_turned(rays, share, turn_rad) for turn_rad in turns_rad)
+    return [np.asarray(f * each[:, :2] / each[:, 2:] + c, np.float64) for each in turned]
 
 
 def straighten(uv_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
     """Return where things that an image shows at pixels (N, 2) are in the features: as `correct_shutter` moves them."""
     uv_rect_px, _ = camera.rectify(uv_px)
-    return uv_px + _at_mid_row(uv_rect_px, uv_px[:, 1], camera, turn_rad) - uv_rect_px
+    (moved_px,) = at_mid_row(uv_rect_px, uv_px[:, 1], camera, turn_rad)
+    return uv_px + moved_px - uv_rect_px
 
 
 def find_as_read(uv_px: FloatArray, uv_rect_px: FloatArray, camera: Camera, turn_rad: FloatArray) -> FloatArray:
@@ -63,5 +70,6 @@ def find_as_read(uv_px: FloatArray, uv_rect_px: FloatArray, camera: Camera, turn
     read_px = uv_px
     # Each was read in a row that is known once it is put back: a second time, it is.
     for _ in range(2):
-        read_px = uv_px + _at_mid_row(uv_rect_px, read_px[:, 1], camera, -turn_rad) - uv_rect_px
+        (moved_px,) = at_mid_row(uv_rect_px, read_px[:, 1], camera, -turn_rad)
+        read_px = uv_px + moved_px - uv_rect_px
     return read_px

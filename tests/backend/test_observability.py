@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dualslam.backend.observability import compute_depth_sigmas, compute_residuals, find_components
+from dualslam.backend.observability import compute_depth_sigmas, compute_residuals, find_components, numbered
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
 
@@ -41,6 +41,13 @@ def test_one_view_or_no_parallax_is_never_certain():
     assert sigmas[0] > 1e3
     assert np.isinf(sigmas[1])
     assert np.isinf(sigmas[2])
+
+
+def test_numbered_is_unique_with_its_inverse():
+    for values in (np.array([7, 3, 3, 900, 0, 7]), np.zeros(0, np.int64)):
+        ids, place = numbered(values)
+        np.testing.assert_array_equal(ids, np.unique(values))
+        np.testing.assert_array_equal(ids[place], values)
 
 
 def test_components_of_chains_and_islands():

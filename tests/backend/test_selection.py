@@ -45,10 +45,15 @@ def test_each_keyframe_has_enough_and_each_landmark_views_enough() -> None:
     assert views[views > 0].min() >= 3
 
 
-def test_what_is_short_is_taken_whole() -> None:
+@pytest.mark.parametrize("most", [1_000, 1 << 30], ids=["as good as no limit", "none"])
+def test_what_is_short_is_taken_whole(most: int) -> None:
     c = tracks()
-    chosen = choose(c, per_keyframe=10_000, max_views=1_000)
-    assert chosen.all()
+    assert choose(c, per_keyframe=10_000, max_views=most).all()
+    known = np.random.default_rng(2).random(len(c.kf)) < 0.5
+    enough = np.bincount(c.landmark[known], minlength=N_LANDMARKS) >= 3
+    np.testing.assert_array_equal(
+        choose(c, admitted=known, per_keyframe=most, max_views=most), known & enough[c.landmark]
+    )
 
 
 def test_long_tracks_come_first_and_bring_views_over_their_length() -> None:

@@ -13,7 +13,7 @@ from dualslam.core.stage_timer import StageTimer
 from dualslam.core.types import Keyframe, Start, View
 from dualslam.map.anchors import RelativePose
 from dualslam.map.submap import NO_LANDMARK, Submap
-from dualslam.map.tables import Table
+from dualslam.map.tables import Table, observation_table
 from dualslam.testing.point_world import make_features, path
 
 
@@ -197,6 +197,17 @@ class TestTable:
         assert not table["b"].any()
         table["b"][3] = (1, 2, 3)
         assert table["b"][3].tolist() == [1, 2, 3]
+
+    def test_a_copy_holds_the_same_and_grows_by_itself(self) -> None:
+        for n in (0, 3):
+            table = observation_table()
+            table.append(n, kf=7, alive=True)
+            twin = table.copy()
+            twin.append(100, kf=8)
+            twin["alive"][:n] = False
+            assert table["kf"].tolist() == [7] * n
+            assert table["alive"].all()
+            assert twin["kf"].tolist() == [7] * n + [8] * 100
 
     def test_columns_make_the_same_table_again(self) -> None:
         table = Table(a=(np.int64, ()), b=(np.uint8, (2,)))

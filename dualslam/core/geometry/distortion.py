@@ -20,8 +20,11 @@ def radial(r: FloatArray, k: tuple[float, ...]) -> FloatArray:
 
 def radial_derivative(r: FloatArray, k: tuple[float, ...]) -> FloatArray:
     """Return the derivative of `radial` by r."""
-    s = r * r
-    return _factor(s, tuple((2 * i + 3) * c for i, c in enumerate(k)))
+    return _factor(r * r, _of_derivative(k))
+
+
+def _of_derivative(k: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple((2 * i + 3) * c for i, c in enumerate(k))
 
 
 @lru_cache(maxsize=64)  # of one lens it is asked for with each image
@@ -50,19 +53,21 @@ def invert_radial(r_distorted: FloatArray, k: tuple[float, ...], limit: float) -
     high = np.maximum(r_distorted, 1.0)
     if np.isfinite(limit):
         high = np.full_like(r_distorted, limit)
-    else:
-        for _ in range(N_ITERATIONS):
-            short = radial(high, k) < r_distorted
-            if not short.any():
-                break
-            high = np.where(short, 2.0 * high, high)
-    inside = radial(high, k) >= r_distorted
-    r = np.minimum(r_distorted, high)
+    reach = radial(high, k)
+    for _ in range(0 if np.isfinite(limit) else N_ITERATIONS):
+        short = reach < r_distorted
+        if not short.any():
+            break
+        high = np.where(short, 2.0 * high, high)
+        reach = radial(high, k)
+    inside = reach >= r_distorted
+    r, of_slope = np.minimum(r_distorted, high), _of_derivative(k)
     for _ in range(N_ITERATIONS):
-        error = radial(r, k) - r_distorted
+        s = r * r
+        error = r * _factor(s, k) - r_distorted
         np.copyto(high, r, where=error > 0)
         np.copyto(low, r, where=error < 0)
-        slope = radial_derivative(r, k)
+        slope = _factor(s, of_slope)
         rises = slope > 1e-12
         new = r - error / np.where(rises, slope, np.inf)
         odd = ~((new > low) & (new < high) & rises)
@@ -93,8 +98,9 @@ def radtan_jacobian(xy: FloatArray, k: tuple[float, ...], p1: float, p2: float) 
 
 def _factor(s: FloatArray, k: tuple[float, ...]) -> FloatArray:
     """Return by how much points of squared radius s are moved outwards: ``1 + k[0] s + k[1] s^2 + ...``."""
-    total = np.zeros_like(s)
-    for c in reversed(k):
+    *lower, highest = k
+    total = highest * s
+    for c in reversed(lower):
         total += c
         total *= s
     total += 1.0

@@ -17,6 +17,8 @@ from dualslam.core.types import FloatArray
 SERIES_BELOW_RAD2 = 1.0
 """Squared angle under which coefficients with cancellation are summed as series (error then below 1e-16)."""
 N_TERMS = 12
+FEW = 4
+"""Numbers that Python sums a series of sooner than numpy."""
 
 _C3 = [(-1.0) ** k / factorial(2 * k + 3) for k in range(N_TERMS)]
 # |B_2n| / (2n)!, the series of (1 - x/2 cot(x/2)) / x^2 in x^2.
@@ -26,7 +28,16 @@ _COT += [_COT[-1] / (4 * np.pi**2) ** k for k in range(1, 6)]  # zeta(2n) = 1 to
 
 def series(x: FloatArray, coefficients: list[float]) -> FloatArray:
     """Sum ``coefficients[k] * x**k`` by Horner's rule, elementwise."""
+    if x.size <= FEW:
+        return np.array([_sum_at(each, coefficients) for each in x.ravel().tolist()]).reshape(x.shape)
     total = np.full_like(x, coefficients[-1])
+    for c in coefficients[-2::-1]:
+        total = total * x + c
+    return total
+
+
+def _sum_at(x: float, coefficients: list[float]) -> float:
+    total = coefficients[-1]
     for c in coefficients[-2::-1]:
         total = total * x + c
     return total

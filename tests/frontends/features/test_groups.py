@@ -3,8 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from dualslam.frontends.features.groups import best_per_group, consistent_rotation, mutual_best, rank_in_runs
+from dualslam.frontends.features.groups import (
+    ROWS_AT_ONCE,
+    best_per_group,
+    consistent_rotation,
+    mutual_best,
+    nearest,
+    nearest_by_parts,
+    rank_in_runs,
+)
 
 
 def test_best_per_group_agrees_with_a_loop() -> None:
@@ -40,8 +49,15 @@ def test_mutual_best_agrees_with_a_loop_and_leaves_its_input() -> None:
         assert matches.index.tolist() == expected
         assert 0 < len(expected) < 40
         np.testing.assert_array_equal(distances, copy)
-        gathered = mutual_best(distances, 0.7, 300.0, lambda columns, of=copy: of.T[columns])
-        assert gathered.index.tolist() == expected
+
+
+@pytest.mark.parametrize("n_rows", [1, ROWS_AT_ONCE, 2 * ROWS_AT_ONCE + 1])
+def test_nearest_part_by_part_is_that_of_the_whole(n_rows: int) -> None:
+    distances = np.random.default_rng(4).integers(0, 40, (n_rows, 30)).astype(np.int32)  # with equals
+    whole, parts = nearest(distances), nearest_by_parts(n_rows, lambda rows: distances[rows])
+    for name in ("column", "distance", "runner_up"):
+        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
+    np.testing.assert_array_equal(np.stack([whole.distance, whole.runner_up], 1), np.sort(distances, axis=1)[:, :2])
 
 
 def test_mutual_best_of_little() -> None:
