@@ -36,8 +36,8 @@ from dualslam.steps.state import State
 from dualslam.steps.tracking import Tracking
 from dualslam.workers.jobs import Desk, JobKind
 
-SETTLED_A_FRAME = 20
-"""Buffered views that follow a change of the camera at each frame: 2 to 4 ms, where all of 10 s would take 30 to 60."""
+SETTLED_A_FRAME = 10
+"""Buffered views that follow a change of the camera at each frame: 3 to 4 ms, where all of 10 s would take 100."""
 
 
 class System:
