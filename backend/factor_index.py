@@ -73,7 +73,7 @@ class Plan:
 
 
 class FactorIndex:
-    """Row by row, what becomes of each observation; it grows with the submap's table.
+    """Row by row, what becomes of each observation; it grows with the submap's table, and shrinks with it.
 
     Attributes
     ----------
@@ -94,6 +94,7 @@ class FactorIndex:
         self.keyframes: set[int] = set()
         self.banned: set[int] = set()
         self._n_planned = 0
+        self._n_dropped = 0
         self._chosen_with = self._per_keyframe = ALL
 
     def clear(self) -> None:
@@ -103,6 +104,28 @@ class FactorIndex:
         self.keyframes = set()
         self._n_planned = 0
         self._chosen_with = self._per_keyframe = ALL
+
+    def knows_rows_of(self, submap: Submap) -> bool:
+        """Whether its rows are the submap's: none have left the table without its knowing."""
+        return submap.n_dropped == self._n_dropped
+
+    def rows_out(self, submap: Submap) -> IntArray:
+        """Return the rows that are dead and not in the graph any more."""
+        if not self.knows_rows_of(submap):
+            return np.zeros(0, np.int64)
+        alive = submap.observations["alive"][: self._n_planned]
+        inside = self.rows["admitted"] | (self.rows["factor"] >= 0)
+        return np.flatnonzero(~alive & ~inside[: self._n_planned])
+
+    def keep(self, rows: IntArray) -> None:
+        """Follow a submap in which only these rows stay. Where the graph has others, it does not: it is made anew."""
+        own = rows[rows < len(self.rows)]
+        inside = self.rows["admitted"] | (self.rows["factor"] >= 0)
+        if np.count_nonzero(inside[own]) < np.count_nonzero(inside):
+            return
+        self._n_dropped += len(self.rows) - len(own)
+        self._n_planned = int(np.searchsorted(own, self._n_planned))
+        self.rows = self.rows.taken(own)
 
     def plan(
         self,
@@ -228,6 +251,8 @@ class FactorIndex:
         return wanted if 2 * wanted <= self._chosen_with else self._chosen_with
 
     def _take_new_rows(self, submap: Submap) -> None:
+        if not self.knows_rows_of(submap):  # the graph is made anew
+            self.rows, self._n_dropped = self.rows.taken(np.zeros(0, np.int64)), submap.n_dropped
         obs, n = submap.observations, len(self.rows)
         if len(obs) == n:
             return

@@ -104,7 +104,8 @@ class ISam2SubmapGraph:
     def update(self, submap: Submap) -> GraphEstimate:
         """Take in the rows that were added to the submap or died since the last call, and solve.
 
-        The first call, and one that finds the submap moved to another gauge (`Submap.transform`), makes the graph anew.
+        The first call, and one that finds the submap moved to another gauge (`Submap.transform`), or its rows numbered
+        anew without the graph's knowing, makes the graph anew.
 
         Raises
         ------
@@ -116,6 +117,9 @@ class ISam2SubmapGraph:
             return self._remake(submap, start, rebuilt=False)
         if self._ties.gauge is None or self._ties.gauge.was_moved_in(submap):
             logger.info("submap %d changed its gauge: rebuilding its graph", submap.id)
+            return self._remake(submap, start, rebuilt=True)
+        if not self._factor_index.knows_rows_of(submap):
+            logger.info("submap %d has numbered its observations anew: rebuilding its graph", submap.id)
             return self._remake(submap, start, rebuilt=True)
         try:
             plan = self._factor_index.plan(
@@ -150,7 +154,7 @@ class ISam2SubmapGraph:
 
     def full_estimate(self, submap: Submap) -> GraphEstimate:
         """Return the estimate of every keyframe and landmark in the graph as of the last update, without solving."""
-        if self._solver is None:
+        if self._solver is None or not self._factor_index.knows_rows_of(submap):
             return self.update(submap)
         try:
             return self._read(submap, time.thread_time(), None, True, rebuilt=False)
@@ -210,6 +214,14 @@ class ISam2SubmapGraph:
             If the solver cannot tell a pose's.
         """
         return triangulated_covariances(submap, landmark_ids, self._factor_index.rows, self.pose_covariance)
+
+    def rows_out(self, submap: Submap) -> IntArray:
+        """Return the rows of dead observations whose factors, if they were any, an update has removed."""
+        return self._factor_index.rows_out(submap)
+
+    def keep_rows(self, rows: IntArray) -> None:
+        """Follow the submap in that only these rows have stayed in its table."""
+        self._factor_index.keep(rows)
 
     # --- for those who want to look inside
 

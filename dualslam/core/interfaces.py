@@ -114,7 +114,22 @@ class WindowSolver(Protocol):
         ...
 
 
-class SubmapGraph(Protocol):
+class RowFollower(Protocol):
+    """Whatever knows observations of a submap by the numbers of their rows, from one change of the submap to the next.
+
+    One that finds that rows have gone which it was not asked about (`Submap.n_dropped`) makes its state anew.
+    """
+
+    def rows_out(self, submap: Submap) -> IntArray:
+        """Return rows of dead observations that it is done with: they may leave the table now."""
+        ...
+
+    def keep_rows(self, rows: IntArray) -> None:
+        """Take in that only these rows have stayed in the table, in their order (`Submap.keep_observations`)."""
+        ...
+
+
+class SubmapGraph(RowFollower, Protocol):
     """The factor graph of one submap. The submap's arrays are the record, the graph follows them."""
 
     def update(self, submap: Submap) -> GraphEstimate:

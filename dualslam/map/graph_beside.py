@@ -23,6 +23,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.estimates import GraphEstimate
 from dualslam.core.interfaces import SubmapGraph
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
+from dualslam.map.dead_rows import drop_dead_rows
 from dualslam.map.late_estimate import apply_late
 from dualslam.map.submap import Submap
 from dualslam.map.submap_delta import SubmapDelta, SubmapMirror
@@ -90,6 +91,8 @@ class GraphServer:
             return Failure(FailureReason.DISABLED, f"graph {job.graph_id} is not known here")
         replica = job.delta.apply(None if known is None else known[0])
         graph = self._new_graph() if known is None or job.delta.is_whole else known[1]
+        if job.delta.kept_rows is not None:
+            graph.keep_rows(job.delta.kept_rows)
         try:
             solved = graph.rebuild(replica, job.near_optimum) if job.rebuild else graph.update(replica)
             whole = graph.full_estimate(replica)
@@ -162,6 +165,14 @@ class BesideGraph:
     def point_covariances(self, landmark_ids: IntArray) -> FloatArray:
         """Raise `SolverError`: the graph is elsewhere."""
         raise SolverError("the graph is in another process, which gives no covariances")
+
+    def rows_out(self, submap: Submap) -> IntArray:
+        """Return the rows of dead observations that the process is done with, if it has answered all that was sent."""
+        return self.mirror.rows_out(submap)
+
+    def keep_rows(self, rows: IntArray) -> None:
+        """Let the process hear with its next job that only these rows have stayed."""
+        self.mirror.keep_rows(rows)
 
     def _ask(self, submap: Submap) -> None:
         self.is_behind = True
@@ -264,6 +275,7 @@ class BesideGraphs:
         submap, graph = submaps[max(waiting)], self._graphs[max(waiting)]
         near, graph.rebuild_asked = graph.rebuild_asked, None
         graph.is_behind = graph.holds_refused = False
+        drop_dead_rows(submap, graph)  # only now: an answer that is under way names rows as they were when it was sent
         self._under_way = submap.id, graph, submap.K
         self._desk.submit(JobKind.GRAPH, GraphJob(graph.id, graph.mirror.delta(submap), near is not None, bool(near)))
 

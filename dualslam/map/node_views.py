@@ -29,7 +29,7 @@ class NodeView:
     knots : list of int
         Keyframes, ascending.
     observations, n_rows, n_alive : Table, int, int
-        Rows of that table are appended, and die; none is changed otherwise: their numbers tell its state.
+        Rows of one table are appended, and die; none is changed otherwise: their numbers tell its state.
     seen : list of (L,) int64
         Landmarks that each node sees.
     across : list of (int, int)

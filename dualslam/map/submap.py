@@ -19,8 +19,9 @@ NO_LANDMARK = -1
 class Submap:
     """Keyframes, landmarks and observations in one local frame, in that frame's own unit of length.
 
-    Landmark ids and observation rows only grow and are never reused, so that a graph can follow the submap by looking
-    at the rows added since its last update and at the rows that died. Keyframe ids are the indices of their frames.
+    Landmark ids only grow and are never reused. Rows of observations are appended, and die, so that a graph can follow
+    the submap by looking at the rows added since its last update and at those that died; rows long dead leave the table
+    (`keep_observations`), the others keep their order. Keyframe ids are the indices of their frames.
 
     Attributes
     ----------
@@ -39,6 +40,8 @@ class Submap:
         ``n_visible``, ``n_found`` (how often tracking should have seen it, and did), ``condemned``.
     observations : Table
         ``kf``, ``feature``, ``landmark``, ``alive``.
+    n_dropped : int
+        Rows that have left that table: whoever knows rows by their numbers knows by it whether these still hold.
     anchors : dict of int to Anchor
         Keyframes that were culled as redundant.
     relative_poses : dict of int to RelativePose
@@ -63,6 +66,7 @@ class Submap:
         self.condemned: set[int] = set()
         self.landmarks = landmark_table(descriptor)
         self.observations = observation_table()
+        self.n_dropped = 0
         self._counted: tuple[Table, BoolArray, IntArray] | None = None  # see `n_observations`
 
     @classmethod
@@ -258,13 +262,28 @@ class Submap:
         return rows
 
     def remove_observations(self, rows: IntArray) -> None:
-        """Let observation rows die; they stay in the table."""
+        """Let observation rows die; they stay in the table until `keep_observations`."""
         obs = self.observations
         rows = rows[obs["alive"][rows]]
         obs["alive"][rows] = False
         for k in np.unique(obs["kf"][rows]).tolist():
             if k in self.landmark_of:
                 self.landmark_of[k][obs["feature"][rows[obs["kf"][rows] == k]]] = NO_LANDMARK
+
+    def keep_observations(self, rows: IntArray) -> None:
+        """Leave only these rows in the table, ascending, and with them all that live: they are numbered anew."""
+        obs = self.observations
+        if np.count_nonzero(obs["alive"][rows]) < np.count_nonzero(obs["alive"]):
+            raise ValueError(f"submap {self.id}: rows of live observations are to leave the table")
+        self.observations = obs.taken(rows)
+        self.n_dropped += len(obs) - len(rows)
+
+    def find_observations(self, kf: IntArray, feature: IntArray, landmark: IntArray) -> IntArray:
+        """Return the rows in which keyframes see landmarks by these features; what is not there now has none."""
+        rows, obs = self.rows_of_landmarks(landmark), self.observations
+        wanted = set(zip(kf.tolist(), feature.tolist(), landmark.tolist(), strict=True))
+        held = zip(*(obs[name][rows].tolist() for name in ("kf", "feature", "landmark")), strict=True)
+        return rows[np.array([observation in wanted for observation in held], np.bool_)]
 
     def remove_outliers(self, rows: IntArray) -> None:
         """Drop observations that a solution contradicts, and landmarks left with fewer than two."""
@@ -289,8 +308,8 @@ class Submap:
     def n_observations(self, landmark_ids: IntArray) -> IntArray:
         """Return how many keyframes see each landmark."""
         obs = self.observations
-        # Rows are appended, and die; none is changed otherwise. So the counts follow from the rows that have come or
-        # died since the last question.
+        # Rows of a table are appended, and die; none is changed otherwise. So the counts follow from the rows that have
+        # come or died since the last question.
         alive, landmark = obs["alive"], obs["landmark"]
         if self._counted is None or self._counted[0] is not obs:
             self._counted = (obs, np.zeros(0, np.bool_), np.zeros(0, np.int64))
@@ -384,6 +403,7 @@ class Submap:
         twin.relative_poses = dict(self.relative_poses)
         twin.gauge, twin.condemned = self.gauge, set(self.condemned)
         twin.landmarks, twin.observations = self.landmarks.copy(), self.observations.copy()
+        twin.n_dropped = self.n_dropped
         return twin
 
     def take_over(self, changed: Submap) -> None:
@@ -393,3 +413,4 @@ class Submap:
         self.landmark_of, self.anchors = changed.landmark_of, changed.anchors
         self.relative_poses = changed.relative_poses
         self.landmarks, self.observations = changed.landmarks, changed.observations
+        self.n_dropped = changed.n_dropped

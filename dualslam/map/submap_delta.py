@@ -44,6 +44,9 @@ class SubmapDelta:
         Rows whose points come with it, those added included; `xyz_mu` : (L, 3), `first_kf` : (L,)
     n_landmarks : int
         Rows of the table.
+    kept_rows : (R,) int64 or None
+        Rows of the replica's observations that stay in its table, if some do not. All other rows are named as they are
+        numbered after that.
     dead_landmarks, dead_rows : int64 arrays
         Landmarks and observations that have died.
     kf, feature, landmark, alive : arrays
@@ -62,6 +65,7 @@ class SubmapDelta:
     xyz_mu: FloatArray
     first_kf: IntArray
     n_landmarks: int
+    kept_rows: IntArray | None
     dead_landmarks: IntArray
     dead_rows: IntArray
     kf: IntArray
@@ -81,6 +85,8 @@ class SubmapDelta:
         lm["xyz_mu"][self.landmarks] = self.xyz_mu
         lm["first_kf"][self.landmarks] = self.first_kf
         lm["alive"][self.dead_landmarks] = False
+        if self.kept_rows is not None:
+            replica.keep_observations(self.kept_rows)
         replica.remove_observations(self.dead_rows)
         obs = replica.observations
         obs.append(len(self.kf), kf=self.kf, feature=self.feature, landmark=self.landmark, alive=self.alive)
@@ -119,16 +125,32 @@ class SubmapMirror:
         self._row_alive = np.zeros(0, bool)
         self._landmark_alive = np.zeros(0, bool)
         self._K: FloatArray | None = None
+        self._n_dropped = 0
+        self._kept_rows: IntArray | None = None  # what the replica is to be told
+
+    def rows_out(self, submap: Submap) -> IntArray:
+        """Return the rows that were dead in the last delta: a graph that has taken it in is done with them."""
+        return np.flatnonzero(~self._row_alive if submap.n_dropped == self._n_dropped else self._row_alive[:0])
+
+    def keep_rows(self, rows: IntArray) -> None:
+        """Take in, for the next delta, that only these rows have stayed in the submap's table."""
+        own = rows[rows < len(self._row_alive)]
+        self._n_dropped += len(self._row_alive) - len(own)
+        self._row_alive = self._row_alive[own]
+        self._kept_rows = own if self._kept_rows is None else self._kept_rows[own]
 
     def delta(self, submap: Submap) -> SubmapDelta:
         """Return what brings the replica up to date with a submap, and take it as done.
 
-        Where the camera has changed, all pixels have: the replica is made anew.
+        Where the camera has changed, all pixels have: the replica is made anew. So it is where rows have left the table
+        that the mirror was not told of.
         """
-        is_new = self._K is None or bool((self._K != submap.K).any())
+        renumbered = submap.n_dropped != self._n_dropped
+        is_new = self._K is None or renumbered or bool((self._K != submap.K).any())
         if is_new:
             self._features, self._relative = {}, {}
             self._row_alive, self._landmark_alive = np.zeros(0, bool), np.zeros(0, bool)
+            self._kept_rows = None
         obs, lm = submap.observations, submap.landmarks
         n_rows, n_points = len(self._row_alive), len(self._landmark_alive)
         added = [k for k, kf in submap.keyframes.items() if self._features.get(k) is not kf.features]
@@ -153,6 +175,7 @@ class SubmapMirror:
             xyz_mu=lm["xyz_mu"][points],
             first_kf=lm["first_kf"][points],
             n_landmarks=len(lm),
+            kept_rows=self._kept_rows,
             dead_landmarks=np.flatnonzero(_died(self._landmark_alive, lm["alive"])),
             dead_rows=np.flatnonzero(self._row_alive & ~obs["alive"][:n_rows]),
             kf=obs["kf"][new_rows].copy(),
@@ -160,7 +183,7 @@ class SubmapMirror:
             landmark=obs["landmark"][new_rows].copy(),
             alive=obs["alive"][new_rows].copy(),
         )
-        self._K = submap.K.copy()
+        self._K, self._n_dropped, self._kept_rows = submap.K.copy(), submap.n_dropped, None
         self._features = {k: kf.features for k, kf in submap.keyframes.items()}
         self._relative = dict(submap.relative_poses)
         self._row_alive, self._landmark_alive = obs["alive"].copy(), lm["alive"].copy()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class Table:
-    """Named numpy columns of one length; rows are appended in bulk and never move.
+    """Named numpy columns of one length; rows are appended in bulk and stay where they are.
 
     Columns are reached by ``table["name"]`` as views of the live rows, writable in place. A view taken before an
     append may be left behind by it: take it anew.
@@ -46,6 +46,10 @@ class Table:
         rows = np.arange(self._n, end)
         self._n = end
         return rows
+
+    def taken(self, rows: NDArray[np.int64]) -> Table:
+        """Return a table of some of the rows, in the order given."""
+        return Table.from_columns({name: self[name][rows] for name in self._data})
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return copies of all columns: what is needed to make the same table again with `from_columns`."""

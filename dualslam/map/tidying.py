@@ -1,7 +1,8 @@
 """What a run leaves behind of a map that it goes on in: what is dead there, and what has become of it.
 
-While a run lasts, rows of landmarks and observations only grow, and culled keyframes stay as anchors. A map that is
-used many times would carry those of all runs.
+While a run lasts, rows of landmarks only grow, dead observations are up to half of theirs
+(`dualslam/map/dead_rows.py`), and culled keyframes stay as anchors. A map that is used many times would carry those of
+all runs.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import numpy as np
 from dualslam.core.geometry import se3
 from dualslam.map.atlas import Atlas
 from dualslam.map.submap import NO_LANDMARK, Submap
-from dualslam.map.tables import Table
 from dualslam.map.trajectory import FramePose
 
 MAX_EARLIER_FRAMES = 100_000
@@ -54,13 +54,11 @@ def _renumber(submap: Submap) -> None:
     """Leave only the rows that live, in their order."""
     alive = submap.landmarks["alive"]
     new_id = np.where(alive, np.cumsum(alive) - 1, NO_LANDMARK)
-    rows = np.flatnonzero(submap.observations["alive"])
-    landmarks = {name: column[alive] for name, column in submap.landmarks.columns().items()}
-    observations = {name: column[rows] for name, column in submap.observations.columns().items()}
-    observations["landmark"] = new_id[observations["landmark"]]
+    submap.keep_observations(np.flatnonzero(submap.observations["alive"]))
+    submap.observations["landmark"][:] = new_id[submap.observations["landmark"]]
     for k, ids in submap.landmark_of.items():
         submap.landmark_of[k] = np.where(ids >= 0, new_id[ids], NO_LANDMARK)
-    submap.landmarks, submap.observations = Table.from_columns(landmarks), Table.from_columns(observations)
+    submap.landmarks = submap.landmarks.taken(np.flatnonzero(alive))
 
 
 def _drop_anchors(submap: Submap, wanted: Collection[int]) -> None:

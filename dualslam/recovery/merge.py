@@ -2,8 +2,10 @@
 
 Three states of one submap: the snapshot (`base`), the snapshot with what the walk added (`grown`), and the submap that
 went on (`live`): it may have grown at its other end, been solved again, changed its camera, or been archived. Landmark
-ids and observation rows only grow, so that all which is older than the snapshot has the same ids in all three. What the
-walk added are observations; its poses and points are initial values for the next solution, no more.
+ids only grow, so that all which is older than the snapshot has the same ids in all three. Rows of observations do so
+from the snapshot to what has grown from it; in the live submap they may be numbered anew since, and are found by what
+they are: a keyframe, its feature, a landmark. What the walk added are observations; its poses and points are initial
+values for the next solution, no more.
 """
 
 from __future__ import annotations
@@ -88,11 +90,11 @@ def _remove_rejected(merged: Submap, base: Submap, moved: Submap) -> None:
     """Drop the observations that the walk's solver found to disagree."""
     n = len(base.observations)
     died = np.flatnonzero(base.observations["alive"] & ~moved.observations["alive"][:n])
-    landmark, kf = base.observations["landmark"][died], base.observations["kf"][died]
+    kf, feature, landmark = (base.observations[name][died] for name in ("kf", "feature", "landmark"))
     heir = moved.current_ids(landmark)
     # Those of merged landmarks went over to another one, and those of culled keyframes went with them.
     judged = ((heir == landmark) | (heir == NO_LANDMARK)) & _held_by(moved, kf)
-    merged.remove_observations(died[judged])
+    merged.remove_observations(merged.find_observations(kf[judged], feature[judged], landmark[judged]))
     touched = np.unique(landmark[judged])
     merged.remove_landmarks(touched[merged.n_observations(touched) < 2])
 

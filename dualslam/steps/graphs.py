@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from dualslam.core.events import EventKind
+from dualslam.map.dead_rows import drop_dead_rows
 from dualslam.map.graph_beside import N_FREE, N_FREE_BEHIND, Moved
 from dualslam.map.propagation import propagate_links
 from dualslam.map.record import FrameStamp
@@ -12,16 +13,21 @@ from dualslam.steps.state import State
 
 
 class GraphKeeping:
-    """Moves submaps to what their graphs have solved meanwhile; without effect where these are solved inline."""
+    """Moves submaps to what their graphs have solved meanwhile; inline, where nothing is, it only clears away."""
 
     def __init__(self, state: State) -> None:
         self._state = state
 
     def collect(self, now: FrameStamp) -> None:
-        """Move submaps to what their graphs have solved meanwhile, and send the graphs what is new."""
+        """Move submaps to what their graphs have solved meanwhile, and send the graphs what is new.
+
+        What is dead in the live submap leaves it here, too: between two frames no one holds rows by their numbers.
+        """
         state = self._state
         graphs, submaps = state.parts.graphs, state.record.atlas.submaps
         if graphs is None:
+            if state.live is not None:
+                drop_dead_rows(state.live.submap, state.live.graph)
             return
         graphs.n_free = N_FREE_BEHIND if state.pace.behind else N_FREE
         with state.record.timer.measure("graph (late)"):

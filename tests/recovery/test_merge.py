@@ -39,6 +39,28 @@ def test_what_the_walk_has_refused_is_no_observation_any_more_and_all_else_is() 
     assert alive[others].all()
 
 
+def test_what_the_walk_has_refused_is_found_by_what_it_is_where_the_map_numbers_its_rows_anew() -> None:
+    result, grown, refused = merged()
+    base = guessed_submap(make_scene(6), pose_noise=0.0)
+    live = base.copy()
+    live.transform(SCALE, T)
+    dead = np.flatnonzero(base.observations["kf"] == 2)[::3]  # the map has dropped these itself, and forgotten them
+    live.remove_observations(dead)
+    live.keep_observations(np.flatnonzero(live.observations["alive"]))
+    again = merge_recovery(live, base, grown, lambda keyframe: keyframe).submap
+    assert len(again.observations) == len(base.observations) - len(dead)
+    obs = result.submap.observations
+    wanted = seen_in(result.submap, np.setdiff1d(np.flatnonzero(obs["alive"]), dead))
+    dying = {j for j in range(len(base.landmarks)) if not again.landmarks["alive"][j]}  # of one view now
+    assert seen_in(again, np.flatnonzero(again.observations["alive"])) == {o for o in wanted if o[2] not in dying}
+    assert not seen_in(base, refused) & seen_in(again, np.flatnonzero(again.observations["alive"]))
+
+
+def seen_in(submap: Submap, rows: np.ndarray) -> set[tuple[int, int, int]]:
+    columns = (submap.observations[name][rows].tolist() for name in ("kf", "feature", "landmark"))
+    return set(zip(*columns, strict=True))
+
+
 def test_frames_of_the_walk_are_posed_in_the_unit_of_the_map_and_only_where_they_had_no_pose() -> None:
     result, grown, _ = merged()
     record = Record()
