@@ -120,7 +120,7 @@ def refine_overlap(
     submap = new.copy()
     report = graft_keyframes(old, submap, link, config.overlap_keyframes)
     try:
-        n_outliers = solve(submap, new_graph(), near_optimum=True)
+        n_outliers = solve(submap, new_graph())
     except SolverError as error:
         return Failure(FailureReason.SOLVER, str(error))
     again = relink(old, submap, link.suspected_onset)
