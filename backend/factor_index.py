@@ -114,14 +114,13 @@ class FactorIndex:
         if not self.knows_rows_of(submap):
             return np.zeros(0, np.int64)
         alive = submap.observations["alive"][: self._n_planned]
-        inside = self.rows["admitted"] | (self.rows["factor"] >= 0)
-        return np.flatnonzero(~alive & ~inside[: self._n_planned])
+        return np.flatnonzero(~alive & ~self._held()[: self._n_planned])
 
     def keep(self, rows: IntArray) -> None:
         """Follow a submap in which only these rows stay. Where the graph has others, it does not: it is made anew."""
         own = rows[rows < len(self.rows)]
-        inside = self.rows["admitted"] | (self.rows["factor"] >= 0)
-        if np.count_nonzero(inside[own]) < np.count_nonzero(inside):
+        held = self._held()
+        if np.count_nonzero(held[own]) < np.count_nonzero(held):
             return
         self._n_dropped += len(self.rows) - len(own)
         self._n_planned = int(np.searchsorted(own, self._n_planned))
@@ -249,6 +248,10 @@ class FactorIndex:
             config.factors_per_keyframe, min(int(MOST_RATIO * config.factors_per_keyframe), BUDGET // max(beside, 1))
         )
         return wanted if 2 * wanted <= self._chosen_with else self._chosen_with
+
+    def _held(self) -> BoolArray:
+        """Return a mask of the rows that are in the graph, or factors of the solver still."""
+        return np.asarray(self.rows["admitted"] | (self.rows["factor"] >= 0))
 
     def _take_new_rows(self, submap: Submap) -> None:
         if not self.knows_rows_of(submap):  # the graph is made anew

@@ -37,11 +37,12 @@ def drop_dead_rows(submap: Submap, follower: RowFollower) -> int:
     int
         How many rows have gone.
     """
-    n = len(submap.observations)
-    if n <= MIN_DEAD:
+    n, n_alive = len(submap.observations), int(np.count_nonzero(submap.observations["alive"]))
+    least = max(MIN_DEAD, n_alive + 1)
+    if n - n_alive < least:  # at most frames: the follower is not asked
         return 0
     rows = follower.rows_out(submap)
-    if len(rows) < MIN_DEAD or len(rows) <= np.count_nonzero(submap.observations["alive"]):
+    if len(rows) < least:
         return 0
     stays = np.ones(n, np.bool_)
     stays[rows] = False
