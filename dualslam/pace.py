@@ -1,8 +1,9 @@
 """Whether the system keeps up with its camera, and what it leaves out where it does not.
 
-Two things can be behind: the tracking, when frames are looked at after their time, and the back end, when keyframes
-wait for the graph that runs beside. In either case new keyframes are what there is to save: each costs the tracking its
-insertion and the back end its solution. A keyframe that is due but not urgent is put off until both have caught up.
+Two things can be behind: the tracking, when frames are looked at after their time, and the back end, when more
+keyframes wait for the graph that runs beside than it catches up on by taking many at once. In either case keyframes are
+what there is to save: each costs the tracking its insertion and the back end its solution. One that is due but not
+urgent is put off until both have caught up.
 While there is no map, a start is looked for beside the frames (`workers/start_beside.py`), or, without processes, by
 one pair of frames at a time: a start that comes late costs more than frames that are dropped.
 
@@ -16,7 +17,12 @@ from dataclasses import dataclass
 BEHIND_S = 1 / 30
 """A frame that is a frame of 30 Hz late was held up by more than chance: the step before it was too long."""
 MAX_LAG_KEYFRAMES = 4
-"""Keyframes that the graph beside may not know yet: a job on its way, and what comes until it ends."""
+"""Keyframes that the graph beside may not know yet where there is no clock: a job on its way, and what comes until it
+ends."""
+FAR_BEHIND_KEYFRAMES = 30
+"""Keyframes that it may not know in real time: those of a second in which each frame is one, as long as a batch over a
+full submap takes. Below that its lag ends by itself, since five keyframes at once cost a graph half of what five cost
+it one by one, and in a fast turn, where it arises, a keyframe that does not come is what the track is lost for."""
 MAX_PUT_OFF = 5
 """Frames by which a keyframe is put off at most. At 30 Hz that is a sixth of a second: long enough to work
 off what a keyframe and a relinearisation hold up, too short for the view to change by more than a few degrees."""
@@ -82,7 +88,7 @@ class Pace:
     @property
     def behind(self) -> bool:
         """Whether tracking or back end have something to catch up on."""
-        return self.in_real_time and (self._late_s > BEHIND_S or self._lag > MAX_LAG_KEYFRAMES)
+        return self.in_real_time and (self._late_s > BEHIND_S or self._lag > FAR_BEHIND_KEYFRAMES)
 
     def puts_off(self, n_tracked: int, n_weak: int) -> bool:
         """Whether a keyframe that is due is put off to a later frame.

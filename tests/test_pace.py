@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dualslam.pace import BEHIND_S, MAX_LAG_KEYFRAMES, MAX_PUT_OFF, Pace
+from dualslam.pace import BEHIND_S, FAR_BEHIND_KEYFRAMES, MAX_LAG_KEYFRAMES, MAX_PUT_OFF, Pace
 from dualslam.places.revisits import Revisits
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
 
@@ -62,11 +62,11 @@ def test_buffered_views_follow_a_change_while_frames_come_in_time(late_s: float 
 def test_nor_while_the_graph_has_much_to_learn() -> None:
     pace = Pace()
     pace.note(0.0)
-    assert pace.may_lag(MAX_LAG_KEYFRAMES)
+    assert pace.may_lag(FAR_BEHIND_KEYFRAMES)
     assert not pace.behind
-    assert pace.may_lag(MAX_LAG_KEYFRAMES + 1)
+    assert pace.may_lag(FAR_BEHIND_KEYFRAMES + 1)
     assert pace.puts_off(MANY, WEAK)
-    assert pace.statistics.max_lag_keyframes == MAX_LAG_KEYFRAMES + 1
+    assert pace.statistics.max_lag_keyframes == FAR_BEHIND_KEYFRAMES + 1
 
 
 def test_what_would_be_lost_without_new_landmarks_gets_them() -> None:

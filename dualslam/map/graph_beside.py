@@ -33,8 +33,8 @@ log = logging.getLogger(__name__)
 
 Window = Callable[[Submap, list[int]], GraphEstimate | Failure]
 """Adjusts some keyframes of a submap, the newest first, and what they see; the submap is not changed."""
-N_FREE, N_FREE_BEHIND = 3, 1
-"""Keyframes that the window moves: those that the tracking goes on from; fewer while it has to catch up."""
+N_FREE = 3
+"""Keyframes that the window moves: those that the tracking goes on from."""
 MAX_GRAPHS = 3
 """Graphs that a process keeps: the live one, and those that a merge or a map that was seen again may still ask for."""
 
@@ -118,6 +118,8 @@ class BesideGraph:
     window : Window
     register : callable
         Told, whenever there is something to send, of which submap.
+    against_clock : callable
+        Whether frames come by a clock.
     """
 
     def __init__(
@@ -125,6 +127,7 @@ class BesideGraph:
         graph_id: int,
         window: Callable[[Submap], GraphEstimate | Failure],
         register: Callable[[Submap, BesideGraph], None],
+        against_clock: Callable[[], bool],
     ) -> None:
         self.id = graph_id
         self.is_behind = False
@@ -134,6 +137,7 @@ class BesideGraph:
         self.noise2 = 1.0
         self._window = window
         self._register = register
+        self._against_clock = against_clock
 
     def update(self, submap: Submap) -> GraphEstimate:
         """Adjust the window; the graph will take in what has changed."""
@@ -145,7 +149,13 @@ class BesideGraph:
         return replace(estimate, seconds=time.thread_time() - start)
 
     def rebuild(self, submap: Submap, near_optimum: bool = False) -> GraphEstimate:
-        """Let the graph be made anew; meanwhile the submap stays as it is."""
+        """Let the graph be made anew; meanwhile the submap stays as it is.
+
+        Not one that is near its optimum and known to the process, against a clock: for a batch, which takes as long as
+        ten updates, the tracking would have to go on from windows alone where it is hardest. That is an update.
+        """
+        if near_optimum and self.mirror.knows_replica and self._against_clock():
+            return self.update(submap)
         self.rebuild_asked = near_optimum
         self.mirror = SubmapMirror()
         self._ask(submap)
@@ -198,8 +208,8 @@ class BesideGraphs:
 
     Attributes
     ----------
-    n_free : int
-        Newest keyframes that the window moves.
+    against_clock : bool
+        Whether frames come by a clock.
     """
 
     def __init__(self, desk: Desk, window: Window) -> None:
@@ -209,14 +219,14 @@ class BesideGraphs:
         self._graphs: dict[int, BesideGraph] = {}  # by the submap's id: the one that it has now
         self._under_way: tuple[int, BesideGraph, FloatArray] | None = None  # submap's id, its graph and its intrinsics
         self._answered: dict[int, frozenset[int]] = {}  # by the submap's id: the keyframes that its estimate knows
-        self.n_free = N_FREE
+        self.against_clock = False
 
     def new_graph(self) -> SubmapGraph:
         """Make the graph of a submap."""
-        return BesideGraph(next(self._ids), self._adjust, self._note)
+        return BesideGraph(next(self._ids), self._adjust, self._note, lambda: self.against_clock)
 
     def _adjust(self, submap: Submap) -> GraphEstimate | Failure:
-        return self._window(submap, list(submap.keyframes)[: -self.n_free - 1 : -1])
+        return self._window(submap, list(submap.keyframes)[: -N_FREE - 1 : -1])
 
     def lag(self, submap: Submap) -> int:
         """Count the keyframes of a submap that no answer of its graph has known yet."""

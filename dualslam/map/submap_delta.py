@@ -128,6 +128,11 @@ class SubmapMirror:
         self._n_dropped = 0
         self._kept_rows: IntArray | None = None  # what the replica is to be told
 
+    @property
+    def knows_replica(self) -> bool:
+        """Whether there has been a delta: the next one need not be whole."""
+        return self._K is not None
+
     def rows_out(self, submap: Submap) -> IntArray:
         """Return the rows that were dead in the last delta: a graph that has taken it in is done with them."""
         return np.flatnonzero(~self._row_alive if submap.n_dropped == self._n_dropped else self._row_alive[:0])

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from dualslam.core.events import EventKind
 from dualslam.map.dead_rows import drop_dead_rows
-from dualslam.map.graph_beside import N_FREE, N_FREE_BEHIND, Moved
+from dualslam.map.graph_beside import Moved
 from dualslam.map.propagation import propagate_links
 from dualslam.map.record import FrameStamp
 from dualslam.steps.state import State
@@ -29,7 +29,7 @@ class GraphKeeping:
             if state.live is not None:
                 drop_dead_rows(state.live.submap, state.live.graph)
             return
-        graphs.n_free = N_FREE_BEHIND if state.pace.behind else N_FREE
+        graphs.against_clock = state.pace.in_real_time
         with state.record.timer.measure("graph (late)"):
             if state.live is not None and not state.pace.may_lag(graphs.lag(state.live.submap)):
                 self._follow(graphs.wait(submaps), now)

@@ -201,3 +201,25 @@ def test_a_process_that_is_killed_costs_the_map_nothing(world: PointWorld) -> No
     system.finish()
     assert desk.statistics[JobKind.GRAPH].n_done > 5
     assert_right(system, world)
+
+
+@pytest.mark.parametrize("against_clock", [False, True])
+def test_a_known_graph_near_its_optimum_is_not_made_anew_against_a_clock(against_clock: bool) -> None:
+    """It takes in what is new, as with any keyframe, and the window moves the newest ones meanwhile."""
+    desk = InlineDesk({JobKind.GRAPH: GraphServer(lambda: ISam2SubmapGraph(Config().graph))})
+    windows: list[list[int]] = []
+    graphs = BesideGraphs(
+        desk,
+        lambda submap, k: windows.append(k) or Failure(FailureReason.SOLVER, "no window"),  # type: ignore[func-returns-value]
+    )
+    graphs.against_clock = against_clock
+    submap = guessed_submap(make_scene(6, noise_px=0.5), pose_noise=0.02)
+    graph = graphs.new_graph()
+    graph.rebuild(submap, near_optimum=True)  # not known yet
+    assert any(each.rebuilt for each in graphs.finish({submap.id: submap}))
+    windows.clear()
+    graph.rebuild(submap, near_optimum=True)
+    assert windows == ([[5, 4, 3]] if against_clock else [])
+    assert any(each.rebuilt for each in graphs.finish({submap.id: submap})) == (not against_clock)
+    graph.rebuild(submap)  # far from it
+    assert any(each.rebuilt for each in graphs.finish({submap.id: submap}))
