@@ -103,6 +103,10 @@ class Sequence(Protocol):
     def __iter__(self) -> Iterator[Frame]: ...
 
 
+N_WINDOW = 3
+"""Newest keyframes that the tracking has a window move: those that it goes on from."""
+
+
 class WindowSolver(Protocol):
     """Poses a new keyframe by a small bundle: what tracking goes on from until the graph has looked at it."""
 

@@ -1,8 +1,8 @@
 """A submap's graph in a process of its own: the tracking solves a window meanwhile, and takes the whole when it comes.
 
-`BesideGraph` is the `SubmapGraph` that the tracking sees. Its updates adjust the newest keyframes (`Window`), and note
-that the graph proper has something to learn. Between two frames `BesideGraphs` sends what has changed in the arrays
-(`dualslam/map/submap_delta.py`) to the process, one job at a time, so that a graph that is behind takes several
+`BesideGraph` is the `SubmapGraph` that the tracking sees. Its updates adjust the newest keyframes (`WindowSolver`), and
+note that the graph proper has something to learn. Between two frames `BesideGraphs` sends what has changed in the
+arrays (`dualslam/map/submap_delta.py`) to the process, one job at a time, so that a graph that is behind takes several
 keyframes in at once; and it puts what came back into the submap as it is now: known keyframes and landmarks take their
 values, what has come since follows (`dualslam/map/late_estimate.py`). A process that dies costs its graph: the next job
 brings the whole submap to a fresh one. A graph that fails leaves the submap to its window, and is made anew with the
@@ -21,7 +21,7 @@ import numpy as np
 
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import GraphEstimate
-from dualslam.core.interfaces import SubmapGraph
+from dualslam.core.interfaces import N_WINDOW, SubmapGraph, WindowSolver
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.dead_rows import drop_dead_rows
 from dualslam.map.late_estimate import apply_late
@@ -31,10 +31,6 @@ from dualslam.workers.jobs import Desk, JobKind, awaited
 
 log = logging.getLogger(__name__)
 
-Window = Callable[[Submap, list[int]], GraphEstimate | Failure]
-"""Adjusts some keyframes of a submap, the newest first, and what they see; the submap is not changed."""
-N_FREE = 3
-"""Keyframes that the window moves: those that the tracking goes on from."""
 MAX_GRAPHS = 3
 """Graphs that a process keeps: the live one, and those that a merge or a map that was seen again may still ask for."""
 
@@ -115,10 +111,11 @@ class BesideGraph:
     Parameters
     ----------
     graph_id : int
-    window : Window
+    window : callable
+        Adjusts the newest keyframes of a submap.
     register : callable
         Told, whenever there is something to send, of which submap.
-    against_clock : callable
+    in_real_time : callable
         Whether frames come by a clock.
     """
 
@@ -127,7 +124,7 @@ class BesideGraph:
         graph_id: int,
         window: Callable[[Submap], GraphEstimate | Failure],
         register: Callable[[Submap, BesideGraph], None],
-        against_clock: Callable[[], bool],
+        in_real_time: Callable[[], bool],
     ) -> None:
         self.id = graph_id
         self.is_behind = False
@@ -137,7 +134,7 @@ class BesideGraph:
         self.noise2 = 1.0
         self._window = window
         self._register = register
-        self._against_clock = against_clock
+        self._in_real_time = in_real_time
 
     def update(self, submap: Submap) -> GraphEstimate:
         """Adjust the window; the graph will take in what has changed."""
@@ -151,10 +148,10 @@ class BesideGraph:
     def rebuild(self, submap: Submap, near_optimum: bool = False) -> GraphEstimate:
         """Let the graph be made anew; meanwhile the submap stays as it is.
 
-        Not one that is near its optimum and known to the process, against a clock: for a batch, which takes as long as
+        Not one that is near its optimum and known to the process, in real time: for a batch, which takes as long as
         ten updates, the tracking would have to go on from windows alone where it is hardest. That is an update.
         """
-        if near_optimum and self.mirror.knows_replica and self._against_clock():
+        if near_optimum and self.mirror.knows_replica and self._in_real_time():
             return self.update(submap)
         self.rebuild_asked = near_optimum
         self.mirror = SubmapMirror()
@@ -204,29 +201,29 @@ class BesideGraphs:
     Parameters
     ----------
     desk : Desk
-    window : Window
+    window : WindowSolver
 
     Attributes
     ----------
-    against_clock : bool
+    in_real_time : bool
         Whether frames come by a clock.
     """
 
-    def __init__(self, desk: Desk, window: Window) -> None:
+    def __init__(self, desk: Desk, window: WindowSolver) -> None:
         self._desk = desk
         self._window = window
         self._ids = count()
         self._graphs: dict[int, BesideGraph] = {}  # by the submap's id: the one that it has now
         self._under_way: tuple[int, BesideGraph, FloatArray] | None = None  # submap's id, its graph and its intrinsics
         self._answered: dict[int, frozenset[int]] = {}  # by the submap's id: the keyframes that its estimate knows
-        self.against_clock = False
+        self.in_real_time = False
 
     def new_graph(self) -> SubmapGraph:
         """Make the graph of a submap."""
-        return BesideGraph(next(self._ids), self._adjust, self._note, lambda: self.against_clock)
+        return BesideGraph(next(self._ids), self._adjust, self._note, lambda: self.in_real_time)
 
     def _adjust(self, submap: Submap) -> GraphEstimate | Failure:
-        return self._window(submap, list(submap.keyframes)[: -N_FREE - 1 : -1])
+        return self._window(submap, list(submap.keyframes)[: -N_WINDOW - 1 : -1])
 
     def lag(self, submap: Submap) -> int:
         """Count the keyframes of a submap that no answer of its graph has known yet."""

@@ -29,7 +29,7 @@ class GraphKeeping:
             if state.live is not None:
                 drop_dead_rows(state.live.submap, state.live.graph)
             return
-        graphs.against_clock = state.pace.in_real_time
+        graphs.in_real_time = state.pace.in_real_time
         with state.record.timer.measure("graph (late)"):
             if state.live is not None and not state.pace.may_lag(graphs.lag(state.live.submap)):
                 self._follow(graphs.wait(submaps), now)

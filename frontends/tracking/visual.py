@@ -14,7 +14,7 @@ from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
 from dualslam.core.estimates import GraphEstimate, KeyframeReport
 from dualslam.core.geometry import se3
-from dualslam.core.interfaces import Frontend, SubmapGraph, WindowSolver
+from dualslam.core.interfaces import N_WINDOW, Frontend, SubmapGraph, WindowSolver
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Rival, Track, View
 from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.gap.uncertainty import track_uncertainty
@@ -34,7 +34,6 @@ REBUILD_SPACING = 8
 
 CULL_BEHIND = 2  # the newest keyframes are not judged redundant: the next ones may need them
 N_CULL_CANDIDATES = 10  # of the covisible keyframes, the nearest in what they see
-N_FREE = 3  # newest keyframes that the window moves
 YOUNG_MAP = 10  # keyframes up to which the graph poses each: two or three say little about a fourth
 MIN_WINDOW_MATCHES = 40  # landmarks of a keyframe below which a window of its neighbours may be led astray
 
@@ -271,7 +270,7 @@ class VisualFrontEnd:
         careful = self._careful or pose_is_given or track.wide or self._window is None
         if not careful and len(self.submap.keyframes) > YOUNG_MAP and n_matched >= MIN_WINDOW_MATCHES:
             assert self._window is not None
-            posed = self._window(self.submap, [track.view.index, *reversed(self._path[1 - N_FREE :])])
+            posed = self._window(self.submap, [track.view.index, *reversed(self._path[1 - N_WINDOW :])])
             if not isinstance(posed, Failure):
                 return self._taken(posed)
         self._careful = False

@@ -203,8 +203,8 @@ def test_a_process_that_is_killed_costs_the_map_nothing(world: PointWorld) -> No
     assert_right(system, world)
 
 
-@pytest.mark.parametrize("against_clock", [False, True])
-def test_a_known_graph_near_its_optimum_is_not_made_anew_against_a_clock(against_clock: bool) -> None:
+@pytest.mark.parametrize("in_real_time", [False, True])
+def test_a_known_graph_near_its_optimum_is_not_made_anew_in_real_time(in_real_time: bool) -> None:
     """It takes in what is new, as with any keyframe, and the window moves the newest ones meanwhile."""
     desk = InlineDesk({JobKind.GRAPH: GraphServer(lambda: ISam2SubmapGraph(Config().graph))})
     windows: list[list[int]] = []
@@ -212,14 +212,14 @@ def test_a_known_graph_near_its_optimum_is_not_made_anew_against_a_clock(against
         desk,
         lambda submap, k: windows.append(k) or Failure(FailureReason.SOLVER, "no window"),  # type: ignore[func-returns-value]
     )
-    graphs.against_clock = against_clock
+    graphs.in_real_time = in_real_time
     submap = guessed_submap(make_scene(6, noise_px=0.5), pose_noise=0.02)
     graph = graphs.new_graph()
     graph.rebuild(submap, near_optimum=True)  # not known yet
     assert any(each.rebuilt for each in graphs.finish({submap.id: submap}))
     windows.clear()
     graph.rebuild(submap, near_optimum=True)
-    assert windows == ([[5, 4, 3]] if against_clock else [])
-    assert any(each.rebuilt for each in graphs.finish({submap.id: submap})) == (not against_clock)
+    assert windows == ([[5, 4, 3]] if in_real_time else [])
+    assert any(each.rebuilt for each in graphs.finish({submap.id: submap})) == (not in_real_time)
     graph.rebuild(submap)  # far from it
     assert any(each.rebuilt for each in graphs.finish({submap.id: submap}))
