@@ -6,7 +6,6 @@ from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
 from dualslam.map.atlas import Link, LinkKind
-from dualslam.map.atlas_report import AtlasReport
 from dualslam.map.connections import Connections
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap_change import change_of_frame
@@ -40,7 +39,8 @@ def fuse(
     joined = Link(found.old_id, new_id, S_old_new, covariance, LinkKind.RECOVERY, tuple(agreeing))
     report = connections.connect([joined], now)
     if not report or any(link.attached_as(joined) for link in report.newly_rejected):
-        _refused(record, found, new_id, report, now)
+        why = report.failure or Failure(FailureReason.CONTRADICTION, "the rest of the atlas contradicts the link")
+        note_refused(record, found, new_id, why, now)
         return False
     record.event(
         EventKind.LINKED,
@@ -93,9 +93,8 @@ def _hand_over(
     )
 
 
-def _refused(record: Record, found: FoundLink, new_id: int, report: AtlasReport, now: FrameStamp) -> None:
-    """Say that the atlas could not take a link in, or did not believe it."""
-    why = report.failure or Failure(FailureReason.CONTRADICTION, "the rest of the atlas contradicts the link")
+def note_refused(record: Record, found: FoundLink, new_id: int, why: Failure, now: FrameStamp) -> None:
+    """Say why a link that a walk had found is not made."""
     record.event(
         EventKind.LINK_REFUSED,
         now,
@@ -104,6 +103,7 @@ def _refused(record: Record, found: FoundLink, new_id: int, report: AtlasReport,
         old_submap=found.old_id,
         verdict=why.detail,
         reason=str(why.reason),
+        **why.numbers,
     )
 
 

@@ -27,7 +27,7 @@ from dualslam.recovery.audits import Audits
 from dualslam.recovery.bypass import absorb, n_frames, pose_frames
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
-from dualslam.recovery.fusion import fuse
+from dualslam.recovery.fusion import fuse, note_refused
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.leaps import refuse_leaps
 from dualslam.recovery.link_tries import LinkTries
@@ -244,9 +244,11 @@ class Recoveries:
             if walk.again and not job.onsets and not self._poses_any(result):
                 continue  # the last one for these frames; what it would add to the map is not worth a solution
             if not isinstance(result, Failure) and (refused := self._refuse_leaps(result)) is not None:
-                self._failed(job, now, refused, time.perf_counter() - walk.began_s)
+                self._note_events(result)
                 if result.link is not None:
+                    note_refused(self._record, result.link, job.submap.id, refused, now)
                     self._tries.note_try(result.link.old_id, refused.reason)
+                self._failed(job, now, refused, time.perf_counter() - walk.began_s)
                 self._retries.leave_open(job.submap.id, walk.n_live, job.camera)  # grown, it knows its velocity better
                 continue
             if not isinstance(result, Failure):
@@ -270,6 +272,13 @@ class Recoveries:
         path = Path.of([*(p for p in own if p.keyframe_id in new.keyframes), *walked.values()], new)
         scale = float(sim3.scale(result.link.estimate.S_old_new))
         return refuse_leaps(path.times_s, path.centres, known.times_s, known.centres / scale, known.refound)
+
+    def _note_events(self, result: RecoveryResult) -> None:
+        """Take over the events of a walk's attempts; each attempt says what was known of the loss, too."""
+        told = self._circumstances.get(result.submap.id, {})
+        for event in result.events:
+            data = event.data | (told if event.event is EventKind.RECOVERY_ATTEMPT else {})
+            self._record.events.add(event.event, event.frame, event.timestamp_s, event.submap, **data)
 
     def _poses_any(self, result: RecoveryResult | Failure) -> bool:
         """Whether a walk has found a pose for a frame that has none."""
@@ -333,10 +342,7 @@ class Recoveries:
         if live is not None and live.submap is submap:
             live.adopt(graph, before)
         self._connections.follow(before, submap, now)
-        told = self._circumstances.get(submap.id, {})
-        for event in result.events:
-            data = event.data | (told if event.event is EventKind.RECOVERY_ATTEMPT else {})
-            self._record.events.add(event.event, event.frame, event.timestamp_s, event.submap, **data)
+        self._note_events(result)
         recovered_frames = pose_frames(self._record, result.frames, merged, submap)
         seconds = time.perf_counter() - started_s
         linked = False

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 from dualslam.config.settings import RecoveryConfig
+from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import sim3
-from dualslam.core.types import FailureReason, FloatArray
+from dualslam.core.types import FailureReason, FloatArray, FrameStatus
+from dualslam.map.frame_records import FrameRow
+from dualslam.map.record import Record
 from dualslam.map.trajectory import FramePose
 from dualslam.recovery.frame_buffer import FrameBuffer
-from dualslam.recovery.job import RecoveredFrame
-from dualslam.recovery.manager import Recoveries
+from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult
+from dualslam.recovery.manager import Recoveries, _UnderWay
 from dualslam.testing.point_world import CAMERA
 from tests.recovery.test_earlier_runs import book, enter, pose_frames
 from tests.recovery.test_leaps import way, without
@@ -22,8 +25,8 @@ FIRST = 1000
 FOUND_AFTER = 80  # frames of the lost map that the new one has not seen
 
 
-def judged(unit: float, off: FloatArray, seed: int) -> object:
-    """Return what is said of a walk over ten missing frames that came out `off`, in units of the new map."""
+def walk(unit: float, off: FloatArray, seed: int) -> tuple[Record, Recoveries, RecoveryResult]:
+    """Make a walk that has linked to a lost map over ten missing frames, and came out `off`, in the new map's units."""
     record, lost = book()
     new = lost.copy()
     new.id = 1
@@ -39,15 +42,34 @@ def judged(unit: float, off: FloatArray, seed: int) -> object:
         T = np.eye(4)
         T[:3, 3] = centre
         frames.append(RecoveredFrame(FramePose(FIRST + FOUND_AFTER + i, float(time_s), 1, 0, T), 90, 80))
-    parts = (Fake(), None, Fake(camera=CAMERA, covariance=None), None)
+    link = FoundLink(0, Fake(S_old_new=sim3.from_parts(unit, np.eye(3), np.zeros(3))), Fake(), "live")  # type: ignore[arg-type]
+    attempt = Event(EventKind.RECOVERY_ATTEMPT, FIRST + FOUND_AFTER, float(t_new[0]), 1, {"attempt": "live"})
+    job = RecoveryJob(new, 0, {0: lost}, {0: FIRST + 99}, (), (), CAMERA, None)
+    result = RecoveryResult(new, tuple(frames), link, (attempt,), 0.1, 0.1)
+    executor = Fake(submit=lambda job: None, poll=lambda: [(job, result)])
+    parts = (executor, None, Fake(camera=CAMERA, covariance=None), None)
     recoveries = Recoveries(record, FrameBuffer(10.0, 100.0), *parts, RecoveryConfig())  # type: ignore[arg-type]
-    link = Fake(old_id=0, estimate=Fake(S_old_new=sim3.from_parts(unit, np.eye(3), np.zeros(3))))
-    return recoveries._refuse_leaps(Fake(submap=new, frames=frames, link=link))  # type: ignore[arg-type]
+    return record, recoveries, result
 
 
 @pytest.mark.parametrize("unit", [0.1, 1.0, 10.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_right_walk_is_believed_and_one_that_is_a_period_off_is_not(unit: float, seed: int) -> None:
-    assert judged(unit, np.zeros(3), seed) is None
-    refused = judged(unit, np.array([-1.5, 0.0, 0.0]), seed)
-    assert getattr(refused, "reason", None) is FailureReason.LEAP
+    _, recoveries, right = walk(unit, np.zeros(3), seed)
+    assert recoveries._refuse_leaps(right) is None
+    _, recoveries, wrong = walk(unit, np.array([-1.5, 0.0, 0.0]), seed)
+    assert getattr(recoveries._refuse_leaps(wrong), "reason", None) is FailureReason.LEAP
+
+
+def test_a_link_that_is_refused_for_its_leap_says_so_beside_what_the_walk_tried() -> None:
+    record, recoveries, _ = walk(1.0, np.array([-1.5, 0.0, 0.0]), 0)
+    recoveries._under_way[1] = _UnderWay(0.0, 5, again=False)
+    recoveries.collect(None, FrameRow(FIRST + 120, 4.0, FrameStatus.TRACKED, 1))
+    (refused,) = record.events.of_kind(EventKind.LINK_REFUSED)
+    assert refused.data["old_submap"] == 0
+    assert refused.data["reason"] == "leap"
+    assert refused.data["leap_off"] > refused.data["leap_usual"]
+    assert [e.data["attempt"] for e in record.events.of_kind(EventKind.RECOVERY_ATTEMPT)] == ["live"]
+    assert record.events.of_kind(EventKind.RECOVERY_FAILED)[0].data["reason"] == "leap"
+    assert not record.events.of_kind(EventKind.LINKED)
+    assert all(pose.submap_id == 0 for pose in record.poses.values())
