@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dualslam.backend.local_ba import bundle_adjust_arrays
-from dualslam.config.settings import InitialiserConfig
+from dualslam.config.settings import HealthConfig, InitialiserConfig
 from dualslam.core.types import Failure, FailureReason, FloatArray, Start, View
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.tracking.initialiser import Initialiser
@@ -169,6 +169,29 @@ def test_witnesses_that_disagree_refuse_the_start() -> None:
     assert isinstance(refusal, Failure)
     assert refusal.reason is FailureReason.DOUBTFUL_INITIALISATION
     assert refusal.numbers["support"] == 0
+
+
+@pytest.mark.parametrize(("n_seen", "starts"), [(34, False), (50, True)])
+def test_a_map_starts_with_points_enough_to_go_on_with(n_seen: int, starts: bool) -> None:
+    """The next frame must find `health.min_inliers`: a map of hardly more is lost at once."""
+    world = PointWorld(cloud(), path(4, np.array([0.3, 0, 0]), np.zeros(3)))
+    starter = initialiser()
+    first, between, last = (world.view(i) for i in range(3))
+    orb = OrbFrontend()
+    in_first, in_last = orb.match_wide(first.features, last.features).index[:75].T
+    ends = [replace(v, features=v.features.take(seen)) for v, seen in ((first, in_first), (last, in_last))]
+    seen = orb.match_wide(ends[0].features, between.features).index[:, 1]
+    others = np.setdiff1d(np.arange(len(between.features)), seen)[:50]
+    witness = replace(between, features=between.features.take(np.concatenate([seen[:n_seen], others])))
+    for view in (ends[0], witness, ends[1]):
+        starter.collect(view)
+    start = starter.try_pair(0, 2)
+    if starts:
+        assert isinstance(start, Start)
+        assert len(start.xyz) > 1.25 * HealthConfig().min_inliers
+    else:
+        assert isinstance(start, Failure)
+        assert "prove" in start.detail
 
 
 def test_direction_is_known_as_well_as_is_said() -> None:
