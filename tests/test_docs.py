@@ -73,3 +73,8 @@ def test_what_it_names_in_the_code_is_there(page: Path) -> None:
             tree = ast.parse((ROOT / path).read_text())
             defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
             assert name in defined, f"{path}::{name}"
+
+
+def test_every_note_is_listed_once() -> None:
+    listed = re.findall(r"\(notes/([\w-]+\.md)\)", (ROOT / "docs" / "findings.md").read_text())
+    assert sorted(listed) == sorted(page.name for page in (ROOT / "docs" / "notes").iterdir())
