@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from dualslam.backend.atlas_solver import GtsamAtlasSolver
+    from dualslam.backend.final_refinement import refine_submap
     from dualslam.backend.local_ba import SubmapBundle, bundle_adjust, bundle_adjust_arrays
     from dualslam.backend.self_calibration import estimate_calibration
     from dualslam.backend.sim3_graph import Sim3Edge, Sim3Prior, Sim3Solution, optimise_sim3
@@ -28,6 +29,7 @@ _WHERE = {
     "bundle_adjust_arrays": "local_ba",
     "estimate_calibration": "self_calibration",
     "optimise_sim3": "sim3_graph",
+    "refine_submap": "final_refinement",
 }
 
 __all__ = [
@@ -42,6 +44,7 @@ __all__ = [
     "bundle_adjust_arrays",
     "estimate_calibration",
     "optimise_sim3",
+    "refine_submap",
 ]
 
 

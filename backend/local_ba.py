@@ -59,7 +59,11 @@ class SubmapBundle:
 
 
 def bundle_adjust_arrays(
-    problem: BundleProblem, robust_k: float = 1.345, max_iterations: int = 10, tolerance: float = 1e-4
+    problem: BundleProblem,
+    robust_k: float = 1.345,
+    max_iterations: int = 10,
+    tolerance: float = 1e-4,
+    forgets: bool = False,
 ) -> BundleResult:
     """Refine poses and points.
 
@@ -71,6 +75,8 @@ def bundle_adjust_arrays(
     max_iterations : int
     tolerance : float
         Relative decrease of the cost below which to stop.
+    forgets : bool
+        See `PixelNoise`.
 
     Raises
     ------
@@ -101,7 +107,7 @@ def bundle_adjust_arrays(
             p.uv_px[row],
             p.sigma_px[row],
             convert.to_cal3_s2(p.K),
-            PixelNoise(robust_k),
+            PixelNoise(robust_k, forgets),
         )
         convert.insert_poses(values, poses, p.T_submap_kf[poses])
         convert.insert_points(values, points, p.xyz_mu[points])
@@ -126,6 +132,7 @@ def bundle_adjust(
     fixed_keyframes: IntArray | list[int] | None = None,
     robust_k: float = 1.345,
     max_iterations: int = 10,
+    forgets: bool = False,
 ) -> SubmapBundle:
     """Refine some keyframes of a submap and every landmark that they see; the submap itself is not changed.
 
@@ -136,7 +143,7 @@ def bundle_adjust(
         To be refined.
     fixed_keyframes : keyframe ids, optional
         Seen from these the landmarks are fixed in place; default: all other keyframes that see any of them.
-    robust_k, max_iterations
+    robust_k, max_iterations, forgets
         See `bundle_adjust_arrays`.
 
     Raises
@@ -165,4 +172,6 @@ def bundle_adjust(
         uv,
         sigma,
     )
-    return SubmapBundle(keyframes, landmarks, rows, bundle_adjust_arrays(problem, robust_k, max_iterations))
+    return SubmapBundle(
+        keyframes, landmarks, rows, bundle_adjust_arrays(problem, robust_k, max_iterations, forgets=forgets)
+    )

@@ -53,16 +53,19 @@ def residual_variance(chi2: FloatArray, n_views: IntArray, least: float) -> floa
 
 
 class PixelNoise:
-    """Huber-robust isotropic pixel noise, cached by its sigma: a pyramid has a handful of them.
+    """Robust isotropic pixel noise, cached by its sigma: a pyramid has a handful of them.
 
     Parameters
     ----------
     robust_k : float
         Huber threshold in sigmas.
+    forgets : bool
+        Whether the loss is Geman and McClure's, `robust_k` its shape: what does not fit loses its say.
     """
 
-    def __init__(self, robust_k: float) -> None:
-        self._huber = gtsam.noiseModel.mEstimator.Huber.Create(robust_k)
+    def __init__(self, robust_k: float, forgets: bool = False) -> None:
+        estimators = gtsam.noiseModel.mEstimator
+        self._loss = (estimators.GemanMcClure if forgets else estimators.Huber).Create(robust_k)
         self._models: dict[float, gtsam.noiseModel.Robust] = {}
 
     def __call__(self, sigma_px: float) -> gtsam.noiseModel.Robust:
@@ -70,7 +73,7 @@ class PixelNoise:
         model = self._models.get(sigma_px)
         if model is None:
             isotropic = gtsam.noiseModel.Isotropic.Sigma(2, sigma_px)
-            model = self._models[sigma_px] = gtsam.noiseModel.Robust.Create(self._huber, isotropic)
+            model = self._models[sigma_px] = gtsam.noiseModel.Robust.Create(self._loss, isotropic)
         return model
 
 

@@ -239,7 +239,7 @@ class System:
         Parameters
         ----------
         interrupted : bool
-            Someone is waiting: leave out the last reverse tracking, which the growth of the live map would earn.
+            Someone is waiting: leave out the last walk, which the growth of the live map would earn, and refinement.
         """
         self.numbers.end()
         state, last = self._state, next(reversed(self.rows.values()), None)
@@ -250,6 +250,8 @@ class System:
         self._graphs.finish(last)
         if state.live is not None and not state.localises:
             self._endings.archive(state.live, "end of sequence")
+        if not (interrupted or state.localises):
+            self._endings.refine()
         if last is not None:
             self._connections.settle(last)
             self._endings.part_what_lost_its_scale(last)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,6 +15,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, FrameStatus, Track, View
 from dualslam.lab.bench.measure import breakages
+from dualslam.map.submap import Submap
 from dualslam.places.sightings import Relocalised, Sightings
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.steps.starting import EARLY_FRAMES
@@ -52,6 +56,44 @@ def world() -> PointWorld:
 @pytest.fixture(scope="module")
 def plain(world: PointWorld) -> System:
     return run(world)
+
+
+def ended(world: PointWorld, refine: Callable[[Submap], None], interrupted: bool = False) -> System:
+    """A run whose maps are refined at its end by something else."""
+    system = system_in(world)
+    for frame in world.frames():
+        system.step(frame)
+    system._state.parts = replace(system._state.parts, refine_at_end=refine)
+    system.finish(interrupted)
+    return system
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_each_map_is_refined_once_at_the_end_unless_someone_waits(world: PointWorld, interrupted: bool) -> None:
+    refined: list[int] = []
+    ended(world, lambda submap: refined.append(submap.id), interrupted)
+    assert refined == ([] if interrupted else [0])
+
+
+def test_frames_follow_the_refinement(world: PointWorld) -> None:
+    """Each keyframe a little farther to the side than the one before: frames between two go the way between theirs."""
+
+    def shear(submap: Submap) -> None:
+        for k, T in submap.T_submap_kf.items():
+            T[:3, 3] += [0.0, 0.0, 0.01 * k]
+
+    (index, T), (_, T_as_it_was) = (main_trajectory(ended(world, refine)) for refine in (shear, lambda submap: None))
+    moved = T[:, :3, 3] - T_as_it_was[:, :3, 3]
+    np.testing.assert_allclose(moved[:, :2], 0.0, atol=0.01)
+    np.testing.assert_allclose(moved[:, 2], 0.01 * np.array(index), atol=0.06)
+
+
+def test_a_refinement_that_fails_leaves_the_map_as_it_was(world: PointWorld) -> None:
+    def fail(submap: Submap) -> None:
+        raise SolverError("no")
+
+    indices, T = main_trajectory(ended(world, fail))
+    assert_right(indices, T, world)
 
 
 def test_all_frames_are_posed_and_right(plain: System, world: PointWorld) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
+from dualslam.backend.final_refinement import refine_submap
 from dualslam.build.checks import check_config, check_given
 from dualslam.build.parts import (
     atlas_solver,
@@ -133,6 +134,7 @@ def build_system(
             desk=desk,
             atlas_solver=atlas_solver(config),
             adjust_bundle=bundle_adjuster(config),
+            refine_at_end=partial(refine_submap, robust_k=config.graph.robust_k),
             graphs=graphs,
             places=places,
             open_features=partial(features_beside, desk, config.frontend) if isinstance(desk, WorkerDesk) else None,

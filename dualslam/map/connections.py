@@ -206,12 +206,13 @@ class Connections:
         now : FrameStamp
             For the event log.
         """
-        self._carry(before, after)
+        self.carry(before, after)
         if after.id in self._atlas.placement:
             self._due.add(after.id)
             self._ask_due(now)
 
-    def _carry(self, before: Submap, after: Submap) -> None:
+    def carry(self, before: Submap, after: Submap) -> None:
+        """As `follow`, without solving the atlas again: `settle` comes later."""
         self._count_change([after.id])
         self._mover.leave(after.id)  # it is solved again
         for pose in propagate_poses(self._record.poses.values(), before, after):
@@ -261,7 +262,7 @@ class Connections:
             for front_end in self._front_ends():
                 if front_end.submap.id == m:
                     front_end.adopt(self._new_graph(), before)
-            self._carry(before, self._atlas.submaps[m])
+            self.carry(before, self._atlas.submaps[m])
         # The pixels of both sides have said how they stand to each other: that is the measurement now.
         self._atlas.links = [
             replace(other, S_a_b=S_a_b) if other.attached_as(link) else other for other in self._atlas.links

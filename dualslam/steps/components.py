@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from dualslam.calibration.lens import Calibration
 from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.bundle import BundleAdjuster
-from dualslam.core.interfaces import MapStarter, Seeker, Shutter, SubmapGraph, VisualOdometry
+from dualslam.core.interfaces import MapStarter, Seeker, Shutter, SubmapAdjuster, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FloatArray, Frame, View
 from dualslam.map.graph_beside import BesideGraphs
 from dualslam.map.submap import Submap
@@ -25,9 +25,10 @@ class Components:
     `new_relocaliser`: a front end that finds its submap again wherever it is seen, and tracks from there.
     `walk_watch`: hears of reverse tracking that is under way. `desk`: does the work beside the tracking; reverse
     tracking has an executor of its own, which may use the same desk. `graphs`: carries changes to submaps' graphs in
-    another process and back, if they are solved there. `open_features`: starts one more process, and returns a function
-    that has the features of a frame found there. `foresee`: has found beside the tracking what reverse tracking may ask
-    for in a frame; none where nothing is done beside it.
+    another process and back, if they are solved there. `refine_at_end`: has the last word on each submap.
+    `open_features`: starts one more process, and returns a function that has the features of a frame found there.
+    `foresee`: has found beside the tracking what reverse tracking may ask for in a frame; none where nothing is done
+    beside it.
     """
 
     view_of: Callable[[Frame], View | Failure]
@@ -41,6 +42,7 @@ class Components:
     walk_watch: WalkWatch
     atlas_solver: AtlasSolver
     adjust_bundle: BundleAdjuster
+    refine_at_end: SubmapAdjuster
     places: PlaceParts
     desk: Desk
     graphs: BesideGraphs | None = None

@@ -153,6 +153,20 @@ class Endings:
             self._recoveries.collect(state.live, view)
         return True
 
+    def refine(self) -> None:
+        """Refine this run's submaps in batch, at the end of the run, now that all they have seen is in them."""
+        record = self._state.record
+        with record.timer.measure("final refinement"):
+            for m in sorted(record.atlas.submaps.keys() - self._earlier):
+                submap = record.atlas.submaps[m]
+                before = submap.copy()
+                try:
+                    self._state.parts.refine_at_end(submap)
+                except SolverError as error:
+                    log.warning("submap %d stays as tracking has left it: %s", m, error)
+                    continue
+                self._connections.carry(before, submap)
+
     def part_what_lost_its_scale(self, last: FrameStamp) -> None:
         """Part this run's archived maps where no link holds what lies beyond a loss of scale, at the end of the run."""
         state, record = self._state, self._state.record

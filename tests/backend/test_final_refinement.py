@@ -1,0 +1,109 @@
+"""A map's last refinement: nearer to the truth than a batch that outliers pull at, and never a map that is broken."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dualslam.backend import local_ba
+from dualslam.backend.final_refinement import refine_submap
+from dualslam.backend.local_ba import bundle_adjust
+from dualslam.backend.observability import compute_residuals
+from dualslam.core.chi_square import MEDIAN_CHI2
+from dualslam.core.geometry import se3, so3
+from dualslam.core.types import Features
+from dualslam.lab.metrics.alignment import align_points
+from dualslam.map.submap import Submap
+from dualslam.testing.graph_scene import GraphScene, guessed_submap, make_features, make_scene
+
+N, ROBUST_K = 30, 0.8
+
+
+def scene_with_outliers(share: float, seed: int, off_px: float = 4.0, noise_px: float = 0.3) -> GraphScene:
+    """A scene some of whose features are not where their points are: all off to the same side, as edges pull them."""
+    scene = make_scene(N, 100, noise_px, seed)
+    rng = np.random.default_rng(seed)
+
+    def pulled(f: Features) -> Features:
+        off = (rng.random(len(f)) < share)[:, None] * rng.normal([off_px, 0.0], 0.5, (len(f), 2))
+        return make_features(f.uv_px + off * f.sigma_px[:, None], f.sigma_px, f.octave)
+
+    scene.features = [pulled(f) for f in scene.features]
+    return scene
+
+
+def error(submap: Submap, scene: GraphScene) -> float:
+    """RMS of the camera's centres, after one alignment."""
+    centres = submap.keyframe_poses(np.arange(N))[:, :3, 3]
+    s, R, t = align_points(centres, scene.T_true[:, :3, 3])
+    return float(np.sqrt(((s * centres @ R.T + t - scene.T_true[:, :3, 3]) ** 2).sum(axis=1).mean()))
+
+
+def solved(scene: GraphScene) -> Submap:
+    """A map at its optimum under the graph's own loss."""
+    submap = guessed_submap(scene)
+    submap.apply_estimate(*bundle_adjust(submap, list(range(1, N)), [0], ROBUST_K, 20).estimate)
+    return submap
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_outliers_lose_their_say(seed: int) -> None:
+    scene = scene_with_outliers(0.08, seed)
+    submap = solved(scene)
+    before = error(submap, scene)
+    refine_submap(submap, ROBUST_K)
+    assert error(submap, scene) < 0.9 * before
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_without_outliers_little_changes(seed: int) -> None:
+    scene = make_scene(N, 100, 0.3, seed)
+    submap = solved(scene)
+    before = error(submap, scene)
+    refine_submap(submap, ROBUST_K)
+    assert error(submap, scene) < 1.2 * before
+
+
+def test_the_first_keyframe_and_the_unit_stay() -> None:
+    submap = solved(scene_with_outliers(0.08, 0))
+    before = submap.keyframe_poses(np.arange(N))
+    refine_submap(submap, ROBUST_K)
+    after = submap.keyframe_poses(np.arange(N))
+    np.testing.assert_allclose(after[0], before[0], atol=1e-4)
+    assert np.abs(after - before).max() > 1e-4
+    spread = [((T[:, :3, 3] - T[0, :3, 3]) ** 2).sum() for T in (before, after)]
+    assert spread[1] == pytest.approx(spread[0], rel=1e-4)
+
+
+def test_pixels_without_noise_are_borne() -> None:
+    scene = make_scene(N, 100, 0.0)
+    submap = guessed_submap(scene, pose_noise=1e-4, point_noise=1e-4)
+    before = error(submap, scene)
+    refine_submap(submap, ROBUST_K)
+    assert error(submap, scene) < 0.1 * before
+
+
+def test_landmarks_too_uncertain_to_take_part_follow_the_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = make_scene(N, 100, 0.3, 4)
+    submap = solved(scene)
+    monkeypatch.setattr(local_ba, "MAX_DEPTH_SIGMA", 0.02)
+    beside = ~bundle_adjust(submap, list(range(1, N)), [0], ROBUST_K, 1).result.adjusted
+    assert 0.1 < beside.mean() < 0.9
+    for k in range(N):  # a map that has bent, in one piece
+        T = se3.from_parts(so3.exp(np.array([0.0, 0.001 * k, 0.0])), np.array([0.0, 0.002 * k, 0.0]))
+        submap.T_submap_kf[k] = T @ submap.T_submap_kf[k]
+    refine_submap(submap, ROBUST_K)
+    rows = np.flatnonzero(submap.observations["alive"] & beside[submap.observations["landmark"]])
+    uv, sigma = submap.observed_pixels(rows)
+    kf, landmark = (submap.observations[name][rows] for name in ("kf", "landmark"))
+    xyz = submap.landmarks["xyz_mu"][landmark]
+    chi2 = compute_residuals(submap.K, submap.keyframe_poses(np.arange(N)), kf, xyz, uv, sigma).chi2
+    assert np.median(chi2) < 2 * 0.3**2 * MEDIAN_CHI2[2]
+
+
+def test_one_keyframe_is_nothing_to_refine() -> None:
+    scene = make_scene(2, 100, 0.3)
+    submap = Submap(0, guessed_submap(scene).K, np.zeros(4, np.uint8))
+    submap.add_keyframe(scene.keyframe(0), np.eye(4))
+    refine_submap(submap, ROBUST_K)
+    np.testing.assert_array_equal(submap.T_submap_kf[0], np.eye(4))
