@@ -93,7 +93,8 @@ def test_the_events_tell_the_recovery_in_order(recovered: tuple[System, PointWor
     (started,) = system.events.of_kind(EventKind.RECOVERY_STARTED)
     assert (attempt.data["k"], attempt.data["k_r"]) == (35, started.frame + 1 - 35)
     (linked,) = system.events.of_kind(EventKind.LINKED)
-    np.testing.assert_allclose(linked.data["S_old_new"], system.atlas.links[0].S_a_b)
+    # As it was found: the link has followed its maps' refinement at the end of the run since.
+    np.testing.assert_allclose(linked.data["S_old_new"], system.atlas.links[0].S_a_b, atol=1e-3)
     assert linked.data["old_submap"] == 0
     assert linked.data["inliers"] <= linked.data["matches"]
     assert max(linked.data["agreeing_keyframes"]) < min(COVERED)
