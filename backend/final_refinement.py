@@ -2,8 +2,8 @@
 
 The graph that tracking goes by has a part of the observations, and Huber's loss, under which an outlier keeps pulling
 with the same force however far off it is. A loss that forgets leads astray while a map is made; from a map that is
-right already it leads closer. On rendered streets of 90 frames it takes a third from the error, on `hololens_000` half;
-on `kitti_03` it makes the seeds alike, and their mean no worse (docs/notes, 2026-11-27).
+right already it leads closer: on rendered streets by a fifth, on a road by a tenth to two fifths (six seeds, three
+others), while hand-held maps stay what they are (docs/notes/2026-11-27-a-last-batch-over-all-observations.md).
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from dualslam.map.connections import Connections
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap_change import change_of_frame
 from dualslam.recovery.bypass import bypass, condemn_tail, drop_corrupted
-from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob
+from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, refusal_data
 
 
 def fuse(
@@ -95,16 +95,7 @@ def _hand_over(
 
 def note_refused(record: Record, found: FoundLink, new_id: int, why: Failure, now: FrameStamp) -> None:
     """Say why a link that a walk had found is not made."""
-    record.event(
-        EventKind.LINK_REFUSED,
-        now,
-        new_id,
-        attempt=found.attempt,
-        old_submap=found.old_id,
-        verdict=why.detail,
-        reason=str(why.reason),
-        **why.numbers,
-    )
+    record.event(EventKind.LINK_REFUSED, now, new_id, **refusal_data(found.attempt, found.old_id, why))
 
 
 def _was_lost(record: Record, index: int, old_id: int) -> bool:

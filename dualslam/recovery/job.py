@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.events import Event
@@ -119,3 +120,15 @@ class RecoveryResult:
     looks_alike: bool = False
     needs_camera: bool = False
     tries: LinkTries = field(default_factory=LinkTries)
+
+
+def refusal_data(attempt: str, old_id: int, why: Failure, **known: Any) -> dict[str, Any]:
+    """Return what the event `link_refused` tells, wherever the link is refused; `known`: of the try, besides."""
+    return {
+        "attempt": attempt,
+        "old_submap": old_id,
+        **known,
+        "verdict": why.detail,
+        "reason": str(why.reason),
+        **why.numbers,
+    }

@@ -27,7 +27,7 @@ from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, Rival, Track, View
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose, Path
-from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult
+from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult, refusal_data
 from dualslam.recovery.leaps import WINDOW_FRAMES
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.linking import NO_BEND, Bend, LinkEstimate
@@ -340,14 +340,7 @@ def _recovered_frame(reverse_tracker: VisualOdometry, view: View, track: Track) 
 
 
 def _refusal(tried: LinkTry, failure: Failure, attempt: str, view: View, submap_id: int) -> Event:
-    data = {
-        "attempt": attempt,
-        "old_submap": tried.old_id,
-        "shared_keyframes": tried.n_shared,
-        "verdict": failure.detail,
-        "reason": str(failure.reason),
-        **failure.numbers,
-    }
+    data = refusal_data(attempt, tried.old_id, failure, shared_keyframes=tried.n_shared)
     return Event(EventKind.LINK_REFUSED, view.index, view.timestamp_s, submap_id, data)
 
 

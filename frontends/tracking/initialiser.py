@@ -56,7 +56,7 @@ PROVEN = 1 / 3  # share of the points that are proven, at least: a start is made
 CARRYING = 2 / 3
 """Of the points that a start needs, the share that is proven at least. A map goes on with half (`health.min_inliers`),
 and of a start's points the next frame finds 78 % or fewer in one case of ten, 70 % or fewer in one of twenty (107
-starts on streets). Maps that began with 20 to 31 of 50 were lost at once."""
+starts on streets). Each of 33 maps that the next one absorbed, lost at once, had begun with 20 to 31."""
 NEAR = 0.5  # share of the points that a start needs at least which must be near: on a road these fix the motion
 RUNNER_UP = 0.75  # a pose that explains less than this share of what the best one does is out of the question,
 UNEXPLAINED_TIMES, UNEXPLAINED_MORE = 2, 20  # and so is one that leaves more than twice as many, and a layer's worth
