@@ -25,7 +25,7 @@ LEAST_NOISE = 0.05
 ITERATIONS = 3
 
 
-def refine_submap(submap: Submap, robust_k: float) -> None:
+def refine_submap(submap: Submap, robust_k: float) -> float:
     """Refine all keyframes and landmarks of a submap, in place.
 
     Its first keyframe stays where it is, and the mean square distance of the others from it stays what it is.
@@ -36,6 +36,11 @@ def refine_submap(submap: Submap, robust_k: float) -> None:
     robust_k : float
         Huber threshold in sigmas, for landmarks whose depth is too uncertain to take part: they follow the poses.
 
+    Returns
+    -------
+    float
+        Shape of the loss, in the pixels' sigmas; `FORGETS_AT` where there is one keyframe.
+
     Raises
     ------
     SolverError
@@ -43,7 +48,7 @@ def refine_submap(submap: Submap, robust_k: float) -> None:
     """
     first, *others = submap.keyframes
     if not others:
-        return
+        return FORGETS_AT
     shape = FORGETS_AT * _residual_sigma(submap)
     bundle = bundle_adjust(submap, others, [first], shape, ITERATIONS, forgets=True)
     keyframe_ids, T, landmark_ids, xyz_mu = bundle.estimate
@@ -54,6 +59,7 @@ def refine_submap(submap: Submap, robust_k: float) -> None:
     beside = np.setdiff1d(np.flatnonzero(submap.landmarks["alive"]), landmark_ids)
     if len(beside):
         submap.landmarks["xyz_mu"][beside] = refit_points(submap, robust_k, beside)
+    return shape
 
 
 def _extent(T_submap_kf: FloatArray, centre: FloatArray) -> float:

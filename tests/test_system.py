@@ -58,12 +58,21 @@ def plain(world: PointWorld) -> System:
     return run(world)
 
 
-def ended(world: PointWorld, refine: Callable[[Submap], None], interrupted: bool = False) -> System:
-    """A run whose maps are refined at its end by something else."""
+def ended(
+    world: PointWorld, refine: Callable[[Submap], object], interrupted: bool = False, forget: bool = False
+) -> System:
+    """A run whose maps are refined at its end by something else; `forget`: what its frames have seen is lost."""
     system = system_in(world)
     for frame in world.frames():
         system.step(frame)
-    system._state.parts = replace(system._state.parts, refine_at_end=refine)
+    if forget:
+        system._state.record.observations.clear()
+
+    def refine_at_end(submap: Submap) -> float:
+        refine(submap)
+        return 1.0
+
+    system._state.parts = replace(system._state.parts, refine_at_end=refine_at_end)
     system.finish(interrupted)
     return system
 
@@ -82,10 +91,28 @@ def test_frames_follow_the_refinement(world: PointWorld) -> None:
         for k, T in submap.T_submap_kf.items():
             T[:3, 3] += [0.0, 0.0, 0.01 * k]
 
-    (index, T), (_, T_as_it_was) = (main_trajectory(ended(world, refine)) for refine in (shear, lambda submap: None))
+    (index, T), (_, T_as_it_was) = (
+        main_trajectory(ended(world, refine, forget=True)) for refine in (shear, lambda submap: None)
+    )
     moved = T[:, :3, 3] - T_as_it_was[:, :3, 3]
     np.testing.assert_allclose(moved[:, :2], 0.0, atol=0.01)
     np.testing.assert_allclose(moved[:, 2], 0.01 * np.array(index), atol=0.06)
+
+
+def test_frames_are_posed_by_the_landmarks_as_the_refinement_leaves_them(world: PointWorld) -> None:
+    """The landmarks move to the side, the keyframes stay: so the frames between them move."""
+    aside = np.array([0.05, 0.0, 0.0])
+
+    def move(submap: Submap) -> None:
+        submap.landmarks["xyz_mu"][:] += aside
+
+    system = ended(world, move)
+    (index, T), (_, T_as_it_was) = (main_trajectory(s) for s in (system, ended(world, lambda submap: None)))
+    between = np.array([i not in system.atlas.submaps[0].keyframes for i in index])
+    assert between.sum() > 30
+    moved = T[:, :3, 3] - T_as_it_was[:, :3, 3]
+    np.testing.assert_allclose(moved[between], np.tile(aside, (between.sum(), 1)), atol=2e-3)
+    np.testing.assert_array_equal(moved[~between], 0.0)
 
 
 def test_a_refinement_that_fails_leaves_the_map_as_it_was(world: PointWorld) -> None:

@@ -10,11 +10,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
-from dualslam.calibration.lens import Calibration, CalibrationAnswer, CalibrationJob, change_camera
+from dualslam.calibration.lens import (
+    Calibration,
+    CalibrationAnswer,
+    CalibrationJob,
+    change_camera,
+    rectified_where_possible,
+)
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
@@ -146,7 +153,11 @@ class Calibrations:
         live.adopt(graph, before)
         self._buffer.map_later(self._calibration.rectified, "camera")
         self._connections.follow(before, live.submap, now)
-        return [m for m in sorted(lost) if self._change_lost(m, job, answer, now)]
+        changed = [m for m in sorted(lost) if self._change_lost(m, job, answer, now)]
+        rectified = partial(rectified_where_possible, camera=answer.camera)
+        for m in (live.submap.id, *changed):
+            self._record.change_pixels(m, lambda _: rectified)
+        return changed
 
     def _change_lost(self, submap_id: int, job: CalibrationJob, answer: CalibrationAnswer, now: FrameStamp) -> bool:
         """Change a lost submap with the live one, if it could be."""

@@ -245,11 +245,7 @@ class Calibration:
 
     def rectified(self, view: View) -> View:
         """Return a view with the pixels of the present camera; features without a place there keep their old one."""
-        features = view.features
-        uv_rect_px, _ = self._camera.rectify(features.uv_px)
-        lost = ~np.isfinite(uv_rect_px).all(axis=1)
-        uv_rect_px[lost] = features.uv_rect_px[lost]
-        return replace(view, features=replace(features, uv_rect_px=uv_rect_px))
+        return replace(view, features=rectified_where_possible(view.features, self._camera))
 
 
 def answer(
@@ -288,6 +284,14 @@ def rectified_again(features: Features, camera: Camera) -> Features:
     lost = ~np.isfinite(uv_rect_px).all(axis=1)
     if lost.any():
         raise InputError(f"camera: {int(lost.sum())} features have no place in the corrected image")
+    return replace(features, uv_rect_px=uv_rect_px)
+
+
+def rectified_where_possible(features: Features, camera: Camera) -> Features:
+    """Return features with their pixels under another camera; those without a place there keep their old one."""
+    uv_rect_px, _ = camera.rectify(features.uv_px)
+    lost = ~np.isfinite(uv_rect_px).all(axis=1)
+    uv_rect_px[lost] = features.uv_rect_px[lost]
     return replace(features, uv_rect_px=uv_rect_px)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
+from functools import partial
 from typing import Protocol
 
 from dualslam.calibration.background import Views
@@ -23,6 +24,7 @@ from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Shutter, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FloatArray, View
 from dualslam.map.connections import Connections
+from dualslam.map.frame_observations import Change
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
 from dualslam.workers.jobs import Desk, JobKind
@@ -137,7 +139,11 @@ class ShutterWatch:
     def _change(self, submap: Submap, more_s: float, now: FrameStamp, live: VisualOdometry | None = None) -> bool:
         """Change a submap, in which `live` goes on if it is given; return whether it could be solved."""
         changed, graph = submap.copy(), self._new_graph()
-        self._move(changed, more_s)
+        changed.relative_poses = {}  # they were measured with the pixels of before
+        changes = self._changes(submap, more_s)
+        for k in changes.keys() & changed.keyframes.keys():
+            keyframe = changed.keyframes[k]
+            changed.keyframes[k] = replace(keyframe, features=changes[k](keyframe.features))
         try:
             changed.apply_estimate(*graph.rebuild(changed).values)
         except SolverError as error:
@@ -145,19 +151,17 @@ class ShutterWatch:
             return False
         before = submap.copy()
         submap.take_over(changed)
+        self._record.change_pixels(submap.id, changes.get)
         if live is not None:
             live.adopt(graph, before)
         self._connections.follow(before, submap, now)
         return True
 
-    def _move(self, submap: Submap, more_s: float) -> None:
-        """Take so much more of the readout out of a submap's keyframes; poses and points stay."""
-        submap.relative_poses = {}  # they were measured with the pixels of before
+    def _changes(self, submap: Submap, more_s: float) -> dict[int, Change]:
+        """Return what takes so much more of the readout out of a submap's frames, where it is known how they turned."""
+        move, camera = self._shutter.moved, self._calibration.camera
         rates = turn_rates(submap, self._record.poses.values())
-        for k in rates.keys() & submap.keyframes.keys():
-            keyframe = submap.keyframes[k]
-            features = self._shutter.moved(keyframe.features, self._calibration.camera, more_s * rates[k])
-            submap.keyframes[k] = replace(keyframe, features=features)
+        return {i: partial(move, camera=camera, turn_rad=more_s * rate) for i, rate in rates.items()}
 
     def _take(self, readout_s: float) -> None:
         """Let the buffered frames and those to come be read in the time that was found."""

@@ -178,6 +178,14 @@ class SubmapAdjuster(Protocol):
         ...
 
 
+class FinalRefiner(Protocol):
+    """Refines a submap in place at the end of a run, in batch, under a loss that forgets outliers; or `SolverError`."""
+
+    def __call__(self, submap: Submap) -> float:
+        """Refine, and return the shape of that loss, in the pixels' sigmas."""
+        ...
+
+
 START_REACH = 64
 """Frames back from the newest that a starter looks for its first view, at most."""
 

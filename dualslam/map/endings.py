@@ -10,7 +10,7 @@ from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import SubmapGraph
 from dualslam.map.record import Record
-from dualslam.map.split import take_out
+from dualslam.map.split import shared_landmarks, take_out
 from dualslam.map.submap import Submap
 
 log = logging.getLogger(__name__)
@@ -40,11 +40,14 @@ def archive(record: Record, submap: Submap, graph: SubmapGraph, why: str) -> Non
 def hand_frames_over(record: Record, old: Submap, new: Submap) -> None:
     """Let the frames that are posed relative to keyframes which both submaps hold take their pose from the new one."""
     anchored = {p.index: old.keyframe_for(p.keyframe_id) for p in record.poses.values() if p.submap_id == old.id}
+    id_of = shared_landmarks(old, new)
     for i, k in anchored.items():
         if k in new.keyframes:
             pose = record.poses[i]
             T_kf_cam = se3.inverse(old.T_submap_kf[k]) @ old.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
             record.poses[i] = replace(pose, submap_id=new.id, keyframe_id=k, T_kf_cam=T_kf_cam)
+            if i in record.observations and record.observations[i].submap_id == old.id:
+                record.observations[i] = record.observations[i].in_submap(new.id, id_of)
             if i in record.rows:  # it may be another run's
                 record.rows[i].submap = new.id
 

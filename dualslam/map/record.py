@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -12,8 +12,12 @@ from dualslam.core.events import EventKind, EventLog
 from dualslam.core.stage_timer import StageTimer
 from dualslam.core.types import BoolArray, FrameStatus
 from dualslam.map.atlas import Atlas
+from dualslam.map.frame_observations import Change, FrameObservations
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.trajectory import FramePose
+
+MAX_OBSERVED = 10_000
+"""Frames of which the observations are kept, 24 bytes for each landmark: some 60 MB. Those posed before stay so."""
 
 
 class FrameStamp(Protocol):
@@ -40,6 +44,8 @@ class Record:
     rows : dict of int to FrameRow
         Every frame that was given to the system, by its index.
     poses : dict of int to FramePose
+    observations : dict of int to FrameObservations
+        What they saw of their submaps, of the frames that were posed last.
     events : EventLog
     timer : StageTimer
     """
@@ -47,16 +53,34 @@ class Record:
     atlas: Atlas = field(default_factory=Atlas)
     rows: dict[int, FrameRow] = field(default_factory=dict)
     poses: dict[int, FramePose] = field(default_factory=dict)
+    observations: dict[int, FrameObservations] = field(default_factory=dict)
     events: EventLog = field(default_factory=EventLog)
     timer: StageTimer = field(default_factory=StageTimer)
 
-    def pose(self, pose: FramePose, n_matches: int | None = None, n_inliers: int = 0) -> None:
-        """Enter where a frame is; without numbers, its row keeps those that it has."""
+    def pose(
+        self,
+        pose: FramePose,
+        n_matches: int | None = None,
+        n_inliers: int = 0,
+        observations: FrameObservations | None = None,
+    ) -> None:
+        """Enter where a frame is, and what it saw; without numbers, its row keeps those that it has."""
         self.poses[pose.index] = pose
+        self.observations.pop(pose.index, None)
+        if observations is not None:
+            self.observations[pose.index] = observations
+            if len(self.observations) > MAX_OBSERVED:
+                del self.observations[next(iter(self.observations))]
         row = self.rows[pose.index]
         row.status, row.submap = FrameStatus.TRACKED, pose.submap_id
         if n_matches is not None:
             row.n_matches, row.n_inliers = n_matches, n_inliers
+
+    def change_pixels(self, submap_id: int, change_of: Callable[[int], Change | None]) -> None:
+        """Let what a submap's frames have seen follow its pixels: `change_of` tells how those of a frame change."""
+        for i, seen in self.observations.items():
+            if seen.submap_id == submap_id and (change := change_of(i)) is not None:
+                self.observations[i] = seen.with_change(change)
 
     def own_poses(self) -> Iterator[FramePose]:
         """Yield the poses of this run's frames: those of earlier runs, in a saved map, go by another clock."""

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from dualslam.core.types import IntArray
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 
@@ -61,6 +62,20 @@ def submap_of(submap: Submap, submap_id: int, keyframe_ids: list[int]) -> Submap
         twin.add_observations(k, feature[kept], new_id[ids[feature[kept]]])
     twin.gauge = _widest_pair(submap, keyframe_ids)
     return twin
+
+
+def shared_landmarks(old: Submap, new: Submap) -> IntArray:
+    """Return for each landmark of a submap the one that the same feature shows in another, or `NO_LANDMARK`.
+
+    Of landmarks that have become one with others: what these are.
+    """
+    id_of = np.full(len(old.landmarks), NO_LANDMARK, np.int64)
+    for k in old.keyframes.keys() & new.keyframes.keys():
+        was, now = old.landmark_of[k], new.landmark_of[k]
+        both = np.flatnonzero((was != NO_LANDMARK) & (now != NO_LANDMARK))
+        id_of[was[both]] = now[both]
+    heir = old.current_ids(np.arange(len(id_of)))
+    return np.where(heir != NO_LANDMARK, id_of[heir], NO_LANDMARK)
 
 
 def take_out(submap: Submap, keyframe_ids: Iterable[int], anchor: int) -> None:

@@ -103,7 +103,7 @@ class Audits:
         if self._is_linked(submap.id) or not same_camera:
             return False
         before, frames = submap.copy(), frames_before(record.poses.values(), submap.id, first)
-        rows = {i: (record.poses[i], record.rows[i].status) for i in frames}
+        rows = {i: (record.poses[i], record.rows[i].status, record.observations.get(i)) for i in frames}
         start = before.copy()
         start.id = len(record.atlas.submaps)
         cut_start(submap, first)
@@ -111,8 +111,8 @@ class Audits:
             del record.poses[i]
         if not take_in(job, result):
             submap.take_over(before)
-            for i, (pose, status) in rows.items():
-                record.pose(pose)
+            for i, (pose, status, seen) in rows.items():
+                record.pose(pose, observations=seen)
                 record.rows[i].status = status
             return False
         start.condemn(start.keyframes)

@@ -51,9 +51,12 @@ def pose_frames(
     carried = {pose.index: pose for pose in propagate_poses(scaled, merged.moved, submap)}
     recovered_frames = []
     for frame, pose in zip(frames, scaled, strict=True):
-        recovered_frames.append(replace(frame, pose=carried.get(pose.index, pose)))
+        seen = frame.observations
+        if seen is not None:
+            seen = seen.in_submap(submap.id, merged.id_of)
+        recovered_frames.append(replace(frame, pose=carried.get(pose.index, pose), observations=seen))
         if pose.index not in record.poses:
-            record.pose(recovered_frames[-1].pose, frame.n_matches, frame.n_inliers)
+            record.pose(recovered_frames[-1].pose, frame.n_matches, frame.n_inliers, seen)
     return recovered_frames
 
 
@@ -74,7 +77,7 @@ def bypass(record: Record, recovered_frames: Collection[RecoveredFrame], new_id:
         i = frame.pose.index
         if i <= handover or poses[i].submap_id == new_id:
             continue
-        record.pose(frame.pose)
+        record.pose(frame.pose, observations=frame.observations)
         record.rows[i].status = FrameStatus.BYPASSED
         n_bypassed += 1
     return n_bypassed
@@ -89,6 +92,7 @@ def drop_corrupted(record: Record, old_id: int, since: int) -> int:
     corrupted = [i for i, pose in poses.items() if pose.submap_id == old_id and i >= since]
     for i in corrupted:
         del poses[i]
+        record.observations.pop(i, None)
         record.rows[i].status, record.rows[i].submap = FrameStatus.BYPASSED, None
     return len(corrupted)
 
@@ -129,7 +133,7 @@ def absorb(
     -------
     Absorption
     """
-    found = {frame.pose.index: frame.pose for frame in recovered_frames}
+    found = {frame.pose.index: frame for frame in recovered_frames}
     n_own, gone, n_stay = n_frames(record, new_id), list[int](), list[int]()
     for component in record.atlas.components():
         frames = {i for i, pose in record.poses.items() if pose.submap_id in component}
@@ -140,7 +144,7 @@ def absorb(
             n_stay.append(len(frames))
             continue
         for i in frames:
-            record.pose(found[i])
+            record.pose(found[i].pose, observations=found[i].observations)
             record.rows[i].status = FrameStatus.BYPASSED
         gone += component
         for m in component:

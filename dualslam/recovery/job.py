@@ -8,6 +8,7 @@ from typing import Any
 from dualslam.core.camera.base import Camera
 from dualslam.core.events import Event
 from dualslam.core.types import Failure, FloatArray, View
+from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose, Path
 from dualslam.recovery.link_tries import LinkTries
@@ -70,11 +71,12 @@ class RecoveryJob:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecoveredFrame:
-    """A frame that the walk posed, relative to a keyframe of its submap."""
+    """A frame that the walk posed, relative to a keyframe of its submap, and what it saw of that."""
 
     pose: FramePose
     n_matches: int
     n_inliers: int
+    observations: FrameObservations | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import takewhile
 from typing import Any
 
-from dualslam.calibration.lens import Calibration
+from dualslam.calibration.lens import Calibration, rectified_where_possible
 from dualslam.config.settings import RecoveryConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
@@ -28,7 +28,7 @@ from dualslam.recovery.bypass import absorb, n_frames, pose_frames
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.fusion import fuse, note_refused
-from dualslam.recovery.job import RecoveryJob, RecoveryResult
+from dualslam.recovery.job import RecoveredFrame, RecoveryJob, RecoveryResult
 from dualslam.recovery.leaps import refuse_leaps
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.merge import merge_recovery
@@ -343,7 +343,7 @@ class Recoveries:
             live.adopt(graph, before)
         self._connections.follow(before, submap, now)
         self._note_events(result)
-        recovered_frames = pose_frames(self._record, result.frames, merged, submap)
+        recovered_frames = pose_frames(self._record, self._in_pixels_of_now(result.frames, job, submap), merged, submap)
         seconds = time.perf_counter() - started_s
         linked = False
         if result.link is not None:
@@ -380,6 +380,17 @@ class Recoveries:
             return replace(keyframe, features=self._calibration.rectified(view).features)
 
         return rectify
+
+    def _in_pixels_of_now(
+        self, frames: Sequence[RecoveredFrame], job: RecoveryJob, submap: Submap
+    ) -> Sequence[RecoveredFrame]:
+        """Give what the frames of a walk have seen the pixels of that camera, too."""
+        if _same_camera(job, submap):
+            return frames
+        change = partial(rectified_where_possible, camera=self._calibration.camera)
+        seen = [frame.observations for frame in frames]
+        changed = [None if each is None else each.with_change(change) for each in seen]
+        return [replace(frame, observations=each) for frame, each in zip(frames, changed, strict=True)]
 
     def _settle(self, old_id: int, live: VisualOdometry | None) -> None:
         """Let no walk look any more for what is linked: the old submap, and all that is one map with the live one."""

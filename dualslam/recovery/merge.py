@@ -37,11 +37,14 @@ class Merged:
         The walk's own state of it, in the frame and unit of the live one.
     S_live_grown : (4, 4)
         From the frame in which the walk has ended to the live one's.
+    id_of : (L,) int64
+        Of each landmark of the walk's own state the one that it is in the submap, or `NO_LANDMARK`.
     """
 
     submap: Submap
     moved: Submap
     S_live_grown: FloatArray
+    id_of: IntArray
 
 
 def merge_recovery(live: Submap, base: Submap, grown: Submap, rectify: Rectify) -> Merged:
@@ -67,7 +70,7 @@ def merge_recovery(live: Submap, base: Submap, grown: Submap, rectify: Rectify) 
     id_of = _add_landmarks(merged, base, moved, id_of)
     merged.add_observations(*_new_rows(merged, base, moved, id_of))
     _add_counts(merged, base, moved)
-    return Merged(merged, moved, S_live_grown)
+    return Merged(merged, moved, S_live_grown, _heirs_in(merged, moved, id_of))
 
 
 def _add_keyframes(merged: Submap, base: Submap, moved: Submap, rectify: Rectify) -> None:
@@ -137,6 +140,13 @@ def _add_landmarks(merged: Submap, base: Submap, moved: Submap, id_of: IntArray)
     id_of = id_of.copy()
     id_of[new] = merged.copy_landmarks(moved, new)
     return id_of
+
+
+def _heirs_in(merged: Submap, moved: Submap, id_of: IntArray) -> IntArray:
+    """Return the same for landmarks that the walk has made one with others, too: what these are."""
+    heir = moved.current_ids(np.arange(len(moved.landmarks)))
+    ids = np.where(id_of != NO_LANDMARK, id_of, np.where(heir != NO_LANDMARK, id_of[heir], NO_LANDMARK))
+    return merged.current_ids(ids)
 
 
 def _new_rows(merged: Submap, base: Submap, moved: Submap, id_of: IntArray) -> tuple[IntArray, IntArray, IntArray]:

@@ -25,6 +25,7 @@ from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, Rival, Track, View
+from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose, Path
 from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult, refusal_data
@@ -336,7 +337,8 @@ def _walked(job: RecoveryJob, submap: Submap, progress: Progress) -> Path:
 def _recovered_frame(reverse_tracker: VisualOdometry, view: View, track: Track) -> RecoveredFrame:
     T_kf_cam = reverse_tracker.relative_pose(track)
     pose = FramePose(view.index, view.timestamp_s, reverse_tracker.submap.id, reverse_tracker.reference_id, T_kf_cam)
-    return RecoveredFrame(pose, track.n_matches, track.n_inliers)
+    seen = FrameObservations.of(track.view.features, track.landmark_ids, pose.submap_id)
+    return RecoveredFrame(pose, track.n_matches, track.n_inliers, seen)
 
 
 def _refusal(tried: LinkTry, failure: Failure, attempt: str, view: View, submap_id: int) -> Event:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from dualslam.calibration.lens import Calibration
 from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.bundle import BundleAdjuster
-from dualslam.core.interfaces import MapStarter, Seeker, Shutter, SubmapAdjuster, SubmapGraph, VisualOdometry
+from dualslam.core.interfaces import FinalRefiner, MapStarter, Seeker, Shutter, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FloatArray, Frame, View
 from dualslam.map.graph_beside import BesideGraphs
 from dualslam.map.submap import Submap
@@ -42,7 +42,7 @@ class Components:
     walk_watch: WalkWatch
     atlas_solver: AtlasSolver
     adjust_bundle: BundleAdjuster
-    refine_at_end: SubmapAdjuster
+    refine_at_end: FinalRefiner
     places: PlaceParts
     desk: Desk
     graphs: BesideGraphs | None = None

@@ -14,6 +14,7 @@ from dualslam.map.atlas import Link
 from dualslam.map.connections import Connections
 from dualslam.map.endings import archive, part_off
 from dualslam.map.record import FrameStamp
+from dualslam.map.reposing import pose_frames_anew
 from dualslam.map.split import next_submap, submap_of
 from dualslam.map.submap import Submap
 from dualslam.places.sightings import Sightings
@@ -154,18 +155,22 @@ class Endings:
         return True
 
     def refine(self) -> None:
-        """Refine this run's submaps in batch, at the end of the run, now that all they have seen is in them."""
-        record = self._state.record
+        """Refine this run's submaps in batch, at the end of the run, now that all they have seen is in them.
+
+        Then their frames are posed by the landmarks as they have become.
+        """
+        record, min_inliers = self._state.record, self._state.config.health.min_inliers
         with record.timer.measure("final refinement"):
             for m in sorted(record.atlas.submaps.keys() - self._earlier):
                 submap = record.atlas.submaps[m]
                 before = submap.copy()
                 try:
-                    self._state.parts.refine_at_end(submap)
+                    shape = self._state.parts.refine_at_end(submap)
                 except SolverError as error:
                     log.warning("submap %d stays as tracking has left it: %s", m, error)
                     continue
                 self._connections.carry(before, submap)
+                pose_frames_anew(record, submap, shape, min_inliers)
 
     def part_what_lost_its_scale(self, last: FrameStamp) -> None:
         """Part this run's archived maps where no link holds what lies beyond a loss of scale, at the end of the run."""

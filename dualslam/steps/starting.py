@@ -12,6 +12,7 @@ from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import START_REACH, SubmapGraph
 from dualslam.core.types import Failure, FailureReason, Start, Track, View
+from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
 from dualslam.places.sightings import Sightings
@@ -222,9 +223,9 @@ class Starting:
         kind = EventKind.INITIALISED if not record.atlas.submaps else EventKind.REINITIALISED
         record.atlas.add(submap)
         for k, keyframe in submap.keyframes.items():
-            record.pose(FramePose(k, keyframe.timestamp_s, submap.id, k, np.eye(4)))
-            row = record.rows[k]
-            row.n_matches = row.n_inliers = int((submap.landmark_of[k] >= 0).sum())
+            seen = FrameObservations.of(keyframe.features, submap.landmark_of[k], submap.id)
+            n = len(seen.landmark_ids)
+            record.pose(FramePose(k, keyframe.timestamp_s, submap.id, k, np.eye(4)), n, n, seen)
         record.event(kind, start.views[-1], submap.id, first_view=start.views[0].index, **start.numbers)
 
     def _track_in(self, submap: Submap, graph: SubmapGraph, view: View) -> None:

@@ -11,6 +11,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Seeker, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, Track, View
+from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.trajectory import FramePose
 from dualslam.steps.places import PlaceKeeping
 from dualslam.steps.state import State
@@ -56,7 +57,8 @@ class Tracking:
             if (failure := self._insert_keyframe(odometry, track)) is not None:
                 return failure
         pose = FramePose(view.index, view.timestamp_s, submap.id, odometry.reference_id, odometry.relative_pose(track))
-        state.record.pose(pose, track.n_matches, track.n_inliers)
+        seen = None if state.localises else FrameObservations.of(track.view.features, track.landmark_ids, submap.id)
+        state.record.pose(pose, track.n_matches, track.n_inliers, seen)
         self._last_pose = pose
         return track
 

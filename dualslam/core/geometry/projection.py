@@ -23,6 +23,11 @@ MIN_DEPTH = 1e-6
 MIN_EIGENVALUE = 1e-11
 """Of the Hessian scaled to unit diagonal: below, rounding decides the pose (squared condition of the Jacobian)."""
 
+WIDE = 16.0
+"""How many times as wide as at its end the loss is with which a pose begins to settle: a power of two. Of 900 made-up
+poses, 3 to 15 cm off, with a fifth of outliers, one in ten came to rest a centimetre or more off with 1, two in a
+hundred with 8, and none with this."""
+
 
 def project_points(K: FloatArray, T_cam_w: FloatArray, xyz: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Project points into a pinhole image.
@@ -270,6 +275,63 @@ def refine_pose(
     return _finish(problem, T, T_prior, prior_information, chi2, inliers, n_steps, counted)
 
 
+def settle_pose(
+    K: FloatArray,
+    T_cam_w: FloatArray,
+    xyz: FloatArray,
+    uv: FloatArray,
+    sigma: FloatArray,
+    *,
+    shape: float,
+    min_inliers: int = 6,
+    max_steps: int = 10,
+    tolerance: float = 1e-4,
+) -> FloatArray | Failure:
+    """Refine a pose against known points under a loss that forgets outliers, to the optimum of those that agree.
+
+    Gauss-Newton with the weights of Geman and McClure's loss. From afar that forgets what is right, the nearest points
+    first: it begins `WIDE` times as wide, and is half as wide at each step.
+
+    Parameters
+    ----------
+    K, T_cam_w, xyz, uv, sigma, tolerance
+        As in `refine_pose`.
+    shape : float
+        Of the loss, in sigmas: at so much of a residual a quarter of its weight is left.
+    min_inliers : int
+        Fewer points that agree, to within `shape`, are a failure.
+    max_steps : int
+        Of Gauss-Newton.
+
+    Returns
+    -------
+    (4, 4) or Failure
+        ``T_cam_w``; `TOO_FEW_MATCHES`, `TOO_FEW_INLIERS`, or `DEGENERATE` where the points do not fix the pose.
+    """
+    n = len(xyz)
+    if n < min_inliers:
+        return Failure(FailureReason.TOO_FEW_MATCHES, f"{n} points, {min_inliers} needed", {"n": n})
+    problem = _PoseProblem(K, np.asarray(xyz), np.asarray(uv), np.asarray(sigma))
+    T, width = np.array(T_cam_w, np.float64), WIDE
+    chi2 = problem.evaluate(T)
+    for _ in range(max_steps):
+        G = problem.normal_equations((1.0 + chi2 / (width * shape) ** 2) ** -2)  # zero behind the camera
+        step = _solve(G)
+        if step is None:
+            return Failure(FailureReason.DEGENERATE, f"{n} points do not fix the pose")
+        T = _exp(step.tolist()) @ T
+        chi2 = problem.evaluate(T)
+        if width == 1.0 and -float(step @ G[:6, 6]) < tolerance:
+            break
+        width = max(width / 2, 1.0)
+    n_inliers = int(np.count_nonzero(chi2 < shape**2))
+    if n_inliers < min_inliers:
+        return Failure(FailureReason.TOO_FEW_INLIERS, f"{n_inliers} of {n} points, {min_inliers} needed")
+    if _half_covariance(G[:6, :6]) is None:
+        return Failure(FailureReason.DEGENERATE, f"{n_inliers} inliers do not fix the pose")
+    return _on_so3(T)
+
+
 def _huber_weights(chi2: FloatArray, gate: float, inliers: BoolArray) -> FloatArray:
     """Return Huber's weights, threshold ``sqrt(gate)``, zero for outliers."""
     weight: FloatArray = np.sqrt(gate / np.maximum(chi2, gate))
@@ -300,11 +362,22 @@ def _finish(
     G = problem.normal_equations((inliers & counted).astype(np.float64))
     if prior_information is not None:
         _add_prior(G, T, T_prior, prior_information)
-    H = G[:6, :6]
+    half = _half_covariance(G[:6, :6])
+    if half is None:
+        return Failure(FailureReason.DEGENERATE, f"{int(inliers.sum())} inliers do not fix the pose")
+    return PoseEstimate(_on_so3(T), half @ half.T, inliers, chi2, int(np.count_nonzero(inliers)), n_steps)
+
+
+def _half_covariance(H: FloatArray) -> FloatArray | None:
+    """Return (6, 6) a root of the inverse of the normal equations, or None where they do not fix the pose."""
     scale = 1.0 / np.sqrt(np.maximum(H.diagonal(), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(H * scale * scale[:, None])
     if not eigenvalues[0] > MIN_EIGENVALUE:
-        return Failure(FailureReason.DEGENERATE, f"{int(inliers.sum())} inliers do not fix the pose")
-    half = vectors / np.sqrt(eigenvalues) * scale[:, None]
-    T[:3, :3] += 0.5 * T[:3, :3] @ (np.eye(3) - T[:3, :3].T @ T[:3, :3])  # one Newton step back onto SO(3)
-    return PoseEstimate(T, half @ half.T, inliers, chi2, int(np.count_nonzero(inliers)), n_steps)
+        return None
+    return np.asarray(vectors / np.sqrt(eigenvalues) * scale[:, None])
+
+
+def _on_so3(T: FloatArray) -> FloatArray:
+    """Let a pose, in place, take one Newton step back onto SO(3)."""
+    T[:3, :3] += 0.5 * T[:3, :3] @ (np.eye(3) - T[:3, :3].T @ T[:3, :3])
+    return T

@@ -1,0 +1,105 @@
+"""What a frame saw of its submap when it was posed: by the same landmarks it can be posed anew."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.geometry import se3
+from dualslam.core.geometry.projection import settle_pose
+from dualslam.core.types import Failure, Features, FloatArray, IntArray
+from dualslam.map.submap import NO_LANDMARK, Submap
+
+Change = Callable[[Features], Features]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameObservations:
+    """What a frame saw of a submap. In single precision: a run keeps thousands.
+
+    Attributes
+    ----------
+    submap_id : int
+    landmark_ids : (N,) int32
+    uv_px, uv_rect_px : (N, 2) float32
+        As in `Features`.
+    sigma_px : (N,) float32
+    changes : tuple of callables
+        What has become of the submap's pixels since, another camera or another shutter: made when asked for.
+    """
+
+    submap_id: int
+    landmark_ids: NDArray[np.int32]
+    uv_px: NDArray[np.float32]
+    uv_rect_px: NDArray[np.float32]
+    sigma_px: NDArray[np.float32]
+    changes: tuple[Change, ...] = ()
+
+    @classmethod
+    def of(cls, features: Features, landmark_ids: IntArray, submap_id: int) -> FrameObservations:
+        """Return the same of a frame: `landmark_ids` (N,) are of each of its features, or `NO_LANDMARK`."""
+        rows = np.flatnonzero(landmark_ids != NO_LANDMARK)
+        return cls(
+            submap_id,
+            landmark_ids[rows].astype(np.int32),
+            features.uv_px.take(rows, axis=0).astype(np.float32),
+            features.uv_rect_px.take(rows, axis=0).astype(np.float32),
+            features.sigma_px[rows].astype(np.float32),
+        )
+
+    def in_submap(self, submap_id: int, id_of: IntArray) -> FrameObservations:
+        """Return the same of another state of the submap: `id_of` each landmark's number there, or `NO_LANDMARK`."""
+        ids = id_of[self.landmark_ids]
+        known = ids != NO_LANDMARK
+        return replace(
+            self,
+            submap_id=submap_id,
+            landmark_ids=ids[known].astype(np.int32),
+            uv_px=self.uv_px[known],
+            uv_rect_px=self.uv_rect_px[known],
+            sigma_px=self.sigma_px[known],
+        )
+
+    def with_change(self, change: Change) -> FrameObservations:
+        """Return the same in the pixels of another camera or shutter."""
+        return replace(self, changes=(*self.changes, change))
+
+    def pose(self, submap: Submap, T_submap_cam: FloatArray, shape: float, min_inliers: int) -> FloatArray | None:
+        """Return (4, 4) ``T_submap_cam`` by the landmarks as they are now; None where they do not tell.
+
+        Parameters
+        ----------
+        submap : Submap
+        T_submap_cam : (4, 4)
+            To begin with.
+        shape, min_inliers
+            See `settle_pose`.
+        """
+        ids = submap.current_ids(self.landmark_ids.astype(np.int64))
+        seen = np.flatnonzero(ids != NO_LANDMARK)
+        pose = settle_pose(
+            submap.K,
+            se3.inverse(T_submap_cam),
+            submap.landmarks["xyz_mu"][ids[seen]],
+            self._uv_rect_px()[seen],
+            self.sigma_px[seen].astype(np.float64),
+            shape=shape,
+            min_inliers=min_inliers,
+        )
+        return None if isinstance(pose, Failure) else se3.inverse(pose)
+
+    def _uv_rect_px(self) -> FloatArray:
+        if not self.changes:
+            return self.uv_rect_px.astype(np.float64)
+        n = len(self.landmark_ids)
+        nothing = np.zeros(n)
+        uv_px, uv_rect_px = self.uv_px.astype(np.float64), self.uv_rect_px.astype(np.float64)
+        features = Features(
+            uv_px, uv_rect_px, self.sigma_px.astype(np.float64), nothing, nothing.astype(np.int64), nothing, nothing
+        )
+        for change in self.changes:
+            features = change(features)
+        return features.uv_rect_px
