@@ -84,14 +84,15 @@ class FrameObservations:
             submap.K,
             se3.inverse(T_submap_cam),
             submap.landmarks["xyz_mu"][ids[seen]],
-            self._uv_rect_px()[seen],
+            self.uv_rect_now_px()[seen],
             self.sigma_px[seen].astype(np.float64),
             shape=shape,
             min_inliers=min_inliers,
         )
         return None if isinstance(pose, Failure) else se3.inverse(pose)
 
-    def _uv_rect_px(self) -> FloatArray:
+    def uv_rect_now_px(self) -> FloatArray:
+        """Return (N, 2) rectified pixels, with what has become of them since."""
         if not self.changes:
             return self.uv_rect_px.astype(np.float64)
         n = len(self.landmark_ids)

@@ -81,6 +81,17 @@ def test_a_late_answer_is_as_good_as_one_in_time(in_time: System, polls: int) ->
         assert np.sqrt((measured**2).mean()) < 1.3 * np.sqrt((expected**2).mean()) + 1e-3
 
 
+@pytest.mark.parametrize("polls", [0, 3])
+def test_what_frames_have_seen_changes_with_the_camera(in_time: System, polls: int) -> None:
+    """Those from before the change, too, have the pixels that the map has now."""
+    system = in_time if polls == 0 else run(polls)
+    changed = system.events.of_kind(EventKind.CALIBRATED)[0].frame
+    observations, camera = system._state.record.observations, system._state.parts.calibration.camera
+    assert sum(i < changed for i in observations) > 10 < sum(i > changed for i in observations)
+    for seen in observations.values():
+        np.testing.assert_allclose(seen.uv_rect_now_px(), camera.rectify(seen.uv_px)[0], atol=1e-3)
+
+
 @pytest.mark.slow
 def test_an_answer_for_a_map_that_was_lost_meanwhile_changes_nothing(in_time: System) -> None:
     asked = in_time.events.of_kind(EventKind.CALIBRATED)[0].frame

@@ -9,10 +9,12 @@ import pytest
 
 from dualslam.core.geometry import se3
 from dualslam.core.types import Features, FrameStatus
+from dualslam.map.endings import part_off
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.record import MAX_OBSERVED, Record
 from dualslam.map.reposing import pose_frames_anew
+from dualslam.map.split import submap_of
 from dualslam.map.submap import NO_LANDMARK, Submap
 from dualslam.map.trajectory import FramePose
 from dualslam.testing.graph_scene import guessed_submap, make_features, make_scene
@@ -181,3 +183,15 @@ def test_pixels_change_in_the_frames_of_the_submap_that_changes_and_where_it_is_
     record.observations.update({FRAME + 1: seen, FRAME + 2: replace(seen, submap_id=5)})
     record.change_pixels(submap.id, {FRAME: lambda features: features, FRAME + 2: lambda features: features}.get)
     assert [len(record.observations[FRAME + i].changes) for i in range(3)] == [1, 0, 0]
+
+
+def test_frames_that_go_over_to_a_part_of_the_map_take_along_what_they_have_seen() -> None:
+    submap, seen, T = seen_by_a_frame()
+    record = record_of(submap, seen, T @ OFF, keyframe_id=5)
+    part = submap_of(submap, 1, [3, 4, 5, 6, 7])
+    part_off(record, submap, part, 2)
+    assert record.observations[FRAME].submap_id == 1
+    assert 50 < len(record.observations[FRAME].landmark_ids) <= len(seen.landmark_ids)
+    assert pose_frames_anew(record, part, 0.4, 25) == 1
+    pose = record.poses[FRAME]
+    assert off_by(part.resolve_anchor(pose.keyframe_id, pose.T_kf_cam), T) < 1e-4

@@ -77,6 +77,7 @@ def test_localise_finds_every_frame_that_the_map_shows_and_adds_nothing(first: P
     error = np.linalg.norm(main.T_world_cam[:30, :3, 3] - truth_in_first(saved, main.index[:30]), axis=1)
     assert error.max() < 0.05
     assert list(system.atlas.submaps) == list(saved.atlas.submaps)
+    assert not system._state.record.observations, "no frame is to be posed anew"
     for m, submap in saved.atlas.submaps.items():
         now = system.atlas.submaps[m]
         assert list(now.keyframes) == list(submap.keyframes)

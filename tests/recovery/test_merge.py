@@ -8,7 +8,7 @@ from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FrameStatus
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.record import Record
-from dualslam.map.submap import Submap
+from dualslam.map.submap import NO_LANDMARK, Submap
 from dualslam.map.trajectory import FramePose
 from dualslam.recovery.bypass import pose_frames
 from dualslam.recovery.job import RecoveredFrame
@@ -79,3 +79,26 @@ def test_frames_of_the_walk_are_posed_in_the_unit_of_the_map_and_only_where_they
     assert record.poses[100] is posed[0].pose
     assert record.rows[100].status is FrameStatus.TRACKED
     assert record.poses[101] is known
+
+
+def test_landmarks_of_the_walk_are_known_by_what_they_have_become() -> None:
+    """A new one, one that became the same as a new one, one that became an old one, and one that has died."""
+    base = guessed_submap(make_scene(6), pose_noise=0.0)
+    for k in (2, 3):  # features to spare
+        base.remove_observations(np.flatnonzero(base.observations["kf"] == k)[-5:])
+    grown, n = base.copy(), len(base.landmarks)
+    old = np.flatnonzero(base.landmarks["alive"])[:5]
+    new = grown.copy_landmarks(base, old)
+    for k in (2, 3):
+        feature = np.flatnonzero(grown.landmark_of[k] < 0)[: len(new)]
+        grown.add_observations(k, feature, new)
+    grown.merge_landmarks(new[:1], new[1:2])
+    grown.merge_landmarks(old[2:3], new[2:3])
+    grown.remove_landmarks(new[3:4])
+    result = merge_recovery(base.copy(), base, grown, lambda keyframe: keyframe)
+    known = result.id_of[new]
+    assert known[0] == known[1] >= n
+    assert known[2] == old[2]
+    assert known[3] == NO_LANDMARK
+    assert known[4] > n
+    np.testing.assert_array_equal(result.id_of[:n], result.submap.current_ids(np.arange(n)))

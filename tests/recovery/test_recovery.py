@@ -14,6 +14,7 @@ from dualslam.lab.audits.link_audit import LinkAudit, audit_links
 from dualslam.map.atlas import LinkKind
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.system import System
+from dualslam.testing.frames_seen import residuals_px
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
 
 COVERED = frozenset(range(35, 50))
@@ -53,6 +54,17 @@ def test_both_sides_of_a_black_out_end_in_one_map(recovered: tuple[System, Point
     translation, rotation = pose_errors(main.T_world_cam, world.T_world_cam[main.index])
     assert translation.max() < POSITION_M
     assert rotation.max() < ROTATION_RAD
+
+
+def test_what_frames_have_seen_fits_the_map_that_has_posed_them(recovered: tuple[System, PointWorld]) -> None:
+    """Those that the walk has posed, too: of landmarks that have other numbers in its own state of the map."""
+    system, _ = recovered
+    off = residuals_px(system)
+    (link,) = system.atlas.links
+    walked = [i for i in off if system.poses[i].submap_id == link.b and i < min(COVERED)]
+    assert len(walked) > 1
+    assert len(off) > 50
+    assert max(off.values()) < 2.0
 
 
 def test_the_link_has_the_true_scale(recovered: tuple[System, PointWorld]) -> None:
