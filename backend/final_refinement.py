@@ -14,6 +14,7 @@ from dualslam.backend.local_ba import bundle_adjust
 from dualslam.backend.noise import residual_variance
 from dualslam.backend.observability import compute_residuals
 from dualslam.backend.refit import refit_points
+from dualslam.core.bundle import FrameRows
 from dualslam.core.types import FloatArray
 from dualslam.map.submap import Submap
 
@@ -25,7 +26,7 @@ LEAST_NOISE = 0.05
 ITERATIONS = 3
 
 
-def refine_submap(submap: Submap, robust_k: float) -> float:
+def refine_submap(submap: Submap, robust_k: float, frames: FrameRows | None = None) -> float:
     """Refine all keyframes and landmarks of a submap, in place.
 
     Its first keyframe stays where it is, and the mean square distance of the others from it stays what it is.
@@ -35,6 +36,8 @@ def refine_submap(submap: Submap, robust_k: float) -> float:
     submap : Submap
     robust_k : float
         Huber threshold in sigmas, for landmarks whose depth is too uncertain to take part: they follow the poses.
+    frames : FrameRows, optional
+        What frames that are no keyframes have seen: more views of the same landmarks.
 
     Returns
     -------
@@ -50,7 +53,7 @@ def refine_submap(submap: Submap, robust_k: float) -> float:
     if not others:
         return FORGETS_AT
     shape = FORGETS_AT * _residual_sigma(submap)
-    bundle = bundle_adjust(submap, others, [first], shape, ITERATIONS, forgets=True)
+    bundle = bundle_adjust(submap, others, [first], shape, ITERATIONS, forgets=True, frames=frames)
     keyframe_ids, T, landmark_ids, xyz_mu = bundle.estimate
     centre, T = submap.T_submap_kf[first][:3, 3], T.copy()
     unit = _extent(submap.keyframe_poses(keyframe_ids), centre) / _extent(T, centre)

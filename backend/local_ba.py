@@ -8,7 +8,7 @@ optimum.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -18,7 +18,7 @@ from dualslam.backend.factors import insert_projections, pose_prior
 from dualslam.backend.noise import PixelNoise
 from dualslam.backend.observability import compute_depth_sigmas, compute_residuals
 from dualslam.backend.solver import SolverFailure, optimise_batch
-from dualslam.core.bundle import BundleProblem, BundleResult
+from dualslam.core.bundle import BundleProblem, BundleResult, FrameRows
 from dualslam.core.errors import SolverError
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
@@ -133,6 +133,7 @@ def bundle_adjust(
     robust_k: float = 1.345,
     max_iterations: int = 10,
     forgets: bool = False,
+    frames: FrameRows | None = None,
 ) -> SubmapBundle:
     """Refine some keyframes of a submap and every landmark that they see; the submap itself is not changed.
 
@@ -145,6 +146,8 @@ def bundle_adjust(
         Seen from these the landmarks are fixed in place; default: all other keyframes that see any of them.
     robust_k, max_iterations, forgets
         See `bundle_adjust_arrays`.
+    frames : FrameRows, optional
+        Frames that have their say on the landmarks, too. Their poses are free, and are not handed back.
 
     Raises
     ------
@@ -161,17 +164,20 @@ def bundle_adjust(
     inside = np.isin(kf, keyframes)
     rows, kf = rows[inside], kf[inside]
     order = np.argsort(keyframes)
+    pose, point = order[np.searchsorted(keyframes[order], kf)], submap.observations["landmark"][rows]
     uv, sigma = submap.observed_pixels(rows)
-    problem = BundleProblem(
-        submap.K,
-        submap.keyframe_poses(keyframes),
-        np.arange(len(keyframes)) >= len(free),
-        submap.landmarks["xyz_mu"][landmarks],
-        order[np.searchsorted(keyframes[order], kf)],
-        np.searchsorted(landmarks, submap.observations["landmark"][rows]),
-        uv,
-        sigma,
-    )
-    return SubmapBundle(
-        keyframes, landmarks, rows, bundle_adjust_arrays(problem, robust_k, max_iterations, forgets=forgets)
-    )
+    T, fixed = submap.keyframe_poses(keyframes), np.arange(len(keyframes)) >= len(free)
+    if frames is not None:
+        known = np.isin(frames.landmark_ids, landmarks)
+        T = np.concatenate([T, frames.T_submap_cam])
+        fixed = np.concatenate([fixed, np.zeros(len(frames.T_submap_cam), bool)])
+        pose = np.concatenate([pose, len(keyframes) + frames.frame[known]])
+        point = np.concatenate([point, frames.landmark_ids[known]])
+        uv = np.concatenate([uv, frames.uv_px[known]])
+        sigma = np.concatenate([sigma, frames.sigma_px[known]])
+    xyz_mu, point = submap.landmarks["xyz_mu"][landmarks], np.searchsorted(landmarks, point)
+    problem = BundleProblem(submap.K, T, fixed, xyz_mu, pose, point, uv, sigma)
+    result = bundle_adjust_arrays(problem, robust_k, max_iterations, forgets=forgets)
+    n, n_rows = len(keyframes), len(rows)
+    result = replace(result, T_submap_kf=result.T_submap_kf[:n], chi2=result.chi2[:n_rows])
+    return SubmapBundle(keyframes, landmarks, rows, result)

@@ -11,6 +11,7 @@ import pytest
 from dualslam.backend.atlas_solver import GtsamAtlasSolver
 from dualslam.config.settings import RecoveryConfig
 from dualslam.core.atlas_problem import AtlasProblem, AtlasSolution
+from dualslam.core.bundle import FrameRows
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, FrameStatus, Track, View
@@ -68,7 +69,8 @@ def ended(
     if forget:
         system._state.record.observations.clear()
 
-    def refine_at_end(submap: Submap) -> float:
+    def refine_at_end(submap: Submap, *, frames: FrameRows) -> float:
+        assert len(frames.T_submap_cam) == (0 if forget else len(submap.keyframes))
         refine(submap)
         return 1.0
 

@@ -36,6 +36,28 @@ class BundleProblem:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class FrameRows:
+    """What frames that are no keyframes see of a submap.
+
+    Attributes
+    ----------
+    T_submap_cam : (F, 4, 4)
+    frame : (R,) int64
+        Row of `T_submap_cam` of each observation.
+    landmark_ids : (R,) int64
+    uv_px : (R, 2)
+        Rectified.
+    sigma_px : (R,)
+    """
+
+    T_submap_cam: FloatArray
+    frame: IntArray
+    landmark_ids: IntArray
+    uv_px: FloatArray
+    sigma_px: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class BundleResult:
     """The solution of a `BundleProblem`.
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.bundle import FrameRows
 from dualslam.core.estimates import (
     CalibrationEstimate,
     GraphEstimate,
@@ -181,8 +182,8 @@ class SubmapAdjuster(Protocol):
 class FinalRefiner(Protocol):
     """Refines a submap in place at the end of a run, in batch, under a loss that forgets outliers; or `SolverError`."""
 
-    def __call__(self, submap: Submap) -> float:
-        """Refine, and return the shape of that loss, in the pixels' sigmas."""
+    def __call__(self, submap: Submap, *, frames: FrameRows) -> float:
+        """Refine by keyframes and frames, and return the shape of that loss, in the pixels' sigmas."""
         ...
 
 

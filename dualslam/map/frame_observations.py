@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.firsts import is_first
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import settle_pose
 from dualslam.core.types import Failure, Features, FloatArray, IntArray
@@ -78,18 +79,23 @@ class FrameObservations:
         shape, min_inliers
             See `settle_pose`.
         """
-        ids = submap.current_ids(self.landmark_ids.astype(np.int64))
-        seen = np.flatnonzero(ids != NO_LANDMARK)
+        ids, uv_px, sigma_px = self.seen_now(submap)
         pose = settle_pose(
             submap.K,
             se3.inverse(T_submap_cam),
-            submap.landmarks["xyz_mu"][ids[seen]],
-            self.uv_rect_now_px()[seen],
-            self.sigma_px[seen].astype(np.float64),
+            submap.landmarks["xyz_mu"][ids],
+            uv_px,
+            sigma_px,
             shape=shape,
             min_inliers=min_inliers,
         )
         return None if isinstance(pose, Failure) else se3.inverse(pose)
+
+    def seen_now(self, submap: Submap) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Return landmarks (M,), rectified pixels (M, 2) and their sigmas (M,): of what is left, each landmark once."""
+        ids = submap.current_ids(self.landmark_ids.astype(np.int64))
+        rows = np.flatnonzero((ids != NO_LANDMARK) & is_first(ids))
+        return ids[rows], self.uv_rect_now_px()[rows], self.sigma_px[rows].astype(np.float64)
 
     def uv_rect_now_px(self) -> FloatArray:
         """Return (N, 2) rectified pixels, with what has become of them since."""

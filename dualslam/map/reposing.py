@@ -10,9 +10,38 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
+from dualslam.core.bundle import FrameRows
 from dualslam.core.geometry import se3
 from dualslam.map.record import Record
 from dualslam.map.submap import Submap
+
+
+def rows_of_frames(record: Record, submap: Submap, at_most: int, min_inliers: int) -> FrameRows:
+    """Return what the frames of a submap that are no keyframes of it have seen.
+
+    Parameters
+    ----------
+    record : Record
+    submap : Submap
+    at_most : int
+        So many frames, spread evenly over those that are kept.
+    min_inliers : int
+        Frames that have seen fewer of its landmarks are left out.
+    """
+    own = np.array(sorted(_frames_of(record, submap)), np.int64)
+    chosen = own[np.linspace(0, len(own) - 1, min(at_most, len(own))).round().astype(np.int64)]
+    rows = [(record.poses[i], *record.observations[i].seen_now(submap)) for i in chosen.tolist()]
+    rows = [row for row in rows if len(row[1]) >= min_inliers]
+    n_seen = np.array([len(ids) for _, ids, _, _ in rows], np.int64)
+    return FrameRows(
+        np.array([submap.resolve_anchor(p.keyframe_id, p.T_kf_cam) for p, *_ in rows]).reshape(-1, 4, 4),
+        np.repeat(np.arange(len(rows)), n_seen),
+        np.concatenate([np.zeros(0, np.int64), *(ids for _, ids, _, _ in rows)]),
+        np.concatenate([np.zeros((0, 2)), *(uv_px for _, _, uv_px, _ in rows)]),
+        np.concatenate([np.zeros(0), *(sigma_px for _, _, _, sigma_px in rows)]),
+    )
 
 
 def pose_frames_anew(record: Record, submap: Submap, shape: float, min_inliers: int) -> int:
@@ -29,14 +58,23 @@ def pose_frames_anew(record: Record, submap: Submap, shape: float, min_inliers: 
         A frame of which fewer landmarks agree stays where it is.
     """
     n_posed = 0
-    for i, seen in record.observations.items():
-        pose = record.poses.get(i)
-        if pose is None or i in submap.keyframes or not pose.submap_id == seen.submap_id == submap.id:
-            continue
-        T_submap_cam = seen.pose(submap, submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam), shape, min_inliers)
-        if T_submap_cam is not None:
+    for i in _frames_of(record, submap):
+        pose = record.poses[i]
+        T_submap_cam = submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
+        T_submap_cam_now = record.observations[i].pose(submap, T_submap_cam, shape, min_inliers)
+        if T_submap_cam_now is not None:
             k = submap.keyframe_for(pose.keyframe_id)
-            T_kf_cam = se3.inverse(submap.T_submap_kf[k]) @ T_submap_cam
+            T_kf_cam = se3.inverse(submap.T_submap_kf[k]) @ T_submap_cam_now
             record.poses[i] = replace(pose, keyframe_id=k, T_kf_cam=T_kf_cam)
             n_posed += 1
     return n_posed
+
+
+def _frames_of(record: Record, submap: Submap) -> list[int]:
+    """Return the frames that are posed in a submap, have kept what they saw of it, and are no keyframes."""
+    return [
+        i
+        for i, seen in record.observations.items()
+        if seen.submap_id == submap.id and i in record.poses and i not in submap.keyframes
+        if record.poses[i].submap_id == submap.id
+    ]

@@ -14,7 +14,7 @@ from dualslam.map.atlas import Link
 from dualslam.map.connections import Connections
 from dualslam.map.endings import archive, part_off
 from dualslam.map.record import FrameStamp
-from dualslam.map.reposing import pose_frames_anew
+from dualslam.map.reposing import pose_frames_anew, rows_of_frames
 from dualslam.map.split import next_submap, submap_of
 from dualslam.map.submap import Submap
 from dualslam.places.sightings import Sightings
@@ -163,9 +163,9 @@ class Endings:
         with record.timer.measure("final refinement"):
             for m in sorted(record.atlas.submaps.keys() - self._earlier):
                 submap = record.atlas.submaps[m]
-                before = submap.copy()
+                before, frames = submap.copy(), rows_of_frames(record, submap, len(submap.keyframes), min_inliers)
                 try:
-                    shape = self._state.parts.refine_at_end(submap)
+                    shape = self._state.parts.refine_at_end(submap, frames=frames)
                 except SolverError as error:
                     log.warning("submap %d stays as tracking has left it: %s", m, error)
                     continue

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,12 +11,13 @@ from dualslam.backend import local_ba
 from dualslam.backend.final_refinement import refine_submap
 from dualslam.backend.local_ba import bundle_adjust
 from dualslam.backend.observability import compute_residuals
+from dualslam.core.bundle import FrameRows
 from dualslam.core.chi_square import MEDIAN_CHI2
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import Features
 from dualslam.lab.metrics.alignment import align_points
 from dualslam.map.submap import Submap
-from dualslam.testing.graph_scene import GraphScene, guessed_submap, make_features, make_scene
+from dualslam.testing.graph_scene import Feeder, GraphScene, guessed_submap, make_features, make_scene
 
 N, ROBUST_K = 30, 0.8
 
@@ -107,3 +110,58 @@ def test_one_keyframe_is_nothing_to_refine() -> None:
     submap.add_keyframe(scene.keyframe(0), np.eye(4))
     refine_submap(submap, ROBUST_K)
     np.testing.assert_array_equal(submap.T_submap_kf[0], np.eye(4))
+
+
+def every_other(seed: int) -> tuple[Submap, FrameRows, GraphScene]:
+    """A map of every other view of a scene, at its optimum, and what the views between saw of it."""
+    scene = make_scene(N, 100, 0.3, seed)
+    feeder = Feeder(scene, seed)
+    for k in range(0, N, 2):
+        feeder.add(k)
+    submap = feeder.submap
+    submap.apply_estimate(*bundle_adjust(submap, list(range(2, N, 2)), [0], ROBUST_K, 20).estimate)
+    T, frame, ids, uv, sigma = [], [], [], [], []
+    for k in range(1, N, 2):
+        known = np.flatnonzero(feeder.landmark_of_point[scene.seen[k]] >= 0)
+        frame.append(np.full(len(known), len(T)))
+        T.append(submap.T_submap_kf[k - 1] @ se3.inverse(scene.T_true[k - 1]) @ scene.T_true[k])
+        ids.append(feeder.landmark_of_point[scene.seen[k][known]])
+        uv.append(scene.features[k].uv_rect_px[known])
+        sigma.append(scene.features[k].sigma_px[known])
+    return submap, FrameRows(np.array(T), *map(np.concatenate, (frame, ids, uv, sigma))), scene
+
+
+def error_of_keyframes(submap: Submap, scene: GraphScene) -> float:
+    ids = np.array(list(submap.keyframes))
+    centres, true = submap.keyframe_poses(ids)[:, :3, 3], scene.T_true[ids][:, :3, 3]
+    s, R, t = align_points(centres, true)
+    return float(np.sqrt(((s * centres @ R.T + t - true) ** 2).sum(axis=1).mean()))
+
+
+def test_frames_between_the_keyframes_add_what_they_know() -> None:
+    """Twice as many views of the same points: on average the error falls as the root of two says, or nearly."""
+    with_frames, without = [], []
+    for seed in range(6):
+        submap, frames, scene = every_other(seed)
+        alone = submap.copy()
+        refine_submap(alone, ROBUST_K)
+        refine_submap(submap, ROBUST_K, frames)
+        without.append(error_of_keyframes(alone, scene))
+        with_frames.append(error_of_keyframes(submap, scene))
+    assert np.mean(with_frames) < 0.85 * np.mean(without)
+
+
+def test_frames_of_landmarks_that_are_gone_change_nothing() -> None:
+    submap, frames, _ = every_other(1)
+    alone, gone = submap.copy(), np.full(len(frames.landmark_ids), len(submap.landmarks) + 5)
+    refine_submap(alone, ROBUST_K)
+    refine_submap(submap, ROBUST_K, replace(frames, landmark_ids=gone))
+    np.testing.assert_allclose(submap.keyframe_poses([4, 8]), alone.keyframe_poses([4, 8]), atol=1e-9)
+
+
+def test_what_a_bundle_hands_back_is_of_keyframes_alone() -> None:
+    submap, frames, _ = every_other(2)
+    bundle = bundle_adjust(submap, [2, 4, 6], None, ROBUST_K, 5, frames=frames)
+    assert len(bundle.result.T_submap_kf) == len(bundle.keyframe_ids)
+    assert len(bundle.result.chi2) == len(bundle.rows)
+    assert np.isfinite(bundle.result.chi2).all()

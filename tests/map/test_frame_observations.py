@@ -13,7 +13,7 @@ from dualslam.map.endings import part_off
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.record import MAX_OBSERVED, Record
-from dualslam.map.reposing import pose_frames_anew
+from dualslam.map.reposing import pose_frames_anew, rows_of_frames
 from dualslam.map.split import submap_of
 from dualslam.map.submap import NO_LANDMARK, Submap
 from dualslam.map.trajectory import FramePose
@@ -195,3 +195,39 @@ def test_frames_that_go_over_to_a_part_of_the_map_take_along_what_they_have_seen
     assert pose_frames_anew(record, part, 0.4, 25) == 1
     pose = record.poses[FRAME]
     assert off_by(part.resolve_anchor(pose.keyframe_id, pose.T_kf_cam), T) < 1e-4
+
+
+def test_frames_are_chosen_evenly_and_only_those_that_have_seen_enough() -> None:
+    submap, seen, T = seen_by_a_frame()
+    record = record_of(submap, seen, T)
+    few = replace(
+        seen,
+        landmark_ids=seen.landmark_ids[:9],
+        uv_px=seen.uv_px[:9],
+        uv_rect_px=seen.uv_rect_px[:9],
+        sigma_px=seen.sigma_px[:9],
+    )
+    for i in range(FRAME + 1, FRAME + 9):
+        T_kf_cam = se3.exp([0.0, 0.0, 0.0, 0.1 * (i - FRAME), 0.0, 0.0])
+        record.rows[i] = FrameRow(i, 0.1 * i, FrameStatus.INITIALISING)
+        record.pose(FramePose(i, 0.1 * i, submap.id, 4, T_kf_cam), observations=few if i == FRAME + 8 else seen)
+    rows = rows_of_frames(record, submap, 3, 25)
+    assert len(rows.T_submap_cam) == 2  # of the first, the middle and the last, which has seen too little
+    np.testing.assert_allclose(rows.T_submap_cam[0], T, atol=1e-12)
+    T_middle = submap.T_submap_kf[4] @ se3.exp([0.0, 0.0, 0.0, 0.4, 0.0, 0.0])
+    np.testing.assert_allclose(rows.T_submap_cam[1], T_middle, atol=1e-12)
+    n = len(seen.landmark_ids)
+    np.testing.assert_array_equal(rows.frame, np.repeat([0, 1], n))
+    np.testing.assert_array_equal(rows.landmark_ids[:n], seen.landmark_ids)
+    np.testing.assert_allclose(rows.uv_px[n:], seen.uv_rect_px)
+    assert len(rows_of_frames(Record(), submap, 3, 25).T_submap_cam) == 0
+
+
+def test_a_landmark_that_two_have_become_is_seen_once() -> None:
+    submap, seen, _ = seen_by_a_frame()
+    a, b = seen.landmark_ids[:2].astype(np.int64)
+    submap.merge_landmarks(np.array([a]), np.array([b]))
+    ids, uv_px, sigma_px = seen.seen_now(submap)
+    assert len(ids) == len(uv_px) == len(sigma_px) == len(seen.landmark_ids) - 1
+    assert ids[0] == a
+    np.testing.assert_allclose(uv_px[0], seen.uv_rect_px[0])
