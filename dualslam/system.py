@@ -250,10 +250,10 @@ class System:
         self._graphs.finish(last)
         if state.live is not None and not state.localises:
             self._endings.archive(state.live, "end of sequence")
-        if not (interrupted or state.localises):
-            self._endings.refine()
+        shapes = {} if interrupted or state.localises else self._endings.refine()
         if last is not None:
             self._connections.settle(last)
+            self._endings.pose_frames_anew(shapes)
             self._endings.part_what_lost_its_scale(last)
         state.parts.desk.close()
 

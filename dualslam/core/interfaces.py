@@ -180,7 +180,10 @@ class SubmapAdjuster(Protocol):
 
 
 class FinalRefiner(Protocol):
-    """Refines a submap in place at the end of a run, in batch, under a loss that forgets outliers; or `SolverError`."""
+    """Refines a submap in place at the end of a run, in batch, under a loss that forgets outliers.
+
+    Raises `SolverError`, and leaves the submap as it was, where the solver fails.
+    """
 
     def __call__(self, submap: Submap, *, frames: FrameRows) -> float:
         """Refine by keyframes and frames, and return the shape of that loss, in the pixels' sigmas."""

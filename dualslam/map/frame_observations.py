@@ -41,7 +41,7 @@ class FrameObservations:
 
     @classmethod
     def of(cls, features: Features, landmark_ids: IntArray, submap_id: int) -> FrameObservations:
-        """Return the same of a frame: `landmark_ids` (N,) are of each of its features, or `NO_LANDMARK`."""
+        """Return what a frame saw; `landmark_ids` (N,): the landmark of each of its features, or `NO_LANDMARK`."""
         rows = np.flatnonzero(landmark_ids != NO_LANDMARK)
         return cls(
             submap_id,

@@ -17,7 +17,7 @@ from dualslam.map.frame_records import FrameRow
 from dualslam.map.trajectory import FramePose
 
 MAX_OBSERVED = 10_000
-"""Frames of which the observations are kept, 24 bytes for each landmark: some 60 MB. Those posed before stay so."""
+"""Frames of which observations are kept, 24 bytes a landmark: some 60 MB. Those posed earlier are not posed anew."""
 
 
 class FrameStamp(Protocol):

@@ -120,7 +120,9 @@ class Audits:
         left = [i for i in frames if i not in record.poses]
         for i in frames:
             if i in left:
-                record.pose(replace(rows[i][0], submap_id=start.id))
+                pose, _, seen = rows[i]
+                seen = None if seen is None else replace(seen, submap_id=start.id)
+                record.pose(replace(pose, submap_id=start.id), observations=seen)
             record.rows[i].status = FrameStatus.BYPASSED
         told = {"old_submap": start.id, "before": first, "reposed": len(frames) - len(left), "left": left}
         record.event(EventKind.CUT, now, submap.id, **told)

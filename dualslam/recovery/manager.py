@@ -384,7 +384,7 @@ class Recoveries:
     def _in_pixels_of_now(
         self, frames: Sequence[RecoveredFrame], job: RecoveryJob, submap: Submap
     ) -> Sequence[RecoveredFrame]:
-        """Give what the frames of a walk have seen the pixels of that camera, too."""
+        """Give what a walk's frames have seen the pixels of the camera that the submap has now."""
         if _same_camera(job, submap):
             return frames
         change = partial(rectified_where_possible, camera=self._calibration.camera)

@@ -143,7 +143,7 @@ def _add_landmarks(merged: Submap, base: Submap, moved: Submap, id_of: IntArray)
 
 
 def _heirs_in(merged: Submap, moved: Submap, id_of: IntArray) -> IntArray:
-    """Return the same for landmarks that the walk has made one with others, too: what these are."""
+    """Complete `id_of`: a landmark that the walk has merged into another has the other's id, dead ones have none."""
     heir = moved.current_ids(np.arange(len(moved.landmarks)))
     ids = np.where(id_of != NO_LANDMARK, id_of, np.where(heir != NO_LANDMARK, id_of[heir], NO_LANDMARK))
     return merged.current_ids(ids)

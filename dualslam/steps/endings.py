@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Set
+from collections.abc import Mapping, Set
 
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
@@ -154,23 +154,31 @@ class Endings:
             self._recoveries.collect(state.live, view)
         return True
 
-    def refine(self) -> None:
+    def refine(self) -> dict[int, float]:
         """Refine this run's submaps in batch, at the end of the run, now that all they have seen is in them.
 
-        Then their frames are posed by the landmarks as they have become.
+        Returns for each the shape of the loss under which that was done, for `pose_frames_anew`.
         """
         record, min_inliers = self._state.record, self._state.config.health.min_inliers
+        shapes = {}
         with record.timer.measure("final refinement"):
             for m in sorted(record.atlas.submaps.keys() - self._earlier):
                 submap = record.atlas.submaps[m]
                 before, frames = submap.copy(), rows_of_frames(record, submap, len(submap.keyframes), min_inliers)
                 try:
-                    shape = self._state.parts.refine_at_end(submap, frames=frames)
+                    shapes[m] = self._state.parts.refine_at_end(submap, frames=frames)
                 except SolverError as error:
                     log.warning("submap %d stays as tracking has left it: %s", m, error)
                     continue
                 self._connections.carry(before, submap)
-                pose_frames_anew(record, submap, shape, min_inliers)
+        return shapes
+
+    def pose_frames_anew(self, shapes: Mapping[int, float]) -> None:
+        """Pose the frames of refined submaps by what they were tracked by: landmarks, where these have come to be."""
+        record, min_inliers = self._state.record, self._state.config.health.min_inliers
+        with record.timer.measure("final refinement"):
+            for m, shape in shapes.items():
+                pose_frames_anew(record, record.atlas.submaps[m], shape, min_inliers)
 
     def part_what_lost_its_scale(self, last: FrameStamp) -> None:
         """Part this run's archived maps where no link holds what lies beyond a loss of scale, at the end of the run."""

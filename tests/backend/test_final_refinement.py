@@ -151,6 +151,17 @@ def test_frames_between_the_keyframes_add_what_they_know() -> None:
     assert np.mean(with_frames) < 0.85 * np.mean(without)
 
 
+def test_the_first_keyframe_and_the_unit_stay_where_frames_take_part() -> None:
+    submap, frames, _ = every_other(3)
+    before = submap.keyframe_poses(list(submap.keyframes))
+    refine_submap(submap, ROBUST_K, frames)
+    after = submap.keyframe_poses(list(submap.keyframes))
+    np.testing.assert_array_equal(after[0], before[0])
+    assert np.abs(after - before).max() > 1e-5
+    spread = [((T[:, :3, 3] - T[0, :3, 3]) ** 2).sum() for T in (before, after)]
+    assert spread[1] == pytest.approx(spread[0], rel=1e-9)
+
+
 def test_frames_of_landmarks_that_are_gone_change_nothing() -> None:
     submap, frames, _ = every_other(1)
     alone, gone = submap.copy(), np.full(len(frames.landmark_ids), len(submap.landmarks) + 5)
