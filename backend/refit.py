@@ -31,6 +31,8 @@ def refit_points(submap: Submap, robust_k: float, landmark_ids: IntArray) -> Flo
     ids, pose = np.unique(obs["kf"][rows], return_inverse=True)
     T = submap.keyframe_poses(ids)[pose]
     point, best = place[obs["landmark"][rows]], submap.landmarks["xyz_mu"][landmark_ids]
+    if not len(rows):
+        return best
     uv, sigma = submap.observed_pixels(rows)
     xyz, cost = best, np.full(len(best), np.inf)
     for step in range(STEPS + 1):

@@ -176,3 +176,10 @@ def test_what_a_bundle_hands_back_is_of_keyframes_alone() -> None:
     assert len(bundle.result.T_submap_kf) == len(bundle.keyframe_ids)
     assert len(bundle.result.chi2) == len(bundle.rows)
     assert np.isfinite(bundle.result.chi2).all()
+
+
+def test_a_landmark_that_nothing_sees_any_more_stays_where_it_is() -> None:
+    submap = solved(make_scene(N, 100, 0.3, 5))
+    (lost,) = submap.add_landmarks(np.array([[0.1, 0.2, 3.0]]), np.zeros((1, 4), np.uint8), np.ones(1), 0)
+    refine_submap(submap, ROBUST_K)
+    np.testing.assert_array_equal(submap.landmarks["xyz_mu"][lost], [0.1, 0.2, 3.0])
