@@ -74,8 +74,7 @@ def shared_landmarks(old: Submap, new: Submap) -> IntArray:
         was, now = old.landmark_of[k], new.landmark_of[k]
         both = np.flatnonzero((was != NO_LANDMARK) & (now != NO_LANDMARK))
         id_of[was[both]] = now[both]
-    heir = old.current_ids(np.arange(len(id_of)))
-    return np.where(heir != NO_LANDMARK, id_of[heir], NO_LANDMARK)
+    return old.by_heirs(id_of)
 
 
 def take_out(submap: Submap, keyframe_ids: Iterable[int], anchor: int) -> None:

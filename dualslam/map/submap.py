@@ -248,6 +248,11 @@ class Submap:
         ids[(ids >= 0) & ~self.landmarks["alive"][ids]] = NO_LANDMARK
         return ids
 
+    def by_heirs(self, id_of: IntArray) -> IntArray:
+        """Return what landmarks are elsewhere, those merged by their heirs: `id_of` (L,) tells it of the living."""
+        heir = self.current_ids(np.arange(len(id_of)))
+        return np.where(heir != NO_LANDMARK, id_of[heir], NO_LANDMARK)
+
     # --- observations
 
     def add_observations(self, kf: IntArray | int, feature: IntArray, landmark: IntArray) -> IntArray:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.map.frame_observations import Change
 from dualslam.map.propagation import propagate_poses
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
@@ -32,7 +33,11 @@ class Absorption:
 
 
 def pose_frames(
-    record: Record, frames: Sequence[RecoveredFrame], merged: Merged, submap: Submap
+    record: Record,
+    frames: Sequence[RecoveredFrame],
+    merged: Merged,
+    submap: Submap,
+    change: Change | None = None,
 ) -> list[RecoveredFrame]:
     """Carry the frames of a walk into the submap that has taken it in, and enter those that had no pose.
 
@@ -45,6 +50,8 @@ def pose_frames(
         The submap with what the walk added, in its unit, not solved.
     submap : Submap
         The same, solved.
+    change : callable, optional
+        See `merge_recovery`.
     """
     scale = float(sim3.scale(merged.S_live_grown))
     scaled = [replace(frame.pose, T_kf_cam=_scaled(frame.pose.T_kf_cam, scale)) for frame in frames]
@@ -54,6 +61,7 @@ def pose_frames(
         seen = frame.observations
         if seen is not None:
             seen = seen.in_submap(submap.id, merged.id_of)
+            seen = seen if change is None else seen.with_change(change)
         recovered_frames.append(replace(frame, pose=carried.get(pose.index, pose), observations=seen))
         if pose.index not in record.poses:
             record.pose(recovered_frames[-1].pose, frame.n_matches, frame.n_inliers, seen)

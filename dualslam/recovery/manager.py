@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import takewhile
@@ -15,8 +15,9 @@ from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
-from dualslam.core.types import Failure, FailureReason, Keyframe, View
+from dualslam.core.types import Failure, FailureReason, View
 from dualslam.map.connections import Connections
+from dualslam.map.frame_observations import Change
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.solving import solve
 from dualslam.map.split import sound_copy
@@ -28,7 +29,7 @@ from dualslam.recovery.bypass import absorb, n_frames, pose_frames
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.fusion import fuse, note_refused
-from dualslam.recovery.job import RecoveredFrame, RecoveryJob, RecoveryResult
+from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.leaps import refuse_leaps
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.merge import merge_recovery
@@ -327,12 +328,13 @@ class Recoveries:
         Returns whether it could be solved.
         """
         submap = self._record.atlas.submaps[job.submap.id]
-        merged = merge_recovery(submap, job.submap, result.submap, self._rectifier(job, submap))
+        change = self._change_of_pixels(job, submap)
+        merged = merge_recovery(submap, job.submap, result.submap, change)
         if result.link is not None:
             merged.submap.gauge = gauge_at_overlap(merged.submap, result.link.estimate.agreeing_keyframes)
         unsolved, graph = merged.submap.copy(), self._new_graph()
         try:
-            solve(merged.submap, graph, near_optimum=_same_camera(job, submap))
+            solve(merged.submap, graph, near_optimum=change is None)
         except SolverError as error:
             failure = Failure(FailureReason.SOLVER, str(error))
             self._failed(job, now, failure, time.perf_counter() - started_s)
@@ -343,7 +345,7 @@ class Recoveries:
             live.adopt(graph, before)
         self._connections.follow(before, submap, now)
         self._note_events(result)
-        recovered_frames = pose_frames(self._record, self._in_pixels_of_now(result.frames, job, submap), merged, submap)
+        recovered_frames = pose_frames(self._record, result.frames, merged, submap, change)
         seconds = time.perf_counter() - started_s
         linked = False
         if result.link is not None:
@@ -370,27 +372,11 @@ class Recoveries:
             self._outgrown_at[submap.id] = absorbed.outgrown_at
         return True
 
-    def _rectifier(self, job: RecoveryJob, submap: Submap) -> Callable[[Keyframe], Keyframe]:
-        """Return what gives the walk's keyframes the pixels of the camera that the submap has now."""
-
-        def rectify(keyframe: Keyframe) -> Keyframe:
-            if _same_camera(job, submap):
-                return keyframe
-            view = View(keyframe.id, keyframe.timestamp_s, keyframe.features)
-            return replace(keyframe, features=self._calibration.rectified(view).features)
-
-        return rectify
-
-    def _in_pixels_of_now(
-        self, frames: Sequence[RecoveredFrame], job: RecoveryJob, submap: Submap
-    ) -> Sequence[RecoveredFrame]:
-        """Give what a walk's frames have seen the pixels of the camera that the submap has now."""
-        if _same_camera(job, submap):
-            return frames
-        change = partial(rectified_where_possible, camera=self._calibration.camera)
-        seen = [frame.observations for frame in frames]
-        changed = [None if each is None else each.with_change(change) for each in seen]
-        return [replace(frame, observations=each) for frame, each in zip(frames, changed, strict=True)]
+    def _change_of_pixels(self, job: RecoveryJob, submap: Submap) -> Change | None:
+        """Return what gives a walk the pixels of the camera that its submap has now; None where it is the same."""
+        if (submap.K == job.submap.K).all():
+            return None
+        return partial(rectified_where_possible, camera=self._calibration.camera)
 
     def _settle(self, old_id: int, live: VisualOdometry | None) -> None:
         """Let no walk look any more for what is linked: the old submap, and all that is one map with the live one."""
@@ -398,7 +384,3 @@ class Recoveries:
         if live is not None:
             settled.update(self._record.atlas.component_of(live.submap.id))
         self._lost = {m: loss for m, loss in self._lost.items() if m not in settled}
-
-
-def _same_camera(job: RecoveryJob, submap: Submap) -> bool:
-    return bool((submap.K == job.submap.K).all())

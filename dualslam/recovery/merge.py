@@ -10,19 +10,17 @@ values for the next solution, no more.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dualslam.core.firsts import is_first
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe
+from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.anchors import Anchor
+from dualslam.map.frame_observations import Change
 from dualslam.map.submap import NO_LANDMARK, Submap
 from dualslam.map.submap_change import change_of_frame
-
-Rectify = Callable[[Keyframe], Keyframe]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,15 +45,15 @@ class Merged:
     id_of: IntArray
 
 
-def merge_recovery(live: Submap, base: Submap, grown: Submap, rectify: Rectify) -> Merged:
+def merge_recovery(live: Submap, base: Submap, grown: Submap, change: Change | None = None) -> Merged:
     """Put the additions of reverse tracking into a copy of the live submap.
 
     Parameters
     ----------
     live, base, grown : Submap
         Three states of one submap, see above. The keyframes of its gauge stand in all of them.
-    rectify : callable
-        Gives a keyframe of the walk the pixels of the camera that the live submap has now.
+    change : callable, optional
+        Gives features of the walk the pixels of the camera that the live submap has now, if it is another.
     """
     S_live_grown = change_of_frame(grown, live, base.keyframes, len(base.landmarks))
     moved = grown.copy()
@@ -64,7 +62,7 @@ def merge_recovery(live: Submap, base: Submap, grown: Submap, rectify: Rectify) 
         se3.from_parts(sim3.rotation(S_live_grown), sim3.translation(S_live_grown)),
     )
     merged = live.copy()
-    _add_keyframes(merged, base, moved, rectify)
+    _add_keyframes(merged, base, moved, change)
     _remove_rejected(merged, base, moved)
     id_of = _identify(merged, base, moved)
     id_of = _add_landmarks(merged, base, moved, id_of)
@@ -73,10 +71,12 @@ def merge_recovery(live: Submap, base: Submap, grown: Submap, rectify: Rectify) 
     return Merged(merged, moved, S_live_grown, _heirs_in(merged, moved, id_of))
 
 
-def _add_keyframes(merged: Submap, base: Submap, moved: Submap, rectify: Rectify) -> None:
+def _add_keyframes(merged: Submap, base: Submap, moved: Submap, change: Change | None) -> None:
     """The walk's keyframes stand before the live ones, oldest first: the last in order stay the live end's newest."""
     new = sorted(k for k in moved.keyframes if k not in base.keyframes and k not in merged.keyframes)
-    added = {k: rectify(moved.keyframes[k]) for k in new}
+    added = {k: moved.keyframes[k] for k in new}
+    if change is not None:
+        added = {k: replace(keyframe, features=change(keyframe.features)) for k, keyframe in added.items()}
     merged.keyframes = added | merged.keyframes
     for k, keyframe in added.items():
         merged.T_submap_kf[k] = moved.T_submap_kf[k]
@@ -144,9 +144,7 @@ def _add_landmarks(merged: Submap, base: Submap, moved: Submap, id_of: IntArray)
 
 def _heirs_in(merged: Submap, moved: Submap, id_of: IntArray) -> IntArray:
     """Complete `id_of`: a landmark that the walk has merged into another has the other's id, dead ones have none."""
-    heir = moved.current_ids(np.arange(len(moved.landmarks)))
-    ids = np.where(id_of != NO_LANDMARK, id_of, np.where(heir != NO_LANDMARK, id_of[heir], NO_LANDMARK))
-    return merged.current_ids(ids)
+    return merged.current_ids(np.where(id_of != NO_LANDMARK, id_of, moved.by_heirs(id_of)))
 
 
 def _new_rows(merged: Submap, base: Submap, moved: Submap, id_of: IntArray) -> tuple[IntArray, IntArray, IntArray]:

@@ -6,7 +6,6 @@ import numpy as np
 
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
-from dualslam.map.submap import NO_LANDMARK
 from dualslam.system import System
 
 
@@ -21,11 +20,10 @@ def residuals_px(system: System) -> dict[int, float]:
         if pose is None or pose.submap_id != seen.submap_id:
             continue
         submap = system.atlas.submaps[pose.submap_id]
-        ids = submap.current_ids(seen.landmark_ids.astype(np.int64))
-        alive = ids != NO_LANDMARK
-        if not alive.any():  # posed by other features than those of the map
+        ids, seen_px, _ = seen.seen_now(submap)
+        if not len(ids):  # posed by other features than those of the map
             continue
         T_cam_submap = se3.inverse(submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam))
-        uv_px, _ = project_points(submap.K, T_cam_submap, submap.landmarks["xyz_mu"][ids[alive]])
-        found[i] = float(np.nanquantile(np.linalg.norm(uv_px - seen.uv_rect_now_px()[alive], axis=1), 0.9))
+        uv_px, _ = project_points(submap.K, T_cam_submap, submap.landmarks["xyz_mu"][ids])
+        found[i] = float(np.nanquantile(np.linalg.norm(uv_px - seen_px, axis=1), 0.9))
     return found

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import FrameStatus
+from dualslam.core.types import Features, FrameStatus
+from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.record import Record
+from dualslam.map.split import submap_of
 from dualslam.map.submap import NO_LANDMARK, Submap
 from dualslam.map.trajectory import FramePose
 from dualslam.recovery.bypass import pose_frames
@@ -26,7 +30,7 @@ def merged() -> tuple[Merged, Submap, np.ndarray]:
     refused = np.flatnonzero(base.observations["alive"] & (base.observations["kf"] == 3))[[4, 40, 70]]
     grown.remove_observations(refused)
     live.transform(SCALE, T)
-    return merge_recovery(live, base, grown, lambda keyframe: keyframe), grown, refused
+    return merge_recovery(live, base, grown), grown, refused
 
 
 def test_what_the_walk_has_refused_is_no_observation_any_more_and_all_else_is() -> None:
@@ -47,7 +51,7 @@ def test_what_the_walk_has_refused_is_found_by_what_it_is_where_the_map_numbers_
     dead = np.flatnonzero(base.observations["kf"] == 2)[::3]  # the map has dropped these itself, and forgotten them
     live.remove_observations(dead)
     live.keep_observations(np.flatnonzero(live.observations["alive"]))
-    again = merge_recovery(live, base, grown, lambda keyframe: keyframe).submap
+    again = merge_recovery(live, base, grown).submap
     assert len(again.observations) == len(base.observations) - len(dead)
     obs = result.submap.observations
     wanted = seen_in(result.submap, np.setdiff1d(np.flatnonzero(obs["alive"]), dead))
@@ -95,10 +99,32 @@ def test_landmarks_of_the_walk_are_known_by_what_they_have_become() -> None:
     grown.merge_landmarks(new[:1], new[1:2])
     grown.merge_landmarks(old[2:3], new[2:3])
     grown.remove_landmarks(new[3:4])
-    result = merge_recovery(base.copy(), base, grown, lambda keyframe: keyframe)
+    result = merge_recovery(base.copy(), base, grown)
     known = result.id_of[new]
     assert known[0] == known[1] >= n
     assert known[2] == old[2]
     assert known[3] == NO_LANDMARK
     assert known[4] > n
     np.testing.assert_array_equal(result.id_of[:n], result.submap.current_ids(np.arange(n)))
+
+
+def test_a_walk_of_the_camera_of_before_gets_the_pixels_of_the_present_one() -> None:
+    """Its keyframes at once, what its frames have seen when it is asked for."""
+    scene = make_scene(6)
+    whole = guessed_submap(scene, pose_noise=0.0)
+    base = submap_of(whole, 0, [0, 1, 2, 3])
+    grown = base.copy()
+    grown.add_keyframe(scene.keyframe(4), whole.T_submap_kf[4])
+
+    def aside(features: Features) -> Features:
+        return replace(features, uv_rect_px=features.uv_rect_px + [4.0, 0.0])
+
+    result = merge_recovery(base.copy(), base, grown, aside)
+    then, now = scene.features[4].uv_rect_px, result.submap.keyframes[4].features.uv_rect_px
+    np.testing.assert_allclose(now, then + [4.0, 0.0])
+    assert result.submap.keyframes[3].features is base.keyframes[3].features
+    record, seen = Record(), FrameObservations.of(base.keyframes[3].features, base.landmark_of[3], base.id)
+    record.rows[100] = FrameRow(100, 10.0, FrameStatus.INITIALISING)
+    frame = RecoveredFrame(FramePose(100, 10.0, grown.id, 3, np.eye(4)), 90, 80, seen)
+    pose_frames(record, [frame], result, result.submap, aside)
+    np.testing.assert_allclose(record.observations[100].uv_rect_now_px(), seen.uv_rect_px + [4.0, 0.0])
