@@ -88,15 +88,14 @@ def run(world: Any, frames: list[Any], seed: int, loops: bool, settings: dict[st
 
 def ate(system: Any, T_true: FloatArray) -> tuple[float, float]:
     """Return the error in metres (Sim(3) alignment) and the share of the frames in the map."""
-    from dualslam.lab.metrics.alignment import align_points
+    from dualslam.lab.metrics.alignment import distances_when_aligned
     from dualslam.run.results import trajectories_of
 
     main = trajectories_of(system).main
     if len(main) < 10:
         return float("nan"), len(main) / len(T_true)
     p, q = main.T_world_cam[:, :3, 3], T_true[main.index][:, :3, 3]
-    s, R, t = align_points(p, q)
-    return float(np.sqrt(((q - (s * p @ R.T + t)) ** 2).sum(1).mean())), len(main) / len(T_true)
+    return float(np.sqrt((distances_when_aligned(p, q) ** 2).mean())), len(main) / len(T_true)
 
 
 def run_once(job: tuple[str, int], settings: dict[str, Any]) -> dict[str, Any]:

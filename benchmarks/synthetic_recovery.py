@@ -128,7 +128,7 @@ def measure(system: Any, world: Any, audits: list[Any], cpu_s: float) -> dict[st
     """Return the numbers of a finished run."""
     from dualslam.core.events import EventKind
     from dualslam.lab.audits.map_jumps import find_map_jumps
-    from dualslam.lab.metrics.alignment import align_points
+    from dualslam.lab.metrics.alignment import distances_when_aligned
     from dualslam.run.results import trajectories_of
 
     truth = truth_of(world)
@@ -138,9 +138,8 @@ def measure(system: Any, world: Any, audits: list[Any], cpu_s: float) -> dict[st
     ate_pct = None
     if len(main) >= 10:
         p, q = main.T_world_cam[:, :3, 3], world.ground_truth_T_world_cam[main.index][:, :3, 3]
-        s, R, t = align_points(p, q)
         path = float(np.linalg.norm(np.diff(q, axis=0), axis=1).sum())
-        ate_pct = 100 * float(np.sqrt(((q - (s * p @ R.T + t)) ** 2).sum(1).mean())) / path
+        ate_pct = 100 * float(np.sqrt((distances_when_aligned(p, q) ** 2).mean())) / path
     return {
         "failures": len(system.events.of_kind(EventKind.FAILED)),
         "restarts": len(system.events.of_kind(EventKind.REINITIALISED)),

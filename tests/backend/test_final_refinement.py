@@ -15,7 +15,7 @@ from dualslam.core.bundle import FrameRows
 from dualslam.core.chi_square import MEDIAN_CHI2
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import Features
-from dualslam.lab.metrics.alignment import align_points
+from dualslam.lab.metrics.alignment import distances_when_aligned
 from dualslam.map.submap import Submap
 from dualslam.testing.graph_scene import Feeder, GraphScene, guessed_submap, make_features, make_scene
 
@@ -39,8 +39,7 @@ def error(submap: Submap, scene: GraphScene) -> float:
     """RMS of the camera's centres, after one alignment."""
     ids = np.array(list(submap.keyframes))
     centres, true = submap.keyframe_poses(ids)[:, :3, 3], scene.T_true[ids][:, :3, 3]
-    s, R, t = align_points(centres, true)
-    return float(np.sqrt(((s * centres @ R.T + t - true) ** 2).sum(axis=1).mean()))
+    return float(np.sqrt((distances_when_aligned(centres, true) ** 2).mean()))
 
 
 def solved(scene: GraphScene) -> Submap:

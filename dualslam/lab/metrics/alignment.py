@@ -23,3 +23,9 @@ def align_points(p: FloatArray, q: FloatArray, *, with_scale: bool = True) -> tu
     variance = (a * a).sum() / len(p)
     s = float((D * S).sum() / max(variance, 1e-300)) if with_scale else 1.0  # Eq. (42)
     return s, R, np.asarray(mean_q - s * R @ mean_p, np.float64)  # Eq. (41)
+
+
+def distances_when_aligned(p: FloatArray, q: FloatArray) -> FloatArray:
+    """Return how far each of p is from its partner of q, both (N, 3), once all of p are aligned by a similarity."""
+    s, R, t = align_points(p, q)
+    return np.asarray(np.linalg.norm(q - (s * p @ R.T + t), axis=1), np.float64)
