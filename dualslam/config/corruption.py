@@ -29,6 +29,12 @@ class CorruptionKind(StrEnum):
     SOLVER_ERROR = "solver_error"  # the live graph fails once, at the first keyframe of the frames (without meaning)
     SHUTTER = "shutter"  # rendered worlds: the shutter stays open (fraction of the time between frames)
     ROTATION = "rotation"  # rendered worlds: the camera is swung aside and back (degrees, positive to the right)
+    FOCAL = "focal"  # the calibration's focal length is wrong (factor)
+    RESOLUTION = "resolution"  # the calibration is that of images of another size (factor)
+    NO_DISTORTION = "no_distortion"  # the calibration lacks the lens distortion (without meaning)
+    CLOCK_UNIT = "clock_unit"  # times are in another unit than seconds (units a second)
+    CLOCK_JITTER = "clock_jitter"  # times scatter evenly (fraction of the time between frames)
+    CLOCK_REPEAT = "clock_repeat"  # neighbouring frames share the time of their first (their number)
 
 
 class Cause(StrEnum):
@@ -37,10 +43,16 @@ class Cause(StrEnum):
     NATURAL = "natural"
     """Nothing was added: what the sequence itself does."""
     IMAGE = "image"
+    INPUT = "input"
+    """What comes with the images is wrong: the calibration or the clock."""
     INTERNAL = "internal"
 
 
 INTERNAL_KINDS = frozenset({CorruptionKind.WRONG_POSE, CorruptionKind.SOLVER_ERROR, CorruptionKind.KILL_WORKER})
+
+CAMERA_KINDS = frozenset({CorruptionKind.FOCAL, CorruptionKind.RESOLUTION, CorruptionKind.NO_DISTORTION})
+
+CLOCK_KINDS = frozenset({CorruptionKind.CLOCK_UNIT, CorruptionKind.CLOCK_JITTER, CorruptionKind.CLOCK_REPEAT})
 
 RENDERED_KINDS = frozenset({CorruptionKind.SHUTTER, CorruptionKind.ROTATION})
 
@@ -62,6 +74,12 @@ STRENGTHS: dict[CorruptionKind, tuple[float, float, float]] = {
     CorruptionKind.KILL_WORKER: (1.0, 0.0, 1.0),
     CorruptionKind.SHUTTER: (1.0, 0.0, 4.0),
     CorruptionKind.ROTATION: (60.0, -180.0, 180.0),
+    CorruptionKind.FOCAL: (0.8, 0.1, 10.0),
+    CorruptionKind.RESOLUTION: (0.5, 0.1, 10.0),
+    CorruptionKind.NO_DISTORTION: (1.0, 0.0, 1.0),
+    CorruptionKind.CLOCK_UNIT: (1000.0, 1e-9, 1e9),
+    CorruptionKind.CLOCK_JITTER: (0.5, 0.0, 0.99),
+    CorruptionKind.CLOCK_REPEAT: (2.0, 2.0, 1000.0),
 }
 
 
@@ -70,7 +88,8 @@ class Corruption(StrictModel):
 
     kind: CorruptionKind
     """wipe, occlusion, blur, motion_blur, blackout, exposure, noise, freeze, drop, stride, few_features, wrong_pose,
-    solver_error or kill_worker; in the script of a rendered world also shutter and rotation."""
+    solver_error, kill_worker, focal, resolution, no_distortion, clock_unit, clock_jitter or clock_repeat; in the script
+    of a rendered world also shutter and rotation."""
     start: int = Field(0, ge=0)
     """First frame, counted in the source whatever the stride."""
     length: int | None = Field(None, ge=1)
@@ -87,6 +106,8 @@ class Corruption(StrictModel):
             raise ValueError(f"strength of {self.kind} is {self.level:g}; it must lie between {low:g} and {high:g}")
         if self.kind is CorruptionKind.ROTATION and self.length is None:
             raise ValueError("rotation needs a length: the camera is swung aside and back in it")
+        if self.kind in CAMERA_KINDS and (self.start, self.length) != (0, None):
+            raise ValueError(f"{self.kind} is of the whole run; leave out start and length")
         return self
 
     @property
@@ -96,8 +117,10 @@ class Corruption(StrictModel):
 
     @property
     def cause(self) -> Cause:
-        """Whether images or the system's inside are disturbed."""
-        return Cause.INTERNAL if self.kind in INTERNAL_KINDS else Cause.IMAGE
+        """Whether images, what comes with them, or the system's inside are disturbed."""
+        if self.kind in INTERNAL_KINDS:
+            return Cause.INTERNAL
+        return Cause.INPUT if self.kind in CAMERA_KINDS | CLOCK_KINDS else Cause.IMAGE
 
     def covers(self, index: int) -> bool:
         """Return whether frame `index` is disturbed."""

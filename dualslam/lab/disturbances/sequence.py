@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.config.corruption import RENDERED_KINDS, Corruption, CorruptionKind
+from dualslam.config.corruption import CAMERA_KINDS, CLOCK_KINDS, RENDERED_KINDS, Corruption, CorruptionKind
 from dualslam.core.errors import ConfigError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame, IntArray
 from dualslam.lab.disturbances.images import U8Image, corrupt_image
+from dualslam.lab.disturbances.inputs import WrongClock, wrong_camera
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +45,8 @@ def corrupted(sequence: Sequence, corruptions: Collection[Corruption]) -> Sequen
         if corruption.kind in RENDERED_KINDS:
             raise ConfigError(f"{corruption.kind} is for rendered worlds: write it into their script (events=FILE)")
     _tell_idle(getattr(sequence, "source_indices", None), corruptions)
-    chosen = [c for c in corruptions if c.kind in _ON_IMAGES + _ON_STREAM]
+    inputs = CAMERA_KINDS | CLOCK_KINDS
+    chosen = [c for c in corruptions if c.kind in _ON_IMAGES + _ON_STREAM or c.kind in inputs]
     return CorruptedSequence(sequence, chosen) if chosen else sequence
 
 
@@ -60,7 +62,7 @@ def _tell_idle(indices: IntArray | None, corruptions: Iterable[Corruption]) -> N
 
 
 class CorruptedSequence:
-    """Frames of another sequence, spoilt. Everything else about it (camera, ground truth, times) is that sequence's.
+    """Frames of another sequence, spoilt. What no corruption changes (ground truth, exposure) is that sequence's.
 
     Frames that are dropped do not arrive at all, and are in none of the lists; indices stay those of the source.
 
@@ -76,7 +78,7 @@ class CorruptedSequence:
         self._sequence = sequence
         self._corruptions = tuple(corruptions)
         self.name = sequence.name
-        self.camera = sequence.camera
+        self.camera = wrong_camera(sequence.camera, self._corruptions)
         self.rate_hz = sequence.rate_hz
 
     def __getattr__(self, name: str) -> Any:
@@ -92,8 +94,9 @@ class CorruptedSequence:
 
     @property
     def frame_timestamps(self) -> Any:
-        """(M,) float64, the same frames' times."""
-        return getattr(self._sequence, "frame_timestamps")[self._arriving()]  # noqa: B009
+        """(M,) float64, the same frames' times, as the clock gives them."""
+        true_s = getattr(self._sequence, "frame_timestamps")[self._arriving()]  # noqa: B009
+        return self._clock().times_of(self.source_indices, true_s)
 
     def __len__(self) -> int:
         len(self._sequence)  # a webcam has no length, and says so
@@ -102,10 +105,12 @@ class CorruptedSequence:
     def __iter__(self) -> Iterator[Frame]:
         source = iter(self._sequence)
         last: U8Image | None = None  # the newest image that was not frozen
+        clock = self._clock()
         try:
-            for frame in source:
-                if not self._arrives(frame.index):
+            for arriving in source:
+                if not self._arrives(arriving.index):
                     continue
+                frame = replace(arriving, timestamp_s=clock.time_of(arriving.index, arriving.timestamp_s))
                 frozen = last is not None and self._active(frame.index, CorruptionKind.FREEZE)
                 image = last if frozen else frame.image
                 if image is None:
@@ -117,6 +122,9 @@ class CorruptedSequence:
             close = getattr(source, "close", None)
             if close is not None:
                 close()
+
+    def _clock(self) -> WrongClock:
+        return WrongClock(self._corruptions, 1.0 / self.rate_hz)
 
     def _spoil(self, image: U8Image, index: int) -> U8Image:
         for kind in _ON_IMAGES:

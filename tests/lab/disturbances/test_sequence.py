@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from dualslam.config.files import load_config
-from dualslam.core.camera.models import PinholeCamera
+from dualslam.config.corruption import CAMERA_KINDS
+from dualslam.core.camera.models import PinholeCamera, RadTanCamera
 from dualslam.core.errors import ConfigError
 from dualslam.core.types import Frame
 from dualslam.lab.disturbances import Corruption, CorruptionKind, corrupted
@@ -185,7 +186,45 @@ def test_a_wrong_corruption_is_named(text: str, said: str) -> None:
 
 def test_all_kinds_have_a_default() -> None:
     for kind in CorruptionKind:
-        assert isinstance(Corruption(kind=kind, length=3).level, float)
+        assert isinstance(Corruption(kind=kind, length=None if kind in CAMERA_KINDS else 3).level, float)
+
+
+def of_run(kind: str, strength: float | None = None, **fields: object) -> Corruption:
+    return only(kind, start=0, length=None, strength=strength, **fields)
+
+
+def test_a_wrong_calibration_reaches_the_run_and_changes_no_image() -> None:
+    true = Recorded.camera
+    wrong = corrupted(Recorded(), [of_run("focal", 1.3)])
+    assert (wrong.camera.fx, wrong.camera.fy) == pytest.approx((1.3 * true.fx, 1.3 * true.fy))
+    assert (wrong.camera.cx, wrong.camera.size_px) == (true.cx, true.size_px)
+    assert np.array_equal(next(iter(wrong)).image, photograph(0))
+    half = corrupted(Recorded(), [of_run("resolution", 0.5)]).camera
+    assert (half.fx, half.cx, half.cy) == pytest.approx((150.0, 79.75, 59.75))
+    assert half.size_px == true.size_px
+    with pytest.raises(ConfigError):
+        load_config(None, ["corruptions=[{kind: focal, start: 3}]"])
+
+
+def test_a_calibration_without_its_distortion_is_a_pinhole() -> None:
+    recorded = Recorded()
+    recorded.camera = RadTanCamera(WIDTH, HEIGHT, 300.0, 300.0, 160.0, 120.0, -0.2, 0.05)  # type: ignore[assignment]
+    assert corrupted(recorded, [of_run("no_distortion")]).camera == Recorded.camera
+
+
+def test_a_wrong_clock_says_the_same_to_the_frames_and_in_the_list() -> None:
+    def times(*corruptions: Corruption) -> np.ndarray:
+        sequence = corrupted(Recorded(), corruptions)
+        in_list = sequence.frame_timestamps  # type: ignore[attr-defined]
+        assert np.array_equal([frame.timestamp_s for frame in sequence], in_list)
+        return np.asarray(in_list)
+
+    true = Recorded.frame_timestamps
+    assert times(of_run("clock_unit", 1000.0)) == pytest.approx(1000 * true)
+    jitter = times(of_run("clock_jitter", 0.9, seed=3)) - true
+    assert 0.02 < np.abs(jitter).max() <= 0.045
+    assert (np.diff(true + jitter) > 0).all()
+    assert times(only("clock_repeat", length=5))[4:11] == pytest.approx([0.4, 0.5, 0.5, 0.7, 0.7, 0.9, 1.0])
 
 
 def test_a_corruption_that_never_strikes_is_told(caplog: pytest.LogCaptureFixture) -> None:
