@@ -3,9 +3,9 @@
     python benchmarks/traps.py --seeds 101 102 103
     python benchmarks/traps.py --worlds parked board --gaps 0.5 2 4 --occlude 0.7 1 --seeds 101 102 103 104
 
-Prints for each run its world, seed and trap, the share of frames in the main map, stretches broken and judged
-(`dualslam/lab/audits/silent_breaks.py`), submaps, RMS error in metres after one alignment, how the parts before and
-after the trap are joined (`dualslam/lab/audits/join_audit.py`), events and CPU seconds. Then one row a cell.
+Prints one line a run: world, seed, trap, share of frames in the main map, stretches broken of those judged, submaps,
+RMS error in metres, the join across the trap, events, CPU seconds. Then it prints one row a cell.
+`dualslam/lab/audits/silent_breaks.py` and `join_audit.py` there say what is broken and what is joined wrongly.
 """
 
 from __future__ import annotations

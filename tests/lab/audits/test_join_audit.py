@@ -21,7 +21,7 @@ def true_poses() -> np.ndarray:
 
 
 def estimate(offset_m: float = 0.0, scale: float = 1.0, turn_deg: float = 0.0) -> np.ndarray:
-    """The truth in another unit and frame, with the part after the gap moved, scaled and turned about its first pose."""
+    """The truth in another unit and frame, the part after the gap moved, scaled and turned about its start."""
     T = true_poses()
     part, origin = T[AFTER:], T[AFTER, :3, 3].copy()
     R = so3.exp(np.radians([0.0, turn_deg, 0.0]))

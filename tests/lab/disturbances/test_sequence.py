@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from dualslam.config.files import load_config
 from dualslam.config.corruption import CAMERA_KINDS
+from dualslam.config.files import load_config
 from dualslam.core.camera.models import PinholeCamera, RadTanCamera
 from dualslam.core.errors import ConfigError
 from dualslam.core.types import Frame
