@@ -47,6 +47,7 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tools/structure.py --budget tools/budget.toml
 
 docs: setup
 	$(BIN)/mkdocs build --quiet --strict
