@@ -81,7 +81,6 @@ class System:
             record,
             components.atlas_solver,
             components.new_graph,
-            components.adjust_bundle,
             components.desk,
             self._state.front_ends,
             None if components.graphs is None else components.graphs.forget,

@@ -11,7 +11,6 @@ from dualslam.backend.final_refinement import refine_submap
 from dualslam.build.checks import check_config, check_given
 from dualslam.build.parts import (
     atlas_solver,
-    bundle_adjuster,
     graph_maker,
     new_calibration,
     new_initialiser,
@@ -133,7 +132,6 @@ def build_system(
             walk_watch=watch,
             desk=desk,
             atlas_solver=atlas_solver(config),
-            adjust_bundle=bundle_adjuster(config),
             refine_at_end=partial(refine_submap, robust_k=config.graph.robust_k),
             graphs=graphs,
             places=places,

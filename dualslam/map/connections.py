@@ -12,17 +12,14 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 from dualslam.core.atlas_problem import AtlasSolution, AtlasSolver
-from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.errors import SolverError
-from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
-from dualslam.core.types import Failure, FailureReason, IntArray
+from dualslam.core.types import Failure, FailureReason
 from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.atlas_beside import AskedSolution
 from dualslam.map.atlas_problems import AtlasProblems
 from dualslam.map.atlas_report import AtlasReport, Solved, tell, together
 from dualslam.map.moving import Mover
-from dualslam.map.overlap_sides import OverlapRefinement, apply_overlap, overlap_problem
 from dualslam.map.propagation import propagate_anchors, propagate_links, propagate_poses
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.skeleton import Skeleton
@@ -44,8 +41,6 @@ class Connections:
     solver : AtlasSolver
     new_graph : callable
         Makes an empty graph, for a front end whose submap has been bent.
-    adjust : BundleAdjuster
-        Of overlaps.
     desk : Desk
         Where solutions are computed, and covariances that they will need.
     front_ends : callable
@@ -59,16 +54,12 @@ class Connections:
         record: Record,
         solver: AtlasSolver,
         new_graph: Callable[[], SubmapGraph],
-        adjust: BundleAdjuster,
         desk: Desk,
         front_ends: Callable[[], Iterable[VisualOdometry]] = tuple,
         forget_graph: Callable[[int], None] | None = None,
     ) -> None:
         self._record = record
         self._solver = solver
-        self._new_graph = new_graph
-        self._adjust = adjust
-        self._front_ends = front_ends
         self._desk = desk
         self._problems = AtlasProblems(record, solver, desk)
         self._mover = Mover(record, solver, self._problems.covariances, new_graph, front_ends, forget_graph)
@@ -229,53 +220,6 @@ class Connections:
         for component in self._atlas.components():
             if component[0] in self._atlas.placement:
                 self._solve(set(component), (), now)
-
-    def refine_overlap(self, link: Link, landmark_pairs: IntArray) -> OverlapRefinement | Failure:
-        """Refine keyframes and landmarks about a connection together, on both of its sides, live or archived.
-
-        Parameters
-        ----------
-        link : Link
-            One that has been taken in.
-        landmark_pairs : (I, 2) int64
-            Landmarks of its two submaps that are the same point; those of frames that both hold are known already.
-
-        Returns
-        -------
-        OverlapRefinement or Failure
-            `TOO_FEW_MATCHES` where too few points are seen from both sides; nothing has changed then.
-        """
-        sides = self._atlas.submaps[link.a], self._atlas.submaps[link.b]
-        component = self._atlas.component_of(link.a)
-        S_world = self._atlas.S_world_submap(component)
-        S_a_b = sim3.inverse(S_world[link.a]) @ S_world[link.b]
-        refinement = overlap_problem(sides, link.attached(self._atlas), S_a_b, landmark_pairs)
-        if isinstance(refinement, Failure):
-            return refinement
-        try:
-            result = self._adjust(refinement.problem)
-        except SolverError as error:
-            return Failure(FailureReason.SOLVER, str(error))
-        befores = {submap.id: submap.copy() for submap in sides}
-        moved = apply_overlap(sides, refinement, result)
-        for m, before in befores.items():
-            for front_end in self._front_ends():
-                if front_end.submap.id == m:
-                    front_end.adopt(self._new_graph(), before)
-            self.carry(before, self._atlas.submaps[m])
-        # The pixels of both sides have said how they stand to each other: that is the measurement now.
-        self._atlas.links = [
-            replace(other, S_a_b=S_a_b) if other.attached_as(link) else other for other in self._atlas.links
-        ]
-        return OverlapRefinement(
-            n_keyframes=int((~refinement.problem.fixed).sum()),
-            n_landmarks=len(refinement.problem.xyz_mu),
-            n_joined=refinement.n_joined,
-            n_observations=len(refinement.problem.kf),
-            cost_before=result.cost_before,
-            cost_after=result.cost_after,
-            moved=moved,
-        )
 
     # --- solving
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from dualslam.calibration.lens import Calibration
 from dualslam.core.atlas_problem import AtlasSolver
-from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.interfaces import FinalRefiner, MapStarter, Seeker, Shutter, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FloatArray, Frame, View
 from dualslam.map.graph_beside import BesideGraphs
@@ -41,7 +40,6 @@ class Components:
     recovery: RecoveryExecutor
     walk_watch: WalkWatch
     atlas_solver: AtlasSolver
-    adjust_bundle: BundleAdjuster
     refine_at_end: FinalRefiner
     places: PlaceParts
     desk: Desk

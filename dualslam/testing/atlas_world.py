@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from dualslam.backend.atlas_solver import GtsamAtlasSolver
-from dualslam.backend.local_ba import bundle_adjust_arrays
 from dualslam.backend.refit import refit_points
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.config.settings import GraphConfig
@@ -74,7 +73,6 @@ class DriftingMap:
             self.record,
             self.solver,
             lambda: ISam2SubmapGraph(GraphConfig()),
-            bundle_adjust_arrays,
             InlineDesk(atlas_handlers(self.solver)),
             lambda: self.front_ends,
         )

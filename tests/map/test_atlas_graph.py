@@ -16,7 +16,6 @@ from dualslam.core.atlas_problem import AtlasEdge, AtlasProblem, AtlasSolution
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import Failure, FailureReason
 from dualslam.io.map_files import load_arrays, save_arrays
 from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.map.anchors import Anchor
@@ -406,70 +405,6 @@ def test_covariance_across_submaps_shrinks_with_a_loop() -> None:
     world.add(60)
     with pytest.raises(SolverError, match="not connected"):
         world.relative((0, 10), (3, 60))
-
-
-# --- overlaps, opened graphs
-
-
-def the_same_points(world: DriftingMap, a: int, b: int, keyframes: tuple[list[int], list[int]]) -> np.ndarray:
-    """Landmarks of two submaps that are the same point, seen about some keyframes of either."""
-    point_of = []
-    for m, ids in zip((a, b), keyframes, strict=True):
-        submap, found = world.atlas.submaps[m], {}
-        for k in ids:
-            seen = submap.landmark_of[k]
-            found.update(zip(world.points[k][seen >= 0].tolist(), seen[seen >= 0].tolist(), strict=True))
-        point_of.append(found)
-    return np.array([(point_of[0][p], point_of[1][p]) for p in sorted(point_of[0].keys() & point_of[1].keys())])
-
-
-def test_a_seam_is_refined_on_both_sides_and_tears_nothing() -> None:
-    world = lap_in_submaps(seed=1)
-    link = world.loop(*CLOSED)
-    world.connections.connect([link], world.now)
-    before = {m: submap.copy() for m, submap in world.atlas.submaps.items()}
-    pairs = the_same_points(world, 0, 2, (list(range(12)), list(range(112, 130))))
-    gap = seam_gap(world, pairs)
-    refined = world.connections.refine_overlap(world.atlas.links[-1], pairs)
-    assert refined
-    assert refined.n_joined >= 0.8 * len(pairs)
-    assert refined.n_keyframes == 16
-    assert refined.cost_after < 0.5 * refined.cost_before
-    assert set(refined.moved) == {0, 2}
-    assert seam_gap(world, pairs) < 0.3 * gap
-    far = [k for k in before[0].keyframes if k > 35]
-    np.testing.assert_array_equal(world.atlas.submaps[0].keyframe_poses(far), before[0].keyframe_poses(far))
-    world.connections.settle(world.now)
-    assert seam_gap(world, pairs) < 0.5 * gap
-    none = world.connections.refine_overlap(world.atlas.links[-1], np.zeros((0, 2), np.int64))
-    assert isinstance(none, Failure)
-    assert none.reason is FailureReason.TOO_FEW_MATCHES
-
-
-def seam_gap(world: DriftingMap, pairs: np.ndarray) -> float:
-    """How far points that are the same lie apart in the world, median."""
-    S = world.atlas.S_world_submap([0, 1, 2])
-    a, b = (world.atlas.submaps[m].landmarks["xyz_mu"][pairs[:, i]] for i, m in ((0, 0), (1, 2)))
-    return float(np.median(np.linalg.norm(sim3.act(S[0], a) - sim3.act(S[2], b), axis=1)))
-
-
-def test_a_seam_within_one_submap() -> None:
-    world = DriftingMap(130, seed=1)
-    for k in range(130):
-        world.add(k)
-    world.connections.connect([world.loop((0, 3), (0, 123))], world.now)
-    pairs = the_same_points(world, 0, 0, (list(range(12)), list(range(112, 130))))
-    assert (pairs[:, 0] != pairs[:, 1]).all()
-
-    def gap() -> float:
-        xyz = world.submap.landmarks["xyz_mu"]
-        return float(np.median(np.linalg.norm(xyz[pairs[:, 0]] - xyz[pairs[:, 1]], axis=1)))
-
-    before = gap()
-    refined = world.connections.refine_overlap(world.atlas.links[-1], pairs)
-    assert refined
-    assert refined.n_joined >= 0.8 * len(pairs)
-    assert gap() < 0.3 * before
 
 
 # --- on the disk
