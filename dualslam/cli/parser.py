@@ -144,7 +144,12 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
     images = parser.add_argument_group("camera")
     camera = images.add_mutually_exclusive_group()
     camera.add_argument("--camera", metavar="FILE", type=_path, help="calibration, instead of the source's own")
-    camera.add_argument("--fov", metavar="DEGREES", type=_angle, help="horizontal field of view, without a calibration")
+    camera.add_argument(
+        "--fov",
+        metavar="DEGREES",
+        type=_angle,
+        help="field of view along the longer side of the images, without a calibration",
+    )
     images.add_argument("--full-size", action="store_true", help="read images of more than 2048 pixels as they are")
     saved = parser.add_argument_group("saved map")
     saved.add_argument(

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.geometry.so3 import matrix_from_quat_xyzw
 from dualslam.core.types import FloatArray
-from dualslam.io.camera_files import check_model, distorted_camera, parse_yaml
+from dualslam.io.camera_keys import camera_of_mapping
+from dualslam.io.camera_text import parse_yaml
 from dualslam.io.images import ImageFiles
 from dualslam.io.sequence import Given, Recording
 from dualslam.io.times import checked_times, resolve_times
@@ -46,7 +46,7 @@ def open_recording(folder: Path, given: Given) -> Recording:
         timestamps_s=checked_times(times, str(listing))
         if given.times is None
         else resolve_times(given.times, len(paths), listing),
-        camera=None if given.camera else _camera(sensor, sensor_path),
+        camera=None if given.camera else camera_of_mapping(sensor, str(sensor_path)),
         ground_truth=truth,
         calibration=str(sensor_path),
     )
@@ -78,22 +78,6 @@ def _seconds(nanoseconds: str) -> float:
     # Whole numbers first: the nanoseconds of an epoch time do not fit a float, its seconds fit to 0.2 microseconds.
     seconds, rest = divmod(int(nanoseconds), 10**9)
     return seconds + rest * 1e-9
-
-
-def _camera(sensor: dict[str, Any], where: Path) -> Camera:
-    try:
-        fxycxy = [float(x) for x in sensor["intrinsics"]]
-        width, height = (float(n) for n in sensor["resolution"])
-        distortion = [float(x) for x in sensor.get("distortion_coefficients", [])]
-    except KeyError as e:
-        raise InputError(f"{where} has no {e.args[0]}; it should have resolution and intrinsics.") from None
-    except (TypeError, ValueError):
-        raise InputError(f"{where}: resolution, intrinsics or distortion_coefficients is no list of numbers.") from None
-    if len(fxycxy) != 4:
-        raise InputError(f"{where}: intrinsics has {len(fxycxy)} numbers; it should be fx fy cx cy.")
-    check_model(str(sensor.get("camera_model", "pinhole")).lower(), ("pinhole",), str(where))
-    model = str(sensor.get("distortion_model", "radial-tangential")).lower()
-    return distorted_camera(model, fxycxy, distortion, (width, height), str(where))
 
 
 def body_from_camera(sensor: dict[str, Any], where: Path) -> FloatArray:

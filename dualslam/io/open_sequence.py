@@ -14,9 +14,10 @@ from dualslam.core.camera.models import camera_from_fov
 from dualslam.core.errors import InputError, NoCalibrationError
 from dualslam.core.missing import check_exists
 from dualslam.io import dataset_folder, euroc, folder, kitti, tum_mono, tum_rgbd, video
-from dualslam.io.camera_files import make_camera, read_camera_file
+from dualslam.io.camera_build import make_camera
+from dualslam.io.camera_files import read_camera_file
 from dualslam.io.reduced import MAX_SIDE_PX, ReducedImages, reduced_camera, reduction
-from dualslam.io.sequence import Given, RecordedSequence, Recording, Selection, check_image_size, image_size
+from dualslam.io.sequence import Given, RecordedSequence, Recording, Selection, camera_of_size, image_size
 from dualslam.io.trajectory_files import MAX_BEGIN_GAP_S
 from dualslam.io.video import WebcamSequence
 
@@ -66,7 +67,7 @@ def open_sequence(
     camera_file : path, optional
         Calibration to use instead of the source's own (see `dualslam.io.camera_files`).
     fov_degrees : float, optional
-        Horizontal field of view, where there is no calibration at all.
+        Field of view along the longer side of the images, where there is no calibration at all.
     start, stride, max_frames : int
         Which frames: counted in the source, from `start`, every `stride`-th, at most `max_frames`.
     reverse : bool
@@ -90,20 +91,23 @@ def open_sequence(
     if rate_hz is not None and not 0 < rate_hz < float("inf"):
         raise InputError(f"The frame rate is {rate_hz} Hz; it must be above zero.")
     selection = Selection(start, stride, max_frames, reverse)
-    given_camera = None if camera_file is None else read_camera_file(camera_file)
     given = Given(camera_file is not None or fov_degrees is not None, times, rate_hz)
     if video.is_live(source):
         name = str(source)
         device = int(name) if name.isdigit() else name
-        return video.open_webcam(device, given_camera, fov_degrees, selection, given, grey)
+        of_file = None if camera_file is None else read_camera_file(camera_file)
+        return video.open_webcam(device, of_file, fov_degrees, selection, given, grey)
     recording = _open_recording(Path(str(source)), given)
     _check_clock(recording)
-    camera = given_camera or recording.camera
+    camera, calibration = recording.camera, recording.calibration
+    if camera_file is not None:
+        calibration = str(camera_file)
+        camera = read_camera_file(camera_file, lambda: image_size(recording.images, recording.name))
     if camera is None:
         camera = _camera_from_fov(recording, fov_degrees)
     else:
-        calibration = recording.calibration if camera_file is None else str(camera_file)
-        check_image_size(recording.images, recording.name, camera, calibration)
+        size_px = image_size(recording.images, recording.name, camera.size_px)
+        camera = camera_of_size(camera, size_px, recording.name, calibration)
     recording, camera = _reduced(recording, camera, max_side_px)
     log.info("%s: %d frames, %s", recording.name, len(recording.images), camera)
     return RecordedSequence(recording, camera, selection, grey=grey)
@@ -158,4 +162,6 @@ def _camera_from_fov(recording: Recording, fov_degrees: float | None) -> Camera:
             f"{recording.name} has no calibration; give a camera file, or a field of view in degrees (--camera, --fov)."
         )
     width, height = image_size(recording.images, recording.name)
+    if height > width:
+        log.warning("%s is upright: the field of view is that of its longer side, %d pixels", recording.name, height)
     return make_camera("the field of view", lambda: camera_from_fov(width, height, fov_degrees))

@@ -23,6 +23,8 @@ from dualslam.io.trajectory_files import Trajectory
 log = logging.getLogger(__name__)
 
 READ_AHEAD_FRAMES = 8
+MAX_ROUNDING_PX = 2.0
+"""By which images that were scaled may miss the shape of their calibration: sizes are whole, and often even."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,14 +226,25 @@ def image_size(images: ImageStore, name: str, wanted: tuple[int, int] | None = N
     return Counter(sizes).most_common(1)[0][0]
 
 
-def check_image_size(images: ImageStore, name: str, camera: Camera, calibration: str) -> None:
-    """Refuse a calibration that was made for images of another size."""
-    width, height = image_size(images, name, camera.size_px)
-    if (width, height) != camera.size_px:
+def camera_of_size(camera: Camera, size_px: tuple[int, int], name: str, calibration: str) -> Camera:
+    """Return a calibration for images of this size: scaled if it is for another size of the same shape.
+
+    Raises
+    ------
+    InputError
+        If the shape is another one: it cannot be known what was cut off.
+    """
+    if camera.size_px == size_px:
+        return camera
+    (width, height), was = size_px, f"{camera.width} x {camera.height}"
+    scale = max(size_px) / max(camera.size_px)
+    if scale == 1.0 or max(abs(camera.width * scale - width), abs(camera.height * scale - height)) > MAX_ROUNDING_PX:
         raise InputError(
-            f"{calibration} is for images of {camera.width} x {camera.height} pixels, but those of {name} are "
-            f"{width} x {height}; give the calibration of these images."
+            f"{calibration} is for images of {was} pixels, but those of {name} are "
+            f"{width} x {height}, of another shape; give the calibration of these images."
         )
+    log.warning("%s is for images of %s pixels: scaled to those of %s, %d x %d", calibration, was, name, width, height)
+    return camera.resized(width, height)
 
 
 def _rate(timestamps_s: FloatArray) -> float:

@@ -20,12 +20,12 @@ from dualslam.core.camera.focal import ToldFocal
 from dualslam.core.camera.models import camera_from_fov
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, Frame
-from dualslam.io.camera_files import make_camera
+from dualslam.io.camera_build import make_camera
 from dualslam.io.container import equivalent_focal_mm
 from dualslam.io.exif import is_likely, over_longer_side
 from dualslam.io.images import ImageReader, UnreadableImageError
 from dualslam.io.read_ahead import read_ahead
-from dualslam.io.sequence import Given, Recording, Selection
+from dualslam.io.sequence import Given, Recording, Selection, camera_of_size
 from dualslam.io.times import NOMINAL_RATE_HZ, resolve_times
 
 log = logging.getLogger(__name__)
@@ -319,11 +319,8 @@ def open_webcam(
     if camera is None:
         degrees = float(fov_degrees or 0.0)
         camera = make_camera("the field of view", lambda: camera_from_fov(width, height, degrees))
-    elif camera.size_px != (width, height):
-        raise InputError(
-            f"The camera file is for images of {camera.width} x {camera.height} pixels, but those of {name} "
-            f"are {width} x {height}; give the calibration of these images."
-        )
+    else:
+        camera = camera_of_size(camera, (width, height), name, "The camera file")
     return WebcamSequence(name, camera, fps if fps > 0 else NOMINAL_RATE_HZ, selection, grey, connected)
 
 

@@ -19,6 +19,7 @@ from dualslam.core.camera.models import (
     camera_from_dict,
     camera_from_fov,
 )
+from dualslam.core.camera.sphere import DoubleSphereCamera, EucmCamera, OmniCamera
 from dualslam.core.errors import InputError
 
 ROUND_TRIP_PX = 1e-7
@@ -33,9 +34,14 @@ TUMVI = KannalaBrandtCamera(
 )
 TUMMONO = FovCamera.from_tum_mono(0.535719308086809, 0.669566858850269, 0.493248545285398, 0.500408664348414,
                                   0.897966326944875, 1280, 1024)  # fmt: skip
+# The examples of Kalibr's and Basalt's pages, or near them.
+OMNI = OmniCamera(752, 480, 1200.0, 1201.0, 367.0, 248.0, xi=1.9, k1=-0.1, k2=0.02, p1=0.0003, p2=-0.0006)
+UCM = OmniCamera(752, 480, 350.0, 351.0, 367.0, 248.0, xi=0.7)
+EUCM = EucmCamera(512, 512, 220.0, 221.0, 255.0, 256.0, alpha=0.6, beta=1.1)
+SPHERES = DoubleSphereCamera(512, 512, 150.0, 151.0, 255.0, 256.0, xi=-0.2, alpha=0.59)
 BARREL = DivisionCamera(752, 480, 461.0, 461.0, 375.5, 239.5, k=-0.3)
-CAMERAS = [PINHOLE, FR1, EUROC, TUMVI, TUMMONO, BARREL]
-IDS = ["pinhole", "fr1", "euroc", "tumvi", "tummono", "division"]
+CAMERAS = [PINHOLE, FR1, EUROC, TUMVI, TUMMONO, BARREL, OMNI, UCM, EUCM, SPHERES]
+IDS = ["pinhole", "fr1", "euroc", "tumvi", "tummono", "division", "omni", "ucm", "eucm", "double_sphere"]
 
 
 def pixels(camera: Camera, seed: int = 0, n: int = 400, middle: float = 1.0) -> np.ndarray:
@@ -75,7 +81,7 @@ def test_rectified_pixels_are_told_to_be_in_the_image_or_not(camera: Camera) -> 
     uv = pixels(camera)
     rect, _ = camera.rectify(uv)
     known = np.isfinite(rect).all(1)
-    assert known.mean() > 0.8  # the TUM-VI lens has corners beyond 80 degrees
+    assert known.mean() > 0.8  # the TUM-VI lens and the double sphere has corners beyond 80 degrees
     np.testing.assert_allclose(camera.unrectify(rect[known]), uv[known], atol=ROUND_TRIP_PX)
     assert np.array_equal(camera.shows(rect), known)
     beyond = np.concatenate([uv * (1, 0) - (0, 1), uv * (0, 1) - (1, 0), uv * (1, 0) + (0, camera.height)])
@@ -108,6 +114,24 @@ def test_radtan_agrees_with_opencv(camera: RadTanCamera) -> None:
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-14)
     theirs = cv2.undistortPoints(uv.reshape(-1, 1, 2), K, d, R=np.eye(3), P=K, criteria=criteria).reshape(-1, 2)
     np.testing.assert_allclose(camera.rectify(uv)[0], theirs, atol=ORACLE_PX)
+
+
+def test_models_of_a_sphere_project_as_their_papers_say() -> None:
+    """Each formula with the letters of its paper, for rays up to 100 degrees from the axis."""
+    rng = np.random.default_rng(3)
+    theta, phi = rng.uniform(0.0, math.radians(100.0), 200), rng.uniform(0.0, 2.0 * math.pi, 200)
+    p = 2.5 * np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], 1)
+    x, y, z = p.T
+    xi, alpha, beta = SPHERES.xi, SPHERES.alpha, EUCM.beta
+    d1 = np.sqrt(x * x + y * y + z * z)
+    d2 = np.sqrt(x * x + y * y + (xi * d1 + z) ** 2)
+    divisor = alpha * d2 + (1 - alpha) * (xi * d1 + z)  # Usenko (2018), Eq. (40)
+    np.testing.assert_allclose(SPHERES.project(p), np.stack([150 * x, 151 * y], 1) / divisor[:, None] + (255, 256))
+    alpha = EUCM.alpha
+    divisor = alpha * np.sqrt(beta * (x * x + y * y) + z * z) + (1 - alpha) * z  # Khomutenko (2016)
+    np.testing.assert_allclose(EUCM.project(p), np.stack([220 * x, 221 * y], 1) / divisor[:, None] + (255, 256))
+    x, y = x / (z + UCM.xi * d1), y / (z + UCM.xi * d1)  # Mei (2007)
+    np.testing.assert_allclose(UCM.project(p), np.stack([350 * x + 367, 351 * y + 248], 1))
 
 
 def test_kannala_brandt_agrees_with_opencv_fisheye() -> None:
@@ -206,6 +230,13 @@ def test_field_of_view() -> None:
     camera = camera_from_fov(640, 480, 90.0)
     edges = camera.unproject([[-0.5, 239.5], [639.5, 239.5]])
     np.testing.assert_allclose(edges[0] @ edges[1], 0.0, atol=1e-12)
+
+
+def test_field_of_view_of_an_upright_image_is_that_of_its_longer_side() -> None:
+    """As a telephone's maker tells it, however it is held."""
+    upright, lying = camera_from_fov(480, 640, 70.0), camera_from_fov(640, 480, 70.0)
+    assert (upright.fx, upright.fy) == (lying.fx, lying.fy)
+    assert (upright.cx, upright.cy) == (lying.cy, lying.cx)
 
 
 @pytest.mark.parametrize(

@@ -50,6 +50,19 @@ def test_dataset_folder_with_distortion(dataset: Path, numbers: str) -> None:
     assert camera.k3 == (0.3 if numbers.endswith("0.3") else 0.0)
 
 
+def test_a_calibration_for_another_size_is_scaled(dataset: Path, tmp_path: Path, caplog) -> None:
+    """The rays of pixels stay: pixel corners are scaled, not their centres. What it was made of is said."""
+    path = tmp_path / "camera.yaml"
+    path.write_text("model: radtan\nfx: 60\nfy: 62\ncx: 31.5\ncy: 24.5\nk1: -0.1\nwidth: 64\nheight: 48\n")
+    camera = open_sequence(dataset, camera_file=path).camera
+    assert camera == RadTanCamera(32, 24, 30.0, 31.0, 15.5, 12.0, k1=-0.1)
+    assert f"{path} is for images of 64 x 48 pixels: scaled to those of walk_01, 32 x 24" in caplog.text
+    for size in ("width: 64\nheight: 40\n", "width: 32\nheight: 25\n"):
+        path.write_text(f"model: pinhole\nfx: 30\nfy: 30\ncx: 15\ncy: 12\n{size}")
+        with pytest.raises(InputError, match="of another shape; give the calibration of these images"):
+            open_sequence(dataset, camera_file=path)
+
+
 @pytest.mark.parametrize(("camera", "offset"), [(0, 0.0), (2, 1.0)])
 def test_kitti(make, tmp_path: Path, camera: int, offset: float) -> None:
     sequence = open_sequence(make["kitti"](tmp_path, camera))

@@ -131,7 +131,10 @@ class Camera(ABC):
 
     def scaled(self, factor: float) -> Self:
         """Return the camera of the image resized by `factor` (sizes rounded, intrinsics follow the rounded sizes)."""
-        width, height = max(round(self.width * factor), 1), max(round(self.height * factor), 1)
+        return self.resized(max(round(self.width * factor), 1), max(round(self.height * factor), 1))
+
+    def resized(self, width: int, height: int) -> Self:
+        """Return the camera of the whole image resized to `width` x `height` pixels."""
         sx, sy = width / self.width, height / self.height
         return dataclasses.replace(
             self,

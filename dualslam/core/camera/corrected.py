@@ -122,9 +122,9 @@ class CorrectedCamera(Camera):
         K = self.K
         return xy * (K[0, 0], K[1, 1]) + K[:2, 2], magnification / np.sqrt(np.where(ratio > 0, ratio, np.nan))
 
-    def scaled(self, factor: float) -> Self:
-        """Return the camera of the image resized by `factor`."""
-        base = self.base.scaled(factor)
+    def resized(self, width: int, height: int) -> Self:
+        """Return the camera of the whole image resized to `width` x `height` pixels."""
+        base = self.base.resized(width, height)
         moved = dataclasses.replace(
             self.correction,
             du_px=self.correction.du_px * base.width / self.width,

@@ -1,4 +1,4 @@
-"""Camera models: pinhole, radial-tangential, Kannala-Brandt, field-of-view and division; see `Camera`."""
+"""Camera models: pinhole, radial-tangential, Kannala-Brandt, field-of-view, division, and those of sphere.py."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dualslam.core.camera.base import Camera, lift, plane
+from dualslam.core.camera.sphere import DoubleSphereCamera, EucmCamera, OmniCamera
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import distortion
 from dualslam.core.types import FloatArray
@@ -219,8 +220,9 @@ class DivisionCamera(Camera):
         return distortion.division_area_ratio(self._distort(lift(xy)), self.k)
 
 
+_SPHERES = (OmniCamera, EucmCamera, DoubleSphereCamera)
 MODELS: dict[str, type[Camera]] = {
-    c.model: c for c in (PinholeCamera, RadTanCamera, KannalaBrandtCamera, FovCamera, DivisionCamera)
+    c.model: c for c in (PinholeCamera, RadTanCamera, KannalaBrandtCamera, FovCamera, DivisionCamera, *_SPHERES)
 }
 
 
@@ -243,8 +245,11 @@ def camera_from_dict(values: Mapping[str, Any]) -> Camera:
 
 
 def camera_from_fov(width: int, height: int, degrees: float) -> PinholeCamera:
-    """Return a pinhole camera with the given horizontal field of view and its principal point in the middle."""
+    """Return a pinhole camera with a field of view along its longer side, and its principal point in the middle.
+
+    The longer side, as that is what makers of cameras tell, however a telephone is held.
+    """
     if not isinstance(degrees, int | float | np.number) or not 0 < degrees < 180:
         raise InputError(f"camera: field of view is {degrees!r} degrees, it must be between 0 and 180")
-    f = 0.5 * width / math.tan(math.radians(0.5 * degrees))
+    f = 0.5 * max(width, height) / math.tan(math.radians(0.5 * degrees))
     return PinholeCamera(width, height, f, f, 0.5 * (width - 1), 0.5 * (height - 1))
