@@ -18,7 +18,7 @@ from dualslam.io.map_store import StoredMap
 from dualslam.map.connections import Connections
 from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameResult, FrameRow
-from dualslam.map.record import Record
+from dualslam.map.record import FrameStamp, Record
 from dualslam.map.worlds import Worlds
 from dualslam.places.handover import Handover
 from dualslam.places.revisits import Revisits
@@ -103,6 +103,7 @@ class System:
             components.calibration,
             self._connections,
             config.recovery,
+            self._state.front_ends,
             config.audit.enabled,
         )
         self._calibrations = Calibrations(
@@ -243,7 +244,11 @@ class System:
         self.numbers.end()
         state, last = self._state, next(reversed(self.rows.values()), None)
         self._graphs.finish(last)
+        if state.live is not None and last is not None:
+            self._calibrations.collect(state.live, last, self._recoveries.waiting, wait=True)
         self._recoveries.finish(state.live, last, interrupted or state.localises)
+        if state.live is not None and last is not None:
+            self._take_shutter(state.live, last, wait=True)
         if last is not None:
             self._places.finish(last)
         self._graphs.finish(last)
@@ -324,6 +329,7 @@ class System:
         self._ask_shutter(live, view)
         self._calibrations.ask_if_due(live, view, self._recoveries.waiting)
         if self._endings.is_full(live.submap):
+            self._take_open(live, view)
             self._endings.roll_over(live, view)
         else:
             self._recoveries.retry(live.submap, view)
@@ -332,9 +338,15 @@ class System:
 
     def _ask_shutter(self, live: VisualOdometry, view: View) -> None:
         """Ask the live map how long its images were read; not where what comes back meanwhile has the pixels of now."""
-        under_way = self._recoveries.is_under_way(live.submap) or self.desk.n_open(JobKind.CALIBRATION)
-        if self.saved is None and not under_way:
-            self._shutter_watch.ask_if_due(live, view, self._recoveries.waiting)
+        if self.saved is None:
+            self._shutter_watch.ask_if_due(live)
+            self._take_shutter(live, view)
+
+    def _take_shutter(self, live: VisualOdometry, now: FrameStamp, wait: bool = False) -> None:
+        """Take in how long its images were read; not while what is open for the map has the pixels of now."""
+        open_ = self._recoveries.is_under_way(live.submap) or self.desk.n_open(JobKind.CALIBRATION, live.submap.id)
+        if not open_:
+            self._shutter_watch.collect(live, now, self._recoveries.waiting, wait)
 
     def _lose(self, live: VisualOdometry, view: View, failure: Failure) -> Track | Failure:
         """Take a frame that was not posed: the map may be seen again until the next one starts, or it is given up."""
@@ -362,9 +374,16 @@ class System:
         # A map whose end is suspected is no witness.
         if all(frame.failed for frame in self._state.health.suspected()):
             self._calibrations.ask_at_loss(live, view, self._recoveries.waiting)
+        self._take_open(live, view)
         self._starting.begin_anew([])
         self._starting.foresee()
         return self.buffer.newest(1)[0]
+
+    def _take_open(self, live: VisualOdometry, now: FrameStamp) -> None:
+        """Wait, where no clock goes on, for what a map that may end is still to hear of its camera."""
+        if not self.pace.in_real_time:
+            self._calibrations.collect(live, now, self._recoveries.waiting, wait=True)
+            self._take_shutter(live, now, wait=True)
 
     def _begin_anew(self) -> None:
         """Look for the next map's start from the frames since the loss on, rectified by the camera of now."""

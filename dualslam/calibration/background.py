@@ -92,21 +92,21 @@ class Calibrations:
             self._ask(live, now, lost)
 
     def _ask(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int]) -> None:
-        if self._desk.n_open(JobKind.CALIBRATION):
+        if self._desk.n_open(JobKind.CALIBRATION, live.submap.id):
             return
         with self._record.timer.measure("calibration"):
             job = self._calibration.ask(live.submap, {m: self._record.atlas.submaps[m] for m in lost})
-            self._desk.submit(JobKind.CALIBRATION, job)
+            self._desk.submit(JobKind.CALIBRATION, job, of=live.submap.id)
         self.collect(live, now, lost)
 
-    def collect(self, live: VisualOdometry | None, now: FrameStamp, lost: Collection[int]) -> bool:
+    def collect(self, live: VisualOdometry | None, now: FrameStamp, lost: Collection[int], wait: bool = False) -> bool:
         """Take in what was answered meanwhile; `live` goes on in its submap as it is after that.
 
         It may be the front end that looks for a submap which was lost since it was asked. Returns whether the frames to
-        come have another camera.
+        come have another camera. `wait`: for a limited time, for what is open.
         """
-        before = self._calibration.camera
-        for ended in self._desk.poll(JobKind.CALIBRATION):
+        before, desk = self._calibration.camera, self._desk
+        for ended in desk.drain(JobKind.CALIBRATION) if wait else desk.poll(JobKind.CALIBRATION):
             with self._record.timer.measure("calibration"):
                 self._take(ended.work, ended.result, live, now, lost)
         return self._calibration.camera is not before

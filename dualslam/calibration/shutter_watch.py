@@ -95,29 +95,35 @@ class ShutterWatch:
         self._new_graph = new_graph
         self._connections = connections
         self._due_at: dict[int, float] = {}  # by submap, keyframes
-        self._asked: tuple[object, int, float, Camera] | None = None  # what, of which submap, of which pixels
+        self._asked: dict[int, tuple[object, float, Camera]] = {}  # by submap: what, and of which pixels
 
-    def ask_if_due(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int]) -> None:
-        """Ask the live submap where it is time to, and take in what it has answered.
-
-        `lost`: the submaps that are to be linked with it, and must have the same pixels.
-        """
+    def ask_if_due(self, live: VisualOdometry) -> None:
+        """Ask the live submap where it is time to."""
         submap = live.submap
         n = len(submap.keyframes)
-        if self._shutter.is_stated:
+        if self._shutter.is_stated or self._desk.n_open(JobKind.READOUT, submap.id):
             return
         with self._record.timer.measure("shutter"):
-            if n >= self._due_at.get(submap.id, FIRST_KEYFRAMES) and not self._desk.n_open(JobKind.READOUT):
+            if n >= self._due_at.get(submap.id, FIRST_KEYFRAMES):
                 self._due_at[submap.id] = GROWTH * n
                 question = self._shutter.ask(
                     submap, turn_rates(submap, self._record.poses.values()), self._calibration.camera
                 )
                 if not isinstance(question, Failure):
-                    self._desk.submit(JobKind.READOUT, question)
-                    self._asked = question, submap.id, self._shutter.readout_s, self._calibration.camera
-            for ended in self._desk.poll(JobKind.READOUT):
-                # What was asked of another map, or of other pixels, is no answer.
-                if self._asked == (ended.work, submap.id, self._shutter.readout_s, self._calibration.camera):
+                    self._asked[submap.id] = question, self._shutter.readout_s, self._calibration.camera
+                    self._desk.submit(JobKind.READOUT, question, of=submap.id)
+
+    def collect(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int], wait: bool = False) -> None:
+        """Take in what the live submap has answered.
+
+        `lost`: the submaps that are to be linked with it, and must have the same pixels. `wait`: for a limited time,
+        for what is open.
+        """
+        for ended in self._desk.drain(JobKind.READOUT) if wait else self._desk.poll(JobKind.READOUT):
+            asked = self._asked.get(live.submap.id)
+            # An answer of another map, or of other pixels, is no answer.
+            if asked == (ended.work, self._shutter.readout_s, self._calibration.camera):
+                with self._record.timer.measure("shutter"):
                     self._take_answer(ended.result, live, now, lost)
 
     def _take_answer(

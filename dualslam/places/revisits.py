@@ -134,7 +134,7 @@ class Revisits:
         self._n_asked += 1
         # Which another must not take the place of.
         waits = self._believed is not None or self._closing is not None
-        busy = waits or self._desk.n_open(JobKind.LOOP)
+        busy = waits or self._desk.n_open(JobKind.LOOP, live.submap.id)
         if busy or (self._provisional is None and self._n_asked % ASK_EVERY):
             return
         submap, keyframe_id = live.submap, live.reference_id
@@ -144,7 +144,7 @@ class Revisits:
         candidates = tuple(self._recogniser.query(features, submaps, self._may_be(submap, keyframe_id)))
         named = {submap.id, *(candidate.submap_id for candidate in candidates)} if candidates else set()
         search = PlaceSearch(submap.id, keyframe_id, candidates, {m: submaps[m].copy() for m in sorted(named)})
-        self._desk.submit(JobKind.LOOP, search)
+        self._desk.submit(JobKind.LOOP, search, of=submap.id)
 
     def wait(self, live: VisualOdometry, now: FrameStamp) -> None:
         """Wait for the search that is under way: without a clock none is left out for one that is not over."""

@@ -71,6 +71,8 @@ class Recoveries:
     calibration : Calibration
     connections : Connections
     config : RecoveryConfig
+    front_ends : callable
+        Gives those that go on, or may go on, in a submap of the atlas.
     audits : bool
         Whether the starts of maps are audited (`recovery/audit.py`).
     """
@@ -84,6 +86,7 @@ class Recoveries:
         calibration: Calibration,
         connections: Connections,
         config: RecoveryConfig,
+        front_ends: Callable[[], Iterable[VisualOdometry]],
         audits: bool = False,
     ) -> None:
         self._record = record
@@ -93,6 +96,7 @@ class Recoveries:
         self._calibration = calibration
         self._connections = connections
         self._config = config
+        self._front_ends = front_ends
         self._lost: dict[int, Loss] = {}  # submaps that are not linked yet
         self._under_way: dict[int, _UnderWay] = {}  # by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
@@ -341,8 +345,9 @@ class Recoveries:
             return False
         before = submap.copy()
         submap.take_over(merged.submap)
-        if live is not None and live.submap is submap:
-            live.adopt(graph, before)
+        for front_end in self._front_ends():
+            if front_end.submap is submap:
+                front_end.adopt(graph, before)
         self._connections.follow(before, submap, now)
         self._note_events(result)
         recovered_frames = pose_frames(self._record, result.frames, merged, submap, change)

@@ -128,14 +128,15 @@ class ScaleWatch:
         """Ask about the next group, once what comes after it is there."""
         ids = np.array(sorted(submap.keyframes), np.int64)
         begin = int(np.searchsorted(ids, self._asked.setdefault(submap.id, int(ids[-1])), side="right"))
-        if len(ids) < begin + GROUP + BEHIND or self._desk.n_open(JobKind.SCALE):
+        if len(ids) < begin + GROUP + BEHIND or self._desk.n_open(JobKind.SCALE, submap.id):
             return
         before, group = ids[begin - GROUP : begin], ids[begin : begin + GROUP]
         after = ids[begin + GROUP : begin + 2 * GROUP]
         self._asked[submap.id] = int(group[-1])
         if len(before) < GROUP or count_ties(submap, ids, begin, begin + GROUP, n_views=2) >= FIRM_TIES:
             return
-        self._desk.submit(JobKind.SCALE, _Asked(submap.id, group, question_about(submap, ids, before, after)))
+        asked = _Asked(submap.id, group, question_about(submap, ids, before, after))
+        self._desk.submit(JobKind.SCALE, asked, of=submap.id)
 
     @staticmethod
     def _loss_at(submap: Submap, group: IntArray, sigma: float, links: Iterable[Link]) -> ScaleLoss | None:

@@ -61,8 +61,9 @@ class Endings:
         self._scale_watch = ScaleWatch(config.linking, state.parts.desk) if config.audit.enabled else None
 
     def archive(self, live: VisualOdometry, why: str) -> None:
-        """Archive the live submap."""
+        """Archive the live submap; what only a live one could use is no longer computed."""
         archive(self._state.record, live.submap, live.graph, why)
+        self._state.parts.desk.withdraw(live.submap.id)
 
     # --- with the track
 
@@ -90,11 +91,11 @@ class Endings:
         self._recoveries.declare_lost(live.submap.id, onset, str(failure.reason), lost[0].index)
         state.live = None
         state.begin_health()
-        # Not where two poses stood, or where reverse tracking is about to change it.
+        # Not where two poses stood.
         doubtful = failure.reason in (FailureReason.LOOK_ALIKE, FailureReason.LEAP)
         if doubtful:
             self._sightings.avoid(live.submap.id)
-        if may_return and not doubtful and not self._recoveries.is_under_way(live.submap):
+        if may_return and not doubtful:
             state.relocaliser.begin(live)
 
     def break_at(self, live: VisualOdometry, view: View, first: int, failure: Failure) -> None:

@@ -182,7 +182,8 @@ class Starting:
         One that comes early rests on frames close together, and must be firm: it is to be tracked back from.
         """
         self._foresee_from(view)
-        if self._state.parts.desk.n_open(JobKind.CALIBRATION):  # what the present one says of its camera is for both
+        present = None if self._state.live is None else self._state.live.submap.id
+        if self._state.parts.desk.n_open(JobKind.CALIBRATION, present):  # what it says of its camera is for both
             self._starter.collect(view)
             return Failure(FailureReason.BUSY, "the camera is being asked for")
         start, is_early = self.find_start(view), len(self._state.lost) <= EARLY_FRAMES

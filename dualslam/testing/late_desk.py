@@ -14,12 +14,14 @@ class LateDesk:
         self.inner, self.polls = inner, polls
         self.waiting: dict[JobKind, list[tuple[int, Ended]]] = {}
         self.n_polls: dict[JobKind, int] = {}
+        self.maps: dict[int, int | None] = {}  # by the work's id
 
-    def submit(self, kind: JobKind, work: Any) -> None:
+    def submit(self, kind: JobKind, work: Any, of: int | None = None) -> None:
         """Do the work at once, and keep its result back."""
         self.inner.submit(kind, work)
         at = self.n_polls.get(kind, 0) + self.polls
         self.waiting.setdefault(kind, []).extend((at, ended) for ended in self.inner.poll(kind))
+        self.maps[id(work)] = of
 
     def poll(self, kind: JobKind) -> list[Ended]:
         """Return what is due."""
@@ -28,9 +30,14 @@ class LateDesk:
         self.waiting[kind] = [(at, ended) for at, ended in self.waiting.get(kind, []) if at >= now]
         return due
 
-    def n_open(self, kind: JobKind) -> int:
-        """Return how many results are kept back."""
-        return len(self.waiting.get(kind, []))
+    def n_open(self, kind: JobKind, of: int | None = None) -> int:
+        """Return how many results are kept back; `of`: of one submap."""
+        return sum(of in (None, self.maps.get(id(ended.work))) for _, ended in self.waiting.get(kind, []))
+
+    def withdraw(self, of: int) -> None:
+        """Drop the results that are of use to this submap alone."""
+        for kind, waiting in self.waiting.items():
+            self.waiting[kind] = [(at, ended) for at, ended in waiting if self.maps.get(id(ended.work)) != of]
 
     def drain(self, kind: JobKind) -> list[Ended]:
         """Return all results, due or not."""

@@ -73,6 +73,7 @@ class _Job:
     kind: JobKind
     work: Any
     submitted_s: float
+    of: int | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,14 +199,14 @@ class WorkerDesk:
             self._look(queue, wait=True)
         return ended[0]
 
-    def submit(self, kind: JobKind, work: Any) -> None:
+    def submit(self, kind: JobKind, work: Any, of: int | None = None) -> None:
         """Give the job to an idle worker, or let it wait for one."""
         queue = self._by_kind[kind]
         n_waiting = sum(job.kind is kind for job in queue.waiting)
         if n_waiting >= queue.lane.max_waiting:
             self._end(kind, Ended(work, Failure(FailureReason.BUSY, f"{n_waiting} jobs wait for a {kind} already")))
             return
-        queue.waiting.append(_Job(kind, work, time.monotonic()))
+        queue.waiting.append(_Job(kind, work, time.monotonic(), of))
         self._hand_out(queue)
         statistics = self.statistics[kind]
         statistics.max_waiting = max(statistics.max_waiting, sum(job.kind is kind for job in queue.waiting))
@@ -215,12 +216,18 @@ class WorkerDesk:
         self._look(self._by_kind[kind])
         return self._ended.pop(kind, [])
 
-    def n_open(self, kind: JobKind) -> int:
-        """Count the jobs of a kind that wait or run."""
+    def n_open(self, kind: JobKind, of: int | None = None) -> int:
+        """Count the jobs of a kind that wait or run; `of`: those that are of use to this submap alone."""
         queue = self._by_kind.get(kind)
         if queue is None:
             return 0
-        return sum(job.kind is kind for job in [*queue.waiting, *(task.job for task in queue.busy)])
+        jobs = [*queue.waiting, *(task.job for task in queue.busy)]
+        return sum(job.kind is kind and of in (None, job.of) for job in jobs)
+
+    def withdraw(self, of: int) -> None:
+        """Drop the jobs that wait and are of use to this submap alone."""
+        for queue in self._queues:
+            queue.waiting = [job for job in queue.waiting if job.of != of]
 
     def drain(self, kind: JobKind) -> list[Ended]:
         """Wait, for a limited time, for what is under way; what has not ended by then ends as a `Failure`.

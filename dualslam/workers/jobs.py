@@ -34,6 +34,7 @@ class JobKind(StrEnum):
     CALIBRATION = "calibration"
     LOOP = "loop search"
     WALK = "walk back"
+    AUDIT = "audit"
     FORESIGHT = "foresight"
 
 
@@ -80,16 +81,23 @@ class Ended:
 class Desk(Protocol):
     """Takes work on and gives results out: nobody waits for anything before the run ends."""
 
-    def submit(self, kind: JobKind, work: Any) -> None:
-        """Take a job on; one too many ends at once, as a `Failure`."""
+    def submit(self, kind: JobKind, work: Any, of: int | None = None) -> None:
+        """Take a job on; one too many ends at once, as a `Failure`.
+
+        `of`: the submap without which the answer is of no use.
+        """
         ...
 
     def poll(self, kind: JobKind) -> list[Ended]:
         """Return what has ended of a kind since the last call, in the order in which it ended; never wait."""
         ...
 
-    def n_open(self, kind: JobKind) -> int:
-        """Count the jobs of a kind that wait or run."""
+    def n_open(self, kind: JobKind, of: int | None = None) -> int:
+        """Count the jobs of a kind that wait or run; `of`: those that are of use to this submap alone."""
+        ...
+
+    def withdraw(self, of: int) -> None:
+        """Drop the jobs that wait and are of use to this submap alone: it is no longer live."""
         ...
 
     def drain(self, kind: JobKind) -> list[Ended]:
@@ -126,7 +134,7 @@ class InlineDesk:
         self._handlers = handlers
         self._done: defaultdict[JobKind, list[Ended]] = defaultdict(list)
 
-    def submit(self, kind: JobKind, work: Any) -> None:
+    def submit(self, kind: JobKind, work: Any, of: int | None = None) -> None:
         """Do the job."""
         self._done[kind].append(Ended(work, self._handlers[kind](work)))
 
@@ -134,9 +142,12 @@ class InlineDesk:
         """Return what was done since the last call."""
         return self._done.pop(kind, [])
 
-    def n_open(self, kind: JobKind) -> int:
+    def n_open(self, kind: JobKind, of: int | None = None) -> int:
         """Return 0."""
         return 0
+
+    def withdraw(self, of: int) -> None:
+        """Do nothing: no job waits."""
 
     def drain(self, kind: JobKind) -> list[Ended]:
         """Return what was done since the last call."""

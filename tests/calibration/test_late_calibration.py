@@ -25,7 +25,8 @@ from tests.calibration.test_lens import WRONG, CalibrationWorld
 N_FRAMES = 60
 
 
-def late_system(polls: int, recovery: bool = False) -> tuple[System, CalibrationWorld]:
+def late_system(polls: int, recovery: bool = False, waits: bool = False) -> tuple[System, CalibrationWorld]:
+    """`waits`: there is no clock, and a map that may end is waited for."""
     settings = {
         "calibration": {"first_keyframes": 12, "max_observations": 6000},
         "keyframes": {"max_parallax_deg": 1.0},
@@ -35,11 +36,12 @@ def late_system(polls: int, recovery: bool = False) -> tuple[System, Calibration
     }
     system, world = build_system(Config.model_validate(settings), wrong_camera(WRONG)), CalibrationWorld()
     system._calibrations._desk = LateDesk(system._state.parts.desk, polls)
+    system._state.pace.in_real_time = not waits
     return system, world
 
 
-def run(polls: int, n_frames: int = N_FRAMES, blind: range = range(0)) -> System:
-    system, world = late_system(polls)
+def run(polls: int, n_frames: int = N_FRAMES, blind: range = range(0), waits: bool = False) -> System:
+    system, world = late_system(polls, waits=waits)
     calibration = system._state.parts.calibration
 
     def view_of(frame: Frame) -> object:
@@ -102,6 +104,18 @@ def test_an_answer_for_a_map_that_was_lost_meanwhile_changes_nothing(in_time: Sy
     assert "live no more" in kept.data["reason"]
     np.testing.assert_array_equal(system._state.parts.calibration.camera.K, wrong_camera(WRONG).K)
     assert all((submap.K == wrong_camera(WRONG).K).all() for submap in system.atlas.submaps.values())
+
+
+@pytest.mark.parametrize("is_lost", [False, True])
+def test_without_a_clock_a_map_that_ends_has_the_answer_first(in_time: System, is_lost: bool) -> None:
+    """It is to come after a hundred frames; the run, or the map, ends five after the question."""
+    asked = in_time.events.of_kind(EventKind.CALIBRATED)[0].frame
+    end = asked + 5
+    system = run(100, end + 1, range(end, end + 1) if is_lost else range(0), waits=True)
+    (found,) = system.events.of_kind(EventKind.CALIBRATED)
+    assert found.frame == end
+    (submap,) = system.atlas.submaps.values()
+    np.testing.assert_array_equal(submap.K, system._state.parts.calibration.camera.K)
 
 
 def test_a_next_start_has_the_pixels_of_a_camera_that_was_found_while_the_map_was_about_to_be_lost() -> None:

@@ -29,10 +29,10 @@ class CountingDesk(LateDesk):
         self.asked: list[object] = []
         self._failures = list(failures)
 
-    def submit(self, kind: JobKind, work: object) -> None:
+    def submit(self, kind: JobKind, work: object, of: int | None = None) -> None:
         """Do the work, or lose it."""
         self.asked.append(work)
-        super().submit(kind, work)
+        super().submit(kind, work, of)
         if self._failures:
             at, ended = self.waiting[kind].pop()
             self.waiting[kind].append((at, Ended(ended.work, Failure(self._failures.pop(0), "it died"))))

@@ -216,7 +216,7 @@ def test_a_worker_that_dies_over_a_search_costs_that_search_alone() -> None:
     inner, lost = system._state.parts.desk, []
 
     class Deadly(InlineDesk):
-        def submit(self, kind: JobKind, work: PlaceSearch) -> None:
+        def submit(self, kind: JobKind, work: PlaceSearch, of: int | None = None) -> None:
             if work.candidates and len(lost) < 2:
                 lost.append(work)
                 self._done[kind].append(Ended(work, Failure(FailureReason.WORKER, "it died")))

@@ -164,7 +164,7 @@ class _LateDesk(InlineDesk):
     def poll(self, kind: JobKind) -> list[Ended]:
         return [] if self.held else super().poll(kind)
 
-    def n_open(self, kind: JobKind) -> int:
+    def n_open(self, kind: JobKind, of: int | None = None) -> int:
         return len(self._done[kind]) if self.held else 0
 
 

@@ -179,6 +179,19 @@ def test_what_is_not_waited_for_any_longer_leaves_its_place_to_others() -> None:
         assert collect(desk, CALIBRATION)[0].result == 2
 
 
+def test_a_map_that_is_no_longer_live_withdraws_what_waits_for_it_and_nothing_else() -> None:
+    with working(lane(CALIBRATION, WALK)) as desk:
+        desk.submit(WALK, ("sleep", 0.5))
+        desk.submit(CALIBRATION, np.arange(3.0), of=0)
+        desk.submit(CALIBRATION, np.ones(3), of=1)
+        desk.submit(WALK, ("sleep", 0.0))
+        assert [desk.n_open(CALIBRATION, of) for of in (0, 1, 2, None)] == [1, 1, 0, 2]
+        desk.withdraw(0)
+        assert [desk.n_open(CALIBRATION, of) for of in (0, 1, 2, None)] == [0, 1, 0, 1]
+        assert [ended.result.tolist() for ended in desk.drain(CALIBRATION)] == [[2, 2, 2]]
+        assert reasons(desk.drain(WALK)) == [None] * 2
+
+
 def kill(desk: WorkerDesk) -> None:
     os.kill(desk.pids[0] or 0, signal.SIGKILL)
 

@@ -107,11 +107,13 @@ def test_an_unsure_answer_changes_nothing() -> None:
 
 
 def test_an_answer_that_came_late_counts_for_the_map_that_was_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first map was lost before its answer was looked at; the next one asks, and meets it."""
+    """The first map was lost before its answer was looked at; the next one asks nevertheless, and meets both."""
     system, taken = system_in(PointWorld(cloud(), walk(2)), camera={"readout_s": None}), []
-    watch, ended = system._shutter_watch, []
+    watch, ended, maps = system._shutter_watch, [], []
     desk = SimpleNamespace(
-        n_open=lambda kind: 0, submit=lambda kind, work: ended.append(Ended(work, len(ended))), poll=lambda kind: []
+        n_open=lambda kind, of: sum(each == of for each in maps),
+        submit=lambda kind, work, of: (ended.append(Ended(work, len(ended))), maps.append(of)),
+        poll=lambda kind: [],
     )
     monkeypatch.setattr(watch, "_desk", desk)
     monkeypatch.setattr(watch, "_shutter", SimpleNamespace(is_stated=False, readout_s=0.0, ask=lambda *_: object()))
@@ -120,7 +122,9 @@ def test_an_answer_that_came_late_counts_for_the_map_that_was_asked(monkeypatch:
         submap = made_map(0.0)[0]
         submap.id = m
         desk.poll = (lambda kind: []) if m == 0 else (lambda kind: ended)
-        watch.ask_if_due(cast(VisualOdometry, SimpleNamespace(submap=submap)), Frame(0, 0.0, None), ())
+        live = cast(VisualOdometry, SimpleNamespace(submap=submap))
+        watch.ask_if_due(live)
+        watch.collect(live, Frame(0, 0.0, None), ())
     assert taken == [1]
 
 
