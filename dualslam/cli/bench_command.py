@@ -23,21 +23,22 @@ from dualslam.lab.bench.record import TrialRecord, judge
 from dualslam.lab.bench.run import Executor, run_bench
 from dualslam.lab.bench.spec import BenchSpec, Half, load_spec
 from dualslam.lab.bench.tables import bench_tables
+from dualslam.lab.bench.verdict_tables import verdict_tables
 from dualslam.lab.bench.write_tables import TABLES, write_tables
 from dualslam.run.bench_trial import describe_source, run_trial
 
 
 def execute(args: argparse.Namespace) -> int:
     """Run what is not done yet, write the tables, and print them."""
-    spec = load_spec(args.spec).only(args.only).with_trials(args.trials, args.half)
+    spec = load_spec(args.spec).only(args.only).parts(args.part).with_trials(args.trials, args.half)
     if args.data is not None and not args.data.is_dir():
         raise InputError(f"--data {args.data} is no folder; give the one that holds the sequences.")
     trials = plan_trials(spec, partial(describe_source, data=args.data))
     out: Path = args.out if args.out is not None else Path("runs") / _folder_name(spec)
     logs.release()
     with _progress(spec, args.quiet) as on_trial:
-        records = run_bench(spec, trials, out, _executor(args, out), on_trial)
-    tables = bench_tables(spec, records)
+        records = run_bench(spec, trials, out, _executor(args, out), on_trial, args.limit)
+    tables = verdict_tables(spec, records) + bench_tables(spec, records)
     written = write_tables(spec, tables, records, out, command=_command(args))
     written += draw_figures(spec, tables, records, out)
     if not args.quiet:
@@ -64,6 +65,7 @@ def _command(args: argparse.Namespace) -> str:
     words = ["dualslam bench", str(args.spec)]
     words += ["--data DIR"] if args.data is not None else []
     words += [f"--only {name}" for name in args.only]
+    words += [f"--part {name}" for name in args.part]
     words += [f"--trials {args.trials}"] if args.trials is not None else []
     words += [f"--half {args.half}"] if args.half is not None else []
     return " ".join(words)

@@ -284,7 +284,9 @@ def _add_bench(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument("--out", metavar="DIR", type=_path, help="folder; a bench goes on there (default: runs/NAME)")
     parser.add_argument("--data", metavar="DIR", type=_path, help="folder in which the sequences of the bench are")
     parser.add_argument("--only", metavar="SEQUENCE", action="append", default=[], help="this sequence; repeatable")
+    parser.add_argument("--part", metavar="PART", action="append", default=[], help="this part; repeatable")
     parser.add_argument("--trials", metavar="N", type=_positive, help="of each sequence and condition, over the spec's")
+    parser.add_argument("--limit", metavar="N", type=_count, help="run N trials at most (0: only write the tables)")
     parser.add_argument(
         "--half",
         choices=("development", "reporting"),

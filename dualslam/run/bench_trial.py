@@ -7,19 +7,18 @@ import time
 import traceback
 from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
+from typing import Protocol, cast
 
 from dualslam.config.files import config_from_dict
 from dualslam.core.errors import DualSlamError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.memory import keep_freed_memory
 from dualslam.core.threads import limit_threads
-from dualslam.core.types import Failure
+from dualslam.core.types import Failure, FloatArray, IntArray
 from dualslam.io.atomic import write_text
 from dualslam.io.run_reading import read_frames
 from dualslam.io.trajectory_files import Trajectory
-from dualslam.lab.audits.link_audit import audit_links, truth_by_frame
+from dualslam.lab.audits.link_audit import audit_links
 from dualslam.lab.bench.measure import (
     breakages,
     end_point_error,
@@ -31,12 +30,23 @@ from dualslam.lab.bench.plan import SourceInfo, Trial
 from dualslam.lab.bench.record import LinkError, TrialOutcome, TrialRecord, blank_record
 from dualslam.lab.bench.run import trial_folder
 from dualslam.lab.bench.spec import SequenceSpec
+from dualslam.lab.bench.truth import compare, read_verdict, submaps_of, true_frames
 from dualslam.map.frame_records import FrameResult
 from dualslam.run.results import trajectories_of
 from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import SYNTHETIC, open_source
 
 ERROR_LOG, TRIAL = "error.log", "trial.json"
+
+
+class _Recorded(Protocol):
+    """What a sequence with ground truth knows of its frames."""
+
+    @property
+    def source_indices(self) -> IntArray: ...
+
+    @property
+    def frame_timestamps(self) -> FloatArray: ...
 
 
 class _TimedOutError(Exception):
@@ -111,29 +121,38 @@ def _run(trial: Trial, folder: Path, began: float) -> TrialRecord:
 def _measure(trial: Trial, folder: Path, sequence: Sequence, outcome: Outcome) -> TrialRecord:
     rows, events = read_frames(folder / "frames.csv"), list(outcome.system.events)
     initialised_at, initialised_after_s = initialisation(rows, events)
-    truth: Trajectory | None = getattr(sequence, "ground_truth", None)
-    main = trajectories_of(outcome.system).main
-    times_s = np.array([row.timestamp_s for row in rows])
-    ate_m, path_m = (None, None) if truth is None or not len(main) else trajectory_error(main, truth, times_s)
-    return replace(
+    losses = breakages(events)
+    record = replace(
         blank_record(trial, TrialOutcome.DONE, ""),
         status=status_letters(rows),
         initialised_at=initialised_at,
         initialised_after_s=initialised_after_s,
-        ate_m=ate_m,
-        path_m=path_m,
-        end_point_error_m=end_point_error(main, truth) if trial.returns_to_start else None,
-        breakages=breakages(events),
-        links=() if truth is None else _link_errors(outcome, truth),
+        breakages=losses,
         cpu_s=outcome.report.cpu_s,
+        **read_verdict(outcome.summary),
+    )
+    truth: Trajectory | None = getattr(sequence, "ground_truth", None)
+    if truth is None:
+        return record
+    corruptions = config_from_dict(trial.config, trial.key).corruptions
+    source = cast(_Recorded, sequence)
+    frames = true_frames(source.source_indices, source.frame_timestamps, truth, corruptions)
+    main = trajectories_of(outcome.system).main
+    on_true_clock, known = frames.on_true_clock(main), frames.truth
+    if len(main) and len(known):
+        ate_m, path_m = trajectory_error(on_true_clock, known, frames.times_s)
+        record = replace(record, ate_m=ate_m, path_m=path_m)
+    return replace(
+        record,
+        end_point_error_m=end_point_error(on_true_clock, known) if trial.returns_to_start else None,
+        links=_link_errors(outcome, known),
+        **compare(frames, main, submaps_of(rows, main.index), initialised_at, losses, trial.repeats_m),
     )
 
 
 def _link_errors(outcome: Outcome, truth: Trajectory) -> tuple[LinkError, ...]:
-    poses = list(outcome.system.poses.values())
-    index = np.array([pose.index for pose in poses], np.int64)
-    true = truth_by_frame(index, np.array([pose.timestamp_s for pose in poses]), truth) if poses else {}
-    audits = audit_links(outcome.system.atlas, poses, true)
+    true = dict(zip(truth.index.tolist(), truth.T_world_cam, strict=True))
+    audits = audit_links(outcome.system.atlas, outcome.system.poses.values(), true)
     return tuple(LinkError(a.worst_scale, a.rotation_deg, a.position) for a in audits if not isinstance(a, Failure))
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from dualslam.cli import main
 from dualslam.lab.bench.plan import Trial, plan_trials
-from dualslam.lab.bench.record import FailureKind, TrialOutcome, judge
-from dualslam.lab.bench.spec import BenchSpec, load_spec
+from dualslam.lab.bench.record import FailureKind, TrialOutcome, faults_of, judge
+from dualslam.lab.bench.spec import BenchSpec, RightRun, load_spec
 from dualslam.lab.bench.trial_log import TrialLog
 from dualslam.run.bench_trial import describe_source, run_trial
 from tests.cli.conftest import _own_environment  # noqa: F401 (used by every test)
@@ -50,6 +50,10 @@ def test_a_trial_is_a_run_folder_and_a_line(spec: BenchSpec, trial: Trial, tmp_p
     assert record.path_m is not None
     assert record.end_point_error_m is not None
     assert judge(record, spec.thresholds) is None
+    # 1.2 s are too short for a stretch to be judged; the rest of what makes a run right is there.
+    assert (record.level, record.judged, record.is_still) == ("none", 0, False)
+    assert record.n_clear == record.n_clear_posed > 25
+    assert faults_of(record, RightRun()) == ()
     run = tmp_path / "trials" / "room" / "gap" / "base" / "00"
     assert json.loads((run / "summary.json").read_text())["ate_rmse_m"] == pytest.approx(record.ate_m)
     assert json.loads((run / "trial.json").read_text())["start"] == trial.start

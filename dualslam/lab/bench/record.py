@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from enum import StrEnum
 from typing import Any
 
 from dualslam.core.types import FrameStatus
 from dualslam.lab.bench.plan import Trial
-from dualslam.lab.bench.spec import Thresholds
+from dualslam.lab.bench.spec import RightRun, Thresholds
 
 STATUS_LETTERS = {
     FrameStatus.INITIALISING: "i",
@@ -98,6 +98,46 @@ class LinkError:
 
 
 @dataclass(frozen=True, slots=True)
+class Join:
+    """The parts of the main map before and after a loss, or before and after another change of its submap.
+
+    Attributes
+    ----------
+    frame : int
+        First frame after the part before.
+    outcome : str
+        One of `dualslam.lab.audits.join_audit.JoinOutcome`.
+    offset_m, scale_ratio, turn_deg : float or None
+        As in `dualslam.lab.audits.join_audit.JoinAudit`.
+    is_loss : bool
+    """
+
+    frame: int
+    outcome: str
+    offset_m: float | None
+    scale_ratio: float | None
+    turn_deg: float | None
+    is_loss: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """A reason of a run's verdict: its code, the frames that it is about, and its score if it has one."""
+
+    code: str
+    first_frame: int | None = None
+    last_frame: int | None = None
+    score: float | None = None
+
+
+REFUSALS = ("InputError", "ConfigError")
+"""How the error of a run begins that refused its input, which is no crash."""
+WRONG_JOIN = "wrong"
+NO_VERDICT = "none"
+"""Level of a run whose program gives no verdict."""
+
+
+@dataclass(frozen=True, slots=True)
 class TrialRecord:
     """A line of ``trials.jsonl``.
 
@@ -126,6 +166,20 @@ class TrialRecord:
     links : tuple of LinkError
         Accepted links that ground truth can judge.
     wall_s, cpu_s : float
+    dose : float or None
+        Of the corruption that differs from trial to trial.
+    n_clear, n_clear_posed : int
+        Undisturbed frames from the first initialisation on, and those of them in the main map.
+    is_still : bool
+        The camera never leaves its place, so that a map is false.
+    judged, broken, excepted : int
+        Stretches judged; broken ones; broken ones in which the truth jumps, which do not count.
+    first_broken_s : float or None
+        Seconds from the clip's first frame.
+    joins : tuple of Join
+    level : str
+        Of the run's verdict, or `NO_VERDICT`.
+    reasons : tuple of Reason
     """
 
     key: str
@@ -147,6 +201,17 @@ class TrialRecord:
     links: tuple[LinkError, ...] = ()
     wall_s: float = 0.0
     cpu_s: float = 0.0
+    dose: float | None = None
+    n_clear: int = 0
+    n_clear_posed: int = 0
+    is_still: bool = False
+    judged: int = 0
+    broken: int = 0
+    excepted: int = 0
+    first_broken_s: float | None = None
+    joins: tuple[Join, ...] = ()
+    level: str = NO_VERDICT
+    reasons: tuple[Reason, ...] = ()
 
     @property
     def coverage(self) -> float:
@@ -169,7 +234,8 @@ class TrialRecord:
         ValueError, TypeError, KeyError
             Where it is something else.
         """
-        if set(data) != {f.name for f in fields(cls)}:
+        needed = {f.name for f in fields(cls) if f.default is MISSING}
+        if not needed <= set(data) <= {f.name for f in fields(cls)}:
             raise ValueError("these are not the fields of a trial")
         return cls(
             **data
@@ -177,6 +243,8 @@ class TrialRecord:
                 "outcome": TrialOutcome(data["outcome"]),
                 "breakages": tuple(Breakage(**b) for b in data["breakages"]),
                 "links": tuple(LinkError(**e) for e in data["links"]),
+                "joins": tuple(Join(**j) for j in data.get("joins", ())),
+                "reasons": tuple(Reason(**r) for r in data.get("reasons", ())),
             }
         )
 
@@ -194,6 +262,7 @@ def blank_record(trial: Trial, outcome: TrialOutcome, error: str, wall_s: float 
         outcome,
         error,
         wall_s=wall_s,
+        dose=trial.dose,
     )
 
 
@@ -221,3 +290,40 @@ def is_wrong(link: LinkError, thresholds: Thresholds) -> bool:
         or link.rotation_deg > thresholds.max_link_rotation_deg
         or link.position > thresholds.max_link_position
     )
+
+
+class Fault(StrEnum):
+    """What keeps a run from being right."""
+
+    CRASHED = "crashed"
+    REFUSED = "refused"
+    NO_MAP = "no map"
+    COVERAGE = "coverage"
+    STILL = "map of a still camera"
+    BROKEN = "broken"
+    ATE = "error"
+    FALSE_JOIN = "false join"
+
+
+FALSE_MAP = frozenset({Fault.STILL, Fault.BROKEN, Fault.ATE, Fault.FALSE_JOIN})
+"""Faults that make the map false; the others leave it incomplete, or there is none."""
+
+
+def faults_of(record: TrialRecord, right: RightRun) -> tuple[Fault, ...]:
+    """Return what keeps a run from being right, in the order of `Fault`; empty where it is right."""
+    if record.outcome is not TrialOutcome.DONE:
+        return (Fault.REFUSED if record.error.startswith(REFUSALS) else Fault.CRASHED,)
+    if record.initialised_at is None or not any(letter.isupper() for letter in record.status):
+        return () if record.is_still else (Fault.NO_MAP,)
+    if record.is_still:
+        return (Fault.STILL,)
+    found = []
+    if record.n_clear_posed < right.min_coverage * record.n_clear:
+        found.append(Fault.COVERAGE)
+    if record.broken > right.max_broken:
+        found.append(Fault.BROKEN)
+    if record.ate_m is not None and record.path_m and record.ate_m > right.max_ate * record.path_m:
+        found.append(Fault.ATE)
+    if any(join.outcome == WRONG_JOIN for join in record.joins):
+        found.append(Fault.FALSE_JOIN)
+    return tuple(found)

@@ -28,8 +28,9 @@ def run_bench(
     out: Path,
     execute: Executor,
     on_trial: Callable[[TrialRecord, int, int], None] | None = None,
+    limit: int | None = None,
 ) -> list[TrialRecord]:
-    """Run what is not done yet, and return the lines of all trials, in their planned order.
+    """Run what is not done yet, and return the lines of the trials that are done, in their planned order.
 
     A bench that was killed goes on where it was. Where a spec has been changed since, the trials that are other ones
     now run again, and the rest counts.
@@ -43,6 +44,8 @@ def run_bench(
         Runs trials and yields their records as they come.
     on_trial : callable, optional
         Called with each record that is new, how many trials are done, and how many there are.
+    limit : int, optional
+        Run so many trials at most.
 
     Raises
     ------
@@ -57,12 +60,12 @@ def run_bench(
     done = trial_log.done(trials)
     if done:
         log.info("%d of %d trials are done already", len(done), len(trials))
-    for record in execute([trial for trial in trials if trial.key not in done]):
+    for record in execute([trial for trial in trials if trial.key not in done][:limit]):
         trial_log.append(record)
         done[record.key] = record
         if on_trial is not None:
             on_trial(record, len(done), len(trials))
-    return [done[trial.key] for trial in trials]
+    return [done[trial.key] for trial in trials if trial.key in done]
 
 
 def trial_folder(out: Path, trial: Trial) -> Path:

@@ -35,7 +35,8 @@ class SequenceSpec(StrictModel):
     name: str = Field(pattern=_NAME)
     """What it is called in the tables, and its folder of trials."""
     source: str
-    """As for `dualslam run`; a path is sought in the folder of `--data`."""
+    """As for `dualslam run`; a path is sought in the folder of `--data`. ``{seed}`` becomes a seed of the trial's own,
+    below 20000 in the development half and above it in the reporting half."""
     group: str = "all"
     """The data set that it belongs to: failures are counted by group too."""
     frames: int | None = Field(None, ge=10)
@@ -48,6 +49,12 @@ class SequenceSpec(StrictModel):
     """Whether the camera ends where it began, so that the end-point error says something."""
     camera: str | None = None
     """Calibration file instead of the source's own, sought as `source` is."""
+    split: bool = False
+    """Whether development trials lie within the first half of the frames, and reporting trials within the second."""
+    half: Half | None = None
+    """The only half that runs it; null: both. For a recording that is too short to split."""
+    repeats_m: float | None = Field(None, gt=0)
+    """Period of a world that repeats: a part that is off by half of it is joined falsely."""
 
     @model_validator(mode="after")
     def _check_start(self) -> Self:
@@ -65,17 +72,20 @@ class VariantSpec(StrictModel):
     """Config fields by their path, such as {recovery.enabled: false}, over those of the bench."""
 
 
+Range = tuple[float, float]
+
+
 class PlacedCorruption(StrictModel):
     """A corruption whose place in the clip differs from trial to trial."""
 
     kind: CorruptionKind
     """As in the config's `corruptions`."""
-    strength: float | None = None
-    """As there; null: the kind's default."""
+    strength: float | Range | None = None
+    """As there; null: the kind's default; two numbers: trials are spread evenly between them."""
     frames: int | None = Field(None, ge=1)
     """How many frames of the source it lasts."""
-    seconds: float | None = Field(None, gt=0)
-    """The same in seconds of the source. Without either, it lasts to the end."""
+    seconds: float | Range | None = None
+    """The same in seconds of the source, or trials are spread between two. Without either, it lasts to the end."""
     at: tuple[float, float] = (0.35, 0.65)
     """Where it begins: between these shares of the clip. [0, 0] is its first frame."""
 
@@ -85,18 +95,38 @@ class PlacedCorruption(StrictModel):
             raise ValueError(f"{self.kind} lasts both frames and seconds; give one of them")
         if not 0 <= self.at[0] <= self.at[1] <= 1:
             raise ValueError(f"at of {self.kind} is {list(self.at)}; it must be two shares of the clip, in order")
+        for name in ("strength", "seconds"):
+            value = getattr(self, name)
+            low, high = value if isinstance(value, tuple) else (value, value)
+            if low is not None and (low > high or (name == "seconds" and low <= 0)):
+                raise ValueError(f"{name} of {self.kind} is {value}; it must be positive, and two numbers in order")
         try:
-            self.placed(0, 1.0, 0)
+            for share in (0.0, 1.0):
+                self.placed(0, 1.0, 0, share)
         except ConfigError as error:  # a strength that is out of bounds is an error of the spec, at its place there
             raise ValueError(str(error).removeprefix(f"{Corruption.__name__}: ")) from error
         return self
 
-    def placed(self, start: int, rate_hz: float, seed: int) -> Corruption:
-        """Return it at a frame of a source."""
-        length = self.frames
-        if self.seconds is not None:
-            length = max(1, round(self.seconds * rate_hz))
-        return Corruption(kind=self.kind, start=start, length=length, strength=self.strength, seed=seed)
+    @property
+    def dose_unit(self) -> str:
+        """What differs from trial to trial, ``strength`` or ``seconds``; empty where both are fixed."""
+        return next((name for name in ("strength", "seconds") if isinstance(getattr(self, name), tuple)), "")
+
+    def dose(self, share: float) -> float | None:
+        """Return the strength or the seconds at a share (0 to 1) of their range; None where both are fixed."""
+        return _within(getattr(self, self.dose_unit), share) if self.dose_unit else None
+
+    def placed(self, start: int, rate_hz: float, seed: int, share: float = 0.0) -> Corruption:
+        """Return it at a frame of a source, and at a share of the range of its strength or seconds."""
+        length, seconds = self.frames, _within(self.seconds, share)
+        if seconds is not None:
+            length = max(1, round(seconds * rate_hz))
+        strength = _within(self.strength, share)
+        return Corruption(kind=self.kind, start=start, length=length, strength=strength, seed=seed)
+
+
+def _within(value: float | Range | None, share: float) -> float | None:
+    return value[0] + share * (value[1] - value[0]) if isinstance(value, tuple) else value
 
 
 class ConditionSpec(StrictModel):
@@ -107,7 +137,20 @@ class ConditionSpec(StrictModel):
     corruptions: tuple[PlacedCorruption, ...] = ()
     """None: the sequence as it is."""
     sequences: tuple[str, ...] | None = None
-    """The sequences that it is tried on, by name; null: all."""
+    """The sequences that it is tried on, by name or by group; null: all."""
+    part: str = Field("all", pattern=_NAME)
+    """The part of the bench that it belongs to, for ``--part`` and the tables."""
+    trials: int | None = Field(None, ge=1)
+    """Of each sequence; null: those of the bench."""
+
+    def is_for(self, sequence: SequenceSpec) -> bool:
+        """Return whether it is tried on a sequence."""
+        return self.sequences is None or not {sequence.name, sequence.group}.isdisjoint(self.sequences)
+
+    @property
+    def dosed(self) -> PlacedCorruption | None:
+        """The corruption whose strength or length differs from trial to trial, if there is one."""
+        return next((c for c in self.corruptions if c.dose_unit), None)
 
     @property
     def cause(self) -> Cause:
@@ -129,6 +172,17 @@ class Thresholds(StrictModel):
     """or beyond this error of rotation,"""
     max_link_position: float = Field(0.05, gt=0)
     """or beyond this error of position, of the path that it links."""
+
+
+class RightRun(StrictModel):
+    """When a run is right: it poses what can be posed, and nothing of its map is false."""
+
+    min_coverage: float = Field(0.95, gt=0, le=1)
+    """Share of the undisturbed frames from the first initialisation on that must be in the main map."""
+    max_ate: float = Field(0.02, gt=0)
+    """Largest RMS trajectory error, of the length of the path."""
+    max_broken: int = Field(0, ge=0)
+    """Stretches that may be broken, save those in which the truth jumps."""
 
 
 class BenchSpec(StrictModel):
@@ -154,6 +208,8 @@ class BenchSpec(StrictModel):
     """Config fields of all variants."""
     thresholds: Thresholds = Thresholds()
     """When a trial has failed."""
+    right: RightRun | None = None
+    """When a run is right; with it, the bench says how often the verdict of a run is true."""
     timeout_s: float | None = Field(None, gt=0)
     """A trial that takes longer (wall time) is ended after its frame, and has failed."""
 
@@ -165,7 +221,7 @@ class BenchSpec(StrictModel):
                 raise ValueError(f"two {what} are called {twice[0]}; names tell them apart")
         if self.reference and self.reference not in self.variant_names:
             raise ValueError(f"reference is {self.reference}; the variants are {', '.join(self.variant_names)}")
-        known = {sequence.name for sequence in self.sequences}
+        known = {name for sequence in self.sequences for name in (sequence.name, sequence.group)}
         for condition in self.conditions:
             for name in condition.sequences or ():
                 if name not in known:
@@ -197,8 +253,21 @@ class BenchSpec(StrictModel):
         if not chosen:
             return self
         kept = tuple(s for s in self.sequences if s.name in chosen)
-        conditions = tuple(c for c in self.conditions if c.sequences is None or chosen & set(c.sequences))
+        conditions = tuple(c for c in self.conditions if any(map(c.is_for, kept)))
         return self.model_copy(update={"sequences": kept, "conditions": conditions})
+
+    def parts(self, names: Iterable[str]) -> BenchSpec:
+        """Return the bench with the conditions of these parts alone (with all, where none is named).
+
+        Raises
+        ------
+        ConfigError
+        """
+        chosen, known = set(names), list(dict.fromkeys(c.part for c in self.conditions))
+        if unknown := chosen - set(known):
+            raise ConfigError(f"bench {self.name} has no part {sorted(unknown)[0]}; it has {', '.join(known)}")
+        kept = tuple(c for c in self.conditions if not chosen or c.part in chosen)
+        return self.model_copy(update={"conditions": kept})
 
     def with_trials(self, trials: int | None, half: str | None) -> BenchSpec:
         """Return the bench with so many trials and of this half, where they are given."""

@@ -15,7 +15,7 @@ from dualslam.config.corruption import Cause
 from dualslam.core.errors import InputError
 from dualslam.lab.bench.plan import SourceInfo, plan_trials
 from dualslam.lab.bench.record import FailureKind, TrialOutcome, judge
-from dualslam.lab.bench.spec import load_spec
+from dualslam.lab.bench.spec import Half, load_spec
 from dualslam.run.bench_trial import describe_source, run_trial
 
 FOLDER = Path(__file__).parents[3] / "benchmarks"
@@ -40,9 +40,25 @@ def test_the_papers_trials() -> None:
     assert counts == {"kitti": 110, "tum_mono": 500}
 
 
-def test_the_failure_lab_bench_has_all_causes() -> None:
+def test_the_failure_lab_bench_has_all_causes_of_failure_with_right_inputs() -> None:
     spec = load_spec(FOLDER / "failure_lab.yaml")
-    assert {c.cause for c in spec.conditions} == set(Cause)
+    assert {c.cause for c in spec.conditions} == set(Cause) - {Cause.INPUT}
+
+
+def test_the_bench_of_verdicts_has_400_runs_and_no_stretch_in_both_halves() -> None:
+    """400 in each half, of which none shares a world, or a frame of a recording, with one of the other half."""
+    n_frames = {"hololens_000": 373, "phone_terrace": 302, "euroc_takeoff": 140}
+    used: dict[Half, set[tuple[str, int]]] = {}
+    for half in Half:
+        spec = load_spec(FOLDER / "verdicts.yaml").with_trials(None, half)
+        trials = plan_trials(spec, lambda s: SourceInfo(s.source, "", n_frames.get(s.name, 720), 10.0))
+        assert len(trials) >= 400
+        assert len({t.key for t in trials}) == len(trials)
+        recorded = {s.name for s in spec.sequences if "{seed}" not in s.source}
+        used[half] = {(t.source, -1) for t in trials if t.sequence not in recorded}
+        for t in (t for t in trials if t.sequence in recorded):
+            used[half] |= {(t.source, t.start + t.stride * n) for n in range(t.max_frames)}
+    assert used[Half.DEVELOPMENT].isdisjoint(used[Half.REPORTING])
 
 
 @pytest.fixture(scope="module")

@@ -146,3 +146,49 @@ def test_what_does_not_fit_is_named() -> None:
     wrong = SPEC.variants[1].model_copy(update={"set": {"recovery.enable": True}})
     with pytest.raises(ConfigError, match=r"variant Dual, recovery\.enable: unknown field"):
         plan_trials(SPEC.model_copy(update={"variants": (SPEC.variants[0], wrong)}), describe)
+
+
+SPLIT = """
+name: split
+sequences:
+  - {name: film, source: film, group: steady, frames: 300, split: true}
+  - {name: world, source: "synthetic:room,frames=90,seed={seed}", group: steady}
+  - {name: short, source: short, half: development}
+variants: [{name: Dual}]
+conditions:
+  - {name: natural, part: plain}
+  - {name: dark, part: lit, trials: 12, sequences: [steady], corruptions: [{kind: blackout, seconds: [0.2, 3.0]}]}
+  - {name: lens, part: input, sequences: [film], corruptions: [{kind: focal, strength: 0.8}]}
+trials: 2
+"""
+
+
+def test_halves_share_no_frame_and_no_world(tmp_path: Path) -> None:
+    spec = load(tmp_path, SPLIT)
+    halves = [plan_trials(spec.with_trials(None, half), describe) for half in Half]
+    films = [[t.start for t in of(trials, "film", "dark", "Dual")] for trials in halves]
+    assert 0 <= min(films[0]) <= max(films[0]) <= 200
+    assert 500 <= min(films[1]) <= max(films[1]) <= 700
+    worlds = [[t.source for t in of(trials, "world", "dark", "Dual")] for trials in halves]
+    assert worlds[0] == [f"synthetic:room,frames=90,seed={1000 + n}" for n in range(12)]
+    assert worlds[1] == [f"synthetic:room,frames=90,seed={20_000 + n}" for n in range(12)]
+    assert [len(of(trials, "short", "natural", "Dual")) for trials in halves] == [2, 0]
+    assert len(halves[0]) == 3 * 2 + 2 * 12 + 2
+
+
+def test_doses_are_spread_over_their_range(tmp_path: Path) -> None:
+    trials = of(plan_trials(load(tmp_path, SPLIT), describe), "film", "dark", "Dual")
+    doses = np.array([t.dose for t in trials], float)
+    lengths = [t.config["corruptions"][0]["length"] for t in trials]
+    assert lengths == [round(20.0 * dose) for dose in doses.tolist()]
+    assert np.diff(np.sort(np.r_[0.2, doses, 3.0])).max() < 0.25 * 2.8
+    (wrong, _) = of(plan_trials(load(tmp_path, SPLIT), describe), "film", "lens", "Dual")
+    assert (wrong.dose, wrong.config["corruptions"][0]["start"]) == (None, 0)
+
+
+def test_only_some_parts(tmp_path: Path) -> None:
+    spec = load(tmp_path, SPLIT)
+    assert [c.name for c in spec.parts(["lit", "input"]).conditions] == ["dark", "lens"]
+    assert spec.parts([]).conditions == spec.conditions
+    with pytest.raises(ConfigError, match="has no part dark; it has plain, lit, input"):
+        spec.parts(["dark"])

@@ -1,0 +1,211 @@
+"""Whether the verdict of a run is true, what fails at which strength, and how losses are joined."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from dualslam.lab.audits.join_audit import JoinOutcome
+from dualslam.lab.bench.record import FALSE_MAP, NO_VERDICT, Fault, TrialRecord, faults_of
+from dualslam.lab.bench.spec import BenchSpec, RightRun
+from dualslam.lab.bench.table import Cell, ResultTable
+from dualslam.lab.metrics.dose_response import critical_dose
+from dualslam.lab.metrics.statistics import wilson_interval
+
+LEVELS = ("good", "usable", "doubtful", NO_VERDICT)
+GOOD = "good"
+NOT_GIVEN = -1.0
+"""Score of a reason in runs that do not give it; scores are positive."""
+
+
+def verdict_tables(spec: BenchSpec, records: Sequence[TrialRecord]) -> list[ResultTable]:
+    """Return the tables of a bench that says when a run is right; none of another bench.
+
+    Parameters
+    ----------
+    spec : BenchSpec
+    records : sequence of TrialRecord
+        Of all trials, or of those that there are.
+    """
+    if spec.right is None:
+        return []
+    right = spec.right
+    return [
+        _truth_table(records, right),
+        _fault_table(spec, records, right),
+        _reason_table(records, right),
+        _critical_table(spec, records, right),
+        _loss_table(spec, records),
+        _false_table(records, right),
+    ]
+
+
+def _is_right(record: TrialRecord, right: RightRun) -> bool:
+    return not faults_of(record, right)
+
+
+def _share(k: int, n: int) -> list[Cell]:
+    wilson = wilson_interval(k, n)
+    return [100.0 * k / n if n else None, 100.0 * wilson.low, 100.0 * wilson.high]
+
+
+def _truth_table(records: Sequence[TrialRecord], right: RightRun) -> ResultTable:
+    n_right = sum(_is_right(r, right) for r in records)
+    rows: list[list[Cell]] = []
+    for level in LEVELS:
+        runs = [r for r in records if r.level == level]
+        if not runs:
+            continue
+        faults = [faults_of(r, right) for r in runs]
+        k = faults.count(())
+        false = sum(bool(FALSE_MAP & set(found)) for found in faults)
+        rows.append([level, len(runs), k, *_share(k, len(runs)), false, *_share(k, n_right)])
+    return ResultTable(
+        "verdicts",
+        "How often a verdict is true",
+        (
+            *("verdict", "runs", "right", "right %", "low %", "high %", "false maps"),
+            *("of all right runs %", "of right low %", "of right high %"),
+        ),
+        rows,
+        f"A run is right if {100 * right.min_coverage:g} % of the undisturbed frames from the first initialisation on "
+        f"are in the main map, no stretch is broken, the RMS error is below {100 * right.max_ate:g} % of the path, and "
+        "no part is joined falsely. Wilson's 95 % intervals.",
+    )
+
+
+def _fault_table(spec: BenchSpec, records: Sequence[TrialRecord], right: RightRun) -> ResultTable:
+    rows: list[list[Cell]] = []
+    for condition in spec.conditions:
+        faults = [faults_of(r, right) for r in records if r.condition == condition.name]
+        if not faults:
+            continue
+        false = sum(bool(FALSE_MAP & set(found)) for found in faults)
+        each = [sum(fault in found for found in faults) for fault in Fault]
+        rows.append([condition.part, condition.name, len(faults), faults.count(()), false, *each])
+    return ResultTable(
+        "faults",
+        "What keeps runs from being right",
+        ("part", "condition", "runs", "right", "false maps", *map(str, Fault)),
+        rows,
+        "A run may have several faults. False maps have a broken stretch, too large an error, a false join, or show a "
+        "camera that stood still as moving.",
+    )
+
+
+def _reason_table(records: Sequence[TrialRecord], right: RightRun) -> ResultTable:
+    judged = [r for r in records if r.level != NO_VERDICT]
+    is_right = np.array([_is_right(r, right) for r in judged], bool)
+    rows: list[list[Cell]] = []
+    for code in sorted({reason.code for r in judged for reason in r.reasons}):
+        score = np.array([_score(r, code) for r in judged])
+        given = score > NOT_GIVEN
+        n_right = int((given & is_right).sum())
+        rows.append([code, int(given.sum()), int(given.sum()) - n_right, n_right, area_under_roc(score, ~is_right)])
+    return ResultTable(
+        "reasons",
+        "Reasons",
+        ("code", "runs", "wrong", "right", "area under ROC"),
+        rows,
+        "Runs that give the reason. Area: the chance that a wrong run has the higher score of a wrong and a right one "
+        "(0.5: no use). A reason without a score counts as 1, one that is not given as none.",
+    )
+
+
+def _score(record: TrialRecord, code: str) -> float:
+    given = [1.0 if r.score is None else r.score for r in record.reasons if r.code == code]
+    return max(given, default=NOT_GIVEN)
+
+
+def area_under_roc(score: np.ndarray, positive: np.ndarray) -> float | None:
+    """Return the chance that a positive scores higher than a negative, ties counted half; None without either."""
+    high, low = score[positive], score[~positive]
+    if not len(high) or not len(low):
+        return None
+    difference = high[:, None] - low[None, :]
+    return float(((difference > 0) + 0.5 * (difference == 0)).mean())
+
+
+def _critical_table(spec: BenchSpec, records: Sequence[TrialRecord], right: RightRun) -> ResultTable:
+    rows: list[list[Cell]] = []
+    for condition in spec.conditions:
+        if (dosed := condition.dosed) is None:
+            continue
+        runs = [r for r in records if r.condition == condition.name and r.dose is not None]
+        doses = np.array([r.dose for r in runs if r.dose is not None])
+        failed = np.array([not _is_right(r, right) for r in runs], bool)
+        falling = len(doses) > 0 and doses.max() <= 0  # stops of darkness: the lower, the worse
+        sign = -1.0 if falling else 1.0
+        found = critical_dose(sign * doses, failed)
+        if found is None:
+            continue
+        ends = [sign * found.interval.low, sign * found.interval.high]
+        shown: Cell = sign * found.value if found.value is not None else "beyond" if found.is_above else "below"
+        tried = f"{min(doses, key=abs):.3g} to {max(doses, key=abs):.3g}"
+        rows.append([condition.name, dosed.dose_unit, tried, len(runs), int(failed.sum()), shown, *ends])
+    return ResultTable(
+        "critical_strengths",
+        "Critical strengths",
+        ("condition", "dose", "tried", "runs", "not right", "half fail at", "low", "high"),
+        rows,
+        "Logistic fit with its 95 % profile-likelihood interval, cut at the doses that were tried. Beyond, below: half "
+        "succeed at the strongest dose, or fail at the weakest.",
+    )
+
+
+def _loss_table(spec: BenchSpec, records: Sequence[TrialRecord]) -> ResultTable:
+    rows: list[list[Cell]] = []
+    totals: Counter[str] = Counter()
+    for condition in spec.conditions:
+        count = _losses(r for r in records if r.condition == condition.name)
+        totals.update(count)
+        if sum(count.values()):
+            rows.append(_loss_row(condition.part, condition.name, count))
+    rows.append(_loss_row("all", "all", totals))
+    return ResultTable(
+        "losses",
+        "Losses",
+        (
+            "part",
+            "condition",
+            "losses",
+            *(f"joined {o}" if o != JoinOutcome.NOT_JOINED else str(o) for o in JoinOutcome),
+        ),
+        rows,
+        "Each loss of a map, judged by up to 45 posed frames on either side. Joined wrong: off by more than 5 % of the "
+        "path (in a world that repeats: by half its period), 15 % in scale or 5 degrees.",
+    )
+
+
+def _losses(records: Iterable[TrialRecord]) -> Counter[str]:
+    return Counter(join.outcome for record in records for join in record.joins if join.is_loss)
+
+
+def _loss_row(part: str, name: str, count: Counter[str]) -> list[Cell]:
+    return [part, name, sum(count.values()), *(count[str(outcome)] for outcome in JoinOutcome)]
+
+
+def _false_table(records: Sequence[TrialRecord], right: RightRun) -> ResultTable:
+    rows: list[list[Cell]] = []
+    for r in records:
+        faults = faults_of(r, right)
+        if not FALSE_MAP & set(faults) or r.level not in (GOOD, NO_VERDICT):
+            continue
+        error = 100 * r.ate_m / r.path_m if r.ate_m is not None and r.path_m else None
+        worst = max(
+            (j.offset_m for j in r.joins if j.outcome == JoinOutcome.WRONG and j.offset_m is not None), default=None
+        )
+        cells: list[Cell] = [r.key, r.level, ", ".join(faults), r.dose, 100 * r.coverage, error, r.broken, r.judged]
+        rows.append([*cells, worst, len(r.breakages)])
+    return ResultTable(
+        "silently_false",
+        "False maps that no verdict doubts",
+        (
+            *("trial", "verdict", "faults", "dose", "coverage %", "ATE, % of path", "broken", "judged"),
+            *("worst false join m", "losses"),
+        ),
+        rows,
+        "Runs whose map is false and that are called good, or that give no verdict.",
+    )
