@@ -103,9 +103,9 @@ def test_a_step_of_the_truth_alone_is_no_break() -> None:
     known = true_frames(INDEX, TIMES_S, jumping, [])
     found = compared(estimate(), known)
     assert (found["broken"], found["excepted"]) == (0, 3)
-    leaping = estimate()
-    leaping.T_world_cam[120:, 2, 3] += 1.8
-    found = compared(leaping)
+    jumping_map = estimate()
+    jumping_map.T_world_cam[120:, 2, 3] += 1.8
+    found = compared(jumping_map)
     assert (found["broken"], found["excepted"]) == (3, 0)
 
 
