@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from dualslam.recovery.linking import propose_correspondences
     from dualslam.recovery.reverse_tracking import track_in_reverse
     from dualslam.report import comparison_page, read_run, report_page
+    from dualslam.run.judgement import judge_run
     from dualslam.run.results import frame_rows, trajectories_of
     from dualslam.run.runner import run_sequence
     from dualslam.run.session import run_to_folder
@@ -62,6 +63,7 @@ _WHERE = {
     "evaluate_run": "lab.metrics.trajectory_metrics",
     "frame_rows": "run.results",
     "keep_freed_memory": "core.memory",
+    "judge_run": "run.judgement",
     "limit_threads": "core.threads",
     "load_atlas": "io.map_store",
     "load_config": "config.files",
@@ -98,6 +100,7 @@ __all__ = [
     "dump_config",
     "evaluate_run",
     "frame_rows",
+    "judge_run",
     "keep_freed_memory",
     "limit_threads",
     "load_atlas",

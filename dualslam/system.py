@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+from dualslam.audit.photometric import PhotometricAudit
+from dualslam.audit.verdict import ReasonCode
 from dualslam.calibration.background import Calibrations
 from dualslam.calibration.shutter_watch import ShutterWatch
 from dualslam.config.settings import Config
@@ -54,6 +56,10 @@ class System:
     buffer : FrameBuffer
     pace : Pace
         Whoever feeds the system in real time reports here how late its frames are; otherwise without effect.
+    blank : set of int
+        Frames that show too few features to be posed.
+    audit : PhotometricAudit
+        How well the images agree with the map.
     numbers : FrameNumbers
         The frames' own count, by which all here goes but the frames that `step` is given and its results.
     saved : StoredMap or None
@@ -66,6 +72,7 @@ class System:
         """`saved`: a map to continue, which becomes this system's own; `localise`: only find poses in it."""
         record = Record() if saved is None else Record(saved.atlas, poses=dict(saved.poses))
         self.saved, self.numbers = saved, FrameNumbers(0 if saved is None else saved.next_id)
+        self.blank: set[int] = set()
         self._world = saved.main[0] if saved is not None and saved.main else None
         self._worlds = Worlds(record.atlas, self._world)
         earlier = frozenset(record.atlas.submaps)
@@ -74,7 +81,8 @@ class System:
         self.buffer = FrameBuffer(config.buffer.duration_s, config.buffer.max_mb)
         self.buffer.freeze()  # no map yet, as after a loss: the first start is tracked back from to the first frame
         relocaliser, health = Relocaliser(components.new_relocaliser, config), HealthMonitor(config.health)
-        self._state = State(components, config, record, self.buffer, saved, localise, relocaliser, health)
+        self.audit = PhotometricAudit(components.patches)
+        self._state = State(components, config, record, self.buffer, saved, localise, relocaliser, health, self.audit)
         self.pace = self._state.pace
         # What is found beside the tracking and comes into the map between two frames.
         self._connections = Connections(
@@ -226,11 +234,14 @@ class System:
             view = state.parts.view_of(source)
         if isinstance(view, Failure):
             outcome: Track | Failure = self._unusable(frame, view)
+            self.blank.add(frame.index)
         else:
             view = replace(view, index=frame.index)
             self.buffer.append(view)
             # 3. Without a live submap, look for the lost one, or try to start one; with one, track.
             outcome = self._without_map(view) if state.live is None else self._with_map(state.live, view)
+            if len(view.features) < state.config.tracking.min_inliers:
+                self.blank.add(frame.index)
         return self._result(frame, outcome, started)
 
     def finish(self, interrupted: bool = False) -> None:
@@ -403,6 +414,7 @@ class System:
             T_submap_cam = self.atlas.submaps[pose.submap_id].resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
         failure = outcome if isinstance(outcome, Failure) else None
         S_world_submap, world_id = (None, None) if pose is None else self._worlds.of(pose.submap_id)
+        is_doubtful = pose is not None and self.audit.is_doubtful
         return FrameResult(
             self.numbers.index_of(frame.index),
             row.status,
@@ -415,4 +427,6 @@ class System:
             pose_ms,
             S_world_submap,
             world_id,
+            row.method,
+            str(ReasonCode.PHOTOMETRIC) if is_doubtful else "",
         )

@@ -26,6 +26,7 @@ from dualslam.core.camera.corrected import CorrectedCamera
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Frontend, SubmapGraph
 from dualslam.core.types import View
+from dualslam.frontends.direct.patch_audit import PatchAudit
 from dualslam.frontends.frame_reader import FrameReader
 from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.registry import create_frontend
@@ -133,6 +134,7 @@ def build_system(
             desk=desk,
             atlas_solver=atlas_solver(config),
             refine_at_end=partial(refine_submap, robust_k=config.graph.robust_k),
+            patches=PatchAudit(live.camera),
             graphs=graphs,
             places=places,
             open_features=partial(features_beside, desk, config.frontend) if isinstance(desk, WorkerDesk) else None,

@@ -84,6 +84,12 @@ def final_line(outcome: Outcome) -> str:
     return f"{lead}{', '.join(parts)}{why}; results in {outcome.out}"
 
 
+def verdict_line(outcome: Outcome) -> str:
+    """Return in one line how far to trust a run, and why."""
+    verdict = outcome.summary["verdict"]
+    return " ".join([f"verdict: {verdict['level']}.", *(reason["text"] for reason in verdict["reasons"])])
+
+
 def no_map_line(outcome: Outcome) -> str:
     """Return in one line why a run has no map: an error, which is told where nothing else is (``--quiet``)."""
     why = outcome.summary.get("no_map")

@@ -13,7 +13,7 @@ from dualslam import exit_status
 from dualslam.build import check_config, fault_of_frontend
 from dualslam.cli import logs
 from dualslam.cli.configuration import config_of, naming_source
-from dualslam.cli.console import final_line, no_map_line, progress, stage_table, waiting
+from dualslam.cli.console import final_line, no_map_line, progress, stage_table, verdict_line, waiting
 from dualslam.config.settings import Config
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.errors import DualSlamError, InputError, NoCalibrationError
@@ -151,6 +151,8 @@ def conclude(outcome: Outcome, args: argparse.Namespace) -> int:
         print(stage_table(outcome))
     if not args.quiet:
         print(final_line(outcome), flush=True)
+        if outcome.has_map:
+            print(verdict_line(outcome), flush=True)
     elif not outcome.has_map and not outcome.report.interrupted:
         print(f"dualslam: {no_map_line(outcome)}", file=sys.stderr)
     if outcome.report.interrupted:

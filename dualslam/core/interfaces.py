@@ -194,6 +194,21 @@ START_REACH = 64
 """Frames back from the newest that a starter looks for its first view, at most."""
 
 
+class PatchCheck(Protocol):
+    """Compares frames with small image patches that are kept of keyframes."""
+
+    def remember(self, submap: Submap, view: View) -> None:
+        """Keep patches of a view that is a keyframe of a submap."""
+        ...
+
+    def measure(self, submap: Submap, view: View, T_cam_submap: FloatArray) -> float | None:
+        """Return which share (0 to 1) of an older keyframe's patches a posed frame shows where the map predicts them.
+
+        None where no keyframe shows enough of the same, or the view has no image.
+        """
+        ...
+
+
 class MapStarter(Protocol):
     """Collects views until some of them start a map."""
 

@@ -34,6 +34,17 @@ class FrameStatus(StrEnum):
     UNREADABLE = "unreadable"
 
 
+class FrameMethod(StrEnum):
+    """How a frame's pose was found: the `method` column of ``frames.csv``."""
+
+    GUIDED = "guided"
+    """Landmarks searched where the motion model predicts them."""
+    WIDE = "wide"
+    """Whole images matched: at a start, beyond a gap, when a map is relocalised."""
+    DIRECT = "direct"
+    """Image patches aligned."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """One image of a sequence.
@@ -242,6 +253,11 @@ class Track:
     chi2: float
     wide: bool
     covariance: FloatArray
+
+    @property
+    def method(self) -> FrameMethod:
+        """How the pose was found."""
+        return FrameMethod.WIDE if self.wide else FrameMethod.GUIDED
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -42,7 +42,7 @@ MAP = "map"
 
 FRAME_COLUMNS = (
     *("index", "timestamp_s", "status", "submap", "in_main_map", "n_matches", "n_inliers", "latency_ms"),
-    *("sigma_position_rel", "sigma_scale"),
+    *("sigma_position_rel", "sigma_scale", "method", "doubt"),
 )
 _FILES = (
     TRAJECTORY,
@@ -207,7 +207,8 @@ class RunFolder:
             latency = f"{row.latency_ms:.3f}"
             sigmas = ["" if sigma is None else f"{sigma:.3g}" for sigma in (row.sigma_position_rel, row.sigma_scale)]
             time_s = repr(float(row.timestamp_s))
-            writer.writerow([row.index, time_s, str(row.status), submap, *counts, latency, *sigmas])
+            found = ("" if row.method is None else str(row.method), row.doubt)
+            writer.writerow([row.index, time_s, str(row.status), submap, *counts, latency, *sigmas, *found])
         write_text(self.path / FRAMES, text.getvalue())
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dualslam.core.errors import InputError
-from dualslam.core.types import FrameStatus
+from dualslam.core.types import FrameMethod, FrameStatus
 from dualslam.io.run_folder import (
     FRAME_COLUMNS,
     FRAMES,
@@ -27,8 +27,8 @@ from dualslam.map.frame_records import FrameRow
 
 log = logging.getLogger(__name__)
 
-OLD_FRAME_COLUMNS = FRAME_COLUMNS[:8]
-"""Of runs made before the map told what it claims."""
+OLD_FRAME_COLUMNS = (FRAME_COLUMNS[:8], FRAME_COLUMNS[:10])
+"""Of runs made before claims were written, and before methods and doubts were."""
 _Kinds = Mapping[str, tuple[tuple[type, ...], str]]
 """Of values by their names: the types that one may have, and what they are called."""
 _SUMMARY_KINDS: _Kinds = {
@@ -66,7 +66,7 @@ def read_frames(path: str | Path) -> list[FrameRow]:
     """Read a ``frames.csv``."""
     rows = []
     reader = csv.DictReader(io.StringIO(read_text(path)))
-    if tuple(reader.fieldnames or ()) not in (FRAME_COLUMNS, OLD_FRAME_COLUMNS):
+    if tuple(reader.fieldnames or ()) not in (FRAME_COLUMNS, *OLD_FRAME_COLUMNS):
         raise InputError(f"{path} is not a frames.csv: its columns should be {','.join(FRAME_COLUMNS)}.")
     for number, row in enumerate(reader, 2):
         try:
@@ -82,6 +82,8 @@ def read_frames(path: str | Path) -> list[FrameRow]:
                     latency_ms=_finite(row["latency_ms"]),
                     sigma_position_rel=_sigma(row.get("sigma_position_rel")),
                     sigma_scale=_sigma(row.get("sigma_scale")),
+                    method=FrameMethod(row["method"]) if row.get("method") else None,
+                    doubt=row.get("doubt") or "",
                 )
             )
         except (TypeError, ValueError) as e:

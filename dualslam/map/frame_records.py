@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.core.geometry import sim3
-from dualslam.core.types import Failure, FloatArray, FrameStatus
+from dualslam.core.types import Failure, FloatArray, FrameMethod, FrameStatus
 
 
 @dataclass(slots=True)
@@ -24,6 +24,10 @@ class FrameRow:
         None in `System.rows`: it is known once a run has ended, to `dualslam.frame_rows` and ``frames.csv``.
     sigma_position_rel, sigma_scale : float or None
         What the map claims of it (`run/claims.py`), known there as well; None also where it cannot tell.
+    method : FrameMethod or None
+        How its pose was found; None without a pose.
+    doubt : str
+        Empty, or the code of a reason in the run's verdict that is about this frame; known at the end as well.
     """
 
     index: int
@@ -36,6 +40,8 @@ class FrameRow:
     latency_ms: float = 0.0
     sigma_position_rel: float | None = None
     sigma_scale: float | None = None
+    method: FrameMethod | None = None
+    doubt: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +62,10 @@ class FrameResult:
         Why the frame has no pose.
     pose_ms : float or None
         From the start of the step to the frame's pose, before the map grew from it.
+    method : FrameMethod or None
+        How the pose was found.
+    doubt : str
+        Empty, or the code of what makes this stretch doubtful so far (`ReasonCode`).
     """
 
     index: int
@@ -69,6 +79,8 @@ class FrameResult:
     pose_ms: float | None = None
     S_world_submap: FloatArray | None = None
     world_id: int | None = None
+    method: FrameMethod | None = None
+    doubt: str = ""
 
     @property
     def T_world_cam(self) -> FloatArray | None:

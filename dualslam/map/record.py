@@ -10,7 +10,7 @@ import numpy as np
 
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.stage_timer import StageTimer
-from dualslam.core.types import BoolArray, FrameStatus
+from dualslam.core.types import BoolArray, FrameMethod, FrameStatus
 from dualslam.map.atlas import Atlas
 from dualslam.map.frame_observations import Change, FrameObservations
 from dualslam.map.frame_records import FrameRow
@@ -63,8 +63,9 @@ class Record:
         n_matches: int | None = None,
         n_inliers: int = 0,
         observations: FrameObservations | None = None,
+        method: FrameMethod | None = None,
     ) -> None:
-        """Enter where a frame is, and what it saw; without numbers, its row keeps those that it has."""
+        """Enter where a frame is, and what it saw; without numbers or method, its row keeps those that it has."""
         self.poses[pose.index] = pose
         self.observations.pop(pose.index, None)
         if observations is not None:
@@ -75,6 +76,8 @@ class Record:
         row.status, row.submap = FrameStatus.TRACKED, pose.submap_id
         if n_matches is not None:
             row.n_matches, row.n_inliers = n_matches, n_inliers
+        if method is not None:
+            row.method = method
 
     def change_pixels(self, submap_id: int, change_of: Callable[[int], Change | None]) -> None:
         """Let what a submap's frames have seen follow its pixels: `change_of` tells how those of a frame change."""

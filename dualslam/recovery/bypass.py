@@ -64,7 +64,7 @@ def pose_frames(
             seen = seen if change is None else seen.with_change(change)
         recovered_frames.append(replace(frame, pose=carried.get(pose.index, pose), observations=seen))
         if pose.index not in record.poses:
-            record.pose(recovered_frames[-1].pose, frame.n_matches, frame.n_inliers, seen)
+            record.pose(recovered_frames[-1].pose, frame.n_matches, frame.n_inliers, seen, frame.method)
     return recovered_frames
 
 
@@ -85,7 +85,7 @@ def bypass(record: Record, recovered_frames: Collection[RecoveredFrame], new_id:
         i = frame.pose.index
         if i <= handover or poses[i].submap_id == new_id:
             continue
-        record.pose(frame.pose, observations=frame.observations)
+        record.pose(frame.pose, observations=frame.observations, method=frame.method)
         record.rows[i].status = FrameStatus.BYPASSED
         n_bypassed += 1
     return n_bypassed
@@ -101,7 +101,8 @@ def drop_corrupted(record: Record, old_id: int, since: int) -> int:
     for i in corrupted:
         del poses[i]
         record.observations.pop(i, None)
-        record.rows[i].status, record.rows[i].submap = FrameStatus.BYPASSED, None
+        row = record.rows[i]
+        row.status, row.submap, row.method = FrameStatus.BYPASSED, None, None
     return len(corrupted)
 
 
@@ -152,7 +153,7 @@ def absorb(
             n_stay.append(len(frames))
             continue
         for i in frames:
-            record.pose(found[i].pose, observations=found[i].observations)
+            record.pose(found[i].pose, observations=found[i].observations, method=found[i].method)
             record.rows[i].status = FrameStatus.BYPASSED
         gone += component
         for m in component:

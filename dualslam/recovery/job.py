@@ -7,7 +7,7 @@ from typing import Any
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.events import Event
-from dualslam.core.types import Failure, FloatArray, View
+from dualslam.core.types import Failure, FloatArray, FrameMethod, View
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose, Path
@@ -77,6 +77,7 @@ class RecoveredFrame:
     n_matches: int
     n_inliers: int
     observations: FrameObservations | None = None
+    method: FrameMethod = FrameMethod.GUIDED
 
 
 @dataclass(frozen=True, slots=True, eq=False)

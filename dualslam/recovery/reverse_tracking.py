@@ -338,7 +338,7 @@ def _recovered_frame(reverse_tracker: VisualOdometry, view: View, track: Track) 
     T_kf_cam = reverse_tracker.relative_pose(track)
     pose = FramePose(view.index, view.timestamp_s, reverse_tracker.submap.id, reverse_tracker.reference_id, T_kf_cam)
     seen = FrameObservations.of(track.view.features, track.landmark_ids, pose.submap_id)
-    return RecoveredFrame(pose, track.n_matches, track.n_inliers, seen)
+    return RecoveredFrame(pose, track.n_matches, track.n_inliers, seen, track.method)
 
 
 def _refusal(tried: LinkTry, failure: Failure, attempt: str, view: View, submap_id: int) -> Event:

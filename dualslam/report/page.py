@@ -24,6 +24,11 @@ from dualslam.report.trust import trust_section
 
 MAX_EVENTS = 500
 """A bound on the size of the page."""
+VERDICTS = {
+    "good": "Nothing in this run speaks against its trajectory.",
+    "usable": "What is posed can be used; something is missing, or less sure than usual.",
+    "doubtful": "Part of this trajectory is probably wrong.",
+}
 _EVENT_COLUMNS = {"frame": "num", "time": "num", "event": None, "submap": "num", "what belongs to it": "words"}
 
 
@@ -56,7 +61,17 @@ def report_page(run: RunData | str | Path) -> str:
 
 def _header(run: RunData, sequence: str) -> Markup:
     lead = tag("p", headline(run), cls="lead")
-    return tag("header", tag("h1", sequence), lead, _saved_map(run), _warnings(run), _tiles(run))
+    return tag("header", tag("h1", sequence), _verdict(run), lead, _saved_map(run), _warnings(run), _tiles(run))
+
+
+def _verdict(run: RunData) -> Markup | None:
+    """Return how far to trust the run, why, and what to do; None for a run of an earlier version."""
+    told = run.summary.get("verdict")
+    if told is None:
+        return None
+    words = tag("p", tag("strong", f"Verdict: {told['level']}."), f" {VERDICTS[told['level']]}", cls="lead")
+    reasons = [tag("p", f"⚠ {reason['text']}", cls="warning") for reason in told["reasons"]]
+    return join([words, *reasons])
 
 
 def _map_link(run: RunData) -> Markup | None:

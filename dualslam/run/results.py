@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from dualslam.audit.verdict import Verdict
 from dualslam.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.memory import peak_rss_mb
-from dualslam.core.types import FrameStatus
+from dualslam.core.types import FloatArray, FrameStatus
 from dualslam.io.run_folder import FrameRow
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
 from dualslam.lab.metrics.trajectory_metrics import score_trajectory
@@ -48,11 +49,14 @@ class Trajectories:
         Frames posed in it.
     unlinked : dict of int to Trajectory
         Each other submap, in its own unit.
+    S_world_submap : dict of int to (4, 4) float64
+        Where the main submaps lie.
     """
 
     main_submaps: list[int]
     main: Trajectory
     unlinked: dict[int, Trajectory]
+    S_world_submap: dict[int, FloatArray]
 
 
 def trajectories_of(system: System) -> Trajectories:
@@ -75,8 +79,9 @@ def trajectories_of(system: System) -> Trajectories:
     largest = max(components, key=lambda c: sum(count[m] for m in c), default=[])
     if system.world is not None:  # the saved map is the main one, whatever this run has besides
         largest = next(c for c in components if system.world in c)
-    unlinked = {m: _posed(system, [m]) for m in count if m not in largest and count[m]}
-    return Trajectories(largest, _posed(system, largest), unlinked)
+    unlinked = {m: _posed(system, _placed(system, [m])) for m in count if m not in largest and count[m]}
+    S_world_submap = _placed(system, largest)
+    return Trajectories(largest, _posed(system, S_world_submap), unlinked, S_world_submap)
 
 
 def frame_rows(
@@ -84,6 +89,7 @@ def frame_rows(
     main: Trajectory | None = None,
     dropped: Iterable[tuple[int, float]] = (),
     latencies_ms: Sequence[float] | None = None,
+    verdict: Verdict | None = None,
 ) -> list[FrameRow]:
     """Return a row for every frame of the source, in the order in which they came: those of ``frames.csv``.
 
@@ -98,6 +104,8 @@ def frame_rows(
         Index and time of frames that the system was not given; they come where they belong.
     latencies_ms : sequence of float, optional
         Of the frames that were looked at, as the harness measured them; else the time of their steps.
+    verdict : Verdict, optional
+        That of `judge_run`: its reasons go into the frames that they are about.
     """
     in_main = set((trajectories_of(system).main if main is None else main).index.tolist())
     claims = {m: claims_of(submap) for m, submap in system.atlas.submaps.items()}
@@ -107,6 +115,8 @@ def frame_rows(
             index=system.numbers.index_of(row.index),
             in_main_map=system.numbers.index_of(row.index) in in_main,
             latency_ms=row.latency_ms if latencies_ms is None else latencies_ms[n],
+            method=row.method if row.index in system.poses else None,
+            doubt="" if verdict is None else verdict.doubt_about(system.numbers.index_of(row.index)),
         )
         for n, row in enumerate(system.rows.values())
     ]
@@ -127,7 +137,12 @@ def _with_claim(system: System, row: FrameRow, claims: Mapping[int, Mapping[int,
 
 
 def summarise(
-    system: System, report: RunReport, trajectories: Trajectories, config: Config, truth: Trajectory | None = None
+    system: System,
+    report: RunReport,
+    trajectories: Trajectories,
+    config: Config,
+    truth: Trajectory | None = None,
+    verdict: Verdict | None = None,
 ) -> dict[str, Any]:
     """Return what ``summary.json`` holds.
 
@@ -136,6 +151,7 @@ def summarise(
     main = trajectories.main
     posed = len(main)
     summary: dict[str, Any] = {
+        **({} if verdict is None else {"verdict": verdict.as_dict()}),
         "frames": report.n_frames,
         "posed": posed,
         "coverage": posed / report.n_frames if report.n_frames else 0.0,
@@ -213,11 +229,16 @@ def versions() -> dict[str, str]:
     return found
 
 
-def _posed(system: System, submap_ids: list[int]) -> Trajectory:
+def _placed(system: System, submap_ids: list[int]) -> dict[int, FloatArray]:
+    """Return where linked submaps lie in the world: the saved map's, or the first one's."""
     S_world_submap = system.atlas.S_world_submap(submap_ids) if submap_ids else {}
     if system.world in S_world_submap:
         S_world_first = sim3.inverse(S_world_submap[system.world])
         S_world_submap = {m: S_world_first @ S for m, S in S_world_submap.items()}
+    return S_world_submap
+
+
+def _posed(system: System, S_world_submap: dict[int, FloatArray]) -> Trajectory:
     own = (pose for pose in system.poses.values() if pose.index in system.rows)
     composed = compose(own, system.atlas, S_world_submap)
     index = np.array([system.numbers.index_of(i) for i in composed.index.tolist()], np.int64)

@@ -28,6 +28,7 @@ from dualslam.lab.disturbances import corrupted
 from dualslam.map.frame_records import FrameResult
 from dualslam.report import PlaceAlbum, SampleKeeper, read_run, report_page
 from dualslam.run.interrupts import Interrupts
+from dualslam.run.judgement import judge_run
 from dualslam.run.no_map import StartRefusals
 from dualslam.run.results import frame_rows, summarise, trajectories_of, truth_of_frames
 from dualslam.run.runner import RunReport, run_sequence
@@ -279,13 +280,14 @@ def _write_results(
 ) -> dict[str, Any]:
     """Write all that comes at the end of a run, and return the summary, which begins with what was given."""
     trajectories = trajectories_of(system)
+    verdict = judge_run(system, trajectories, len(report.dropped), crashed=report.bug is not None)
     truth: Trajectory | None = getattr(sequence, "ground_truth", None)
     summary = (
         given
         | {"refined": refined_camera(system, "focal_search" in given)}
-        | summarise(system, report, trajectories, config, truth)
+        | summarise(system, report, trajectories, config, truth, verdict)
     )
-    rows = frame_rows(system, trajectories.main, report.dropped, report.latencies_ms)
+    rows = frame_rows(system, trajectories.main, report.dropped, report.latencies_ms, verdict)
     folder.write(RunRecord(rows, trajectories.main, trajectories.unlinked, summary))
     if truth is not None and "no_errors" not in summary:
         folder.write_truth(truth_of_frames(truth, rows))

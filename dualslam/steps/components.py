@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from dualslam.calibration.lens import Calibration
 from dualslam.core.atlas_problem import AtlasSolver
-from dualslam.core.interfaces import FinalRefiner, MapStarter, Seeker, Shutter, SubmapGraph, VisualOdometry
+from dualslam.core.interfaces import FinalRefiner, MapStarter, PatchCheck, Seeker, Shutter, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FloatArray, Frame, View
 from dualslam.map.graph_beside import BesideGraphs
 from dualslam.map.submap import Submap
@@ -25,6 +25,7 @@ class Components:
     `walk_watch`: hears of reverse tracking that is under way. `desk`: does the work beside the tracking; reverse
     tracking has an executor of its own, which may use the same desk. `graphs`: carries changes to submaps' graphs in
     another process and back, if they are solved there. `refine_at_end`: has the last word on each submap.
+    `patches`: compares frames with the images of older keyframes.
     `open_features`: starts one more process, and returns a function that has the features of a frame found there.
     `foresee`: has found beside the tracking what reverse tracking may ask for in a frame; none where nothing is done
     beside it.
@@ -41,6 +42,7 @@ class Components:
     walk_watch: WalkWatch
     atlas_solver: AtlasSolver
     refine_at_end: FinalRefiner
+    patches: PatchCheck
     places: PlaceParts
     desk: Desk
     graphs: BesideGraphs | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import VisualOdometry
-from dualslam.core.types import Track, View
+from dualslam.core.types import FrameMethod, Track, View
 from dualslam.map.record import FrameStamp
 from dualslam.map.trajectory import FramePose
 from dualslam.places.handover import Handover
@@ -117,7 +117,7 @@ class PlaceKeeping:
         state.live, submap, track = found.odometry, found.odometry.submap, found.track
         reference = state.live.reference_id
         pose = FramePose(view.index, view.timestamp_s, submap.id, reference, state.live.relative_pose(track))
-        state.record.pose(pose, track.n_matches, track.n_inliers)
+        state.record.pose(pose, track.n_matches, track.n_inliers, method=FrameMethod.WIDE)
         state.record.event(
             EventKind.RELOCALISED,
             view,

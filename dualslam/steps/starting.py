@@ -11,7 +11,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import START_REACH, SubmapGraph
-from dualslam.core.types import Failure, FailureReason, Start, Track, View
+from dualslam.core.types import Failure, FailureReason, FrameMethod, Start, Track, View
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
@@ -118,7 +118,7 @@ class Starting:
         for track, T_kf_cam in (*found.earlier, (found.track, state.live.relative_pose(found.track))):
             at = track.view
             pose = FramePose(at.index, at.timestamp_s, submap.id, found.reference, T_kf_cam)
-            record.pose(pose, track.n_matches, track.n_inliers)
+            record.pose(pose, track.n_matches, track.n_inliers, method=FrameMethod.WIDE)
         first = found.earlier[0][0]
         record.event(
             EventKind.RELOCALISED,
@@ -226,7 +226,10 @@ class Starting:
         for k, keyframe in submap.keyframes.items():
             seen = FrameObservations.of(keyframe.features, submap.landmark_of[k], submap.id)
             n = len(seen.landmark_ids)
-            record.pose(FramePose(k, keyframe.timestamp_s, submap.id, k, np.eye(4)), n, n, seen)
+            pose = FramePose(k, keyframe.timestamp_s, submap.id, k, np.eye(4))
+            record.pose(pose, n, n, seen, FrameMethod.WIDE)
+        with record.timer.measure("audit of images"):
+            self._state.audit.begin(submap, start.views)
         record.event(kind, start.views[-1], submap.id, first_view=start.views[0].index, **start.numbers)
 
     def _track_in(self, submap: Submap, graph: SubmapGraph, view: View) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from dualslam.audit.photometric import PhotometricAudit
 from dualslam.config.settings import Config
 from dualslam.core.interfaces import VisualOdometry
 from dualslam.core.types import View
@@ -37,6 +38,7 @@ class State:
     health : HealthMonitor
         Of the tracking in the live map, or of the attempts at one.
     leaps : LeapWatch
+    audit : PhotometricAudit
     live : VisualOdometry or None
         The front end of the live submap; None while there is no map.
     lost : list of View
@@ -51,6 +53,7 @@ class State:
     localises: bool
     relocaliser: Relocaliser
     health: HealthMonitor
+    audit: PhotometricAudit
     pace: Pace = field(default_factory=Pace)
     leaps: LeapWatch = field(default_factory=LeapWatch)
     live: VisualOdometry | None = None

@@ -58,8 +58,10 @@ class Tracking:
                 return failure
         pose = FramePose(view.index, view.timestamp_s, submap.id, odometry.reference_id, odometry.relative_pose(track))
         seen = None if state.localises else FrameObservations.of(track.view.features, track.landmark_ids, submap.id)
-        state.record.pose(pose, track.n_matches, track.n_inliers, seen)
+        state.record.pose(pose, track.n_matches, track.n_inliers, seen, track.method)
         self._last_pose = pose
+        with state.record.timer.measure("audit of images"):
+            state.audit.take(submap, track)
         return track
 
     def _keyframe_due(self, odometry: VisualOdometry, track: Track) -> bool:

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dualslam.core.camera.base import Camera, plane
+from dualslam.core.camera.base import Camera
 from dualslam.core.camera.rectification import rectified_sigma
 from dualslam.core.columns import concatenate
 from dualslam.core.geometry import se3
@@ -27,7 +27,8 @@ from dualslam.core.geometry.projection import projection_jacobians, refine_pose
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Failure, Features, FloatArray, IntArray, Track, View
-from dualslam.frontends.gap.patches import HALF_PX, Pyramid, build_pyramid, match_patches
+from dualslam.frontends.direct.search import HALF_PX, match_patches
+from dualslam.frontends.direct.warp import Pyramid, build_pyramid, warp_points
 from dualslam.frontends.gap.uncertainty import track_uncertainty
 from dualslam.frontends.tracking.row_shifts import find_as_read, straighten
 from dualslam.map.landmark_views import landmark_covariances
@@ -221,11 +222,11 @@ class Refinder:
         T_cam_kf = track.T_cam_submap @ self._submap.T_submap_kf[sought.keyframe_id]
         uv_kf = sought.features.uv_px
         depth = self._submap.depths(sought.landmark_ids, T_kf_submap)
-        uv_kf_rect, uv, uv_rect, J = _predict(camera, uv_kf, depth, T_cam_kf)
+        warp = warp_points(camera, uv_kf, depth, T_cam_kf)
+        uv, J, zoom = warp.uv_px, warp.J_b_a, warp.zoom
         turn_rad, turn_kf_rad = track.view.turn_rad, self._turns_rad[sought.keyframe_id]
-        uv = uv if turn_rad is None else find_as_read(uv, uv_rect, camera, turn_rad)
-        uv_kf = uv_kf if turn_kf_rad is None else find_as_read(uv_kf, uv_kf_rect, camera, turn_kf_rad)
-        zoom = _zoom(J)
+        uv = uv if turn_rad is None else find_as_read(uv, warp.uv_rect_px, camera, turn_rad)
+        uv_kf = uv_kf if turn_kf_rad is None else find_as_read(uv_kf, warp.uv_rect_a_px, camera, turn_kf_rad)
         margin = HALF_PX * np.maximum(zoom, 1.0)[:, None]
         inside = ((uv > margin) & (uv < np.array(camera.size_px) - 1 - margin)).all(axis=1)
         usable = np.flatnonzero(inside & (depth > 0) & (zoom > 1 / MAX_ZOOM) & (zoom < MAX_ZOOM))
@@ -292,25 +293,3 @@ class Refinder:
 
 def _inverse(symmetric: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.pinv(symmetric, hermitian=True), np.float64)
-
-
-def _predict(
-    camera: Camera, uv_px: FloatArray, depth: FloatArray, T_b_a: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return pixels (N, 2) of a rectified, where they are in b at a depth (N,) in a, and these rectified.
-
-    And by how much places in b move with those in a (N, 2, 2).
-    """
-    n = len(uv_px)
-    # All in one: taking a lens out costs more by the call than by the pixel.
-    rays = camera.unproject((uv_px + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, None]).reshape(-1, 2))
-    p = rays * (np.tile(depth, 3) / rays[:, 2])[:, None]
-    p_b = p @ T_b_a[:3, :3].T + T_b_a[:3, 3]
-    here, right, down = camera.project(p_b).reshape(3, n, 2)
-    rect, rect_b = (plane(x[:n]) * np.diag(camera.K)[:2] + camera.K[:2, 2] for x in (rays, p_b))
-    return rect, here, rect_b, np.stack([right - here, down - here], axis=2)
-
-
-def _zoom(J: FloatArray) -> FloatArray:
-    """Return how much larger (N,) things are in the second image; NaN where they are not in it."""
-    return np.asarray(np.sqrt(np.abs(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0])))

@@ -6,11 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
+from dualslam.audit.photometric import PhotometricAudit
 from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.stage_timer import StageTimer
-from dualslam.core.types import Features, FloatArray, Frame, FrameStatus, Keyframe
+from dualslam.core.types import Features, FloatArray, Frame, FrameStatus, Keyframe, View
 from dualslam.map.atlas import Atlas
 from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameResult, FrameRow
@@ -29,6 +30,16 @@ NO_FEATURES = Features(
     np.zeros(0),
     np.zeros((0, 32), np.uint8),
 )
+
+
+class NoPatches:
+    """Keeps nothing, so that no frame can be compared."""
+
+    def remember(self, submap: Submap, view: View) -> None:
+        pass
+
+    def measure(self, submap: Submap, view: View, T_cam_submap: FloatArray) -> float | None:
+        return None
 
 
 class FakeSystem:
@@ -50,6 +61,7 @@ class FakeSystem:
         self.desk = InlineDesk({})
         self.n_finished = 0
         self.numbers = FrameNumbers()
+        self.audit, self.blank = PhotometricAudit(NoPatches()), set[int]()
         self.world = self.saved = self.camera = self.log_focal_sigma = None
         self.was_interrupted = False
         self._truth, self._lost, self._before_step = truth, lost, before_step

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from dualslam.cli.console import final_line, no_map_line, progress, waiting
+from dualslam.cli.console import final_line, no_map_line, progress, verdict_line, waiting
 from dualslam.core.types import Frame, FrameStatus
 from dualslam.map.frame_records import FrameResult
 from dualslam.run.sources import open_source
@@ -99,3 +99,11 @@ def test_what_a_run_found_again_and_linked_is_told(tmp_path: Path) -> None:
     assert ", 2 submaps (linked), 1 failure, 1 relocalisation, 2 loops, 20.0 frames/s" in final_line(outcome)  # type: ignore[arg-type]
     summary["posed_in_all_submaps"] = 12  # a later map has frames of its own
     assert ", 2 submaps, 1 failure" in final_line(outcome)  # type: ignore[arg-type]
+
+
+def test_the_verdict_is_one_line(tmp_path: Path) -> None:
+    reasons = [{"code": "jump", "text": "It jumps. Look there.", "first_frame": 1, "last_frame": 2}]
+    outcome = SimpleNamespace(summary={"verdict": {"level": "doubtful", "reasons": reasons}})
+    assert verdict_line(outcome) == "verdict: doubtful. It jumps. Look there."  # type: ignore[arg-type]
+    outcome.summary["verdict"] = {"level": "good", "reasons": []}
+    assert verdict_line(outcome) == "verdict: good."  # type: ignore[arg-type]

@@ -49,10 +49,11 @@ def test_demo_shows_recovery_off_against_on(out: Path, capsys: pytest.CaptureFix
     assert main(command) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "covered in frames 16 to 25" in lines[0]
-    assert (lines[1], lines[3]) == ("Recovery off:", "Recovery on:")
+    assert (lines[1], lines[4]) == ("Recovery off:", "Recovery on:")
     assert "2 submaps, 1 failure" in lines[2]
-    assert lines[4].endswith(f"results in {out / 'on'}")
-    assert lines[5].split() == ["off", "on"]
+    assert lines[5].endswith(f"results in {out / 'on'}")
+    assert lines[3].startswith("verdict: usable.")
+    assert lines[7].split() == ["off", "on"]
     assert ["coverage", "50.0", "%", "56.2", "%"] in [line.split() for line in lines]
     assert [load_config(out / name / "config.yaml").recovery.enabled for name in ("off", "on")] == [False, True]
     assert "recovery.enabled" in (out / "compare.html").read_text(), "what the two differ in"

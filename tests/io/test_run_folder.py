@@ -12,14 +12,16 @@ import pytest
 
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.events import EventKind, EventLog
-from dualslam.core.types import FrameStatus
+from dualslam.core.types import FrameMethod, FrameStatus
 from dualslam.io import FrameRow, RunFolder, RunRecord, Trajectory, read_kitti, read_tum
 from dualslam.io.run_folder import check_vacant, unlinked_submaps
 from dualslam.io.run_reading import read_events, read_frames
 
 ROWS = [
     FrameRow(0, 0.1, FrameStatus.INITIALISING, None, False, 0, 0, 12.3456),
-    FrameRow(2, 0.30000000000000004, FrameStatus.TRACKED, 0, True, 200, 150, 20.0, 0.0125, 0.03),
+    FrameRow(
+        2, 0.30000000000000004, FrameStatus.TRACKED, 0, True, 200, 150, 20.0, 0.0125, 0.03, FrameMethod.WIDE, "jump"
+    ),
     FrameRow(4, 0.5, FrameStatus.UNREADABLE, None, False, 0, 0, 1.0),
 ]
 
@@ -58,9 +60,10 @@ def test_everything_is_written_and_reads_back(tmp_path: Path) -> None:
         "ratio": None,
     }, "on the disk while the run goes on"
     assert (run.path / "frames.csv").read_text().splitlines()[:3] == [
-        "index,timestamp_s,status,submap,in_main_map,n_matches,n_inliers,latency_ms,sigma_position_rel,sigma_scale",
-        "0,0.1,initialising,,0,0,0,12.346,,",
-        "2,0.30000000000000004,tracked,0,1,200,150,20.000,0.0125,0.03",
+        "index,timestamp_s,status,submap,in_main_map,n_matches,n_inliers,latency_ms,sigma_position_rel,sigma_scale,"
+        "method,doubt",
+        "0,0.1,initialising,,0,0,0,12.346,,,,",
+        "2,0.30000000000000004,tracked,0,1,200,150,20.000,0.0125,0.03,wide,jump",
     ]
     back = read_frames(run.path / "frames.csv")
     assert back[1:] == ROWS[1:]
@@ -267,3 +270,6 @@ def test_frames_csv_of_before_sigmas_were_written(tmp_path: Path) -> None:
     path.write_text(f"{columns}\n2,0.1,tracked,0,1,200,150,20.0\n")
     (row,) = read_frames(path)
     assert (row.n_inliers, row.sigma_position_rel, row.sigma_scale) == (150, None, None)
+    path.write_text(f"{columns},sigma_position_rel,sigma_scale\n2,0.1,tracked,0,1,200,150,20.0,0.1,\n")
+    (row,) = read_frames(path)
+    assert (row.sigma_position_rel, row.method, row.doubt) == (0.1, None, "")

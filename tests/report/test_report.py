@@ -410,3 +410,15 @@ def test_a_canvas_holds_what_it_is_drawn_around() -> None:
         xy = canvas.to_svg(uv)
         assert (xy >= 0).all()
         assert (xy <= [1000, canvas.height]).all()
+
+
+def test_the_verdict_stands_first_with_its_reasons(make_run: MakeRun) -> None:
+    run = read_run(make_run())
+    page = report_page(run)
+    told = run.summary["verdict"]
+    assert told["level"] == "usable", "six frames have no pose, and the map after them is not joined"
+    assert f"Verdict: {told['level']}." in page
+    for reason in told["reasons"]:
+        assert page.index(reason["text"]) < page.index("Every frame")
+    del run.summary["verdict"]
+    assert "Verdict:" not in report_page(run)

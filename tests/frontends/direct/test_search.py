@@ -8,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from dualslam.core.types import FloatArray
-from dualslam.frontends.gap.patches import build_pyramid, match_patches
+from dualslam.frontends.direct.search import match_patches
+from dualslam.frontends.direct.warp import build_pyramid
 
 SIZE = 240
 PLACE_TOLERANCE_PX = 0.3

@@ -1,4 +1,4 @@
-"""Points that one image shows, found again in another by what they look like there: no detector is asked.
+"""Search for points of one image in another by their patches, without a detector.
 
 A detector finds a third of its points again at twice the distance, and of these half have descriptors that are still
 alike. Where it is known about where a point must appear, and how much larger or smaller, the image itself can be
@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.types import FloatArray, IntArray
-
-Pyramid = list[NDArray[np.float32]]
+from dualslam.frontends.direct.warp import Pyramid, sample
 
 HALF_PX = 6
 """Half the side of a patch, in pixels of the coarser image."""
@@ -29,9 +28,6 @@ BESIDE_PX = 2
 """Places so far from the peak belong to it."""
 MIN_CONTRAST = 4.0
 """Standard deviation of a patch's greys: less is noise."""
-MAX_LEVELS = 4
-REMAP_ROWS = 30000
-"""`cv2.remap` takes no more than 32767."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,44 +37,6 @@ class PatchMatches:
     row: IntArray
     uv_px: FloatArray
     spacing_px: FloatArray
-
-
-def build_pyramid(image: NDArray[np.uint8]) -> Pyramid:
-    """Return the image and its halves."""
-    levels = [image.astype(np.float32)]
-    while len(levels) < MAX_LEVELS and min(levels[-1].shape) >= 8 * HALF_PX:
-        levels.append(np.asarray(cv2.pyrDown(levels[-1]), np.float32))
-    return levels
-
-
-def sample(levels: Pyramid, uv_px: FloatArray, axes: FloatArray, half: int) -> NDArray[np.float32]:
-    """Return patches (N, S, S), S = 2 half + 1, about places (N, 2).
-
-    Parameters
-    ----------
-    levels : list of (H, W)
-    uv_px : (N, 2)
-    axes : (N, 2, 2)
-        Columns: steps in the image from one pixel of the patch to its right and lower neighbour.
-    half : int
-    """
-    step = np.sqrt(np.abs(np.linalg.det(axes)))
-    side = 2 * half + 1
-    level = np.clip(np.rint(np.log2(np.maximum(step, 1e-6))), 0, len(levels) - 1).astype(np.int64)
-    grid = np.arange(-half, half + 1, dtype=np.float64)
-    patches = np.zeros((len(uv_px), side, side), np.float32)
-    for n in np.unique(level).tolist():
-        of_level = np.flatnonzero(level == n)
-        for begin in range(0, len(of_level), REMAP_ROWS // side):
-            rows = of_level[begin : begin + REMAP_ROWS // side]
-            # The middle of a level's first pixel is the middle of the image's.
-            right, down = axes[rows].transpose(2, 1, 0)[..., None, None] / 2.0**n
-            at = np.empty((2, len(rows), side, side), np.float32)
-            np.add(uv_px[rows].T[..., None, None] / 2.0**n + right * grid, down * grid[:, None], out=at)
-            u, v = at.reshape(2, len(rows) * side, side)
-            out = cv2.remap(levels[n], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            patches[rows] = out.reshape(len(rows), side, side)
-    return patches
 
 
 def match_patches(

@@ -1,0 +1,100 @@
+"""Photometric audit of a run: stretches in which the images disagree with the map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+
+from dualslam.core.interfaces import PatchCheck
+from dualslam.core.types import Track, View
+from dualslam.map.submap import Submap
+
+INTERVAL_S = 0.18
+"""Between two samples: five a second at all usual rates of frames."""
+MIN_AGREEMENT = 0.25
+"""Share of patches below which a sample disagrees. Maps that follow an occluder, or have lost their way in a turn, have
+0 to 0.21; right ones have 0.3 and more, but for single blurred frames."""
+MIN_SAMPLES = 4
+"""Disagreeing samples in a row that make a stretch: about 0.8 s. A single one may be blur, or somebody who passes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One frame compared with patches of an older keyframe.
+
+    Attributes
+    ----------
+    index : int
+        The frame's number inside the system.
+    timestamp_s : float
+    submap_id : int
+    agreement : float
+        Share of the patches that look as the map predicts, 0 to 1.
+    """
+
+    index: int
+    timestamp_s: float
+    submap_id: int
+    agreement: float
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Consecutive samples that disagree: number of the first and last frame, and the median agreement."""
+
+    first: int
+    last: int
+    agreement: float
+
+
+class PhotometricAudit:
+    """Compares tracked frames with the patches of older keyframes, a few times a second.
+
+    Parameters
+    ----------
+    patches : PatchCheck
+
+    Attributes
+    ----------
+    samples : list of Sample
+    """
+
+    def __init__(self, patches: PatchCheck) -> None:
+        self._patches = patches
+        self.samples: list[Sample] = []
+        self._last_s = float("-inf")
+
+    def begin(self, submap: Submap, views: Iterable[View]) -> None:
+        """Keep patches of the views that a submap starts from."""
+        for view in views:
+            self._patches.remember(submap, view)
+
+    def take(self, submap: Submap, track: Track) -> None:
+        """Compare a posed frame if a sample is due, and keep its patches if it has become a keyframe."""
+        view = track.view
+        if abs(view.timestamp_s - self._last_s) >= INTERVAL_S:
+            agreement = self._patches.measure(submap, view, track.T_cam_submap)
+            if agreement is not None:
+                self._last_s = view.timestamp_s
+                self.samples.append(Sample(view.index, view.timestamp_s, submap.id, agreement))
+        if view.index in submap.keyframes:
+            self._patches.remember(submap, view)
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the newest samples disagree."""
+        return bool(disagreeing_stretches(self.samples[-MIN_SAMPLES:]))
+
+
+def disagreeing_stretches(samples: Iterable[Sample]) -> list[Stretch]:
+    """Return the stretches of one map in which consecutive samples disagree, by ascending time."""
+    found = []
+    for (_, disagrees), group in groupby(samples, key=lambda s: (s.submap_id, s.agreement < MIN_AGREEMENT)):
+        stretch = list(group)
+        if disagrees and len(stretch) >= MIN_SAMPLES:
+            agreement = float(np.median([each.agreement for each in stretch]))
+            found.append(Stretch(stretch[0].index, stretch[-1].index, agreement))
+    return found

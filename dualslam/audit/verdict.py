@@ -1,0 +1,96 @@
+"""The verdict on a run: how far to trust it, why, and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+MAX_REASONS = 3
+
+
+class Level(StrEnum):
+    """How far to trust a run."""
+
+    GOOD = "good"
+    USABLE = "usable"
+    """What is posed can be used; something is missing, or less sure than usual."""
+    DOUBTFUL = "doubtful"
+    """Part of what is posed is probably wrong."""
+
+
+class ReasonCode(StrEnum):
+    """What speaks against a run, the gravest first."""
+
+    NO_MAP = "no_map"
+    JUMP = "jump"
+    PHOTOMETRIC = "photometric"
+    CAMERA = "camera"
+    SCALE = "scale"
+    CRASHED = "crashed"
+    UNPOSED = "unposed"
+    UNJOINED = "unjoined"
+    DROPPED = "dropped"
+    CLOCK = "clock"
+    FOCAL = "focal"
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """One reason of a verdict.
+
+    Attributes
+    ----------
+    code : ReasonCode
+    level : Level
+        The best level that a run with this reason can have.
+    text : str
+        What was found and what to do, in plain words.
+    first_frame, last_frame : int
+        The frames that it is about, by their index in the source.
+    """
+
+    code: ReasonCode
+    level: Level
+    text: str
+    first_frame: int
+    last_frame: int
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """How far to trust a run.
+
+    Attributes
+    ----------
+    level : Level
+    reasons : tuple of Reason
+        The gravest first, at most three; none where the run is good.
+    """
+
+    level: Level
+    reasons: tuple[Reason, ...] = ()
+
+    @classmethod
+    def of(cls, reasons: Iterable[Reason]) -> Verdict:
+        """Return the verdict that some reasons lead to."""
+        grades, codes = list(Level), list(ReasonCode)
+        ordered = sorted(reasons, key=lambda r: (-grades.index(r.level), codes.index(r.code), r.first_frame))
+        return cls(ordered[0].level if ordered else Level.GOOD, tuple(ordered[:MAX_REASONS]))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what ``summary.json`` holds."""
+        reasons = [
+            {"code": str(r.code), "text": r.text, "first_frame": r.first_frame, "last_frame": r.last_frame}
+            for r in self.reasons
+        ]
+        return {"level": str(self.level), "reasons": reasons}
+
+    def doubt_about(self, frame: int) -> str:
+        """Return the code of the gravest reason that is about a frame; empty where none is."""
+        return next((str(r.code) for r in self.reasons if r.first_frame <= frame <= r.last_frame), "")
+
+    def __str__(self) -> str:
+        """Return the verdict in one line."""
+        return f"{self.level}: {' '.join(r.text for r in self.reasons)}" if self.reasons else str(self.level)

@@ -1,0 +1,1 @@
+"""Image patches warped between frames by pose and depth."""

@@ -1,0 +1,108 @@
+"""Image patches warped between two views by pose and depth, and how well they agree.
+
+A patch is a square grid of grey values about a point. Its plane is taken parallel to the image of its reference view.
+The warp is affine within a patch. All patches of a view are warped at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.camera.base import Camera, plane
+from dualslam.core.types import FloatArray
+
+Pyramid = list[NDArray[np.float32]]
+
+MAX_LEVELS = 4
+MIN_SIDE_PX = 48
+"""An image with a shorter side is not halved again."""
+REMAP_ROWS = 30000
+"""`cv2.remap` takes no more than 32767."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Warp:
+    """Where N points of view a are in view b.
+
+    Attributes
+    ----------
+    uv_rect_a_px : (N, 2)
+        Rectified pixels of the points in a.
+    uv_px, uv_rect_px : (N, 2)
+        Pixels in b as its lens shows them, and rectified; NaN where b does not show a point.
+    J_b_a : (N, 2, 2)
+        Derivative of a pixel in b by its pixel in a.
+    """
+
+    uv_rect_a_px: FloatArray
+    uv_px: FloatArray
+    uv_rect_px: FloatArray
+    J_b_a: FloatArray
+
+    @property
+    def zoom(self) -> FloatArray:
+        """(N,) how much larger things are in b; NaN where they are not in it."""
+        J = self.J_b_a
+        return np.asarray(np.sqrt(np.abs(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0])))
+
+
+def build_pyramid(image: NDArray[np.uint8]) -> Pyramid:
+    """Return the image and its halves."""
+    levels = [image.astype(np.float32)]
+    while len(levels) < MAX_LEVELS and min(levels[-1].shape) >= MIN_SIDE_PX:
+        levels.append(np.asarray(cv2.pyrDown(levels[-1]), np.float32))
+    return levels
+
+
+def warp_points(camera: Camera, uv_px: FloatArray, depth: FloatArray, T_b_a: FloatArray) -> Warp:
+    """Warp pixels (N, 2) of view a, at depths (N,), into view b of the same camera."""
+    n = len(uv_px)
+    # One call for all: taking a lens out costs more by the call than by the pixel.
+    rays = camera.unproject((uv_px + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, None]).reshape(-1, 2))
+    p = rays * (np.tile(depth, 3) / rays[:, 2])[:, None]
+    p_b = p @ T_b_a[:3, :3].T + T_b_a[:3, 3]
+    here, right, down = camera.project(p_b).reshape(3, n, 2)
+    rect, rect_b = (plane(x[:n]) * np.diag(camera.K)[:2] + camera.K[:2, 2] for x in (rays, p_b))
+    return Warp(rect, here, rect_b, np.stack([right - here, down - here], axis=2))
+
+
+def sample(levels: Pyramid, uv_px: FloatArray, axes: FloatArray, half: int) -> NDArray[np.float32]:
+    """Return patches (N, S, S), S = 2 half + 1, about places (N, 2).
+
+    Parameters
+    ----------
+    levels : list of (H, W)
+    uv_px : (N, 2)
+    axes : (N, 2, 2)
+        Columns: steps in the image from one pixel of the patch to its right and lower neighbour.
+    half : int
+    """
+    step = np.sqrt(np.abs(np.linalg.det(axes)))
+    side = 2 * half + 1
+    level = np.clip(np.rint(np.log2(np.maximum(step, 1e-6))), 0, len(levels) - 1).astype(np.int64)
+    grid = np.arange(-half, half + 1, dtype=np.float64)
+    patches = np.zeros((len(uv_px), side, side), np.float32)
+    for n in np.unique(level).tolist():
+        of_level = np.flatnonzero(level == n)
+        for begin in range(0, len(of_level), REMAP_ROWS // side):
+            rows = of_level[begin : begin + REMAP_ROWS // side]
+            # The middle of a level's first pixel is the middle of the image's.
+            right, down = axes[rows].transpose(2, 1, 0)[..., None, None] / 2.0**n
+            at = np.empty((2, len(rows), side, side), np.float32)
+            np.add(uv_px[rows].T[..., None, None] / 2.0**n + right * grid, down * grid[:, None], out=at)
+            u, v = at.reshape(2, len(rows) * side, side)
+            out = cv2.remap(levels[n], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            patches[rows] = out.reshape(len(rows), side, side)
+    return patches
+
+
+def correlate(a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
+    """Return the zero-mean normalised cross-correlation (N,) of patches (N, S, S); 0 where one of them is flat."""
+    x, y = (each.reshape(len(each), -1).astype(np.float64) for each in (a, b))
+    x, y = x - x.mean(axis=1, keepdims=True), y - y.mean(axis=1, keepdims=True)
+    norm = np.sqrt((x * x).sum(axis=1) * (y * y).sum(axis=1))
+    return np.asarray((x * y).sum(axis=1) / np.maximum(norm, 1e-9), np.float64)

@@ -1,0 +1,108 @@
+"""A run without a fault is good; what is missing makes it usable, and what must be wrong doubtful."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dualslam.audit.photometric import MIN_SAMPLES, Sample
+from dualslam.audit.verdict import Level, ReasonCode, Verdict
+from dualslam.core.types import FloatArray, Frame
+from dualslam.run.judgement import judge_run
+from dualslam.run.results import frame_rows, trajectories_of
+from tests.cli.fakes import FakeSystem
+
+N = 200
+IMAGE = np.zeros((4, 4), np.uint8)
+
+
+def ahead(speed_m_s: float = 1.0) -> dict[int, FloatArray]:
+    truth = {i: np.eye(4) for i in range(N)}
+    for i, T in truth.items():
+        T[0, 3] = speed_m_s * i / 30
+    return truth
+
+
+def run(truth: dict[int, FloatArray], lost: tuple[int, ...] = (), interval_s: float = 1 / 30) -> FakeSystem:
+    system = FakeSystem(truth, lost)
+    for i in range(len(truth)):
+        system.step(Frame(i, interval_s * i, IMAGE))
+    return system
+
+
+def judged(system: FakeSystem, dropped: int = 0) -> Verdict:
+    return judge_run(system, trajectories_of(system), dropped)  # type: ignore[arg-type]
+
+
+def test_a_run_that_poses_all_is_good() -> None:
+    assert judged(run(ahead())) == Verdict(Level.GOOD)
+
+
+def test_a_jump_makes_a_run_doubtful_and_names_its_frames() -> None:
+    truth = ahead()
+    for i in range(120, N):
+        truth[i][2, 3] = 1.0
+    system = run(truth)
+    verdict = judged(system)
+    assert verdict.level is Level.DOUBTFUL
+    (reason,) = verdict.reasons
+    assert (reason.code, reason.first_frame, reason.last_frame) == (ReasonCode.JUMP, 119, 120)
+    assert "frames 119 and 120" in reason.text
+    rows = frame_rows(system, verdict=verdict)  # type: ignore[arg-type]
+    assert [row.index for row in rows if row.doubt] == [119, 120]
+
+
+def test_maps_that_were_not_joined_make_a_run_usable() -> None:
+    verdict = judged(run(ahead(), lost=tuple(range(130, 133))))
+    assert verdict.level is Level.USABLE
+    (reason,) = verdict.reasons
+    assert (reason.code, reason.first_frame, reason.last_frame) == (ReasonCode.UNJOINED, 133, N - 1)
+    assert f"67 frames from 133 to {N - 1}" in reason.text
+
+
+def test_frames_without_a_pose_make_a_run_usable_unless_nothing_is_on_them() -> None:
+    lost = tuple(range(180, N))
+    system = run(ahead(), lost)
+    (reason,) = judged(system).reasons
+    assert (reason.code, reason.first_frame, reason.last_frame) == (ReasonCode.UNPOSED, 180, N - 1)
+    system.blank.update(lost)
+    assert judged(system).level is Level.GOOD
+
+
+def test_dropped_frames_make_a_run_usable() -> None:
+    (reason,) = judged(run(ahead()), dropped=40).reasons
+    assert (reason.code, reason.level) == (ReasonCode.DROPPED, Level.USABLE)
+
+
+def test_a_stretch_that_disagrees_with_the_images_makes_a_run_doubtful_while_its_poses_hold() -> None:
+    system = run(ahead())
+    system.audit.samples += [Sample(60 + 6 * n, 2 + 0.2 * n, 0, 0.02) for n in range(MIN_SAMPLES)]
+    verdict = judged(system)
+    assert verdict.level is Level.DOUBTFUL
+    (reason,) = verdict.reasons
+    assert (reason.code, reason.first_frame, reason.last_frame) == (ReasonCode.PHOTOMETRIC, 60, 78)
+    for i in range(60, 79):
+        del system.poses[i]
+    assert judged(system).level is not Level.DOUBTFUL
+
+
+def test_a_clock_in_another_unit_or_that_repeats_is_told() -> None:
+    (reason,) = judged(run(ahead(), interval_s=33.3)).reasons
+    assert reason.code is ReasonCode.CLOCK
+    system = run(ahead())
+    system.rows[7].timestamp_s = system.rows[6].timestamp_s
+    (reason,) = judged(system).reasons
+    assert reason.code is ReasonCode.CLOCK
+    assert reason.text.startswith(f"1 of {N} timestamps")
+
+
+def test_a_focal_length_that_is_hardly_known_makes_a_run_usable() -> None:
+    system = run(ahead())
+    system.log_focal_sigma = 0.06
+    (reason,) = judged(system).reasons
+    assert (reason.code, reason.level) == (ReasonCode.FOCAL, Level.USABLE)
+
+
+def test_no_pose_is_doubtful() -> None:
+    verdict = judged(run(ahead(), lost=tuple(range(N))))
+    assert (verdict.level, verdict.reasons[0].code) == (Level.DOUBTFUL, ReasonCode.NO_MAP)
+    assert (verdict.reasons[0].first_frame, verdict.reasons[0].last_frame) == (0, N - 1)
