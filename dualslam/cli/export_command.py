@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,8 @@ from dualslam.cli.outputs import check_free
 from dualslam.cli.view_command import save_recording
 from dualslam.core.errors import DualSlamError, InputError, OutputError
 from dualslam.core.types import FloatArray, IntArray
-from dualslam.export.exported_map import ExportedMap, flatten, read_stored
+from dualslam.export.colours import keyframe_indices, landmark_colours
+from dualslam.export.exported_map import flatten, read_stored, with_frames
 from dualslam.export.formats import FORMATS
 from dualslam.export.images import with_images
 from dualslam.export.metric import by_distance
@@ -22,9 +23,10 @@ from dualslam.io.atomic import write_text
 from dualslam.io.map_store import StoredMap
 from dualslam.io.metric_scale import read_scale
 from dualslam.io.run_folder import TRAJECTORY, TRAJECTORY_KITTI
-from dualslam.io.run_reading import read_numbers
+from dualslam.io.run_reading import read_numbers, read_summary
+from dualslam.io.sequence import RecordedSequence
 from dualslam.io.trajectory_files import read_kitti, read_text, read_tum, write_tum
-from dualslam.run.sources import open_images_of_run
+from dualslam.run.sources import SYNTHETIC, WorldSequence, open_images_of_run
 
 TRAJECTORIES = {"tum": TRAJECTORY, "kitti": TRAJECTORY_KITTI}
 """Formats of which a run folder has the file already."""
@@ -39,22 +41,33 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _execute(args: argparse.Namespace) -> int:
+    if args.every is not None and not (args.to in FORMATS and FORMATS[args.to].has_images):
+        raise InputError(f"--every goes with --to colmap and nerfstudio: {args.to} has no images.")
     if args.to == RECORDING:
         return _write_recording(args)
     if args.to in TRAJECTORIES:
         return _copy_trajectory(args)
+    chosen = FORMATS[args.to]
     stored = read_stored(args.run)
     numbers = read_numbers(args.run)
+    source = _source(args, stored) if chosen.has_colours else None
+    if source is not None and not stored.colours:
+        frames = source.in_colour(keyframe_indices(stored.atlas, numbers))
+        stored = replace(stored, colours=landmark_colours(stored.atlas, frames, numbers, {}))
     exported = flatten(stored)
     metres = read_scale(args.run)
     if args.distance is not None:
-        metres = by_distance(exported, numbers, *args.distance).metres_per_unit
+        posed = with_frames(exported, stored, numbers.values())
+        metres = by_distance(posed, numbers, *args.distance).metres_per_unit
+    if args.every is not None:
+        exported = with_frames(exported, stored, list(numbers.values())[:: args.every])
     if metres is not None:
         exported = exported.scaled(metres)
-    chosen = FORMATS[args.to]
-    all_keyframes = exported.frame
-    if args.images is not None:
-        exported = _with_images(args, stored, exported, numbers)
+    all_views = exported.frame
+    if source is not None and chosen.has_images:
+        assert stored.camera is not None
+        images = source.in_colour(exported.rows_by_index(numbers))
+        exported = with_images(exported, stored.camera, images, numbers, args.out)
     chosen.write(exported, args.out)
     if not args.quiet:
         errors = exported.reprojection_errors_px()
@@ -63,16 +76,35 @@ def _execute(args: argparse.Namespace) -> int:
             f"in {_unit(metres)}, mean reprojection error {np.nanmean(errors):.3f} px; {args.to} in {args.out}",
             flush=True,
         )
-        _tell_left_out(np.setdiff1d(all_keyframes, exported.frame), min(numbers.values(), default=0))
+        _tell_left_out(np.setdiff1d(all_views, exported.frame), min(numbers.values(), default=0))
+        if source is not None and chosen.next_command:
+            print(f"next: {chosen.next_command.format(out=args.out)}", flush=True)
     return 0
 
 
-def _tell_left_out(keyframes: IntArray, first: int) -> None:
-    """Say how many keyframes have no image and are not exported; `first`: the number of the run's first frame."""
-    n_saved = int((keyframes < first).sum())
-    for n, whose in ((n_saved, "the saved map"), (len(keyframes) - n_saved, "the run")):
+def _source(args: argparse.Namespace, stored: StoredMap) -> RecordedSequence | WorldSequence | None:
+    """Open what the run was made of, for images and colours; None, and a sentence, where it is not there any more."""
+    remembered = read_summary(args.run).get("source")
+    assert stored.camera is not None
+    if args.images is None and not (
+        remembered and (str(remembered).startswith(SYNTHETIC) or Path(remembered).exists())
+    ):
+        if FORMATS[args.to].has_images and not args.quiet:
+            print(f"no images: {_where_it_was(remembered)}; name it with --images", flush=True)
+        return None
+    return open_images_of_run(str(args.images or remembered), stored.camera.size_px)
+
+
+def _where_it_was(remembered: str | None) -> str:
+    return f"{remembered} is not there any more" if remembered else "the run does not know its source"
+
+
+def _tell_left_out(views: IntArray, first: int) -> None:
+    """Say how many views have no image and are not exported; `first`: the number of the run's first frame."""
+    n_saved = int((views < first).sum())
+    for n, whose in ((n_saved, "the saved map"), (len(views) - n_saved, "the run")):
         if n:
-            print(f"{n} keyframes of {whose} have no image in --images, and were left out", flush=True)
+            print(f"{n} views of {whose} have no image in --images, and were left out", flush=True)
 
 
 @contextmanager
@@ -142,13 +174,3 @@ def _in_metres(T_world_cam: FloatArray, metres: float) -> FloatArray:
     T = np.array(T_world_cam)
     T[:, :3, 3] *= metres
     return T
-
-
-def _with_images(
-    args: argparse.Namespace, stored: StoredMap, exported: ExportedMap, numbers: Mapping[int, int]
-) -> ExportedMap:
-    assert stored.camera is not None
-    camera = stored.camera
-    source = open_images_of_run(args.images, exported.size_px)
-    has_images = FORMATS[args.to].has_images
-    return with_images(exported, camera, source, numbers, args.out if has_images else None)

@@ -216,11 +216,12 @@ def _add_export(commands: argparse._SubParsersAction[_Parser]) -> None:
         metavar=("FRAME", "FRAME", "METRES"),
         nargs=3,
         action=_Distance,
-        help="true distance between two keyframes: the export is in metres",
+        help="true distance between two frames: the export is in metres",
     )
     images = parser.add_argument_group("images")
+    images.add_argument("--images", metavar="SOURCE", help="what the run was made of, if it has moved since")
     images.add_argument(
-        "--images", metavar="SOURCE", help="what the run was made of: colours, and images without the lens (a folder)"
+        "--every", metavar="N", type=_positive, help="besides keyframes, every N-th frame that has a pose"
     )
 
 
@@ -233,7 +234,7 @@ def _add_scale(commands: argparse._SubParsersAction[_Parser]) -> None:
         metavar=("FRAME", "FRAME", "METRES"),
         nargs=3,
         action=_Distance,
-        help="true distance between two keyframes",
+        help="true distance between two frames",
     )
     known.add_argument(
         "--height", metavar="METRES", type=_length, help="of a level camera over the ground that it sees"

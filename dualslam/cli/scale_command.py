@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from dualslam.core.errors import InputError
-from dualslam.export.exported_map import flatten, read_stored
+from dualslam.export.exported_map import flatten, read_stored, with_frames
 from dualslam.export.metric import MetricScale, by_distance, by_height, by_marker
 from dualslam.io.metric_scale import read_scale, write_scale
 from dualslam.io.run_reading import read_numbers
@@ -25,7 +25,7 @@ def execute(args: argparse.Namespace) -> int:
         raise InputError("--images goes with --marker: the others need none.")
     scale: MetricScale
     if args.distance is not None:
-        scale = by_distance(exported, numbers, *args.distance)
+        scale = by_distance(with_frames(exported, stored, numbers.values()), numbers, *args.distance)
     elif args.height is not None:
         scale = by_height(exported, args.height)
     else:

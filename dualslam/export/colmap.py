@@ -23,6 +23,11 @@ def image_name(frame: int) -> str:
     return f"{frame:06d}.png"
 
 
+def mask_path(image: str) -> Path:
+    """Return where the mask of an image is, in the export's folder: as COLMAP names it."""
+    return Path("masks") / f"{image}.png"
+
+
 def write_colmap(exported: ExportedMap, out: Path) -> None:
     """Write ``sparse/0/cameras.txt``, ``images.txt`` and ``points3D.txt`` into a folder."""
     folder = out / FOLDER

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.io.colours import padded
 from dualslam.io.map_store import StoredMap, load_atlas
 from dualslam.map.atlas import Atlas
+from dualslam.map.trajectory import FramePose, compose
 
 MIN_VIEWS = 2
 """Landmarks that fewer of the exported keyframes see are left out."""
-GREY = 128
-"""Of points where no image tells their colour."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +44,7 @@ class ExportedMap:
     xyz : (P, 3)
         World, unit of the map; metres where the map has a metric scale.
     colour : (P, 3) uint8
-        Red, green, blue; `GREY` without images.
+        Red, green, blue; `GREY` where no colour is known.
     view, point : (R,) int64
         Rows of the views and the points, sorted by point, then by view.
     uv_px : (R, 2)
@@ -135,7 +135,7 @@ def flatten(stored: StoredMap) -> ExportedMap:
     T_world_cam = np.array(
         [sim3.act_on_pose(S_world[owner[k]], atlas.submaps[owner[k]].T_submap_kf[k]) for k in row_of]
     )
-    xyz, rows, n_points = [], [], 0
+    xyz, rows, rgb, n_points = [], [], [], 0
     for m in main:
         submap, obs = atlas.submaps[m], atlas.submaps[m].observations
         healthy = submap.landmarks["alive"] & ~submap.landmarks["condemned"]
@@ -158,6 +158,7 @@ def flatten(stored: StoredMap) -> ExportedMap:
             )
         )
         xyz.append(submap.landmarks["xyz_mu"][ids[enough]] @ S_world[m][:3, :3].T + S_world[m][:3, 3])
+        rgb.append(padded(stored.colours, m, len(submap.landmarks))[ids[enough]])
         n_points += int(enough.sum())
     view, point, uv, sigma, feature = (np.concatenate(column) for column in zip(*rows, strict=True))
     order = np.lexsort((view, point))
@@ -172,13 +173,49 @@ def flatten(stored: StoredMap) -> ExportedMap:
         size_px=camera.size_px,
         T_world_cam=T_world_cam,
         xyz=np.concatenate(xyz),
-        colour=np.full((n_points, 3), GREY, np.uint8),
+        colour=np.concatenate(rgb),
         view=view[order],
         point=point[order],
         uv_px=uv[order],
         sigma_px=sigma[order],
         feature=feature[order],
     )
+
+
+def with_frames(exported: ExportedMap, stored: StoredMap, chosen: Iterable[int]) -> ExportedMap:
+    """Return the map with more views: posed frames that are no keyframes, which observe no point.
+
+    Parameters
+    ----------
+    exported : ExportedMap
+        That of `flatten`, in the map's unit.
+    stored : StoredMap
+    chosen : iterable of int
+        Frames, by their number in the map. Those that are views already, have no pose in the main map, or hang on a
+        keyframe that a by-pass has marked invalid are ignored.
+    """
+    atlas, main = stored.atlas, stored.main
+    new = sorted(set(chosen) & stored.poses.keys() - set(exported.frame.tolist()))
+    poses = [pose for pose in map(stored.poses.__getitem__, new) if pose.submap_id in main and _holds(pose, atlas)]
+    if not poses:
+        return exported
+    T_world_cam = compose(poses, atlas, atlas.S_world_submap(main)).T_world_cam
+    frame = np.concatenate([exported.frame, [pose.index for pose in poses]])
+    order = np.argsort(frame)
+    place = np.argsort(order)
+    return replace(
+        exported,
+        frame=frame[order],
+        timestamp_s=np.concatenate([exported.timestamp_s, [pose.timestamp_s for pose in poses]])[order],
+        camera=np.concatenate([exported.camera, [main.index(pose.submap_id) for pose in poses]])[order],
+        T_world_cam=np.concatenate([exported.T_world_cam, T_world_cam])[order],
+        view=place[exported.view],
+    )
+
+
+def _holds(pose: FramePose, atlas: Atlas) -> bool:
+    submap = atlas.submaps[pose.submap_id]
+    return submap.keyframe_for(pose.keyframe_id) not in submap.condemned
 
 
 def _owners(stored: StoredMap) -> dict[int, int]:

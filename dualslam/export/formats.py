@@ -25,18 +25,28 @@ class ExportFormat:
     is_folder : bool
         Whether the path is a folder; else one file.
     has_images : bool
-        Whether the keyframes' images belong to it.
+        Whether the views' images belong to it.
+    has_colours : bool
+        Whether its points have colours.
+    next_command : str
+        To type next, with the path as ``{out}``; empty if there is none.
     """
 
     write: Callable[[ExportedMap, Path], None]
     is_folder: bool = False
     has_images: bool = False
+    has_colours: bool = False
+    next_command: str = ""
 
+
+GSPLAT = "python examples/simple_trainer.py default --data_factor 1 --data_dir {out} --result_dir {out}_splat"
+"""In a checkout of gsplat (github.com/nerfstudio-project/gsplat)."""
+NERFSTUDIO = "ns-train splatfacto --data {out}"
 
 FORMATS = {
     "bal": ExportFormat(write_bal),
-    "colmap": ExportFormat(write_colmap, is_folder=True, has_images=True),
+    "colmap": ExportFormat(write_colmap, True, True, True, GSPLAT),
     "g2o": ExportFormat(write_g2o),
-    "nerfstudio": ExportFormat(write_nerfstudio, is_folder=True, has_images=True),
-    "ply": ExportFormat(write_ply),
+    "nerfstudio": ExportFormat(write_nerfstudio, True, True, True, NERFSTUDIO),
+    "ply": ExportFormat(write_ply, has_colours=True),
 }

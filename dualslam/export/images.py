@@ -1,9 +1,8 @@
-"""The keyframes' images with the lens taken out, and the colours of the points from them."""
+"""The views' images with the lens taken out, and their masks."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, Frame
-from dualslam.export.colmap import image_name
+from dualslam.export.colmap import image_name, mask_path
 from dualslam.export.exported_map import ExportedMap
 from dualslam.io.atomic import atomic_file
 
@@ -21,11 +20,17 @@ FOLDER = "images"
 
 
 def with_images(
-    exported: ExportedMap, camera: Camera, frames: Iterable[Frame], numbers: Mapping[int, int], out: Path | None
+    exported: ExportedMap,
+    camera: Camera,
+    frames: Iterable[Frame],
+    numbers: Mapping[int, int],
+    out: Path,
+    mask: NDArray[np.uint8] | None = None,
 ) -> ExportedMap:
-    """Return the map with its points' colours, the median of their views, and write the images if a folder is given.
+    """Write the views' images without the lens, and return the map without the views that have no image.
 
-    With a folder, views whose image is not there are left out: those of an earlier run, whose map this one continues.
+    An image gets a mask (0 is ignored) where pixels are outside the camera's image, or 0 in `mask`. One image is in
+    memory at a time.
 
     Parameters
     ----------
@@ -33,22 +38,24 @@ def with_images(
     camera : Camera
         As in the saved map: it knows the lens.
     frames : iterable of Frame
-        Of the source that the run was made of; those that are no keyframes are passed over.
+        RGB, of the source that the run was made of; those that are no views are ignored.
     numbers : mapping of int to int
         Of the run's frames, as `read_numbers` gives them.
-    out : Path, optional
-        Images go into ``out/images``.
+    out : Path
+        Images go into ``out/images``, masks into ``out/masks``.
+    mask : (H, W) uint8, optional
+        0 where the camera's images show nothing of the scene.
 
     Raises
     ------
     InputError
-        If a folder is given, and there is no image.
+        If there is no image.
     """
     row_of = exported.rows_by_index(numbers)
     maps: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
-    seen = np.zeros((len(exported.view), 3))
-    known = np.zeros(len(exported.view), bool)
+    valid: dict[int, NDArray[np.uint8]] = {}
     has_image = np.zeros(len(exported.frame), bool)
+    whole = np.full(exported.size_px[::-1], 255, np.uint8) if mask is None else mask
     for frame in frames:
         v = row_of.get(frame.index)
         if v is None or frame.image is None:
@@ -56,22 +63,15 @@ def with_images(
         c = int(exported.camera[v])
         if c not in maps:
             maps[c] = undistortion(camera, exported.K[c], exported.size_px)
-        image = cv2.remap(frame.image, *maps[c], cv2.INTER_LINEAR)
-        image = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-        if out is not None:
-            _write(out / FOLDER / image_name(int(exported.frame[v])), image)
+            valid[c] = cv2.remap(whole, *maps[c], cv2.INTER_NEAREST)
+        name = image_name(int(exported.frame[v]))
+        _write(out / FOLDER / name, cv2.remap(frame.image, *maps[c], cv2.INTER_LINEAR))
+        if not valid[c].all():
+            _write(out / mask_path(name), valid[c])
         has_image[v] = True
-        rows = np.flatnonzero(exported.view == v)
-        at = np.rint(exported.uv_px[rows]).astype(int)
-        inside = ((at >= 0) & (at < np.array(exported.size_px))).all(axis=1)
-        seen[rows[inside]] = image[at[inside, 1], at[inside, 0], ::-1]
-        known[rows[inside]] = True
-    coloured = replace(exported, colour=_medians(exported, seen, known))
-    if out is None:
-        return coloured
     if not has_image.any():
         raise InputError("--images has the image of no keyframe: name the source that the run was made of.")
-    return coloured.of_views(has_image)
+    return exported.of_views(has_image)
 
 
 def undistortion(
@@ -85,16 +85,8 @@ def undistortion(
 
 
 def _write(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write a grey or an RGB image; OpenCV encodes BGR."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image)[1]
     with atomic_file(path) as file:
-        file.write(cv2.imencode(".png", image)[1].tobytes())
-
-
-def _medians(exported: ExportedMap, seen: FloatArray, known: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    colour = exported.colour.copy()
-    rows = np.flatnonzero(known)
-    point = exported.point[rows]
-    first = np.searchsorted(point, np.arange(len(colour) + 1))
-    for p in np.unique(point).tolist():
-        colour[p] = np.rint(np.median(seen[rows[first[p] : first[p + 1]]], axis=0)).astype(np.uint8)
-    return colour
+        file.write(encoded.tobytes())

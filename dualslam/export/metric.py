@@ -59,7 +59,7 @@ class MetricScale:
 
 
 def by_distance(exported: ExportedMap, numbers: Mapping[int, int], a: int, b: int, metres: float) -> MetricScale:
-    """Return the scale by the true distance between two keyframes, named by their indices in the source.
+    """Return the scale by the true distance between two views, named by their indices in the source.
 
     Parameters
     ----------
@@ -72,10 +72,10 @@ def by_distance(exported: ExportedMap, numbers: Mapping[int, int], a: int, b: in
     Raises
     ------
     InputError
-        If one of them is no frame of the run, or no keyframe, or they do not lie apart.
+        If one of them is no frame of the run, or no view, or they do not lie apart.
     """
     row_of = exported.rows_by_index(numbers)
-    continued = len(row_of) < len(exported.frame)
+    continued = bool(set(exported.frame.tolist()) - set(numbers.values()))
     for index in (a, b):
         if index not in numbers:
             those = "; those of the saved map cannot be named here" if continued else ""
@@ -83,10 +83,12 @@ def by_distance(exported: ExportedMap, numbers: Mapping[int, int], a: int, b: in
                 f"--distance: frame {index} is none of the run's, which are {min(numbers)} to {max(numbers)}{those}."
             )
         if not row_of:
-            raise InputError("--distance: no frame of this run is a keyframe of the map, all are of the saved one.")
+            raise InputError("--distance: no frame of this run has a pose in the main map.")
         if index not in row_of:
             nearest = min(row_of, key=lambda i: abs(i - index))
-            raise InputError(f"--distance: frame {index} is no keyframe of the map; the nearest is {nearest}.")
+            raise InputError(
+                f"--distance: frame {index} has no pose in the main map; the nearest that has one is {nearest}."
+            )
     p, q = (exported.T_world_cam[row_of[i], :3, 3] for i in (a, b))
     length = float(np.linalg.norm(p - q))
     if not length > 0 or not metres > 0:

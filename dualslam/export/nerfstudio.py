@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dualslam.export.colmap import image_name
+from dualslam.export.colmap import image_name, mask_path
 from dualslam.export.decimals import DECIMALS
 from dualslam.export.exported_map import ExportedMap
 from dualslam.export.ply import ply_bytes
@@ -18,12 +18,13 @@ TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write_nerfstudio(exported: ExportedMap, out: Path) -> None:
-    """Write ``transforms.json`` and ``points.ply`` into a folder; it expects the images in ``images``."""
+    """Write ``transforms.json`` and ``points.ply`` into a folder; images and masks are those that are there."""
     out.mkdir(parents=True, exist_ok=True)
     width, height = exported.size_px
     frames = []
     for v, frame in enumerate(exported.frame.tolist()):
         K = exported.K[exported.camera[v]]
+        mask = mask_path(image_name(frame))
         frames.append(
             {
                 "file_path": f"images/{image_name(frame)}",
@@ -33,6 +34,7 @@ def write_nerfstudio(exported: ExportedMap, out: Path) -> None:
                 "cx": K[0, 2] + 0.5,
                 "cy": K[1, 2] + 0.5,
             }
+            | ({"mask_path": mask.as_posix()} if (out / mask).is_file() else {})
         )
     content = {"camera_model": "OPENCV", "w": width, "h": height, "ply_file_path": POINTS, "frames": frames}
     with atomic_file(out / POINTS) as file:

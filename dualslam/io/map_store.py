@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import camera_from_dict
 from dualslam.core.errors import InputError
+from dualslam.io.colours import Colours, load_colours
 from dualslam.io.map_checks import FRAME_ROWS, HELD_ROWS, LINK_ROWS, PLACED_ROWS, WARP_ROWS, check_rows
 from dualslam.io.map_files import (
     METADATA,
@@ -46,11 +47,14 @@ class StoredMap:
     poses : dict of int to FramePose
     camera : Camera or None
         By which the features are rectified, with what was found out about it; None in maps of before it was kept.
+    colours : mapping of int to (N, 3) uint8
+        Of each submap's landmarks; none where the map was saved without.
     """
 
     atlas: Atlas
     poses: dict[int, FramePose]
     camera: Camera | None = None
+    colours: Colours = field(default_factory=dict)
 
     @property
     def next_id(self) -> int:
@@ -144,7 +148,7 @@ def load_atlas(folder: str | Path) -> StoredMap:
         camera = _camera(metadata)
     except _DAMAGE as error:
         raise InputError(_damaged(folder, error)) from error
-    return StoredMap(atlas, poses, camera)
+    return StoredMap(atlas, poses, camera, load_colours(folder))
 
 
 def load_camera(folder: str | Path) -> Camera | None:

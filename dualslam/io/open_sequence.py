@@ -110,7 +110,7 @@ def open_sequence(
         camera = camera_of_size(camera, size_px, recording.name, calibration)
     recording, camera = _reduced(recording, camera, max_side_px)
     log.info("%s: %d frames, %s", recording.name, len(recording.images), camera)
-    return RecordedSequence(recording, camera, selection, grey=grey)
+    return RecordedSequence(recording, camera, selection, grey=grey, source=str(Path(str(source)).resolve()))
 
 
 def _open_recording(source: Path, given: Given) -> Recording:

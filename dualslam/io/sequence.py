@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -127,12 +127,21 @@ class RecordedSequence:
         Times of all frames of the source.
     exposure_s : (M,) float64 or None
         Exposure times, where the source has them.
+    source : str
+        What it was opened from, by which it can be opened again; empty if that is not known.
     """
 
     def __init__(
-        self, recording: Recording, camera: Camera, selection: Selection | None = None, *, grey: bool = True
+        self,
+        recording: Recording,
+        camera: Camera,
+        selection: Selection | None = None,
+        *,
+        grey: bool = True,
+        source: str = "",
     ) -> None:
         self._recording = recording
+        self.source = source
         self._grey = grey
         self.name = recording.name
         self.camera = camera
@@ -146,7 +155,7 @@ class RecordedSequence:
 
     def with_camera(self, camera: Camera) -> RecordedSequence:
         """Return the same frames as those of another camera, of images of the same size."""
-        return RecordedSequence(self._recording, camera, self.selection, grey=self._grey)
+        return RecordedSequence(self._recording, camera, self.selection, grey=self._grey, source=self.source)
 
     def told_focal(self) -> ToldFocal | None:
         """Return the focal length that the source's own data tell, or None."""
@@ -157,6 +166,16 @@ class RecordedSequence:
 
     def __iter__(self) -> Iterator[Frame]:
         return read_ahead(self._read(), READ_AHEAD_FRAMES)
+
+    def in_colour(self, indices: Iterable[int]) -> Iterator[Frame]:
+        """Read some frames in colour, by their index in the source, ascending; nothing else is decoded of files."""
+        reader = self._recording.images.reader(grey=False)
+        try:
+            for index in sorted(indices):
+                if index < len(self.source_timestamps):
+                    yield self._frame(reader, index, float(self.source_timestamps[index]))
+        finally:
+            reader.close()
 
     def _read(self) -> Iterator[Frame]:
         reader = self._recording.images.reader(self._grey)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterable
 from contextlib import closing
@@ -20,9 +21,11 @@ from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Sequence
 from dualslam.core.threads import spare_cores
 from dualslam.core.types import Frame
+from dualslam.export.colours import keyframe_indices, landmark_colours
+from dualslam.io.colours import Colours, save_colours
 from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.run_folder import RunFolder, RunRecord, check_vacant
-from dualslam.io.sequence import Selection
+from dualslam.io.sequence import RecordedSequence, Selection
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.lab.disturbances import corrupted
 from dualslam.map.frame_records import FrameResult
@@ -35,6 +38,8 @@ from dualslam.run.runner import RunReport, run_sequence
 from dualslam.system import System
 from dualslam.viewer.map_page import map_page
 from dualslam.workers.desk import WorkerDesk
+
+log = logging.getLogger(__name__)
 
 SEARCHED_SIGMA = 0.031
 """Of the log focal length of a camera that was searched for, beside what self-calibration claims: what the lens leaves
@@ -174,10 +179,12 @@ def run_to_folder(
     }
     if focal is not None:
         given["focal_search"] = focal.as_dict()
-    sequence = corrupted(sequence, config.corruptions)
+    recorded, sequence = sequence, corrupted(sequence, config.corruptions)
     check_out(out, overwrite=overwrite, saved_map=saved_map)
+    colours: Colours = {}
     if saved_map is not None:
         saved = load_atlas(saved_map)
+        colours = saved.colours
         system = build_system(config, sequence.camera, saved=saved, localise=localise)
     else:
         system = (build or build_system)(config, sequence.camera)
@@ -216,6 +223,9 @@ def run_to_folder(
                 _write_new_events(system, folder)
                 given["no_map"] = None if system.poses or saved_map is not None else refusals.sentence()
                 summary = _write_results(system, report, config, sequence, folder, given)
+                if isinstance(recorded, RecordedSequence) and not report.interrupted:
+                    _write_colours(system, recorded, folder, colours)
+                _write_pages(folder)
             except (OutputError, KeyboardInterrupt) as end:
                 end.add_note(folder.what_is_there())
                 raise
@@ -259,6 +269,7 @@ def _given(sequence: Sequence, realtime: bool) -> dict[str, Any]:
     selection: Selection | None = getattr(sequence, "selection", None)  # not every sequence has one
     return {
         "sequence": sequence.name,
+        "source": getattr(sequence, "source", "") or None,
         "selection": None if selection is None else asdict(selection),
         "realtime": realtime,
         "camera": sequence.camera.to_dict(),
@@ -292,11 +303,24 @@ def _write_results(
     if truth is not None and "no_errors" not in summary:
         folder.write_truth(truth_of_frames(truth, rows))
     save_atlas(folder.map_path, system.atlas, system.poses, system.camera)
+    return summary
+
+
+def _write_colours(system: System, sequence: RecordedSequence, folder: RunFolder, before: Colours) -> None:
+    """Read the keyframes again, in colour, and keep the landmarks' colours; `before`: those of a saved map."""
+    numbers = {system.numbers.index_of(i): i for i in system.rows}
+    try:
+        frames = sequence.in_colour(keyframe_indices(system.atlas, numbers))
+        save_colours(folder.map_path, landmark_colours(system.atlas, frames, numbers, before))
+    except InputError as error:  # the source has gone meanwhile: the map is complete without
+        log.warning("the map has no colours: %s", error)
+
+
+def _write_pages(folder: RunFolder) -> None:
     run = read_run(folder.path)
     if (page := map_page(run)) is not None:
         folder.write_map_page(page)
     folder.write_report(report_page(run))
-    return summary
 
 
 class _Watched:

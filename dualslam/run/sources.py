@@ -16,7 +16,7 @@ from dualslam.core.types import Frame
 from dualslam.io.open_sequence import open_sequence
 from dualslam.io.read_ahead import read_ahead
 from dualslam.io.reduced import MAX_SIDE_PX
-from dualslam.io.sequence import Selection
+from dualslam.io.sequence import RecordedSequence, Selection
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.lab.synthetic import SyntheticSequence, make_sequence, parse_events
 
@@ -58,7 +58,7 @@ def open_source(
     InputError
     """
     if isinstance(source, str) and source.startswith(SYNTHETIC):
-        world = WorldSequence(parse_world(source), Selection(start, stride, max_frames, reverse))
+        world = WorldSequence(parse_world(source), Selection(start, stride, max_frames, reverse), source)
         if camera_file is not None or fov_degrees is not None:  # said last: another mistake matters more
             raise InputError(f"{source} has a camera of its own; leave out --camera and --fov.")
         return world
@@ -74,7 +74,7 @@ def open_source(
     )
 
 
-def open_images_of_run(source: str | Path, size_px: tuple[int, int]) -> Sequence:
+def open_images_of_run(source: str | Path, size_px: tuple[int, int]) -> RecordedSequence | WorldSequence:
     """Open what a run was made of, in the size in which the run has read it.
 
     Its camera is not the run's: that is in the map.
@@ -89,10 +89,12 @@ def open_images_of_run(source: str | Path, size_px: tuple[int, int]) -> Sequence
     Raises
     ------
     InputError
-        If it cannot be read, or has images of another size.
+        If it cannot be read, is live, or has images of another size.
     """
     has_camera = str(source).startswith(SYNTHETIC)  # recordings may have one, and that comes before a field of view
     opened = open_source(source, fov_degrees=None if has_camera else ANY_FOV_DEG, max_side_px=max(size_px))
+    if not isinstance(opened, RecordedSequence | WorldSequence):
+        raise InputError(f"{source} is live: its frames cannot be read again.")
     if opened.camera.size_px != size_px:
         raise InputError(f"{source} has images of another size than the run's.")
     return opened
@@ -112,10 +114,13 @@ class WorldSequence:
     selection : Selection
     source_indices : (N,) int64
     frame_timestamps : (N,) float64
+    source : str
+        By which it can be made again; empty if that is not known.
     """
 
-    def __init__(self, world: SyntheticSequence, selection: Selection | None = None) -> None:
+    def __init__(self, world: SyntheticSequence, selection: Selection | None = None, source: str = "") -> None:
         selection = selection or Selection()
+        self.source = source
         self._world = world
         self.selection = selection
         self.name = world.name
@@ -131,6 +136,10 @@ class WorldSequence:
 
     def __iter__(self) -> Iterator[Frame]:
         return read_ahead(map(self._world.frame, self.source_indices.tolist()), RENDER_AHEAD_FRAMES)
+
+    def in_colour(self, indices: Iterable[int]) -> Iterator[Frame]:
+        """Render some frames again, ascending: these worlds are grey."""
+        return map(self._world.frame, sorted(set(indices) & set(self._world.indices.tolist())))
 
 
 def make_world(

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import gtsam
 import numpy as np
 import pytest
@@ -16,12 +17,14 @@ from dualslam.core.geometry import se3
 from dualslam.core.types import Frame
 from dualslam.export.bal import write_bal
 from dualslam.export.colmap import write_colmap
+from dualslam.export.colours import keyframe_indices, landmark_colours
 from dualslam.export.decimals import decimals
-from dualslam.export.exported_map import ExportedMap, flatten
+from dualslam.export.exported_map import ExportedMap, flatten, with_frames
 from dualslam.export.g2o import write_g2o
 from dualslam.export.images import with_images
 from dualslam.export.nerfstudio import write_nerfstudio
 from dualslam.export.ply import write_ply
+from dualslam.io.colours import GREY, load_colours, save_colours
 from dualslam.io.map_store import StoredMap
 from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, system_in
 
@@ -172,7 +175,74 @@ def test_views_without_an_image_are_left_out(exported: ExportedMap, tmp_path: Pa
     assert np.median(kept.reprojection_errors_px()) < 1.0
     with pytest.raises(InputError, match="the image of no keyframe"):
         with_images(exported, CAMERA, frames[:0], numbers, tmp_path)
-    assert len(with_images(exported, CAMERA, frames, numbers, None).frame) == len(exported.frame)
+
+
+GREY_LEVELS = 3.0
+"""Between an exported colour and the source's."""
+
+
+ORANGE = np.array([230, 120, 30])
+
+
+def painted(index: int) -> Frame:
+    """An orange picture, a little brighter to the right, a little bluer from frame to frame."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    return Frame(index, index / 20, (ORANGE + np.stack([u / 320, v / 240, 0 * u + index / 30], -1)).astype(np.uint8))
+
+
+def test_colours_are_those_of_the_source(stored: StoredMap, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+    numbers = {i: i for i in range(60)}
+    frames = [painted(i) for i in range(60)]
+    assert set(keyframe_indices(stored.atlas, numbers)) >= set(flatten(stored).frame.tolist())
+    colours = landmark_colours(stored.atlas, frames, numbers, {})
+    save_colours(tmp_path, colours)
+    exported = flatten(replace(stored, colours=load_colours(tmp_path)))
+    write_colmap(with_images(exported, CAMERA, frames, numbers, tmp_path), tmp_path)
+    read = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    assert read.num_images() == len(exported.frame)
+    for image in read.images.values():
+        bitmap = pycolmap.Bitmap.read(str(tmp_path / "images" / image.name), as_rgb=True).to_array()
+        difference = bitmap.astype(float) - frames[int(Path(image.name).stem)].image
+        assert np.abs(difference).max() <= GREY_LEVELS
+    assert not (tmp_path / "masks").exists()  # all pixels are of the camera's image
+    assert all(np.abs(point.color - ORANGE).max() <= GREY_LEVELS for point in read.points3D.values())
+
+
+def test_landmarks_that_no_image_shows_keep_their_colour(stored: StoredMap) -> None:
+    before = {0: np.full((5, 3), 7, np.uint8)}
+    colours = landmark_colours(stored.atlas, [], {}, before)
+    assert (colours[0][:5] == 7).all()
+    assert (colours[0][5:] == GREY).all()
+    assert {m: len(rgb) for m, rgb in colours.items()} == {m: len(s.landmarks) for m, s in stored.atlas.submaps.items()}
+
+
+def test_posed_frames_that_are_no_keyframes_are_exported_on_request(stored: StoredMap, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+    exported = flatten(stored)
+    every = with_frames(exported, stored, [*range(0, 60, 2), 9999])
+    posed = set(range(0, 60, 2)) & set(stored.poses)
+    assert set(every.frame.tolist()) == set(exported.frame.tolist()) | posed
+    assert len(every.frame) > len(exported.frame)
+    np.testing.assert_allclose(every.reprojection_errors_px(), exported.reprojection_errors_px())
+    truth = hand_held(60)[every.frame]
+    from dualslam.lab.metrics.alignment import distances_when_aligned
+
+    off = distances_when_aligned(every.T_world_cam[:, :3, 3], truth[:, :3, 3])
+    assert off.max() < 0.03 * np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()
+    write_colmap(every, tmp_path)  # views without a point are images without observations there
+    assert pycolmap.Reconstruction(str(tmp_path / "sparse" / "0")).num_images() == len(every.frame)
+
+
+def test_masks_are_of_what_the_camera_did_not_see(exported: ExportedMap, tmp_path: Path) -> None:
+    mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
+    mask[:100] = 0
+    frames = [Frame(i, 0.1 * i, np.zeros_like(mask)) for i in range(60)]
+    write_nerfstudio(with_images(exported, CAMERA, frames, {i: i for i in range(60)}, tmp_path, mask), tmp_path)
+    for each in json.loads((tmp_path / "transforms.json").read_text())["frames"]:
+        written = cv2.imread(str(tmp_path / each["mask_path"]), cv2.IMREAD_GRAYSCALE)
+        assert (written[:99] == 0).all()
+        assert (written[101:] == 255).all()
 
 
 def test_a_refused_export_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -198,6 +268,7 @@ def test_scaled_keeps_what_is_seen(exported: ExportedMap) -> None:
         (["run", "--to", "ply", "--out", "taken"], "is a folder"),
         (["run", "--to", "tum", "--out", "a.txt"], "run has no trajectory to export: no frame was posed"),
         (["run", "--to", "tum", "--out", "a.txt", "--distance", "0", "1", "2"], "--distance"),
+        (["run", "--to", "ply", "--out", "a.ply", "--every", "3"], "--every goes with --to colmap"),
         (["run", "--to", "ply", "--out", "a.ply", "--distance", "0", "x", "2"], "--distance"),
     ],
 )

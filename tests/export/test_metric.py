@@ -17,9 +17,11 @@ from dualslam.core.geometry import se3
 from dualslam.core.types import FloatArray, Frame
 from dualslam.export.exported_map import ExportedMap
 from dualslam.export.metric import DICTIONARIES, by_distance, by_height, by_marker
+from dualslam.io.map_store import StoredMap
 from dualslam.io.metric_scale import SCALE, read_scale, write_scale
 from dualslam.io.run_folder import FRAME_COLUMNS
 from dualslam.io.run_reading import read_numbers
+from dualslam.map.atlas import Atlas
 from dualslam.testing.point_world import CAMERA
 from tests.cli.conftest import _own_environment  # noqa: F401 (used by every test)
 from tests.cli.test_usage import one_sentence
@@ -102,7 +104,7 @@ def test_without_ground_no_height() -> None:
 def test_a_distance_between_two_keyframes() -> None:
     scale = by_distance(seen_map(drive(), road(0)), NUMBERS, 3, 23, 10.0)
     assert scale.metres_per_unit == pytest.approx(METRES_PER_UNIT)
-    with pytest.raises(InputError, match="frame 90 is no keyframe of the map; the nearest is 29"):
+    with pytest.raises(InputError, match="frame 90 has no pose in the main map; the nearest that has one is 29"):
         by_distance(seen_map(drive(), road(0)), NUMBERS, 3, 90, 10.0)
 
 
@@ -121,9 +123,9 @@ def test_on_a_saved_map_the_frames_are_those_of_the_run() -> None:
     assert by_distance(exported, numbers, 3, 9, 3.0).metres_per_unit == pytest.approx(METRES_PER_UNIT)
     with pytest.raises(InputError, match="frame 2 is none of the run's, which are 3 to 19; those of the saved map"):
         by_distance(exported, numbers, 2, 9, 3.0)
-    with pytest.raises(InputError, match="frame 12 is no keyframe of the map; the nearest is 9"):
+    with pytest.raises(InputError, match="frame 12 has no pose in the main map; the nearest that has one is 9"):
         by_distance(exported, numbers, 3, 12, 3.0)
-    with pytest.raises(InputError, match="no frame of this run is a keyframe"):
+    with pytest.raises(InputError, match="no frame of this run has a pose in the main map"):
         by_distance(exported, {3: 900}, 3, 3, 3.0)
 
 
@@ -197,7 +199,7 @@ def test_a_scale_stays_with_the_map_and_exports_use_it(
     rows = [f"{i},{0.1 * i},tracked,0,1,90,80,5.0,," for i in range(30)]
     (tmp_path / "frames.csv").write_text("\n".join([",".join(FRAME_COLUMNS), *rows, ""]))
     for place in ("scale", "export"):
-        monkeypatch.setattr(f"dualslam.cli.{place}_command.read_stored", lambda run: None)
+        monkeypatch.setattr(f"dualslam.cli.{place}_command.read_stored", lambda run: StoredMap(Atlas(), {}, CAMERA))
         monkeypatch.setattr(f"dualslam.cli.{place}_command.flatten", lambda stored: given)
     assert main(["scale", str(tmp_path), "--distance", "3", "23", "10"]) == 0
     assert "a unit of the map is 3.7 m" in capsys.readouterr().out

@@ -1,0 +1,43 @@
+"""Colours of a map's landmarks, one file beside the map's arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.io.map_files import load_arrays, save_arrays
+
+COLOURS = "colours.npz"
+GREY = 128
+"""Red, green and blue of a landmark that no colour image shows."""
+
+Colours = Mapping[int, NDArray[np.uint8]]
+"""(N, 3) red, green, blue of each landmark, by the submap's id."""
+
+
+def save_colours(map_folder: Path, colours: Colours) -> None:
+    """Write the colours into a map's folder."""
+    save_arrays(map_folder / COLOURS, {f"{m:02d}": rgb for m, rgb in colours.items()})
+
+
+def load_colours(map_folder: Path) -> dict[int, NDArray[np.uint8]]:
+    """Return the colours of a map; empty where it was saved without.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged.
+    """
+    path = map_folder / COLOURS
+    if not path.is_file():
+        return {}
+    return {int(name): np.asarray(rgb, np.uint8).reshape(-1, 3) for name, rgb in load_arrays(path).items()}
+
+
+def padded(colours: Colours, submap_id: int, n: int) -> NDArray[np.uint8]:
+    """Return the colours (n, 3) of a submap's first `n` landmarks, `GREY` beyond those that have one."""
+    known = colours.get(submap_id, np.zeros((0, 3), np.uint8))[:n]
+    return np.concatenate([known, np.full((n - len(known), 3), GREY, np.uint8)])
