@@ -35,6 +35,11 @@ class CorruptionKind(StrEnum):
     CLOCK_UNIT = "clock_unit"  # times are in another unit than seconds (units a second)
     CLOCK_JITTER = "clock_jitter"  # times scatter evenly (fraction of the time between frames)
     CLOCK_REPEAT = "clock_repeat"  # neighbouring frames share the time of their first (their number)
+    CAB = "cab"  # a driver's cab about the windscreen stands still in the image (share of the image)
+    BONNET = "bonnet"  # a car's bonnet stands still at the lower edge (share of the image)
+    BARS = "bars"  # black bars on the left and on the right, as about an upright film (share of the image)
+    LOGO = "logo"  # a logo in the upper right corner (share of the image)
+    CLOCK = "clock"  # a clock in the lower left corner, whose digits change (share of the image)
 
 
 class Cause(StrEnum):
@@ -80,6 +85,11 @@ STRENGTHS: dict[CorruptionKind, tuple[float, float, float]] = {
     CorruptionKind.CLOCK_UNIT: (1000.0, 1e-9, 1e9),
     CorruptionKind.CLOCK_JITTER: (0.5, 0.0, 0.99),
     CorruptionKind.CLOCK_REPEAT: (2.0, 2.0, 1000.0),
+    CorruptionKind.CAB: (0.28, 0.01, 0.8),
+    CorruptionKind.BONNET: (0.15, 0.01, 0.4),
+    CorruptionKind.BARS: (0.6, 0.01, 0.9),
+    CorruptionKind.LOGO: (0.02, 0.001, 0.2),
+    CorruptionKind.CLOCK: (0.01, 0.001, 0.1),
 }
 
 
@@ -88,8 +98,8 @@ class Corruption(StrictModel):
 
     kind: CorruptionKind
     """wipe, occlusion, blur, motion_blur, blackout, exposure, noise, freeze, drop, stride, few_features, wrong_pose,
-    solver_error, kill_worker, focal, resolution, no_distortion, clock_unit, clock_jitter or clock_repeat; in the script
-    of a rendered world also shutter and rotation."""
+    solver_error, kill_worker, focal, resolution, no_distortion, clock_unit, clock_jitter, clock_repeat, cab, bonnet,
+    bars, logo or clock; in the script of a rendered world also shutter and rotation."""
     start: int = Field(0, ge=0)
     """First frame, counted in the source whatever the stride."""
     length: int | None = Field(None, ge=1)

@@ -9,6 +9,7 @@
 
 from dualslam.config.corruption import Cause, Corruption, CorruptionKind
 from dualslam.lab.disturbances.faults import FaultScript
+from dualslam.lab.disturbances.overlays import hidden_by
 from dualslam.lab.disturbances.sequence import CorruptedSequence, corrupted
 
-__all__ = ["Cause", "CorruptedSequence", "Corruption", "CorruptionKind", "FaultScript", "corrupted"]
+__all__ = ["Cause", "CorruptedSequence", "Corruption", "CorruptionKind", "FaultScript", "corrupted", "hidden_by"]

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.config.corruption import Corruption, CorruptionKind
+from dualslam.lab.disturbances.overlays import OVERLAYS, put_overlay
 
 U8Image = NDArray[np.uint8]
 
@@ -27,6 +28,8 @@ def corrupt_image(image: U8Image, corruption: Corruption, index: int) -> U8Image
     index : int
     """
     level = corruption.level
+    if corruption.kind in OVERLAYS:
+        return put_overlay(image, corruption, index)
     match corruption.kind:
         case CorruptionKind.WIPE:
             return _wipe(image, level)

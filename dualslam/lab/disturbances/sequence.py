@@ -18,15 +18,20 @@ from dualslam.lab.disturbances.inputs import WrongClock, wrong_camera
 
 log = logging.getLogger(__name__)
 
-# In the order of the light's way: scene, lens, shutter, sensor. CorruptionKind is written down in it.
+# In the order of the light's way: scene, what is before the lens, lens, shutter, sensor, recorder.
 _ON_IMAGES = (
     CorruptionKind.WIPE,
     CorruptionKind.OCCLUSION,
+    CorruptionKind.CAB,
+    CorruptionKind.BONNET,
     CorruptionKind.BLUR,
     CorruptionKind.MOTION_BLUR,
     CorruptionKind.BLACKOUT,
     CorruptionKind.EXPOSURE,
     CorruptionKind.NOISE,
+    CorruptionKind.BARS,
+    CorruptionKind.LOGO,
+    CorruptionKind.CLOCK,
 )
 _ON_STREAM = (CorruptionKind.FREEZE, CorruptionKind.DROP, CorruptionKind.STRIDE)
 
