@@ -10,7 +10,6 @@ from typing import Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from dualslam.config.former import RENAMED, what_became_of
 from dualslam.core.errors import written
 
 _PLAIN_WORDS = {
@@ -74,11 +73,6 @@ def _unknown(path: tuple[str | int, ...], root: type[BaseModel]) -> str:
     sections, field = path[:-1], str(path[-1])
     model = _model_at(root, path[:-1])
     known = list(model.model_fields) if model else []
-    if RENAMED.get(field) in known:
-        return f"{written(path)} is now called {written([*sections, RENAMED[field]])}"
-    former = what_became_of(".".join(map(str, path)))
-    if former:
-        return former
     section = written(sections)
     near = difflib.get_close_matches(field, known, n=1)
     if near:

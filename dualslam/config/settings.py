@@ -140,8 +140,6 @@ class AttemptConfig(StrictModel):
     @model_validator(mode="before")
     @classmethod
     def _from_word(cls, value: Any) -> Any:
-        if value == "leap":
-            raise ValueError("the attempt `leap` is now called `gap`")
         if value == "gap":
             return {"frontend": "sift", "tracking": "live"}
         return {"frontend": value} if isinstance(value, str) else value
