@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.backend.edge_covariance import edge_covariances
-from dualslam.backend.refit import refit_points
+from dualslam.backend.point_refinement import refit_points
 from dualslam.backend.sim3_graph import Sim3Edge, Sim3Prior, Sim3Solution, optimise_sim3
 from dualslam.core.atlas_problem import AtlasProblem, AtlasSolution
 from dualslam.core.chi_square import CHI2_99, MEDIAN_CHI2, squared_distances

@@ -18,6 +18,7 @@ import numpy as np
 from dualslam.backend.observability import MIN_DEPTH_MU
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, so3
+from dualslam.core.robust import huber_weights
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 
@@ -141,8 +142,8 @@ def _linearise(
         ),
         1,
     )
-    size = np.linalg.norm(residual, axis=1) / sigma
-    weight = np.sqrt(np.minimum(1.0, robust_k / np.maximum(size, 1e-9))) / sigma
+    chi2 = (residual**2).sum(axis=1) / sigma**2
+    weight = np.sqrt(huber_weights(chi2, robust_k**2)) / sigma
     J = np.zeros((len(x), 2, 3))
     J[:, 0, 0], J[:, 0, 1] = K[0, 0] / z, K[0, 1] / z
     J[:, 0, 2] = -(K[0, 0] * x[:, 0] + K[0, 1] * x[:, 1]) / (z * z)

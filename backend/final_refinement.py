@@ -13,7 +13,7 @@ import numpy as np
 from dualslam.backend.local_ba import bundle_adjust
 from dualslam.backend.noise import residual_variance
 from dualslam.backend.observability import compute_residuals
-from dualslam.backend.refit import refit_points
+from dualslam.backend.point_refinement import refit_points
 from dualslam.core.bundle import FrameRows
 from dualslam.core.types import FloatArray
 from dualslam.map.submap import Submap

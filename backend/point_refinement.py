@@ -6,9 +6,12 @@ import numpy as np
 
 from dualslam.backend.observability import MIN_DEPTH_MU, projection_jacobian, reproject, sum_products
 from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.submap import Submap
 
 STEPS = 2
 """Gauss-Newton steps: from where the last ones left it a point moves as little as its poses did."""
+REFIT_STEPS = 3
+"""The same for poses that have moved farther: after a loop, or a batch adjustment without these points."""
 DAMPING = 1e-6
 """Relative to the trace of a point's information: keeps the depth of one seen along a single line where it is."""
 
@@ -39,6 +42,7 @@ def refine_points(
     uv_px: FloatArray,
     sigma_px: FloatArray,
     robust_k: float,
+    steps: int = STEPS,
 ) -> FloatArray:
     """Return (P, 3) points that fit their views better, robustly; one that would not gain stays where it is.
 
@@ -52,6 +56,8 @@ def refine_points(
     uv_px : (R, 2), sigma_px : (R,)
     robust_k : float
         Huber threshold in sigmas.
+    steps : int
+        Of Gauss-Newton.
     """
     n = len(xyz_mu)
     if n == 0 or len(pose) == 0:
@@ -60,7 +66,7 @@ def refine_points(
     best = xyz_mu.copy()
     xyz = best
     cost = np.full(n, np.inf)
-    for step in range(STEPS + 1):
+    for step in range(steps + 1):
         xyz_cam, front, uv = reproject(K, T_submap_kf, pose, xyz.take(point, axis=0))
         safe = np.where(front[:, None], xyz_cam, [0.0, 0.0, 1.0])
         r = uv - uv_px
@@ -71,7 +77,7 @@ def refine_points(
         better = (now < cost) & np.isfinite(xyz).all(axis=1)
         best = np.where(better[:, None], xyz, best)
         cost = np.where(better, now, cost)
-        if step == STEPS:
+        if step == steps:
             break
         weight[~front] = 0.0
         J = projection_jacobian(K, R, safe, sigma_px)
@@ -79,6 +85,27 @@ def refine_points(
         H += (DAMPING * np.trace(H, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
         xyz = xyz - np.linalg.solve(H, b[:, :, None])[:, :, 0]
     return best
+
+
+def refit_points(submap: Submap, robust_k: float, landmark_ids: IntArray) -> FloatArray:
+    """Return (N, 3) landmarks that fit all their views in a submap better, as `refine_points` does.
+
+    Parameters
+    ----------
+    submap : Submap
+        Is not changed.
+    robust_k : float
+        Huber threshold in sigmas.
+    landmark_ids : (N,) int64
+        Each once.
+    """
+    obs, place = submap.observations, np.full(len(submap.landmarks), -1)
+    place[landmark_ids] = np.arange(len(landmark_ids))
+    rows = np.flatnonzero(obs["alive"] & (place[obs["landmark"]] >= 0))
+    ids, pose = np.unique(obs["kf"][rows], return_inverse=True)
+    xyz = submap.landmarks["xyz_mu"][landmark_ids]
+    T, point, pixels = submap.keyframe_poses(ids), place[obs["landmark"][rows]], submap.observed_pixels(rows)
+    return refine_points(submap.K, T, pose, xyz, point, *pixels, robust_k, REFIT_STEPS)
 
 
 def triangulation_covariances(

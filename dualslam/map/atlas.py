@@ -215,9 +215,5 @@ def _present(submap: Submap, keyframe_id: int, shared: tuple[int, ...]) -> int:
     Where nothing is said of it, the submap's newest.
     """
     wanted = [keyframe_id] if keyframe_id >= 0 else sorted(shared, reverse=True)
-    for k in wanted:
-        while k in submap.anchors and k not in submap.keyframes:
-            k = submap.anchors[k].keyframe_id
-        if k in submap.keyframes:
-            return k
-    return max(submap.keyframes)
+    known = [k for k in wanted if k in submap.keyframes or k in submap.anchors]
+    return submap.keyframe_for(known[0]) if known else max(submap.keyframes)

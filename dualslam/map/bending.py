@@ -63,7 +63,7 @@ def bend_submap(submap: Submap, warp: Warp) -> None:
     if culled:
         moved = sim3.act_on_pose(warp.at(culled), np.array(T_culled))
         for k, T in zip(culled, moved, strict=True):
-            stays = _heir(submap, submap.anchors[k].keyframe_id)
+            stays = submap.keyframe_for(k)
             submap.anchors[k] = Anchor(stays, se3.inverse(submap.T_submap_kf[stays]) @ T)
     for k, known in submap.relative_poses.items():
         submap.relative_poses[k] = known.scaled(scales[k])
@@ -82,16 +82,9 @@ def bend_frames(poses: Iterable[FramePose], before: Submap, after: Submap, warp:
         return []
     T = np.array([before.resolve_anchor(p.keyframe_id, p.T_kf_cam) for p in own])
     moved = sim3.act_on_pose(warp.at([p.index for p in own]), T)
-    stays = [_heir(after, pose.keyframe_id) for pose in own]
+    stays = [after.keyframe_for(pose.keyframe_id) for pose in own]
     T_kf_cam = se3.inverse(np.array([after.T_submap_kf[k] for k in stays])) @ moved
     return [replace(pose, keyframe_id=k, T_kf_cam=T) for pose, k, T in zip(own, stays, T_kf_cam, strict=True)]
-
-
-def _heir(submap: Submap, keyframe_id: int) -> int:
-    """Return the keyframe that stands for one that may have been culled."""
-    while keyframe_id not in submap.keyframes:
-        keyframe_id = submap.anchors[keyframe_id].keyframe_id
-    return keyframe_id
 
 
 def bend_link(link: Link, attached: tuple[int, int], warps: dict[int, Warp]) -> Link:

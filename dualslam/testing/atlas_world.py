@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dualslam.backend.atlas_solver import GtsamAtlasSolver
-from dualslam.backend.refit import refit_points
+from dualslam.backend.point_refinement import refit_points
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.config.settings import GraphConfig
 from dualslam.core.geometry import se3, sim3

@@ -19,6 +19,7 @@ from dualslam.core.chi_square import MEDIAN_CHI2
 from dualslam.core.estimates import ReadoutEstimate
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, projection_jacobians
+from dualslam.core.robust import huber_weights
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.frontends.features.groups import rank_in_runs
 from dualslam.map.submap import Submap
@@ -145,8 +146,7 @@ def _collect(submap: Submap, ids: IntArray, rates_rad_s: FloatArray, height_px: 
 def _step(b: ReadoutQuestion) -> float:
     """Make one Gauss-Newton step; return the readout time's standard deviation, by the pixels' sigmas."""
     residuals, front = b.residuals()
-    norm = np.sqrt((residuals**2).sum(1))
-    weight = np.where(front, np.minimum(1.0, ROBUST_K / np.maximum(norm, 1e-12)), 0.0)
+    weight = np.where(front, huber_weights((residuals**2).sum(1), ROBUST_K**2), 0.0)
     J, J_point = _jacobians(b, front, np.sqrt(weight))
     r = (residuals * np.sqrt(weight)[:, None]).reshape(-1)
     H, g, cross = (J.T @ J).toarray(), J.T @ r, (J.T @ J_point).tocsr()

@@ -15,6 +15,7 @@ from numpy.random import Generator
 from dualslam.core.chi_square import CHI2_95, CHI2_99
 from dualslam.core.geometry import sim3, so3, symmetric3
 from dualslam.core.geometry.umeyama import Alignment, umeyama, umeyama_batch
+from dualslam.core.robust import huber_weights
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 
 __all__ = ["Alignment", "Sim3Estimate", "estimate_sim3_robust", "umeyama", "umeyama_batch"]
@@ -233,7 +234,7 @@ def _refine(problem: _Sim3Problem, S: FloatArray, gate: float, n_rounds: int = 4
     inliers = d2 < gate
     for _ in range(n_rounds):
         for _ in range(n_iterations):
-            weight = inliers * np.sqrt(CHI2_95[3] / np.maximum(d2, CHI2_95[3]))
+            weight = inliers * huber_weights(d2, CHI2_95[3])
             H, g = problem.normal_equations(S, weight)
             try:
                 step = np.linalg.solve(H, g)

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from dualslam.core.chi_square import CHI2_95
 from dualslam.core.geometry import se3
+from dualslam.core.robust import huber_weights
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray
 
 MIN_DEPTH = 1e-6
@@ -252,7 +253,7 @@ def refine_pose(
     for _ in range(n_rounds):
         largest_gain = 0.0
         for _ in range(n_iterations):
-            G = problem.normal_equations(_huber_weights(chi2, chi2_gate, inliers & counted))
+            G = problem.normal_equations(huber_weights(chi2, chi2_gate) * (inliers & counted))
             if prior_information is not None:
                 _add_prior(G, T, T_prior, prior_information)
             step = _solve(G)
@@ -330,13 +331,6 @@ def settle_pose(
     if _half_covariance(G[:6, :6]) is None:
         return Failure(FailureReason.DEGENERATE, f"{n_inliers} inliers do not fix the pose")
     return _on_so3(T)
-
-
-def _huber_weights(chi2: FloatArray, gate: float, inliers: BoolArray) -> FloatArray:
-    """Return Huber's weights, threshold ``sqrt(gate)``, zero for outliers."""
-    weight: FloatArray = np.sqrt(gate / np.maximum(chi2, gate))
-    weight *= inliers
-    return weight
 
 
 def _solve(G: FloatArray) -> FloatArray | None:
