@@ -91,7 +91,6 @@ def recovery_parts(
         ),
         judge=lambda track: judge_track(track, config.health),
         config=config.recovery,
-        fusion=config.fusion,
         foresee=foresee,
         budget_s=budget_s,
     )

@@ -284,15 +284,6 @@ class LinkingConfig(StrictModel):
         return self.wrong_scale
 
 
-class FusionConfig(StrictModel):
-    """How the overlap of two linked maps is refined."""
-
-    overlap_keyframes: int = Field(10, ge=0)
-    """Keyframes of the old map's healthy end that the new map takes in as observations, beside those that it holds:
-    half of what a frame's local map joins, so that the two overlap by as much as neighbouring frames do. 0 leaves the
-    overlap as the link found it."""
-
-
 class AuditConfig(StrictModel):
     """Whether a map is asked, once it has matured, if it is right."""
 
@@ -340,7 +331,6 @@ class Config(StrictModel):
     recovery: RecoveryConfig = RecoveryConfig()
     graph: GraphConfig = GraphConfig()
     linking: LinkingConfig = LinkingConfig()
-    fusion: FusionConfig = FusionConfig()
     audit: AuditConfig = AuditConfig()
     atlas: AtlasConfig = AtlasConfig()
     places: PlacesConfig = PlacesConfig()

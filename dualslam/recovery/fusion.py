@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
-from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
+from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus, IntArray
 from dualslam.map.atlas import Link, LinkKind
 from dualslam.map.connections import Connections
 from dualslam.map.record import FrameStamp, Record
+from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 from dualslam.recovery.bypass import bypass, condemn_tail, drop_corrupted
 from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, refusal_data
@@ -60,6 +63,24 @@ def fuse(
     return True
 
 
+def gauge_at_overlap(submap: Submap, keyframe_ids: IntArray) -> tuple[int, int]:
+    """Return the two keyframes that are to hold a submap's gauge from now on: the widest baseline of the overlap.
+
+    A link is measured at its overlap. While the map grows at its other end its scale is still solved for, and if the
+    gauge lay there, the overlap would drift away under the link. Where the overlap spans less than the gauge in use (a
+    turn in place), that one stays.
+    """
+    ids = [int(k) for k in keyframe_ids if int(k) in submap.keyframes]
+    if len(ids) < 2:
+        return submap.gauge
+    newest = ids[-1]
+    reach = np.linalg.norm(submap.keyframe_poses(ids)[:, :3, 3] - submap.T_submap_kf[newest][:3, 3], axis=1)
+    in_use = [submap.resolve_anchor(k, np.eye(4))[:3, 3] for k in submap.gauge]
+    if reach.max() <= np.linalg.norm(in_use[0] - in_use[1]):
+        return submap.gauge
+    return newest, ids[int(np.argmax(reach))]
+
+
 def _hand_over(
     record: Record, job: RecoveryJob, found: FoundLink, recovered_frames: list[RecoveredFrame], now: FrameStamp
 ) -> None:
@@ -74,12 +95,6 @@ def _hand_over(
     for frame in recovered_frames:
         if frame.pose.index >= onset and _was_lost(record, frame.pose.index, found.old_id):
             record.rows[frame.pose.index].status = FrameStatus.RECOVERED
-    refinement = found.refinement
-    numbers = (
-        {"overlap": str(refinement.reason)}
-        if isinstance(refinement, Failure)
-        else {"overlap": "refined", **refinement.numbers}
-    )
     record.event(
         EventKind.FUSED,
         now,
@@ -89,7 +104,6 @@ def _hand_over(
         dropped=n_dropped,
         condemned_keyframes=n_condemned,
         condemned_landmarks=int(record.atlas.submaps[found.old_id].landmarks["condemned"].sum()),
-        **numbers,
     )
 
 

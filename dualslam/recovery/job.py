@@ -13,7 +13,6 @@ from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose, Path
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.linking import LinkEstimate
-from dualslam.recovery.overlap_refinement import OverlapReport
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,11 +81,10 @@ class RecoveredFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundLink:
-    """The link that an attempt ended with. `refinement`: of the overlap, or why there was none."""
+    """The link that an attempt ended with."""
 
     old_id: int
     estimate: LinkEstimate
-    refinement: OverlapReport | Failure
     attempt: str
 
 

@@ -28,12 +28,11 @@ from dualslam.recovery.audits import Audits
 from dualslam.recovery.bypass import absorb, n_frames, pose_frames
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
-from dualslam.recovery.fusion import fuse, note_refused
+from dualslam.recovery.fusion import fuse, gauge_at_overlap, note_refused
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.leaps import refuse_leaps
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.merge import merge_recovery
-from dualslam.recovery.overlap_refinement import gauge_at_overlap
 from dualslam.recovery.schedule import RetrySchedule, as_far_as_it_leads, way_to_gaps
 
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.config.settings import FusionConfig, RecoveryConfig
+from dualslam.config.settings import RecoveryConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.events import Event, EventKind
@@ -32,7 +32,6 @@ from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, Recove
 from dualslam.recovery.leaps import WINDOW_FRAMES
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.linking import NO_BEND, Bend, LinkEstimate
-from dualslam.recovery.overlap_refinement import OverlapReport, refine_overlap
 from dualslam.recovery.progress import Progress
 from dualslam.recovery.relinker import Linker, LinkTry, Relinker
 from dualslam.recovery.rivals import choose_by_velocity
@@ -78,7 +77,6 @@ class RecoveryParts:
     check_camera: Callable[[Submap, LinkEstimate, RecoveryJob], Bend | Failure]
     judge: Judge
     config: RecoveryConfig
-    fusion: FusionConfig
     foresee: Callable[[View], None] = lambda view: None
     budget_s: float | None = None
 
@@ -214,7 +212,7 @@ def _make_attempt(
         if step.view.index not in submap.keyframes:
             continue
         for tried in relinker.attempts(step.view.index):
-            found = _fused(tried, job, submap, attempt.name, parts, tries, progress)
+            found = _confirm(tried, job, submap, attempt.name, parts, tries, progress)
             if not isinstance(found, Failure):
                 progress.link = found
                 break
@@ -252,7 +250,7 @@ def _there_and_back(views: tuple[View, ...], progress: Progress) -> Iterator[Vie
     yield from way_to_gaps(views[::-1], progress.frames, progress.submap.keyframes)
 
 
-def _fused(
+def _confirm(
     tried: LinkTry,
     job: RecoveryJob,
     submap: Submap,
@@ -261,7 +259,7 @@ def _fused(
     tries: LinkTries,
     progress: Progress,
 ) -> FoundLink | Failure:
-    """Refine the overlap and with it the link, which must hold as far as where the walk set out, and beyond."""
+    """Return a link that holds as far as the live end, under the camera that the pixels ask for."""
     found = tried.result
     if isinstance(found, Failure):
         return found
@@ -271,29 +269,17 @@ def _fused(
     bend = parts.check_camera(submap, link, job)
     if isinstance(bend, Failure):
         return bend
-    refinement = refine_overlap(job.lost[tried.old_id], submap, found, parts.new_graph, parts.link, parts.fusion)
-    if isinstance(refinement, Failure):
-        unrefined = refinement.reason in (FailureReason.DISABLED, FailureReason.SOLVER)
-        if not unrefined:
-            return refinement
-        refined: Submap = submap
-        report: OverlapReport | Failure = refinement
-        link = parts.propagate(found, submap, job.newest_id, bend)
-    else:
-        refined, report = refinement.submap, refinement.report
-        link = parts.propagate(refinement.link, refined, job.newest_id, bend)
+    link = parts.propagate(found, submap, job.newest_id, bend)
     if isinstance(link, Failure):
         return link
     again = tries.judge(tried.old_id, link.numbers["sigma_scale"], parts.max_scale_sigma)
     if again is not None:
         return again
-    refused = _refuse_rivalled(job, refined, progress, tried.old_id, link)
+    refused = _refuse_rivalled(job, submap, progress, tried.old_id, link)
     if refused is not None:
         return refused
-    if refined is not submap:
-        submap.take_over(refined)
     told = {"tries": tries.refused[tried.old_id] + 1.0, "rivals": float(len(progress.rivals))}
-    return FoundLink(tried.old_id, replace(link, numbers=link.numbers | told), report, attempt)
+    return FoundLink(tried.old_id, replace(link, numbers=link.numbers | told), attempt)
 
 
 def _refuse_rivalled(

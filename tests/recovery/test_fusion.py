@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import Failure, FailureReason, FloatArray
+from dualslam.core.types import FloatArray
 from dualslam.map.atlas import Link
 from dualslam.recovery.fusion import fuse
 from dualslam.recovery.job import FoundLink
@@ -50,7 +50,7 @@ def fused(change_point: int | None = None) -> tuple[DriftingMap, Link, FloatArra
         suspected_onset=ONSET,
         numbers={},
     )
-    found = FoundLink(0, estimate, Failure(FailureReason.TOO_FEW_MATCHES), "gap")
+    found = FoundLink(0, estimate, "gap")
     assert fuse(world.record, world.connections, job, found, S_now_then, [], world.now, 0.0)  # type: ignore[arg-type]
     (link,) = world.atlas.links
     return world, link, S_now_then

@@ -42,7 +42,7 @@ def walk(unit: float, off: FloatArray, seed: int) -> tuple[Record, Recoveries, R
         T = np.eye(4)
         T[:3, 3] = centre
         frames.append(RecoveredFrame(FramePose(FIRST + FOUND_AFTER + i, float(time_s), 1, 0, T), 90, 80))
-    link = FoundLink(0, Fake(S_old_new=sim3.from_parts(unit, np.eye(3), np.zeros(3))), Fake(), "live")  # type: ignore[arg-type]
+    link = FoundLink(0, Fake(S_old_new=sim3.from_parts(unit, np.eye(3), np.zeros(3))), "live")  # type: ignore[arg-type]
     attempt = Event(EventKind.RECOVERY_ATTEMPT, FIRST + FOUND_AFTER, float(t_new[0]), 1, {"attempt": "live"})
     job = RecoveryJob(new, 0, {0: lost}, {0: FIRST + 99}, (), (), CAMERA, None)
     result = RecoveryResult(new, tuple(frames), link, (attempt,), 0.1, 0.1)
