@@ -253,7 +253,11 @@ class BenchSpec(StrictModel):
         if not chosen:
             return self
         kept = tuple(s for s in self.sequences if s.name in chosen)
-        conditions = tuple(c for c in self.conditions if any(map(c.is_for, kept)))
+        conditions = tuple(
+            c if c.sequences is None else c.model_copy(update={"sequences": tuple(s.name for s in kept if c.is_for(s))})
+            for c in self.conditions
+            if any(map(c.is_for, kept))
+        )
         return self.model_copy(update={"sequences": kept, "conditions": conditions})
 
     def parts(self, names: Iterable[str]) -> BenchSpec:

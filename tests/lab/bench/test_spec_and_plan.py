@@ -186,6 +186,14 @@ def test_doses_are_spread_over_their_range(tmp_path: Path) -> None:
     assert (wrong.dose, wrong.config["corruptions"][0]["start"]) == (None, 0)
 
 
+def test_only_one_of_the_sequences_of_a_condition(tmp_path: Path) -> None:
+    only = load(tmp_path, SPLIT).only(["world"])
+    assert {t.key for t in plan_trials(only, describe)} == {
+        *(f"world/natural/Dual/{n:02d}" for n in range(2)),
+        *(f"world/dark/Dual/{n:02d}" for n in range(12)),
+    }
+
+
 def test_only_some_parts(tmp_path: Path) -> None:
     spec = load(tmp_path, SPLIT)
     assert [c.name for c in spec.parts(["lit", "input"]).conditions] == ["dark", "lens"]
