@@ -97,9 +97,17 @@ class LinkError:
     position: float
 
 
+class JoinCause(StrEnum):
+    """Why a place of the trajectory is asked whether it is joined."""
+
+    DISTURBANCE = "disturbance"  # a passing one is over
+    LOSS = "loss"  # a map was given up
+    SEAM = "seam"  # the main map changes its submap
+
+
 @dataclass(frozen=True, slots=True)
 class Join:
-    """The parts of the main map before and after a loss, or before and after another change of its submap.
+    """The parts of the main map before and after a disturbance, a loss, or another change of its submap.
 
     Attributes
     ----------
@@ -109,7 +117,7 @@ class Join:
         One of `dualslam.lab.audits.join_audit.JoinOutcome`.
     offset_m, scale_ratio, turn_deg : float or None
         As in `dualslam.lab.audits.join_audit.JoinAudit`.
-    is_loss : bool
+    cause : JoinCause
     """
 
     frame: int
@@ -117,7 +125,7 @@ class Join:
     offset_m: float | None
     scale_ratio: float | None
     turn_deg: float | None
-    is_loss: bool
+    cause: JoinCause
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +251,7 @@ class TrialRecord:
                 "outcome": TrialOutcome(data["outcome"]),
                 "breakages": tuple(Breakage(**b) for b in data["breakages"]),
                 "links": tuple(LinkError(**e) for e in data["links"]),
-                "joins": tuple(Join(**j) for j in data.get("joins", ())),
+                "joins": tuple(Join(**j | {"cause": JoinCause(j["cause"])}) for j in data.get("joins", ())),
                 "reasons": tuple(Reason(**r) for r in data.get("reasons", ())),
             }
         )

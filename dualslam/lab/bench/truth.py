@@ -14,7 +14,7 @@ from dualslam.io.run_folder import FrameRow
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
 from dualslam.lab.audits.join_audit import JoinOutcome, audit_join
 from dualslam.lab.audits.silent_breaks import MIN_SPREAD_M, MIN_STRETCH_POSES, STEP_S, STRETCH_S, judge_stretches
-from dualslam.lab.bench.record import Breakage, Join, Reason
+from dualslam.lab.bench.record import Breakage, Join, JoinCause, Reason
 from dualslam.lab.metrics.trajectory_metrics import MIN_POSES
 
 JUMP = 3.0
@@ -39,12 +39,15 @@ class TrueFrames:
         True pose of the image that is shown: a frozen camera shows an older one. NaN where there is no truth.
     clear : (N,) bool
         Whether no passing disturbance is on the image, so that the frame can be posed.
+    disturbed : tuple of (int, int)
+        First frame of each passing disturbance, and the first one after it.
     """
 
     index: IntArray
     times_s: FloatArray
     T_world_cam: FloatArray
     clear: BoolArray
+    disturbed: tuple[tuple[int, int], ...] = ()
 
     @property
     def truth(self) -> Trajectory:
@@ -91,7 +94,9 @@ def true_frames(
             shown[n] = last
         last = int(shown[n])
     clear = np.array([not any(c.covers(i) for c in hiding) for i in index.tolist()], bool)
-    return TrueFrames(index, times_s, T[shown], clear)
+    passing = [c for c in hiding if c.length is not None and c.kind is not CorruptionKind.STRIDE]
+    spans = tuple((c.start, c.start + c.length) for c in passing if c.length is not None)
+    return TrueFrames(index, times_s, T[shown], clear, spans)
 
 
 def _arrives(index: int, corruptions: Iterable[Corruption]) -> bool:
@@ -144,21 +149,24 @@ def compare(
     fields |= _stretches(times_s - frames.times_s[0], T_est[:, :3, 3], T_true[:, :3, 3], frames.times_s)
     tolerance_m = None if repeats_m is None else repeats_m / 2.0
     fields["joins"] = tuple(
-        Join(first, str(found.outcome), found.offset_m, found.scale_ratio, found.turn_deg, is_loss)
-        for first, after, is_loss in _seams(index, submap[order][known], breakages)
+        Join(first, str(found.outcome), found.offset_m, found.scale_ratio, found.turn_deg, cause)
+        for first, after, cause in _places(frames, index, submap[order][known], breakages)
         for found in [audit_join(index, T_est, T_true, first, after, tolerance_m)]
-        if is_loss or found.outcome is not JoinOutcome.NOT_JOINED
+        if cause is not JoinCause.SEAM or found.outcome is not JoinOutcome.NOT_JOINED
     )
     return fields
 
 
-def _seams(index: IntArray, submap: IntArray, breakages: Iterable[Breakage]) -> list[tuple[int, int, bool]]:
-    """Return the places to audit: every loss, and every other place at which the main map changes its submap."""
-    found = [(b.frame, b.frame + (b.restart_frames or 1), True) for b in breakages]
+def _places(
+    frames: TrueFrames, index: IntArray, submap: IntArray, breakages: Iterable[Breakage]
+) -> list[tuple[int, int, JoinCause]]:
+    """Return the places to audit: first frame, first frame after it, and why."""
+    found = [(first, after, JoinCause.DISTURBANCE) for first, after in frames.disturbed]
+    found += [(b.frame, b.frame + (b.restart_frames or 1), JoinCause.LOSS) for b in breakages]
     for n in (np.flatnonzero(np.diff(submap)) + 1).tolist():
         first = int(index[n])
         if not any(a <= first <= b for a, b, _ in found):
-            found.append((first, first, False))
+            found.append((first, first, JoinCause.SEAM))
     return found
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from dualslam.lab.audits.join_audit import JoinOutcome
-from dualslam.lab.bench.record import FALSE_MAP, NO_VERDICT, Fault, TrialRecord, faults_of
+from dualslam.lab.bench.record import FALSE_MAP, NO_VERDICT, Fault, JoinCause, TrialRecord, faults_of
 from dualslam.lab.bench.spec import BenchSpec, RightRun
 from dualslam.lab.bench.table import Cell, ResultTable
 from dualslam.lab.metrics.dose_response import critical_dose
@@ -37,7 +37,7 @@ def verdict_tables(spec: BenchSpec, records: Sequence[TrialRecord]) -> list[Resu
         _fault_table(spec, records, right),
         _reason_table(records, right),
         _critical_table(spec, records, right),
-        _loss_table(spec, records),
+        _join_table(spec, records),
         _false_table(records, right),
     ]
 
@@ -155,36 +155,36 @@ def _critical_table(spec: BenchSpec, records: Sequence[TrialRecord], right: Righ
     )
 
 
-def _loss_table(spec: BenchSpec, records: Sequence[TrialRecord]) -> ResultTable:
+def _join_table(spec: BenchSpec, records: Sequence[TrialRecord]) -> ResultTable:
+    causes = (JoinCause.DISTURBANCE, JoinCause.LOSS)
     rows: list[list[Cell]] = []
-    totals: Counter[str] = Counter()
+    totals: Counter[tuple[JoinCause, str]] = Counter()
     for condition in spec.conditions:
-        count = _losses(r for r in records if r.condition == condition.name)
-        totals.update(count)
-        if sum(count.values()):
-            rows.append(_loss_row(condition.part, condition.name, count))
-    rows.append(_loss_row("all", "all", totals))
+        joins = [j for r in records if r.condition == condition.name for j in r.joins if j.cause in causes]
+        totals.update(count := Counter((j.cause, j.outcome) for j in joins))
+        if count:
+            rows.append([condition.part, condition.name, *_join_cells(count, causes)])
+    rows.append(["all", "all", *_join_cells(totals, causes)])
+    columns = [f"{cause}: {_JOINED[outcome]}" for cause in causes for outcome in JoinOutcome]
     return ResultTable(
-        "losses",
-        "Losses",
-        (
-            "part",
-            "condition",
-            "losses",
-            *(f"joined {o}" if o != JoinOutcome.NOT_JOINED else str(o) for o in JoinOutcome),
-        ),
+        "joins",
+        "Disturbances and losses",
+        ("part", "condition", *columns),
         rows,
-        "Each loss of a map, judged by up to 45 posed frames on either side. Joined wrong: off by more than 5 % of the "
-        "path (in a world that repeats: by half its period), 15 % in scale or 5 degrees.",
+        "Passing disturbances and losses of a map, judged by up to 45 posed frames on either side. Joined wrong: off "
+        "by more than 5 % of the path (in a world that repeats: half its period), 15 % in scale or 5 degrees.",
     )
 
 
-def _losses(records: Iterable[TrialRecord]) -> Counter[str]:
-    return Counter(join.outcome for record in records for join in record.joins if join.is_loss)
+_JOINED = {
+    JoinOutcome.RIGHT: "joined right",
+    JoinOutcome.WRONG: "joined wrong",
+    JoinOutcome.NOT_JOINED: "not joined",
+}
 
 
-def _loss_row(part: str, name: str, count: Counter[str]) -> list[Cell]:
-    return [part, name, sum(count.values()), *(count[str(outcome)] for outcome in JoinOutcome)]
+def _join_cells(count: Counter[tuple[JoinCause, str]], causes: Iterable[JoinCause]) -> list[Cell]:
+    return [count[cause, str(outcome)] for cause in causes for outcome in JoinOutcome]
 
 
 def _false_table(records: Sequence[TrialRecord], right: RightRun) -> ResultTable:

@@ -16,7 +16,7 @@ from dualslam.config.corruption import Corruption
 from dualslam.core.geometry import so3
 from dualslam.io.trajectory_files import Trajectory, write_tum
 from dualslam.lab.bench.measure import trajectory_error
-from dualslam.lab.bench.record import Breakage
+from dualslam.lab.bench.record import Breakage, JoinCause
 from dualslam.lab.bench.truth import TrueFrames, compare, read_verdict, true_frames
 
 N, RATE_HZ = 240, 20.0
@@ -83,7 +83,7 @@ def test_a_false_step_between_submaps_is_a_false_join_and_breaks_stretches() -> 
     main.T_world_cam[120:, 0, 3] += 0.5
     submap = np.repeat([0, 1], 120)
     found = compared(main, submap=submap)
-    assert [(j.frame, j.outcome, j.is_loss) for j in found["joins"]] == [(int(INDEX[120]), "wrong", False)]
+    assert [(j.frame, j.outcome, j.cause) for j in found["joins"]] == [(int(INDEX[120]), "wrong", JoinCause.SEAM)]
     assert found["joins"][0].offset_m == pytest.approx(0.5 / 0.3, rel=0.05)
     assert found["broken"] >= 3
     right = compared(estimate(), submap=submap)
@@ -94,7 +94,19 @@ def test_a_loss_is_joined_or_not() -> None:
     lost = Breakage(int(INDEX[100]), 0, "too_few_matches", restart_frames=40)
     joined = compared(estimate(np.r_[:100, 120:N]), breakages=[lost])["joins"]
     left = compared(estimate(np.arange(120, N)), breakages=[lost])["joins"]
-    assert [(j.outcome, j.is_loss) for j in (*joined, *left)] == [("right", True), ("not joined", True)]
+    assert [(j.outcome, j.cause) for j in (*joined, *left)] == [
+        ("right", JoinCause.LOSS),
+        ("not joined", JoinCause.LOSS),
+    ]
+
+
+def test_a_passing_disturbance_is_joined_or_not_whether_or_not_a_map_was_lost() -> None:
+    known = frames({"kind": "drop", "start": 300, "length": 40}, {"kind": "noise"}, {"kind": "stride", "length": 90})
+    assert known.disturbed == ((300, 340),)
+    main = estimate(np.flatnonzero(np.isin(INDEX, known.index)))
+    main.T_world_cam[main.index >= 340, 0, 3] += 0.5
+    (join,) = compared(main, known)["joins"]
+    assert (join.frame, join.outcome, join.cause) == (300, "wrong", JoinCause.DISTURBANCE)
 
 
 def test_a_step_of_the_truth_alone_is_no_break() -> None:

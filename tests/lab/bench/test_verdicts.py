@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dualslam.lab.bench.record import Fault, Join, Reason, TrialOutcome, TrialRecord, faults_of
+from dualslam.lab.bench.record import Fault, Join, JoinCause, Reason, TrialOutcome, TrialRecord, faults_of
 from dualslam.lab.bench.spec import BenchSpec, RightRun
 from dualslam.lab.bench.table import ResultTable
 from dualslam.lab.bench.verdict_tables import area_under_roc, verdict_tables
@@ -24,7 +24,7 @@ GOOD = TrialRecord(
     n_clear_posed=98,
     judged=9,
 )
-FALSE_JOIN = Join(50, "wrong", 3.0, 1.0, 0.1, is_loss=True)
+FALSE_JOIN = Join(50, "wrong", 3.0, 1.0, 0.1, JoinCause.LOSS)
 
 
 @pytest.mark.parametrize(
@@ -125,14 +125,9 @@ def test_the_critical_strength_of_darkness_is_in_stops(tables: dict[str, ResultT
 
 
 def test_losses_and_undoubted_false_maps_are_listed(tables: dict[str, ResultTable]) -> None:
-    assert rows(tables["losses"])[-1] == {
-        "part": "all",
-        "condition": "all",
-        "losses": 6,
-        "joined right": 0,
-        "joined wrong": 6,
-        "not joined": 0,
-    }
+    all_ = rows(tables["joins"])[-1]
+    assert [all_[f"loss: {how}"] for how in ("joined right", "joined wrong", "not joined")] == [0, 6, 0]
+    assert all_["disturbance: joined wrong"] == 0
     (false,) = rows(tables["silently_false"])
     assert (false["verdict"], false["faults"], false["dose"]) == ("good", "broken, false join", -4.3)
 
