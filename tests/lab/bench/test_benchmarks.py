@@ -61,6 +61,15 @@ def test_the_bench_of_verdicts_has_400_runs_and_no_stretch_in_both_halves() -> N
     assert used[Half.DEVELOPMENT].isdisjoint(used[Half.REPORTING])
 
 
+def test_each_clip_of_recovery_is_disturbed_in_its_middle() -> None:
+    spec = load_spec(FOLDER / "recovery_clips.yaml")
+    trials = plan_trials(spec, lambda s: SourceInfo(s.source, "", 720, s.frames / 10.0 if s.frames else 10.0))
+    for trial in trials:
+        (corruption,) = trial.config["corruptions"]
+        assert 0.3 < (corruption["start"] - trial.start) / trial.max_frames < 0.5
+        assert corruption["length"] <= 0.2 * trial.max_frames
+
+
 @pytest.fixture(scope="module")
 def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Small grey images without anything to see: a trial on them is quick, and finds no map."""
