@@ -5,9 +5,9 @@
 
 `export` writes one folder a clip: images/, times.txt, calib.txt, groundtruth_tum.txt, clip.json.
 
-`score` reads TRAJECTORIES/NAME.txt, or TRAJECTORIES/NAME/trajectory.txt, for the clip CLIPS/NAME: TUM format, the largest
-map. It prints whether the parts before and after the loss are joined right, joined wrong, or not joined. A clip without
-a trajectory is not joined.
+`score` reads TRAJECTORIES/NAME.txt, or TRAJECTORIES/NAME/trajectory.txt, for the clip CLIPS/NAME: TUM format, the
+largest map. It prints whether the parts before and after the loss are joined right, joined wrong, or not joined. A clip
+without a trajectory is not joined.
 """
 
 from __future__ import annotations
