@@ -32,6 +32,7 @@ from dualslam.lab.bench.run import trial_folder
 from dualslam.lab.bench.spec import SequenceSpec
 from dualslam.lab.bench.truth import compare, read_verdict, submaps_of, true_frames
 from dualslam.map.frame_records import FrameResult
+from dualslam.run.audit_scores import audit_scores
 from dualslam.run.results import trajectories_of
 from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import SYNTHETIC, open_source
@@ -130,6 +131,7 @@ def _measure(trial: Trial, folder: Path, sequence: Sequence, outcome: Outcome) -
         breakages=losses,
         cpu_s=outcome.report.cpu_s,
         **read_verdict(outcome.summary),
+        scores=audit_scores(outcome.system),
     )
     truth: Trajectory | None = getattr(sequence, "ground_truth", None)
     if truth is None:

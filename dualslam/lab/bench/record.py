@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from enum import StrEnum
 from typing import Any
 
@@ -130,12 +130,11 @@ class Join:
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """A reason of a run's verdict: its code, the frames that it is about, and its score if it has one."""
+    """A reason of a run's verdict: its code, and the frames that it is about."""
 
     code: str
     first_frame: int | None = None
     last_frame: int | None = None
-    score: float | None = None
 
 
 REFUSALS = ("InputError", "ConfigError")
@@ -188,6 +187,8 @@ class TrialRecord:
     level : str
         Of the run's verdict, or `NO_VERDICT`.
     reasons : tuple of Reason
+    scores : dict of str to float
+        By reason: how strongly the run speaks for it, whether or not it is given.
     """
 
     key: str
@@ -220,6 +221,7 @@ class TrialRecord:
     joins: tuple[Join, ...] = ()
     level: str = NO_VERDICT
     reasons: tuple[Reason, ...] = ()
+    scores: dict[str, float] = field(default_factory=dict)
 
     @property
     def coverage(self) -> float:
@@ -242,7 +244,7 @@ class TrialRecord:
         ValueError, TypeError, KeyError
             Where it is something else.
         """
-        needed = {f.name for f in fields(cls) if f.default is MISSING}
+        needed = {f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING}
         if not needed <= set(data) <= {f.name for f in fields(cls)}:
             raise ValueError("these are not the fields of a trial")
         return cls(

@@ -213,7 +213,5 @@ def read_verdict(summary: Mapping[str, Any]) -> dict[str, Any]:
     verdict = summary.get("verdict")
     if verdict is None:
         return {}
-    reasons = tuple(
-        Reason(str(r["code"]), r.get("first_frame"), r.get("last_frame"), r.get("score")) for r in verdict["reasons"]
-    )
+    reasons = tuple(Reason(str(r["code"]), r.get("first_frame"), r.get("last_frame")) for r in verdict["reasons"])
     return {"level": str(verdict["level"]), "reasons": reasons}

@@ -16,8 +16,6 @@ from dualslam.lab.metrics.statistics import wilson_interval
 
 LEVELS = ("good", "usable", "doubtful", NO_VERDICT)
 GOOD = "good"
-NOT_GIVEN = -1.0
-"""Score of a reason in runs that do not give it; scores are positive."""
 
 
 def verdict_tables(spec: BenchSpec, records: Sequence[TrialRecord]) -> list[ResultTable]:
@@ -98,25 +96,26 @@ def _fault_table(spec: BenchSpec, records: Sequence[TrialRecord], right: RightRu
 def _reason_table(records: Sequence[TrialRecord], right: RightRun) -> ResultTable:
     judged = [r for r in records if r.level != NO_VERDICT]
     is_right = np.array([_is_right(r, right) for r in judged], bool)
+    codes = {reason.code for r in judged for reason in r.reasons} | {code for r in judged for code in r.scores}
     rows: list[list[Cell]] = []
-    for code in sorted({reason.code for r in judged for reason in r.reasons}):
-        score = np.array([_score(r, code) for r in judged])
-        given = score > NOT_GIVEN
+    for code in sorted(codes):
+        given = np.array([any(reason.code == code for reason in r.reasons) for r in judged], bool)
+        scored = np.array([code in r.scores for r in judged], bool)
+        if not scored.any():
+            score, scored = given.astype(np.float64), np.ones(len(judged), bool)
+        else:
+            score = np.array([r.scores.get(code, 0.0) for r in judged])
         n_right = int((given & is_right).sum())
-        rows.append([code, int(given.sum()), int(given.sum()) - n_right, n_right, area_under_roc(score, ~is_right)])
+        area = area_under_roc(score[scored], ~is_right[scored])
+        rows.append([code, int(given.sum()), int(given.sum()) - n_right, n_right, int(scored.sum()), area])
     return ResultTable(
         "reasons",
         "Reasons",
-        ("code", "runs", "wrong", "right", "area under ROC"),
+        ("code", "given", "to wrong runs", "to right runs", "runs with a score", "area under ROC"),
         rows,
-        "Runs that give the reason. Area: the chance that a wrong run has the higher score of a wrong and a right one "
-        "(0.5: no use). A reason without a score counts as 1, one that is not given as none.",
+        "Area: the chance that the wrong run has the higher score of a wrong and a right one (0.5: no use). Where no "
+        "run has a score for a reason, a run that gives it counts as 1, another as 0.",
     )
-
-
-def _score(record: TrialRecord, code: str) -> float:
-    given = [1.0 if r.score is None else r.score for r in record.reasons if r.code == code]
-    return max(given, default=NOT_GIVEN)
 
 
 def area_under_roc(score: np.ndarray, positive: np.ndarray) -> float | None:

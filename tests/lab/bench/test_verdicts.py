@@ -50,7 +50,7 @@ def test_what_is_wrong_is_named(change: dict[str, Any], faults: tuple[Fault, ...
 
 
 def test_a_record_survives_its_line_and_one_from_before_verdicts_too() -> None:
-    record = replace(GOOD, level="doubtful", reasons=(Reason("steps", 3, 9, 2.5),), joins=(FALSE_JOIN,), dose=0.4)
+    record = replace(GOOD, level="doubtful", reasons=(Reason("steps", 3, 9),), joins=(FALSE_JOIN,), dose=0.4)
     assert TrialRecord.from_dict(record.as_dict()) == record
     old = {k: v for k, v in GOOD.as_dict().items() if k not in ("joins", "reasons", "level", "dose", "is_still")}
     assert TrialRecord.from_dict(old) == GOOD
@@ -71,12 +71,14 @@ def records() -> list[TrialRecord]:
     """Ten right runs, eight of them called good; six false ones, one of them called good. Dark below -4 stops."""
     made = []
     for n in range(10):
-        level, reasons = ("good", ()) if n < 8 else ("doubtful", (Reason("steps", 1, 2, 1.5),))
-        made.append(replace(GOOD, condition="dark", dose=-1.0 - 0.3 * n, level=level, reasons=reasons))
+        level, reasons = ("good", ()) if n < 8 else ("doubtful", (Reason("steps", 1, 2),))
+        made.append(
+            replace(GOOD, condition="dark", dose=-1.0 - 0.3 * n, level=level, reasons=reasons, scores={"turn": n})
+        )
     for n in range(6):
-        level, reasons = ("good", ()) if n == 0 else ("doubtful", (Reason("steps", 1, 2, 2.0 + n),))
+        level, reasons = ("good", ()) if n == 0 else ("doubtful", (Reason("steps", 1, 2),))
         false = replace(GOOD, condition="dark", dose=-4.3 - 0.3 * n, broken=2, joins=(FALSE_JOIN,))
-        made.append(replace(false, level=level, reasons=reasons))
+        made.append(replace(false, level=level, reasons=reasons, scores={"turn": 4.5 + 2 * n}))
     made.append(replace(GOOD, condition="plain"))
     return made
 
@@ -110,10 +112,13 @@ def test_faults_are_counted_by_condition(tables: dict[str, ResultTable]) -> None
 
 
 def test_a_reason_is_as_good_as_its_area(tables: dict[str, ResultTable]) -> None:
-    (steps,) = rows(tables["reasons"])
-    assert (steps["code"], steps["runs"], steps["wrong"], steps["right"]) == ("steps", 7, 5, 2)
-    # Of 60 pairs the five wrong runs that give it win 50; the sixth ties with eight and loses to two.
-    assert steps["area under ROC"] == pytest.approx((50 + 4) / 60)
+    steps, turn = rows(tables["reasons"])
+    assert (steps["code"], steps["given"], steps["to wrong runs"], steps["to right runs"]) == ("steps", 7, 5, 2)
+    # Of 60 pairs the five wrong runs that give it win 40 and tie 10; the sixth ties with eight and loses to two.
+    assert steps["area under ROC"] == pytest.approx((40 + 10 / 2 + 8 / 2) / 60)
+    # Scores 0 to 9 of right runs against 4.5, 6.5, 8.5 and three above all.
+    assert (turn["code"], turn["given"], turn["runs with a score"]) == ("turn", 0, 16)
+    assert turn["area under ROC"] == pytest.approx((5 + 7 + 9 + 3 * 10) / 60)
     assert area_under_roc(np.ones(3), np.ones(3, bool)) is None
 
 
