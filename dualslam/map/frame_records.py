@@ -27,7 +27,7 @@ class FrameRow:
     method : FrameMethod or None
         How its pose was found; None without a pose.
     doubt : str
-        Empty, or the code of a reason in the run's verdict that is about this frame; known at the end as well.
+        Empty, or the code of a reason in the run's verdict that is about this frame; known to ``frames.csv``.
     """
 
     index: int

@@ -98,4 +98,5 @@ def _scale_sigmas(submap: Submap, excess: dict[int, float]) -> dict[int, float]:
             through = np.concatenate(groups[max(g - 1, 0) : g + 2]).tolist()
             inflation = SCALE_INFLATION * max(excess[k] for k in through)
             sigma_of |= dict.fromkeys(groups[g].tolist(), inflation * sigma)
-    return sigma_of if len(groups) > 1 else dict.fromkeys(sigma_of, float("nan"))
+    can_tell = len(groups) > 1 and bool(submap.landmarks["alive"].any())
+    return sigma_of if can_tell else dict.fromkeys(sigma_of, float("nan"))

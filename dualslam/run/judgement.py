@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from dualslam.audit.photometric import Sample, disagreeing_stretches
 from dualslam.audit.steps import measure_steps
 from dualslam.audit.verdict import Level, Reason, ReasonCode, Verdict
+from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import FloatArray
+from dualslam.core.types import FrameStatus
+from dualslam.map.frame_records import FrameRow
 from dualslam.run.results import Trajectories
 from dualslam.system import System
 
@@ -18,84 +22,84 @@ MIN_JUMP_DEPTHS = 0.02
 """Length of a jump over the median depth of the scene: shorter ones are noise of single frames."""
 MIN_COVERAGE = 0.95
 """Share of the frames that can be posed."""
+MAX_SCALE_SIGMA = 0.5
+"""Of the logarithm of the scale after a keyframe against that before it: as much, or more, is not handed on."""
 MAX_FOCAL_SIGMA = 0.03
 """Standard deviation of the logarithm of the focal length."""
+MAX_FOCAL_CHANGE = 4.0
+"""Sigmas between two estimates of the focal length of one run; they share observations, and differ by at most 2."""
 INTERVALS_S = (1e-3, 2.0)
 """Median time between two frames: outside, timestamps are in another unit, or not those of the frames."""
 
 
-def judge_run(system: System, trajectories: Trajectories, dropped: int = 0, crashed: bool = False) -> Verdict:
+def judge_run(system: System, trajectories: Trajectories, rows: Sequence[FrameRow], crashed: bool = False) -> Verdict:
     """Judge a run that has ended.
 
     Parameters
     ----------
     system : System
     trajectories : Trajectories
-    dropped : int
-        Frames that came too late (real time).
+        Of `trajectories_of`.
+    rows : sequence of FrameRow
+        Of `frame_rows`: one for each frame of the source.
     crashed : bool
     """
-    reasons = _coverage(system, trajectories, dropped) + _clock(system)
+    if not rows:
+        return Verdict(Level.DOUBTFUL)
+    reasons = [*_coverage(system, rows), *_clock(rows)]
     if crashed:
         text = "The run crashed: what it had found until then was kept. Report the error, and run again."
-        reasons.append(_about_all(system, ReasonCode.CRASHED, Level.USABLE, text))
+        reasons.append(_about_all(rows, ReasonCode.CRASHED, Level.USABLE, text))
     if len(trajectories.main):
-        reasons += _jumps(system, trajectories) + _photometric(system, trajectories) + _focal(system)
+        reasons += [*_jumps(system, trajectories), *_photometric(system, trajectories), *_scale(rows)]
+        reasons += _focal(system, rows)
     return Verdict.of(reasons)
 
 
-def _about_all(system: System, code: ReasonCode, level: Level, text: str) -> Reason:
+def _about_all(rows: Sequence[FrameRow], code: ReasonCode, level: Level, text: str) -> Reason:
     """Return a reason that is about the whole run."""
-    indices = [system.numbers.index_of(i) for i in system.rows] or [0]
-    return Reason(code, level, text, min(indices), max(indices))
-
-
-def _about(system: System, code: ReasonCode, level: Level, text: str, first: int, last: int) -> Reason:
-    """Return a reason about the frames between two numbers."""
-    ends = (system.numbers.index_of(first), system.numbers.index_of(last))
-    return Reason(code, level, text.format(*sorted(ends)), min(ends), max(ends))
+    return Reason(code, level, text, *sorted((rows[0].index, rows[-1].index)))
 
 
 # --- what is posed
 
 
-def _coverage(system: System, trajectories: Trajectories, dropped: int) -> list[Reason]:
-    n_main, rows = len(trajectories.main), system.rows
-    if not n_main:
+def _coverage(system: System, rows: Sequence[FrameRow]) -> list[Reason]:
+    main = [row for row in rows if row.in_main_map]
+    if not main:
         text = "No frame has a pose. The last line of the run says why no map started."
-        return [_about_all(system, ReasonCode.NO_MAP, Level.DOUBTFUL, text)]
-    n_apart = sum(len(each) for each in trajectories.unlinked.values())
-    in_main = set(trajectories.main.index.tolist())
-    missing = [i for i in rows if system.numbers.index_of(i) not in in_main and i not in system.blank]
-    n_possible = n_main + len(missing) + dropped
-    if n_main >= MIN_COVERAGE * n_possible:
+        return [_about_all(rows, ReasonCode.NO_MAP, Level.DOUBTFUL, text)]
+    blank = {system.numbers.index_of(i) for i in system.blank}
+    missing = [row for row in rows if not row.in_main_map and row.index not in blank]
+    if len(main) >= MIN_COVERAGE * (len(main) + len(missing)):
         return []
-    reasons = []
-    unposed = [i for i in missing if i not in system.poses]
-    if dropped > len(missing):
+    dropped = [row for row in missing if row.status is FrameStatus.DROPPED]
+    apart = [row for row in missing if system.numbers.number_of(row.index) in system.poses]
+    counted = {row.index for row in (*dropped, *apart)}
+    unposed = [row for row in missing if row.index not in counted]
+    if len(dropped) == max(len(apart), len(dropped), len(unposed)):
         text = (
-            f"{dropped} frames came too late and were dropped. Use a faster machine, smaller images, or no --realtime."
+            f"{len(dropped)} frames came too late. Use a faster machine or smaller images, or run without --realtime."
         )
-        reasons.append(_about_all(system, ReasonCode.DROPPED, Level.USABLE, text))
-    if n_apart > len(unposed):
-        apart = [i for i in missing if i in system.poses]
+        return [_about_all(rows, ReasonCode.DROPPED, Level.USABLE, text)]
+    if len(apart) > len(unposed):
+        first, last = sorted((apart[0].index, apart[-1].index))
         text = (
-            f"{n_apart} frames from {{0}} to {{1}} are in maps that could not be joined to the main one. "
+            f"{len(apart)} frames from {first} to {last} are in maps that could not be joined to the main one. "
             "Their trajectories are in submaps/, each in its own unit. A recording that returns there would join them."
         )
-        reasons.append(_about(system, ReasonCode.UNJOINED, Level.USABLE, text, apart[0], apart[-1]))
-    elif unposed:
-        text = (
-            f"{len(unposed)} frames have no pose; the longest stretch is {{0}} to {{1}}. "
-            "Move slower there, with more light and texture in view."
-        )
-        reasons.append(_about(system, ReasonCode.UNPOSED, Level.USABLE, text, *_longest(unposed)))
-    return reasons
+        return [Reason(ReasonCode.UNJOINED, Level.USABLE, text, first, last)]
+    first, last = _longest_run(sorted(row.index for row in unposed))
+    text = (
+        f"{len(unposed)} frames have no pose; the longest stretch is {first} to {last}. "
+        "Move slower there, with more light and texture in view."
+    )
+    return [Reason(ReasonCode.UNPOSED, Level.USABLE, text, first, last)]
 
 
-def _longest(numbers: list[int]) -> tuple[int, int]:
-    """Return first and last of the longest run of neighbours among ascending numbers."""
-    parts = np.split(np.array(numbers), np.flatnonzero(np.diff(numbers) > 1) + 1)
+def _longest_run(indices: list[int]) -> tuple[int, int]:
+    """Return first and last of the longest run of neighbours among ascending indices."""
+    parts = np.split(np.array(indices), np.flatnonzero(np.diff(indices) > 1) + 1)
     longest = max(parts, key=len)
     return int(longest[0]), int(longest[-1])
 
@@ -112,12 +116,12 @@ def _jumps(system: System, trajectories: Trajectories) -> list[Reason]:
     if not found:
         return []
     worst = max(found, key=lambda n: float(steps.ratio[n]))
-    a, b = sorted(main.index[worst : worst + 2].tolist())
+    first, last = sorted(main.index[worst : worst + 2].tolist())
     text = (
-        f"Between frames {a} and {b} the camera jumps: {steps.ratio[worst]:.0f} times its speed about there. "
+        f"Between frames {first} and {last} the camera jumps: {steps.ratio[worst]:.0f} times its speed about there. "
         "Two places that look alike may have been joined. Do not trust where both sides lie to each other."
     )
-    return [Reason(ReasonCode.JUMP, Level.DOUBTFUL, text, a, b)]
+    return [Reason(ReasonCode.JUMP, Level.DOUBTFUL, text, first, last)]
 
 
 def _median_depth(system: System, trajectories: Trajectories, index: int) -> float:
@@ -141,17 +145,43 @@ def _photometric(system: System, trajectories: Trajectories) -> list[Reason]:
     if not stretches:
         return []
     worst = max(stretches, key=lambda s: s.last - s.first)
+    first, last = sorted(system.numbers.index_of(i) for i in (worst.first, worst.last))
     text = (
-        f"From frame {{0}} to {{1}} the images disagree with the map: {100 * worst.agreement:.0f} % of the patches "
+        f"From frame {first} to {last} the images disagree with the map: {100 * worst.agreement:.0f} % of the patches "
         "look as predicted. Something that moves may have been followed. Do not use the poses there; mask what moves."
     )
-    return [_about(system, ReasonCode.PHOTOMETRIC, Level.DOUBTFUL, text, worst.first, worst.last)]
+    return [Reason(ReasonCode.PHOTOMETRIC, Level.DOUBTFUL, text, first, last)]
+
+
+def _scale(rows: Sequence[FrameRow]) -> list[Reason]:
+    lost = [
+        row for row in rows if row.in_main_map and row.sigma_scale is not None and row.sigma_scale > MAX_SCALE_SIGMA
+    ]
+    if not lost:
+        return []
+    first, last = _longest_run(sorted(row.index for row in lost))
+    text = (
+        f"The scale is not handed on across frames {first} to {last}: what lies before and after may differ in size. "
+        "Too little is seen on both sides. Move sideways there, or turn more slowly."
+    )
+    return [Reason(ReasonCode.SCALE, Level.USABLE, text, first, last)]
 
 
 # --- camera and clock
 
 
-def _focal(system: System) -> list[Reason]:
+def _focal(system: System, rows: Sequence[FrameRow]) -> list[Reason]:
+    kinds = (EventKind.CALIBRATED, EventKind.CALIBRATION_KEPT)
+    told = [event.data for event in system.events.of_kind(*kinds) if "log_focal_sigma" in event.data]
+    log_focal, sigmas = (np.array([data[name] for data in told]) for name in ("log_focal", "log_focal_sigma"))
+    apart = np.abs(log_focal[:, None] - log_focal) / np.hypot(sigmas[:, None], sigmas)
+    if apart.max(initial=0.0) > MAX_FOCAL_CHANGE:
+        low, high = (100 * float(value) for value in (log_focal.min(), log_focal.max()))
+        text = (
+            f"Parts of the run disagree on the focal length: {low:+.0f} to {high:+.0f} % against the calibration. "
+            "Switch off zoom, autofocus and stabilisation, or calibrate the camera as it was used."
+        )
+        return [_about_all(rows, ReasonCode.CAMERA, Level.USABLE, text)]
     sigma = system.log_focal_sigma
     if sigma is None or sigma < MAX_FOCAL_SIGMA:
         return []
@@ -159,11 +189,11 @@ def _focal(system: System) -> list[Reason]:
         f"The focal length is known to {100 * sigma:.0f} % only. "
         "Give a calibration with --camera, or record more sideways motion."
     )
-    return [_about_all(system, ReasonCode.FOCAL, Level.USABLE, text)]
+    return [_about_all(rows, ReasonCode.FOCAL, Level.USABLE, text)]
 
 
-def _clock(system: System) -> list[Reason]:
-    times_s: FloatArray = np.array([row.timestamp_s for row in system.rows.values()])
+def _clock(rows: Sequence[FrameRow]) -> list[Reason]:
+    times_s = np.array([row.timestamp_s for row in rows])
     if len(times_s) < 3:
         return []
     intervals_s = np.diff(times_s)
@@ -178,4 +208,4 @@ def _clock(system: System) -> list[Reason]:
         else f"The median time between two frames is {abs(usual_s):.3g} s"
     )
     text = f"{problem}. Check the clock or the unit of the timestamps: motion is predicted by them."
-    return [_about_all(system, ReasonCode.CLOCK, Level.USABLE, text)]
+    return [_about_all(rows, ReasonCode.CLOCK, Level.USABLE, text)]

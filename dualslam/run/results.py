@@ -89,7 +89,6 @@ def frame_rows(
     main: Trajectory | None = None,
     dropped: Iterable[tuple[int, float]] = (),
     latencies_ms: Sequence[float] | None = None,
-    verdict: Verdict | None = None,
 ) -> list[FrameRow]:
     """Return a row for every frame of the source, in the order in which they came: those of ``frames.csv``.
 
@@ -104,8 +103,6 @@ def frame_rows(
         Index and time of frames that the system was not given; they come where they belong.
     latencies_ms : sequence of float, optional
         Of the frames that were looked at, as the harness measured them; else the time of their steps.
-    verdict : Verdict, optional
-        That of `judge_run`: its reasons go into the frames that they are about.
     """
     in_main = set((trajectories_of(system).main if main is None else main).index.tolist())
     claims = {m: claims_of(submap) for m, submap in system.atlas.submaps.items()}
@@ -116,7 +113,6 @@ def frame_rows(
             in_main_map=system.numbers.index_of(row.index) in in_main,
             latency_ms=row.latency_ms if latencies_ms is None else latencies_ms[n],
             method=row.method if row.index in system.poses else None,
-            doubt="" if verdict is None else verdict.doubt_about(system.numbers.index_of(row.index)),
         )
         for n, row in enumerate(system.rows.values())
     ]

@@ -291,14 +291,15 @@ def _write_results(
 ) -> dict[str, Any]:
     """Write all that comes at the end of a run, and return the summary, which begins with what was given."""
     trajectories = trajectories_of(system)
-    verdict = judge_run(system, trajectories, len(report.dropped), crashed=report.bug is not None)
+    rows = frame_rows(system, trajectories.main, report.dropped, report.latencies_ms)
+    verdict = judge_run(system, trajectories, rows, crashed=report.bug is not None)
+    rows = [replace(row, doubt=verdict.doubt_about(row.index)) for row in rows]
     truth: Trajectory | None = getattr(sequence, "ground_truth", None)
     summary = (
         given
         | {"refined": refined_camera(system, "focal_search" in given)}
         | summarise(system, report, trajectories, config, truth, verdict)
     )
-    rows = frame_rows(system, trajectories.main, report.dropped, report.latencies_ms, verdict)
     folder.write(RunRecord(rows, trajectories.main, trajectories.unlinked, summary))
     if truth is not None and "no_errors" not in summary:
         folder.write_truth(truth_of_frames(truth, rows))

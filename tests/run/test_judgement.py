@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from dualslam.audit.photometric import MIN_SAMPLES, Sample
 from dualslam.audit.verdict import Level, ReasonCode, Verdict
+from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, Frame
 from dualslam.run.judgement import judge_run
 from dualslam.run.results import frame_rows, trajectories_of
@@ -30,7 +33,8 @@ def run(truth: dict[int, FloatArray], lost: tuple[int, ...] = (), interval_s: fl
 
 
 def judged(system: FakeSystem, dropped: int = 0) -> Verdict:
-    return judge_run(system, trajectories_of(system), dropped)  # type: ignore[arg-type]
+    late = [(N + i, (N + i) / 30) for i in range(dropped)]
+    return judge_run(system, trajectories_of(system), frame_rows(system, dropped=late))  # type: ignore[arg-type]
 
 
 def test_a_run_that_poses_all_is_good() -> None:
@@ -47,8 +51,6 @@ def test_a_jump_makes_a_run_doubtful_and_names_its_frames() -> None:
     (reason,) = verdict.reasons
     assert (reason.code, reason.first_frame, reason.last_frame) == (ReasonCode.JUMP, 119, 120)
     assert "frames 119 and 120" in reason.text
-    rows = frame_rows(system, verdict=verdict)  # type: ignore[arg-type]
-    assert [row.index for row in rows if row.doubt] == [119, 120]
 
 
 def test_maps_that_were_not_joined_make_a_run_usable() -> None:
@@ -106,3 +108,31 @@ def test_no_pose_is_doubtful() -> None:
     verdict = judged(run(ahead(), lost=tuple(range(N))))
     assert (verdict.level, verdict.reasons[0].code) == (Level.DOUBTFUL, ReasonCode.NO_MAP)
     assert (verdict.reasons[0].first_frame, verdict.reasons[0].last_frame) == (0, N - 1)
+
+
+def calibration(log_focal: float, sigma: float = 0.01) -> dict[str, float]:
+    return {"log_focal": log_focal, "log_focal_sigma": sigma}
+
+
+def test_parts_that_disagree_on_the_focal_length_make_a_run_usable() -> None:
+    system = run(ahead())
+    for log_focal in (0.0, -0.02):
+        system.events.add(EventKind.CALIBRATED, 60, 2.0, 0, **calibration(log_focal))
+    system.events.add(EventKind.CALIBRATION_KEPT, 90, 3.0, 0, reason="too little turning")
+    assert judged(system).level is Level.GOOD
+    system.events.add(EventKind.CALIBRATION_KEPT, 120, 4.0, 0, **calibration(0.12))
+    (reason,) = judged(system).reasons
+    assert (reason.code, reason.level) == (ReasonCode.CAMERA, Level.USABLE)
+    assert "-2 to +12 %" in reason.text
+
+
+def test_a_scale_that_is_not_handed_on_makes_a_run_usable() -> None:
+    system = run(ahead())
+    trajectories = trajectories_of(system)  # type: ignore[arg-type]
+    rows = [
+        replace(row, sigma_scale=float("inf") if 80 <= row.index < 90 else 0.2)
+        for row in frame_rows(system)  # type: ignore[arg-type]
+    ]
+    (reason,) = judge_run(system, trajectories, rows).reasons  # type: ignore[arg-type]
+    assert (reason.code, reason.level) == (ReasonCode.SCALE, Level.USABLE)
+    assert (reason.first_frame, reason.last_frame) == (80, 89)
