@@ -16,9 +16,9 @@ INTERVAL_S = 0.18
 """Between two samples: five a second at all usual rates of frames."""
 MIN_AGREEMENT = 0.25
 """Share of patches below which a sample disagrees. Maps that follow an occluder, or have lost their way in a turn, have
-0 to 0.21; right ones have 0.3 and more, but for single blurred frames."""
-MIN_SAMPLES = 4
-"""Disagreeing samples in a row that make a stretch: about 0.8 s. A single one may be blur, or somebody who passes."""
+0 to 0.26. In seven right runs 2 of 730 samples are below, for blur or a corner that hides what was seen."""
+MIN_SAMPLES = 3
+"""Disagreeing samples in a row that make a stretch, 0.4 s or more. In right runs no two followed each other."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ N_PATCHES = 120
 """Per keyframe: a share of them is known to within 0.05."""
 N_KEYFRAMES = 60
 """Keyframes whose patches are kept: 10 KB each."""
-MAX_AGE_S = 0.6
+MAX_AGE_S = 0.8
 """Of the keyframe that a frame is compared with, where there is such a one. Over longer times a camera in a hand sees
 surfaces from other sides, and walls hide others: of a right map's patches none may be left."""
 MIN_CONTRAST = 4.0

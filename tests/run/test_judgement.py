@@ -81,8 +81,8 @@ def test_a_stretch_that_disagrees_with_the_images_makes_a_run_doubtful_while_its
     verdict = judged(system)
     assert verdict.level is Level.DOUBTFUL
     (reason,) = verdict.reasons
-    assert (reason.code, reason.first_frame, reason.last_frame) == (ReasonCode.PHOTOMETRIC, 60, 78)
-    for i in range(60, 79):
+    assert (reason.code, reason.first_frame, reason.last_frame) == (ReasonCode.PHOTOMETRIC, 60, 72)
+    for i in range(60, 73):
         del system.poses[i]
     assert judged(system).level is not Level.DOUBTFUL
 
