@@ -8,6 +8,7 @@ from itertools import groupby
 
 import numpy as np
 
+from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import PatchCheck
 from dualslam.core.types import Track, View
 from dualslam.map.submap import Submap
@@ -60,11 +61,15 @@ class PhotometricAudit:
     Attributes
     ----------
     samples : list of Sample
+    repeated : set of int
+        Frames whose image is that of the frame before: the camera hung, or the video was made from fewer frames.
     """
 
     def __init__(self, patches: PatchCheck) -> None:
         self._patches = patches
         self.samples: list[Sample] = []
+        self.repeated: set[int] = set()
+        self._last_image: GreyImage | None = None
         self._last_s = float("-inf")
 
     def begin(self, submap: Submap, views: Iterable[View]) -> None:
@@ -75,6 +80,9 @@ class PhotometricAudit:
     def take(self, submap: Submap, track: Track) -> None:
         """Compare a posed frame if a sample is due, and keep its patches if it has become a keyframe."""
         view = track.view
+        if view.image is not None and self._last_image is not None and view.image.data == self._last_image.data:
+            self.repeated.add(view.index)
+        self._last_image = view.image
         if abs(view.timestamp_s - self._last_s) >= INTERVAL_S:
             agreement = self._patches.measure(submap, view, track.T_cam_submap)
             if agreement is not None:

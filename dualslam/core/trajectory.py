@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dualslam.core.types import FloatArray, IntArray
+from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 
 def _no_index() -> IntArray:
@@ -36,6 +36,10 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.timestamps_s)
+
+    def take(self, rows: BoolArray) -> Trajectory:
+        """Return some of the poses."""
+        return Trajectory(self.timestamps_s[rows], self.T_world_cam[rows], self.index[rows])
 
     def in_time_order(self) -> Trajectory:
         """Return the same poses, ascending in time (a run may have read its frames backwards)."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from dualslam.audit.photometric import MIN_SAMPLES, PhotometricAudit, Sample, Stretch, disagreeing_stretches
+from dualslam.core.grey_image import GreyImage
 from dualslam.core.types import Features, FloatArray, Track, View
 from dualslam.map.submap import Submap
 
@@ -58,3 +61,15 @@ def test_frames_are_sampled_by_their_times_and_doubt_is_there_while_they_disagre
     assert doubtful == list(range(72, 120)), "from the third sample that disagrees to the next that agrees"
     (stretch,) = disagreeing_stretches(audit.samples)
     assert (stretch.first, stretch.last) == (60, 114)
+
+
+def test_an_image_that_repeats_the_one_before_is_noted() -> None:
+    audit, submap = (
+        PhotometricAudit(Script(dict.fromkeys(range(9), None))),
+        Submap(0, np.eye(3), np.zeros(32, np.uint8)),
+    )
+    for i in range(9):
+        image = GreyImage.of(np.full((4, 4), 3 if 3 <= i < 6 else i + 10, np.uint8))
+        shown = track(i, rate_hz=30.0)
+        audit.take(submap, replace(shown, view=replace(shown.view, image=image)))
+    assert audit.repeated == {4, 5}

@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from dualslam.audit.photometric import MIN_SAMPLES, Sample
 from dualslam.audit.verdict import Level, ReasonCode, Verdict
+from dualslam.core.camera.corrected import LensCorrection, correct
+from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, Frame
 from dualslam.run.judgement import judge_run
@@ -110,20 +113,33 @@ def test_no_pose_is_doubtful() -> None:
     assert (verdict.reasons[0].first_frame, verdict.reasons[0].last_frame) == (0, N - 1)
 
 
-def calibration(log_focal: float, sigma: float = 0.01) -> dict[str, float]:
-    return {"log_focal": log_focal, "log_focal_sigma": sigma}
-
-
-def test_parts_that_disagree_on_the_focal_length_make_a_run_usable() -> None:
+@pytest.mark.parametrize(("log_focal", "level"), [(0.03, Level.GOOD), (0.41, Level.DOUBTFUL), (-0.2, Level.DOUBTFUL)])
+def test_a_focal_length_far_from_the_one_used_makes_a_run_doubtful(log_focal: float, level: Level) -> None:
     system = run(ahead())
-    for log_focal in (0.0, -0.02):
-        system.events.add(EventKind.CALIBRATED, 60, 2.0, 0, **calibration(log_focal))
-    system.events.add(EventKind.CALIBRATION_KEPT, 90, 3.0, 0, reason="too little turning")
+    estimates = [{"log_focal": -0.6, "log_focal_sigma": 0.2}, {"log_focal": log_focal, "log_focal_sigma": 0.004}]
+    for frame, estimate in zip((60, 90), estimates, strict=True):
+        system.events.add(EventKind.CALIBRATION_KEPT, frame, frame / 30, 0, reason="too far", **estimate)
+    system.events.add(EventKind.CALIBRATION_KEPT, 120, 4.0, 0, reason="too little turning")
+    verdict = judged(system)
+    assert verdict.level is level
+    assert [reason.code for reason in verdict.reasons] == [ReasonCode.CAMERA] * (level is Level.DOUBTFUL)
+
+
+def test_an_estimate_that_was_taken_over_is_no_doubt() -> None:
+    system = run(ahead())
+    system.camera = correct(PinholeCamera(640, 480, 450.0, 450.0, 319.5, 239.5), LensCorrection(log_focal=-0.2))
+    system.events.add(EventKind.CALIBRATED, 60, 2.0, 0, log_focal=-0.2, log_focal_sigma=0.004)
     assert judged(system).level is Level.GOOD
-    system.events.add(EventKind.CALIBRATION_KEPT, 120, 4.0, 0, **calibration(0.12))
-    (reason,) = judged(system).reasons
-    assert (reason.code, reason.level) == (ReasonCode.CAMERA, Level.USABLE)
-    assert "-2 to +12 %" in reason.text
+
+
+def test_a_camera_that_hung_has_not_jumped() -> None:
+    truth = ahead()
+    for i in range(80, 110):
+        truth[i] = truth[80]
+    system = run(truth)
+    assert judged(system).level is Level.DOUBTFUL
+    system.audit.repeated.update(range(81, 110))
+    assert judged(system).level is Level.GOOD
 
 
 def test_a_scale_that_is_not_handed_on_makes_a_run_usable() -> None:
