@@ -40,7 +40,6 @@ SHOWN = (
     EventKind.LINKED,
     EventKind.MERGED,
     EventKind.GAP_RELOCALISED,
-    EventKind.AUDITED,
     EventKind.CUT,
 )
 

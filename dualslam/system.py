@@ -112,7 +112,6 @@ class System:
             self._connections,
             config.recovery,
             self._state.front_ends,
-            config.audit.enabled,
         )
         self._calibrations = Calibrations(
             record, self.buffer, components.calibration, components.desk, components.new_graph, self._connections
@@ -344,7 +343,6 @@ class System:
             self._endings.roll_over(live, view)
         else:
             self._recoveries.retry(live.submap, view)
-            self._recoveries.audit_if_due(live.submap, view)
             self._places.note_keyframe(live, view)
 
     def _ask_shutter(self, live: VisualOdometry, view: View) -> None:

@@ -90,7 +90,6 @@ def walk_handlers(config: Config, camera: Camera, n_threads: int) -> Handlers:
     verifier = place_parts(config, frontend, camera).verifier
     return {
         JobKind.WALK: lambda job: recover_in_steps(job, parts),
-        JobKind.AUDIT: lambda job: recover_in_steps(job, parts),
         JobKind.FORESIGHT: parts.foresee,
         **atlas_handlers(atlas_solver(config)),
         **SCALE_HANDLERS,
@@ -120,7 +119,6 @@ def worker_desk(config: Config, camera: Camera, faults: FaultScript, watch: Walk
             JobKind.CALIBRATION,
             JobKind.LOOP,
             JobKind.WALK,
-            JobKind.AUDIT,
             JobKind.FORESIGHT,
         ),
         partial(walk_handlers, config, camera, n_threads),

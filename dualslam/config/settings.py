@@ -285,12 +285,10 @@ class LinkingConfig(StrictModel):
 
 
 class AuditConfig(StrictModel):
-    """Whether a map is asked, once it has matured, if it is right."""
+    """Whether a map is checked while it grows and when the run ends."""
 
     enabled: bool = True
-    """Whether the younger part of a map tracks in reverse over its start, confirms it or cuts it off (a walk over some
-    ten keyframes a map; off as well where recovery is, `recovery.enabled`), and whether a map is parted where it has
-    not handed its scale on."""
+    """Whether a map is split at keyframes across which its scale is lost."""
 
 
 class AtlasConfig(StrictModel):

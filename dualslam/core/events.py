@@ -32,7 +32,6 @@ class EventKind(StrEnum):
     LINK_REFUSED = "link_refused"
     FUSED = "fused"
     ABSORBED = "absorbed"
-    AUDITED = "audited"
     CUT = "cut"
     LOOP_CLOSED = "loop_closed"
     LOOP_REFUSED = "loop_refused"

@@ -16,7 +16,6 @@ from dualslam.core.types import Frame
 
 FRAMES_IN_EVENTS = (
     "agreeing_keyframes",
-    "before",
     "change_point",
     "first_view",
     "keyframe",
@@ -25,7 +24,6 @@ FRAMES_IN_EVENTS = (
     "onset",
     "other_frame",
     "other_keyframe",
-    "parted_until",
     "suspected_since",
     "torn",
 )

@@ -12,8 +12,6 @@ from dualslam.recovery.walk_news import WalkNews
 from dualslam.workers.jobs import Desk, JobKind
 
 Outcome = tuple[RecoveryJob, RecoveryResult | Failure]
-KINDS = (JobKind.WALK, JobKind.AUDIT)
-"""A recovery goes before an audit that waits."""
 
 
 class RecoveryExecutor(Protocol):
@@ -68,12 +66,12 @@ class DeskExecutor:
 
     def submit(self, job: RecoveryJob) -> None:
         """Hand the job to the desk."""
-        self.desk.submit(JobKind.AUDIT if job.is_audit else JobKind.WALK, job)
+        self.desk.submit(JobKind.WALK, job)
 
     def poll(self) -> list[Outcome]:
         """Return what has ended since the last call."""
-        return [(ended.work, ended.result) for kind in KINDS for ended in self.desk.poll(kind)]
+        return [(ended.work, ended.result) for ended in self.desk.poll(JobKind.WALK)]
 
     def finish(self) -> list[Outcome]:
         """Wait for what is under way, for so long and no longer."""
-        return [(ended.work, ended.result) for kind in KINDS for ended in self.desk.drain(kind)]
+        return [(ended.work, ended.result) for ended in self.desk.drain(JobKind.WALK)]

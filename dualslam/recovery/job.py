@@ -38,8 +38,6 @@ class RecoveryJob:
         The one that rectified them.
     camera_covariance : (5, 5) or None
         Of the correction that it has, if it was estimated.
-    is_audit : bool
-        Whether the submap is one without its start, which the walk is to be compared with (`recovery/audit.py`).
     tries : LinkTries
         What earlier walks have tried in vain.
     poses : tuple of FramePose
@@ -60,7 +58,6 @@ class RecoveryJob:
     own: tuple[View, ...]
     camera: Camera
     camera_covariance: FloatArray | None
-    is_audit: bool = False
     tries: LinkTries = field(default_factory=LinkTries)
     poses: tuple[FramePose, ...] = ()
     paths: dict[int, Path] = field(default_factory=dict)

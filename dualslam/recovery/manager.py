@@ -24,7 +24,6 @@ from dualslam.map.split import sound_copy
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 from dualslam.map.trajectory import Path
-from dualslam.recovery.audits import Audits
 from dualslam.recovery.bypass import absorb, n_frames, pose_frames
 from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
@@ -72,8 +71,6 @@ class Recoveries:
     config : RecoveryConfig
     front_ends : callable
         Gives those that go on, or may go on, in a submap of the atlas.
-    audits : bool
-        Whether the starts of maps are audited (`recovery/audit.py`).
     """
 
     def __init__(
@@ -86,7 +83,6 @@ class Recoveries:
         connections: Connections,
         config: RecoveryConfig,
         front_ends: Callable[[], Iterable[VisualOdometry]],
-        audits: bool = False,
     ) -> None:
         self._record = record
         self._buffer = buffer
@@ -102,7 +98,6 @@ class Recoveries:
         self._retries = RetrySchedule(config.retry_keyframes)
         self._outgrown_at: dict[int, int] = {}  # by the submap that has posed all frames of a lost one: how many
         self._tries = LinkTries()  # at linking lost submaps
-        self._audits = Audits(record, buffer, calibration, audits and config.enabled)
 
     @property
     def waiting(self) -> list[int]:
@@ -175,13 +170,6 @@ class Recoveries:
             del self._outgrown_at[submap_id]
         return outgrows
 
-    def audit_if_due(self, submap: Submap, now: FrameStamp) -> None:
-        """Track in reverse over the start of a map that has matured, as long as the buffer holds it: once a map."""
-        if submap.id in self._under_way or (job := self._audits.due(submap, now)) is None:
-            return
-        self._under_way[submap.id] = _UnderWay(time.perf_counter(), len(submap.keyframes), again=False)
-        self._executor.submit(job)
-
     def _submit(
         self, submap: Submap, newest: View, views: Iterable[View], onsets: dict[int, int], now: FrameStamp | None
     ) -> None:
@@ -234,9 +222,6 @@ class Recoveries:
     def _take(self, outcomes: list[Outcome], live: VisualOdometry | None, now: FrameStamp) -> None:
         for job, result in outcomes:
             walk = self._under_way.pop(job.submap.id)
-            if job.is_audit:
-                self._audits.take(job, result, now, partial(self._take_in, live=live, now=now, started_s=walk.began_s))
-                continue
             if isinstance(result, Failure):
                 self._failed(job, now, result, time.perf_counter() - walk.began_s)
             else:
@@ -325,11 +310,8 @@ class Recoveries:
 
     def _take_in(
         self, job: RecoveryJob, result: RecoveryResult, live: VisualOdometry | None, now: FrameStamp, started_s: float
-    ) -> bool:
-        """Merge a result into its submap, live or archived by now; solve it; pose frames and link maps by it.
-
-        Returns whether it could be solved.
-        """
+    ) -> None:
+        """Merge a result into its submap, live or archived by now; solve it; pose frames and link maps by it."""
         submap = self._record.atlas.submaps[job.submap.id]
         change = self._change_of_pixels(job, submap)
         merged = merge_recovery(submap, job.submap, result.submap, change)
@@ -341,7 +323,7 @@ class Recoveries:
         except SolverError as error:
             failure = Failure(FailureReason.SOLVER, str(error))
             self._failed(job, now, failure, time.perf_counter() - started_s)
-            return False
+            return
         before = submap.copy()
         submap.take_over(merged.submap)
         for front_end in self._front_ends():
@@ -374,7 +356,6 @@ class Recoveries:
             self._lost.pop(gone, None)
         if job.onsets and absorbed.outgrown_at is not None:
             self._outgrown_at[submap.id] = absorbed.outgrown_at
-        return True
 
     def _change_of_pixels(self, job: RecoveryJob, submap: Submap) -> Change | None:
         """Return what gives a walk the pixels of the camera that its submap has now; None where it is the same."""

@@ -151,5 +151,5 @@ def _part_off(record: Record, submap: Submap, rest: list[int], anchor: int, sigm
     part = submap_of(submap, len(record.atlas.submaps), rest)
     part_off(record, submap, part, anchor)
     frames = sorted(pose.index for pose in record.own_poses() if pose.submap_id == part.id)
-    told = {"reason": "scale_lost", "sigma_scale": sigma, "old_submap": part.id, "reposed": 0, "left": frames}
+    told = {"reason": "scale_lost", "sigma_scale": sigma, "old_submap": part.id, "left": frames}
     record.event(EventKind.CUT, now, submap.id, **told)

@@ -1,4 +1,4 @@
-"""What a run trusts: stretches that were audited, answers that were not believed, and what the map claims of itself."""
+"""What a run trusts: lost scales, answers that were not believed, and the map's own uncertainty."""
 
 from __future__ import annotations
 
@@ -26,12 +26,8 @@ _DOUBTS = {
 def trust_section(run: RunData) -> Markup:
     """Return the words, the table of verdicts, and the strips of what is claimed."""
     rows = [_row(event, *told) for event in run.events if (told := _told(event)) is not None]
-    words = (
-        "Once a map has matured it tracks in reverse over its own start, on points of its own: what agrees is "
-        "confirmed, what does not is cut off and posed again. Links, gaps and places that two answers explain alike "
-        "are not believed."
-    )
-    verdicts = cards(_HEADS, rows) if rows else tag("p", "Nothing was audited or doubted.", cls="empty")
+    words = "A map is split where it loses its scale. Links, gaps and places with two explanations are not believed."
+    verdicts = cards(_HEADS, rows) if rows else tag("p", "Nothing was doubted.", cls="empty")
     strips = (
         _strip(
             run,
@@ -52,14 +48,8 @@ def trust_section(run: RunData) -> Markup:
 def _told(event: dict[str, Any]) -> tuple[str, str] | None:
     """Return the question and its outcome, where an event is about trust."""
     kind, detail = event.get("event"), str(event.get("detail") or "")
-    if kind == "audited":
-        verdict = " ".join(filter(None, [str(event["verdict"]), detail and f"({detail})"]))
-        return "its start, by reverse tracking", verdict
     if kind == "cut":
-        left = len(event.get("left", ()))
-        if event.get("reason") == "scale_lost":
-            return "its scale", f"not handed on: parted off, {left} frames left without a pose in the main map"
-        return "its start was wrong", f"cut off; {event['reposed']} frames posed again, {left} left without"
+        return "its scale", f"lost: split off, {len(event['left'])} frames left without a pose in the main map"
     if kind == "failed" and event.get("reason") == "scale_lost":
         return "its scale", f"not handed on: parted ({detail})"
     if kind in ("failed", "link_refused", "loop_refused", "recovery_failed") and event.get("reason") in _DOUBTS:

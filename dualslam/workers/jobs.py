@@ -34,7 +34,6 @@ class JobKind(StrEnum):
     CALIBRATION = "calibration"
     LOOP = "loop search"
     WALK = "walk back"
-    AUDIT = "audit"
     FORESIGHT = "foresight"
 
 

@@ -50,8 +50,8 @@ def test_frames_within_a_part_of_an_event_are_told_too_and_marks_stay() -> None:
         "rejected": [{"submap": 1, "keyframe": 19, "other_keyframe": -1}],
         "factors": {"loop": 1020},
     }
-    cut = {"before": 1022, "left": [1020, 1021], "parted_until": None, "reposed": 3}
-    assert count.in_source(cut) == {"before": 18, "left": [20, 19], "parted_until": None, "reposed": 3}
+    cut = {"old_submap": 1, "left": [1020, 1021]}
+    assert count.in_source(cut) == {"old_submap": 1, "left": [20, 19]}
 
 
 GREY = np.zeros((4, 6), np.uint8)
