@@ -30,7 +30,7 @@ from scipy.sparse.csgraph import connected_components
 TOPS = ("dualslam", "frontends", "backend")
 APART = {"dualslam.lab", "dualslam.testing"}
 """Rooms that the package's sum leaves out: the failure lab and the support of tests."""
-_IN_DUALSLAM = "system health pace steps build map atlas recovery places calibration workers"
+_IN_DUALSLAM = "system audit health pace steps build map atlas recovery places calibration workers"
 ALGORITHM = {"frontends", "backend", *(f"dualslam.{name}" for name in _IN_DUALSLAM.split())}
 DOCUMENTS = ("docs", "README.md", "CONTRIBUTING.md", "CHANGELOG.md")
 WORDS = Path(__file__).resolve().parent / "words.txt"
