@@ -101,6 +101,14 @@ def test_only_a_reason_raises_a_limit_and_what_shrinks_lowers_it(
     assert len(lowered.raises) == len(budget.raises) - 1
 
 
+def test_of_two_limits_that_a_merge_has_kept_the_larger_holds(measured: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = measured / "budget.toml"
+    path.write_text("literals = 7\nliterals = 9\nliterals = 8\n[lines]\n'frontends' = 3\n'frontends' = 2\n")
+    budget = limits(measured, monkeypatch)
+    assert budget.limit("literals") == 9
+    assert budget.limit("lines.frontends") == 3
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [

@@ -87,7 +87,7 @@ def read(path: Path) -> Budget:
         With one sentence that names the file and what is wrong in it.
     """
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(_without_twins(path.read_text(encoding="utf-8")))
     except (OSError, tomllib.TOMLDecodeError) as error:
         raise SystemExit(f"{path} cannot be read: {error}") from error
     raises = []
@@ -113,6 +113,18 @@ def write(budget: Budget, path: Path) -> None:
     out += ["]", "", "[lines]"]
     out += [f'"{name.removeprefix("lines.")}" = {budget.limits[name]}' for name in rooms]
     path.write_text("\n".join(out) + "\n", encoding="utf-8")
+
+
+def _without_twins(text: str) -> str:
+    """Return a budget of which a merge has kept both sides of a limit: the larger one holds."""
+    lines: dict[str, str] = {}
+    for n, line in enumerate(text.splitlines()):
+        name, _, value = line.partition(" = ")
+        if not value.isdigit():
+            lines[str(n)] = line
+        elif name not in lines or int(value) > int(lines[name].partition(" = ")[2]):
+            lines[name] = line
+    return "\n".join(lines.values())
 
 
 def _numbers(path: Path, data: dict[str, Any]) -> dict[str, int]:

@@ -8,7 +8,7 @@ rooms that import each other, directly or through others.
 
 With `--budget` it compares the sizes of the package and its prose with the limits of a file. It exits with status 1,
 and one sentence for each, where any is exceeded. `--update` lowers the limits to the sizes of today; with `--why` it
-raises those that are exceeded, too.
+raises those that are exceeded instead.
 """
 
 from __future__ import annotations
@@ -75,8 +75,7 @@ def compare(sizes: dict[str, int], path: Path, update: bool = False, why: str | 
     """Compare sizes with a budget, update it on request, and return the exit status."""
     limits = budget.read(path)
     if update:
-        limits = limits.lowered(sizes)
-        limits = limits if why is None else limits.raised(sizes, why)
+        limits = limits.lowered(sizes) if why is None else limits.raised(sizes, why)
         budget.write(limits, path)
     exceeded = limits.excess(sizes)
     for name in exceeded:
