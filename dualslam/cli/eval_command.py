@@ -21,7 +21,7 @@ def execute(args: argparse.Namespace) -> int:
         raise InputError(f"{args.sequence} is live: it has no ground truth.")
     # No camera is asked for a score: a sequence without a calibration has times and true poses all the same.
     fov_degrees = None if args.sequence.startswith(SYNTHETIC) else ANY_FOV_DEG
-    sequence = open_source(args.sequence, fov_degrees=fov_degrees)
+    sequence = open_source(args.sequence, fov_degrees=fov_degrees, time_unit=args.time_unit)
     score = evaluate_run(args.run, sequence)  # type: ignore[arg-type]
     print(json.dumps(to_plain(score)) if args.json else score_text(score), flush=True)
     return 0

@@ -22,6 +22,7 @@ DICTIONARIES = (
     *("apriltag_36h11", "apriltag_25h9", "apriltag_16h5"),
     *("aruco_4x4", "aruco_5x5", "aruco_6x6", "aruco_original"),
 )
+TIME_UNITS = ("s", "ms", "us", "ns")
 MAX_PORT = 65535
 SHORTEST_M, LONGEST_M = 1e-6, 1e9
 """Of a known length: a mistyped exponent, and nothing that a camera could see, lies outside."""
@@ -151,6 +152,9 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
         help="field of view along the longer side of the images, without a calibration",
     )
     images.add_argument("--full-size", action="store_true", help="read images of more than 2048 pixels as they are")
+    clock = parser.add_argument_group("clock").add_mutually_exclusive_group()
+    clock.add_argument("--rate", metavar="HZ", type=_rate, help="frames a second, instead of the source's own times")
+    clock.add_argument("--time-unit", choices=TIME_UNITS, help="unit of the source's own times; by default seconds")
     saved = parser.add_argument_group("saved map")
     saved.add_argument(
         "--map", metavar="DIR", type=_path, help="run folder whose map this run finds its frames in, and extends"
@@ -185,6 +189,7 @@ def _add_eval(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument("run", metavar="RUN", type=_path, help="a run folder, or a trajectory in TUM format")
     parser.add_argument("sequence", metavar="SEQUENCE", type=_source, help="the sequence with its ground truth")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--time-unit", choices=TIME_UNITS, help="unit of the sequence's own times, as the run had it")
 
 
 def _add_compare(commands: argparse._SubParsersAction[_Parser]) -> None:
@@ -375,6 +380,16 @@ def _length(text: str) -> float:
         raise argparse.ArgumentTypeError(
             f"must be a length in metres above 0, {SHORTEST_M:g} to {LONGEST_M:g}, not {text!r}"
         )
+    return value
+
+
+def _rate(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.1 <= value <= 1e4:
+        raise argparse.ArgumentTypeError(f"must be a rate between 0.1 and 10000 Hz, not {text!r}")
     return value
 
 

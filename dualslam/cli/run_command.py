@@ -49,6 +49,8 @@ def _run(args: argparse.Namespace, config: Config) -> int:
         "stride": args.stride,
         "max_frames": args.max_frames,
         "reverse": args.reverse,
+        "rate_hz": args.rate,
+        "time_unit": args.time_unit,
         "max_side_px": None if args.full_size else MAX_SIDE_PX,
     }
     focal: FocalSearch | None = None

@@ -38,4 +38,5 @@ def open_recording(folder: Path, given: Given) -> Recording:
         camera=None if given.camera else read_calib_line(calib_path),
         ground_truth=read_tum(truth_path) if truth_path.exists() else None,
         calibration=str(calib_path),
+        clock=str(times_path),
     )

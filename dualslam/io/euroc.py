@@ -49,6 +49,7 @@ def open_recording(folder: Path, given: Given) -> Recording:
         camera=None if given.camera else camera_of_mapping(sensor, str(sensor_path)),
         ground_truth=truth,
         calibration=str(sensor_path),
+        clock=str(listing),
     )
 
 

@@ -11,7 +11,7 @@ from dualslam.core.types import FloatArray
 from dualslam.io.camera_files import read_calib_line
 from dualslam.io.images import IMAGE_SUFFIXES, ImageFiles, fill_gaps, list_images
 from dualslam.io.sequence import Given, Recording
-from dualslam.io.times import NOMINAL_RATE_HZ, check_count, read_times, resolve_times
+from dualslam.io.times import NOMINAL_RATE_HZ, check_count, read_times, resolve_times, times_in_names
 
 log = logging.getLogger(__name__)
 
@@ -26,12 +26,18 @@ def open_recording(folder: Path, given: Given) -> Recording:
     times_path, calib_path = folder / "times.txt", folder / "calib.txt"
     where = folder / "images" if (folder / "images").is_dir() else folder
     paths = list_images(where)
+    clock = ""
     if given.times is not None:
+        clock = "the given times" if not isinstance(given.times, str | Path) else str(given.times)
         timestamps_s = resolve_times(given.times, len(paths), where)
     elif times_path.exists():
+        clock = str(times_path)
         timestamps_s = read_times(times_path)
         paths = fill_gaps(paths, len(timestamps_s))
         check_count(len(timestamps_s), times_path, len(paths), where)
+    elif given.rate_hz is None and (named := times_in_names(paths)) is not None:
+        log.warning("%s: its images are named by their times, which are taken", where)
+        clock, timestamps_s = f"the names of the images in {where}", named
     else:
         timestamps_s = nominal_times(len(paths), given.rate_hz, times_path)
     return Recording(
@@ -40,6 +46,7 @@ def open_recording(folder: Path, given: Given) -> Recording:
         timestamps_s=timestamps_s,
         camera=None if given.camera or not calib_path.exists() else read_calib_line(calib_path),
         calibration=str(calib_path),
+        clock=clock,
     )
 
 

@@ -49,6 +49,7 @@ def open_recording(folder: Path, given: Given) -> Recording:
         camera=None if given.camera or P is None else _camera(P, images, name, str(calib_path)),
         ground_truth=_ground_truth(folder, timestamps_s, P),
         calibration=str(calib_path),
+        clock=str(times_path),
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from dualslam.core.camera.base import Camera
@@ -18,6 +19,7 @@ from dualslam.io.camera_build import make_camera
 from dualslam.io.camera_files import read_camera_file
 from dualslam.io.reduced import MAX_SIDE_PX, ReducedImages, reduced_camera, reduction
 from dualslam.io.sequence import Given, RecordedSequence, Recording, Selection, camera_of_size, image_size
+from dualslam.io.times import UNITS, epoch_unit, in_seconds
 from dualslam.io.trajectory_files import MAX_BEGIN_GAP_S
 from dualslam.io.video import WebcamSequence
 
@@ -54,6 +56,7 @@ def open_sequence(
     reverse: bool = False,
     times: str | Path | ArrayLike | None = None,
     rate_hz: float | None = None,
+    time_unit: str | None = None,
     grey: bool = True,
     max_side_px: int | None = MAX_SIDE_PX,
 ) -> RecordedSequence | WebcamSequence:
@@ -75,7 +78,9 @@ def open_sequence(
     times : path or array, optional
         Times to use instead of the source's own, for each of its images.
     rate_hz : float, optional
-        Frames a second of a plain folder without times.
+        Frames a second, instead of the source's own times.
+    time_unit : {"s", "ms", "us", "ns"}, optional
+        Of the source's own times. Where it is not given they must make the rate of a camera as seconds.
     grey : bool
         Decode to (H, W) grey; otherwise (H, W, 3) RGB.
     max_side_px : int or None
@@ -91,14 +96,17 @@ def open_sequence(
     if rate_hz is not None and not 0 < rate_hz < float("inf"):
         raise InputError(f"The frame rate is {rate_hz} Hz; it must be above zero.")
     selection = Selection(start, stride, max_frames, reverse)
+    if time_unit is not None and time_unit not in UNITS:
+        raise InputError(f"The unit of the times is {time_unit!r}; it must be one of {', '.join(UNITS)}.")
     given = Given(camera_file is not None or fov_degrees is not None, times, rate_hz)
     if video.is_live(source):
+        if time_unit is not None:
+            raise InputError(f"{source} is live and has times of its own; leave out the unit of the times.")
         name = str(source)
         device = int(name) if name.isdigit() else name
         of_file = None if camera_file is None else read_camera_file(camera_file)
         return video.open_webcam(device, of_file, fov_degrees, selection, given, grey)
-    recording = _open_recording(Path(str(source)), given)
-    _check_clock(recording)
+    recording = _with_clock(_open_recording(Path(str(source)), given), rate_hz, time_unit)
     camera, calibration = recording.camera, recording.calibration
     if camera_file is not None:
         calibration = str(camera_file)
@@ -134,16 +142,28 @@ def _open_recording(source: Path, given: Given) -> Recording:
     )
 
 
-def _check_clock(recording: Recording) -> None:
-    """Refuse ground truth that no frame could be held against at the end of a run."""
-    if recording.ground_truth is None:
-        return
-    begin_s, truth_s = recording.timestamps_s[0], recording.ground_truth.timestamps_s[0]
+def _with_clock(recording: Recording, rate_hz: float | None, unit: str | None) -> Recording:
+    """Return a recording with times in seconds; refuse ground truth that no frame could be held against."""
+    truth = recording.ground_truth
+    if rate_hz is not None:
+        if truth is not None:
+            log.warning("%s: its ground truth is left out, as its frames are timed by their rate", recording.name)
+        times_s = np.arange(len(recording.images)) / rate_hz
+        return replace(recording, timestamps_s=times_s, ground_truth=None)
+    if recording.clock or unit is not None:
+        times_s = in_seconds(recording.timestamps_s, recording.clock or recording.name, unit)
+        if truth is not None and (epoch := epoch_unit(truth.timestamps_s[0])) is not None:
+            truth = replace(truth, timestamps_s=truth.timestamps_s * UNITS[epoch])
+        recording = replace(recording, timestamps_s=times_s, ground_truth=truth)
+    if truth is None:
+        return recording
+    begin_s, truth_s = recording.timestamps_s[0], truth.timestamps_s[0]
     if abs(truth_s - begin_s) > MAX_BEGIN_GAP_S:
         raise InputError(
             f"{recording.name}: its frames begin at {begin_s:.1f} s and its ground truth at {truth_s:.1f} s, "
             "which are different clocks; give both in the same seconds, or take the ground truth away."
         )
+    return recording
 
 
 def _reduced(recording: Recording, camera: Camera, max_side_px: int | None) -> tuple[Recording, Camera]:

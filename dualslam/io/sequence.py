@@ -43,6 +43,8 @@ class Recording:
     exposure_s : (N,) float64 or None
     calibration : str
         Where the camera is from, for messages.
+    clock : str
+        Where the times are from, for messages; empty where they are sure to be seconds.
     """
 
     name: str
@@ -52,6 +54,7 @@ class Recording:
     ground_truth: Trajectory | None = None
     exposure_s: FloatArray | None = None
     calibration: str = ""
+    clock: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +68,7 @@ class Given:
     times : path, array or None
         A file of seconds, one a line, or the numbers.
     rate_hz : float or None
-        Frames a second of a source that has no times.
+        Frames a second of a source that has no times, or none that are right.
     """
 
     camera: bool = False

@@ -1,7 +1,8 @@
-"""Timestamps of the frames of a sequence: read, checked, or made up at a stated rate."""
+"""Timestamps of the frames of a sequence: read, checked, brought to seconds, or made up at a stated rate."""
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,17 @@ from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray
 from dualslam.io.trajectory_files import read_number_table
 
+log = logging.getLogger(__name__)
+
 NOMINAL_RATE_HZ = 30.0
-LATEST_S = 1e11
-"""Beyond the year 5000: such numbers are epoch times in milliseconds or smaller units."""
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+RATE_HZ = (0.5, 1000.0)
+"""Of a camera whose images overlap: slower, a walk moves metres between them; faster, no camera of images is."""
+LIKELY_HZ = (1.0, 500.0)
+"""By which a unit is recognised."""
+EPOCH_S = (1e9, 4.1e9)
+"""The years 2001 to 2099. In a smaller unit such times have 13 digits or more, which no other clock reaches soon."""
 
 
 def read_times(path: Path) -> FloatArray:
@@ -33,9 +42,6 @@ def checked_times(times_s: ArrayLike, where: str) -> FloatArray:
     if not np.isfinite(times).all():
         bad = int(np.argmin(np.isfinite(times)))
         raise InputError(f"{where}: time {bad + 1} is {times[bad]}; every frame needs a finite time in seconds.")
-    if len(times) and np.abs(times).max() > LATEST_S:
-        bad = int(np.argmax(np.abs(times)))
-        raise InputError(f"{where}: time {bad + 1} is {times[bad]:.0f}, which are no seconds; times are in seconds.")
     step = np.diff(times)
     if (step <= 0).any():
         bad = int(np.argmax(step <= 0)) + 1
@@ -44,6 +50,63 @@ def checked_times(times_s: ArrayLike, where: str) -> FloatArray:
             "times must increase from frame to frame."
         )
     return times
+
+
+def epoch_unit(time: float) -> str | None:
+    """Return the unit below seconds in which a number is a time of this century; None where it is none."""
+    return next((u for u in ("ms", "us", "ns") if EPOCH_S[0] < time * UNITS[u] < EPOCH_S[1]), None)
+
+
+def in_seconds(times: FloatArray, where: str, unit: str | None) -> FloatArray:
+    """Return times in seconds: of the stated unit, or of an epoch's; otherwise they must make a camera's rate.
+
+    Raises
+    ------
+    InputError
+        If their rate is none of a camera, with the unit that they seem to have; or if they count frames.
+    """
+    if unit is not None:
+        return times * UNITS[unit]
+    epoch = epoch_unit(float(times[0])) if len(times) else None
+    if epoch is not None:
+        log.warning("%s: its times are read as %s since 1970", where, UNIT_NAMES[epoch])
+        times = times * UNITS[epoch]
+    if len(times) < 3:
+        return times
+    steps = np.diff(times)
+    rate_hz = 1.0 / float(np.median(steps))
+    likely = [u for u in UNITS if u != "s" and LIKELY_HZ[0] <= rate_hz / UNITS[u] <= LIKELY_HZ[1]]
+    say = "give the rate of the frames (--rate HZ), or the unit of the times (--time-unit"
+    if not RATE_HZ[0] <= rate_hz <= RATE_HZ[1]:
+        seem = f", but {rate_hz / UNITS[likely[0]]:.3g} Hz as {UNIT_NAMES[likely[0]]}" if likely else ""
+        raise InputError(
+            f"{where}: its times are {1.0 / rate_hz:.3g} apart: {rate_hz:.3g} Hz as seconds{seem}; {say} "
+            f"{likely[0] if likely else 's'}{', or s if they are seconds' if likely else ' if they are seconds'})."
+        )
+    if (steps == 1.0).all() and float(times[0]).is_integer():
+        raise InputError(f"{where}: its times count frames ({times[0]:.0f}, {times[1]:.0f}, ...); {say} s).")
+    return times
+
+
+def times_in_names(paths: list[Path]) -> FloatArray | None:
+    """Return the epoch times, in seconds, by which images are named; None where the names are none.
+
+    Names are a whole number of milli-, micro- or nanoseconds, or seconds with a fraction.
+    """
+    found = []
+    for path in paths:
+        whole, _, fraction = path.stem.partition(".")
+        unit = epoch_unit(float(whole)) if whole.isdigit() and whole.isascii() else None
+        if unit is not None and not fraction:
+            per_second = round(1.0 / UNITS[unit])
+            # Whole numbers first: nanoseconds of an epoch time do not fit a float, its seconds fit to 0.2 microseconds.
+            found.append(int(whole) // per_second + int(whole) % per_second * UNITS[unit])
+        elif whole.isdigit() and fraction.isdigit() and EPOCH_S[0] < int(whole) < EPOCH_S[1]:
+            found.append(float(path.stem))
+        else:
+            return None
+    times = np.array(found)
+    return times if len(times) > 1 and (np.diff(times) > 0).all() else None
 
 
 def resolve_times(times: str | Path | ArrayLike, n_images: int, images: Path) -> FloatArray:

@@ -50,6 +50,7 @@ def open_recording(folder: Path, given: Given) -> Recording:
         ground_truth=_ground_truth(truth_path),
         exposure_s=exposure_s,
         calibration=str(camera_path),
+        clock=str(times_path),
     )
 
 

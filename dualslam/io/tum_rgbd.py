@@ -52,6 +52,7 @@ def open_recording(folder: Path, given: Given) -> Recording:
         camera=None if given.camera else _camera(folder),
         ground_truth=read_tum(truth_path) if truth_path.exists() else None,
         calibration="the benchmark's calibration",
+        clock=str(listing),
     )
 
 

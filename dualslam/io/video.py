@@ -297,8 +297,8 @@ def open_webcam(
         name, called = Path(source).name, source
     if selection.reverse:
         raise InputError(f"{called} is live and cannot be read in reverse.")
-    if given.times is not None:
-        raise InputError(f"{called} is live and has times of its own; leave out the file of times.")
+    if given.times is not None or given.rate_hz is not None:
+        raise InputError(f"{called} is live and has times of its own; leave out the file of times, or the rate.")
     if camera is None and fov_degrees is None:
         raise InputError(f"{called} has no calibration; give a camera file, or a field of view in degrees.")
 

@@ -24,6 +24,8 @@ import numpy as np
 from dualslam.core.types import View
 
 MB = 2**20
+SLOW_HZ = 5.0
+"""Half the rate of the slowest usual recording. A slower clock leaves as many frames as this rate: not a handful."""
 
 
 class FrameBuffer:
@@ -32,7 +34,7 @@ class FrameBuffer:
     Parameters
     ----------
     duration_s : float
-        Video time that is kept (the paper's k frames).
+        Video time that is kept (the paper's k frames); at least as many frames as `SLOW_HZ` gives in it.
     max_mb : float
         Hard bound on the memory of features and images, mebibytes, also while frozen.
 
@@ -82,11 +84,15 @@ class FrameBuffer:
         """Take the newest view in and, unless frozen, let go of those that are older than the buffer's duration."""
         self._views.append(view)
         self.nbytes += view.nbytes
-        while not self._frozen and self._age_s(self._views[0]) > self._duration_s:
+        while self._is_over_full():
             self.nbytes -= self._views.popleft().nbytes
         if self.nbytes > self._max_bytes:
             self._make_room()
         self.peak_bytes = max(self.peak_bytes, self.nbytes)
+
+    def _is_over_full(self) -> bool:
+        is_old = not self._frozen and self._age_s(self._views[0]) > self._duration_s
+        return is_old and len(self._views) > SLOW_HZ * self._duration_s
 
     def freeze(self) -> None:
         """Stop dropping old views: the newest one was lost, or there has been no map yet. K = k + k_r."""

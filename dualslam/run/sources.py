@@ -37,6 +37,8 @@ def open_source(
     stride: int = 1,
     max_frames: int | None = None,
     reverse: bool = False,
+    rate_hz: float | None = None,
+    time_unit: str | None = None,
     max_side_px: int | None = MAX_SIDE_PX,
 ) -> Sequence:
     """Open a source of frames.
@@ -50,6 +52,8 @@ def open_source(
         Calibration of a source that has none.
     start, stride, max_frames, reverse : optional
         Which frames, counted in the source.
+    rate_hz, time_unit : optional
+        Rate of the frames, or unit of their times (see `dualslam.io.open_sequence`).
     max_side_px : int or None
         Larger recorded images are read smaller, by a whole factor; None: never.
 
@@ -61,6 +65,8 @@ def open_source(
         world = WorldSequence(parse_world(source), Selection(start, stride, max_frames, reverse), source)
         if camera_file is not None or fov_degrees is not None:  # said last: another mistake matters more
             raise InputError(f"{source} has a camera of its own; leave out --camera and --fov.")
+        if rate_hz is not None or time_unit is not None:
+            raise InputError(f"{source} has a clock of its own; leave out --rate and --time-unit.")
         return world
     return open_sequence(
         source,
@@ -70,6 +76,8 @@ def open_source(
         stride=stride,
         max_frames=max_frames,
         reverse=reverse,
+        rate_hz=rate_hz,
+        time_unit=time_unit,
         max_side_px=max_side_px,
     )
 
@@ -92,7 +100,8 @@ def open_images_of_run(source: str | Path, size_px: tuple[int, int]) -> Recorded
         If it cannot be read, is live, or has images of another size.
     """
     has_camera = str(source).startswith(SYNTHETIC)  # recordings may have one, and that comes before a field of view
-    opened = open_source(source, fov_degrees=None if has_camera else ANY_FOV_DEG, max_side_px=max(size_px))
+    fov_degrees, unit = (None, None) if has_camera else (ANY_FOV_DEG, "s")  # times do not matter
+    opened = open_source(source, fov_degrees=fov_degrees, time_unit=unit, max_side_px=max(size_px))
     if not isinstance(opened, RecordedSequence | WorldSequence):
         raise InputError(f"{source} is live: its frames cannot be read again.")
     if opened.camera.size_px != size_px:

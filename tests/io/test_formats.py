@@ -63,6 +63,47 @@ def test_a_calibration_for_another_size_is_scaled(dataset: Path, tmp_path: Path,
             open_sequence(dataset, camera_file=path)
 
 
+@pytest.mark.parametrize(("unit", "per_second"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_times_of_another_unit_are_seconds(dataset: Path, unit: str, per_second: float) -> None:
+    """A stated unit; times since 1970, which can be no seconds, without one, with the truth's."""
+    wanted_s = open_sequence(dataset).frame_timestamps
+    (dataset / "times.txt").write_text("".join(f"{t * per_second:.0f}\n" for t in wanted_s))
+    np.testing.assert_allclose(open_sequence(dataset, time_unit=unit).frame_timestamps, wanted_s, atol=1e-3)
+    epoch_s = 1.7e9
+    (dataset / "times.txt").write_text("".join(f"{(t + epoch_s) * per_second:.0f}\n" for t in wanted_s))
+    truth = (dataset / "groundtruth_tum.txt").read_text().splitlines()[1:]
+    rows = [line.split(" ", 1) for line in truth]
+    (dataset / "groundtruth_tum.txt").write_text(
+        "".join(f"{(float(t) + epoch_s) * per_second:.0f} {rest}\n" for t, rest in rows)
+    )
+    sequence = open_sequence(dataset)
+    np.testing.assert_allclose(sequence.frame_timestamps - epoch_s, wanted_s, atol=1e-3)
+    np.testing.assert_allclose(sequence.ground_truth.timestamps_s, sequence.frame_timestamps, atol=1e-3)
+
+
+def test_counts_are_timed_by_the_rate(dataset: Path) -> None:
+    (dataset / "times.txt").write_text("0\n1\n2\n3\n4\n5\n")
+    sequence = open_sequence(dataset, rate_hz=20.0)
+    assert sequence.frame_timestamps.tolist() == [0.0, 0.05, 0.1, 0.15, 0.2, 0.25]
+    assert sequence.ground_truth is None, "its clock is another one"
+    assert open_sequence(dataset, time_unit="s", camera_file=None).frame_timestamps[5] == 5.0
+
+
+@pytest.mark.parametrize("stem", ["{ns}", "{us}", "{ms}", "{s}.{us_of_s:06d}"])
+def test_images_named_by_their_times(tmp_path: Path, stem: str) -> None:
+    """As EuRoC, TUM-VI and TUM RGB-D name them; a number of another size is a number."""
+    times_ns = [1_403_636_579_763_555_584 + i * 50_000_000 for i in range(N)]
+    for t in times_ns:
+        name = stem.format(ns=t, us=t // 1000, ms=t // 10**6, s=t // 10**9, us_of_s=t % 10**9 // 1000) + ".png"
+        for folder, its_name in ((tmp_path / "a", name), (tmp_path / "b", name[5:])):
+            folder.mkdir(exist_ok=True)
+            cv2.imwrite(str(folder / its_name), np.zeros((24, 32), np.uint8))
+    sequence = open_sequence(tmp_path / "a", fov_degrees=60)
+    assert sequence.rate_hz == pytest.approx(20.0, rel=0.03)
+    assert sequence.frame_timestamps[0] == pytest.approx(times_ns[0] * 1e-9, abs=1e-3)
+    assert open_sequence(tmp_path / "b", fov_degrees=60).frame_timestamps[0] == 0.0
+
+
 @pytest.mark.parametrize(("camera", "offset"), [(0, 0.0), (2, 1.0)])
 def test_kitti(make, tmp_path: Path, camera: int, offset: float) -> None:
     sequence = open_sequence(make["kitti"](tmp_path, camera))
@@ -155,7 +196,7 @@ def test_plain_folder_whose_times_and_calibration_stand_among_the_images(dataset
     assert loose.camera == whole.camera
     assert loose.frame_timestamps.tolist() == whole.frame_timestamps.tolist()
     assert open_sequence(dataset / "images", fov_degrees=90).camera.fx == pytest.approx(16.0)
-    assert open_sequence(dataset / "images", times=np.arange(6.0)).frame_timestamps[5] == 5.0
+    assert open_sequence(dataset / "images", times=np.arange(6.0) / 2).frame_timestamps[5] == 2.5
     (dataset / "images" / "times.txt").write_text("1\n2\n")
     with pytest.raises(InputError, match=r"times.txt has 2 times, but .* has 6 images"):
         open_sequence(dataset / "images")
