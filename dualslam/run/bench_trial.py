@@ -148,7 +148,15 @@ def _measure(trial: Trial, folder: Path, sequence: Sequence, outcome: Outcome) -
         record,
         end_point_error_m=end_point_error(on_true_clock, known) if trial.returns_to_start else None,
         links=_link_errors(outcome, known),
-        **compare(frames, main, submaps_of(rows, main.index), initialised_at, losses, trial.repeats_m),
+        **compare(
+            frames,
+            main,
+            submaps_of(rows, main.index),
+            initialised_at,
+            losses,
+            repeats_m=trial.repeats_m,
+            truth_breaks=trial.truth_breaks,
+        ),
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -69,6 +69,8 @@ class Trial:
         Strength or seconds of the corruption that differs from trial to trial.
     repeats_m : float or None
         Period of a world that repeats.
+    truth_breaks : list of [int, int]
+        First and last frames where the truth is wrong.
     """
 
     sequence: str
@@ -85,6 +87,7 @@ class Trial:
     timeout_s: float | None
     dose: float | None = None
     repeats_m: float | None = None
+    truth_breaks: list[list[int]] = field(default_factory=list)
 
     @property
     def key(self) -> str:
@@ -171,6 +174,7 @@ def _trial(
         timeout_s=spec.timeout_s,
         dose=None if dosed is None else dosed.dose(dose_share),
         repeats_m=sequence.repeats_m,
+        truth_breaks=[list(span) for span in sequence.truth_breaks],
     )
 
 

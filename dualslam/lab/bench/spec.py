@@ -55,6 +55,9 @@ class SequenceSpec(StrictModel):
     """The only half that runs it; null: both. For a recording that is too short to split."""
     repeats_m: float | None = Field(None, gt=0)
     """Period of a world that repeats: a part that is off by half of it is joined falsely."""
+    truth_breaks: tuple[tuple[int, int], ...] = ()
+    """First and last frame of the source where the truth itself is known to be wrong. There no stretch counts as broken,
+    and no join as false."""
 
     @model_validator(mode="after")
     def _check_start(self) -> Self:

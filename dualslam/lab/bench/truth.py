@@ -12,7 +12,7 @@ from dualslam.config.corruption import CAMERA_KINDS, CLOCK_KINDS, INTERNAL_KINDS
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.io.run_folder import FrameRow
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
-from dualslam.lab.audits.join_audit import JoinOutcome, audit_join
+from dualslam.lab.audits.join_audit import MAX_FRAMES, JoinOutcome, audit_join
 from dualslam.lab.audits.silent_breaks import MIN_SPREAD_M, MIN_STRETCH_POSES, STEP_S, STRETCH_S, judge_stretches
 from dualslam.lab.bench.record import Breakage, Join, JoinCause, Reason
 from dualslam.lab.metrics.trajectory_metrics import MIN_POSES
@@ -114,6 +114,7 @@ def compare(
     initialised_at: int | None,
     breakages: Iterable[Breakage] = (),
     repeats_m: float | None = None,
+    truth_breaks: Iterable[Sequence[int]] = (),
 ) -> dict[str, Any]:
     """Return the fields of a `TrialRecord` that the truth gives.
 
@@ -130,6 +131,9 @@ def compare(
         Losses; each is asked about its join.
     repeats_m : float, optional
         Period of a world that repeats.
+    truth_breaks : iterable of (int, int)
+        First and last frames of the source where the truth is known to be wrong: what touches them is not held against
+        the run.
     """
     order = np.argsort(main.index, kind="stable")
     posed = main.index[order]
@@ -146,15 +150,26 @@ def compare(
     T_est = main.T_world_cam[order][known]
     if len(index) < MIN_POSES or frames.is_still:
         return fields
-    fields |= _stretches(times_s - frames.times_s[0], T_est[:, :3, 3], T_true[:, :3, 3], frames.times_s)
+    untrue = np.zeros(len(index), bool)
+    for span in truth_breaks:
+        untrue |= (span[0] <= index) & (index <= span[1])
+    p, q = T_est[:, :3, 3], T_true[:, :3, 3]
+    fields |= _stretches(times_s - frames.times_s[0], p, q, frames.times_s, untrue)
     tolerance_m = None if repeats_m is None else repeats_m / 2.0
     fields["joins"] = tuple(
         Join(first, str(found.outcome), found.offset_m, found.scale_ratio, found.turn_deg, cause)
         for first, after, cause in _places(frames, index, submap[order][known], breakages)
         for found in [audit_join(index, T_est, T_true, first, after, tolerance_m)]
         if cause is not JoinCause.SEAM or found.outcome is not JoinOutcome.NOT_JOINED
+        if found.outcome is not JoinOutcome.WRONG or not _touches(index, untrue, first, after)
     )
     return fields
+
+
+def _touches(index: IntArray, untrue: BoolArray, first: int, after: int) -> bool:
+    """Return whether any frame that a join is judged by has a true pose that is known to be wrong."""
+    before, later = untrue[index < first][-MAX_FRAMES:], untrue[index >= after][:MAX_FRAMES]
+    return bool(before.any() or later.any())
 
 
 def _places(
@@ -170,16 +185,17 @@ def _places(
     return found
 
 
-def _stretches(at_s: FloatArray, p: FloatArray, q: FloatArray, frame_times_s: FloatArray) -> dict[str, Any]:
+def _stretches(
+    at_s: FloatArray, p: FloatArray, q: FloatArray, frame_times_s: FloatArray, untrue: BoolArray
+) -> dict[str, Any]:
     dt_s = float(np.median(np.diff(frame_times_s)))
     stretches = judge_stretches(at_s, p, q, dt_s)
     if stretches is None:
         return {"judged": 0}
     length, step = max(MIN_STRETCH_POSES, round(STRETCH_S / dt_s)), max(1, round(STEP_S / dt_s))
-    jumps = np.flatnonzero(_truth_jumps(at_s, p, q))
-    excepted = np.array(
-        [bool(((jumps >= k * step) & (jumps < k * step + length - 1)).any()) for k in range(len(stretches.first_s))]
-    )
+    jumps = np.append(_truth_jumps(at_s, p, q), False)
+    firsts = [k * step for k in range(len(stretches.first_s))]
+    excepted = np.array([jumps[k : k + length - 1].any() or untrue[k : k + length].any() for k in firsts], bool)
     broken = stretches.broken & ~excepted
     return {
         "judged": int(stretches.judged.sum()),

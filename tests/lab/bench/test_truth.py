@@ -121,6 +121,18 @@ def test_a_step_of_the_truth_alone_is_no_break() -> None:
     assert (found["broken"], found["excepted"]) == (3, 0)
 
 
+def test_what_touches_frames_of_wrong_truth_is_not_held_against_the_run() -> None:
+    main = estimate()
+    main.T_world_cam[120:, 0, 3] += 0.5
+    submap = np.repeat([0, 1], 120)
+    near, far = [[int(INDEX[110]), int(INDEX[130])]], [[int(INDEX[5]), int(INDEX[10])]]
+    found = compared(main, submap=submap, truth_breaks=near)
+    assert (found["broken"], found["joins"]) == (0, ())
+    assert found["excepted"] >= 3
+    found = compared(main, submap=submap, truth_breaks=far)
+    assert (found["broken"], found["excepted"], len(found["joins"])) == (3, 0, 1)
+
+
 def test_a_verdict_is_read_where_there_is_one() -> None:
     assert read_verdict({"frames": 3}) == {}
     reason = {"code": "steps", "text": "a step", "first_frame": 3, "last_frame": 9}
