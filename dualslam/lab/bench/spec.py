@@ -56,8 +56,8 @@ class SequenceSpec(StrictModel):
     repeats_m: float | None = Field(None, gt=0)
     """Period of a world that repeats: a part that is off by half of it is joined falsely."""
     truth_breaks: tuple[tuple[int, int], ...] = ()
-    """First and last frame of the source where the truth itself is known to be wrong. There no stretch counts as broken,
-    and no join as false."""
+    """First and last frames of the source where the truth is known to be wrong. There no stretch counts as broken, and
+    no join as false."""
 
     @model_validator(mode="after")
     def _check_start(self) -> Self:
