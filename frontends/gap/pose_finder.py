@@ -16,7 +16,7 @@ from dualslam.config.settings import Config
 from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
-from dualslam.core.geometry.projection import project_points, refine_pose
+from dualslam.core.geometry.projection import project_points
 from dualslam.core.support import find_lack_of_support, judge_track
 from dualslam.core.types import (
     Failure,
@@ -35,7 +35,7 @@ from dualslam.frontends.gap.consensus import CONFIRMING_SHARE, BeyondGap, are_no
 from dualslam.frontends.gap.relocalisation import GapPose, relocalise_across_gap
 from dualslam.frontends.gap.second_pose import find_other_poses, match_under, refuse_look_alike
 from dualslam.frontends.gap.uncertainty import SMALL_STEP
-from dualslam.frontends.tracking.resection import resect
+from dualslam.frontends.tracking.resection import estimate_pose
 from dualslam.frontends.tracking.tracker import GivenPose
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.map.submap import NO_LANDMARK
@@ -217,8 +217,9 @@ class PoseFinder:
         if len(rows) < minimum:
             return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(rows)} points of {self._frontend.name}")
         uv, sigma = features.uv_rect_px[rows], features.sigma_px[rows]
-        T = resect(self._submap.K, self._camera.size_px, uv, xyz, float(np.median(sigma)), self._config.seed)
-        found = refine_pose(self._submap.K, T, xyz, uv, sigma, min_inliers=minimum)
+        found = estimate_pose(
+            self._submap.K, self._camera.size_px, uv, xyz, sigma, self._config.seed, min_inliers=minimum
+        )
         if isinstance(found, Failure):
             return found
         chi2 = float(found.chi2[found.inliers].mean() / 2)

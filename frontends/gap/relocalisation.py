@@ -116,7 +116,7 @@ def _from_points(
     xyz, good = triangulate(known, K)
     if good.sum() < MIN_CONSENSUS:
         return None
-    return resect(K, size_px, uv_px[good], xyz[good], float(np.median(sigma_px[good])), seed)
+    return resect(K, size_px, uv_px[good], xyz[good], float(np.median(sigma_px[good])), seed).T_cam_w
 
 
 def _from_two_views(

@@ -142,7 +142,7 @@ def find_other_poses(
     uv, sigma = features.uv_rect_px[feature[rest]], features.sigma_px[feature[rest]]
     sigma_px = float(np.median(sigma))
     starts = [*_shifted(T_cam_w, xyz[point[rest]], uv, K, sigma_px)]
-    starts.append(resect(K, camera.size_px, uv, xyz[point[rest]], sigma_px, seed, max_iterations=HYPOTHESES))
+    starts.append(resect(K, camera.size_px, uv, xyz[point[rest]], sigma_px, seed, HYPOTHESES).T_cam_w)
     found: list[SecondPose] = []
     for T_start in starts:
         near = _within(T_start, xyz[point[rest]], uv, K, SAME_PX * sigma)

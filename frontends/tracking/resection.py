@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import poselib
 
-from dualslam.core.types import FloatArray
+from dualslam.core.geometry.projection import PoseEstimate, refine_pose
+from dualslam.core.types import BoolArray, Failure, FloatArray
+
+MIN_SAMPLE = 3
+"""Points that fix a pose."""
+
+
+class Resection(NamedTuple):
+    """A pose found by RANSAC, and the points that agree with it.
+
+    Attributes
+    ----------
+    T_cam_w : (4, 4) float64
+    inliers : (N,) bool
+    """
+
+    T_cam_w: FloatArray
+    inliers: BoolArray
 
 
 def poselib_camera(K: FloatArray, size_px: tuple[int, int]) -> dict[str, Any]:
@@ -24,8 +41,8 @@ def resect(
     sigma_px: float,
     seed: int,
     max_iterations: int = 1000,
-) -> FloatArray:
-    """RANSAC over the 3-point problem (PoseLib), a starting point for `refine_pose`.
+) -> Resection:
+    """RANSAC over the 3-point problem (PoseLib).
 
     Parameters
     ----------
@@ -41,8 +58,7 @@ def resect(
 
     Returns
     -------
-    (4, 4) float64
-        ``T_cam_w``.
+    Resection
     """
     camera = poselib_camera(K, size_px)
     options: dict[str, Any] = {
@@ -51,7 +67,52 @@ def resect(
         "min_iterations": 50,
         "seed": seed,
     }
-    pose, _ = poselib.estimate_absolute_pose(uv_px, xyz, camera, options, {})
+    pose, found = poselib.estimate_absolute_pose(uv_px, xyz, camera, options, {})
     T_cam_w = np.eye(4)
     T_cam_w[:3] = pose.Rt
-    return T_cam_w
+    return Resection(T_cam_w, np.array(found["inliers"], np.bool_))
+
+
+def estimate_pose(
+    K: FloatArray,
+    size_px: tuple[int, int],
+    uv_px: FloatArray,
+    xyz: FloatArray,
+    sigma_px: FloatArray,
+    seed: int,
+    *,
+    min_inliers: int = 6,
+    tolerance: float = 1e-4,
+    counted: BoolArray | None = None,
+) -> PoseEstimate | Failure:
+    """Estimate a pose without a guess: RANSAC, then a refinement that starts from its inliers.
+
+    Parameters
+    ----------
+    K, size_px, uv_px, xyz, seed
+        As for `resect`.
+    sigma_px : (N,) float64
+        Standard deviation of each pixel coordinate.
+    min_inliers, tolerance, counted
+        As for `refine_pose`; points that do not count are left out of RANSAC, too.
+
+    Returns
+    -------
+    PoseEstimate or Failure
+        As `refine_pose` returns it.
+    """
+    rows = np.arange(len(xyz)) if counted is None else np.flatnonzero(counted)
+    start = resect(K, size_px, uv_px[rows], xyz[rows], float(np.median(sigma_px)), seed)
+    consensus = np.zeros(len(xyz), np.bool_)
+    consensus[rows[start.inliers]] = True
+    return refine_pose(
+        K,
+        start.T_cam_w,
+        xyz,
+        uv_px,
+        sigma_px,
+        min_inliers=min_inliers,
+        tolerance=tolerance,
+        counted=counted,
+        consensus=consensus if consensus.sum() >= MIN_SAMPLE else None,
+    )

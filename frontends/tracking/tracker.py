@@ -14,7 +14,7 @@ from dualslam.config.settings import TrackingConfig
 from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_99
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.geometry.projection import project_points, refine_pose
+from dualslam.core.geometry.projection import PoseEstimate, project_points, refine_pose
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Track, View
 from dualslam.frontends.features.matching import FeatureGrid, match_projected
@@ -22,7 +22,7 @@ from dualslam.frontends.gates import MIN_CONSENSUS
 from dualslam.frontends.tracking.beyond_gap import refuse_lost_scale, refuse_second_pose
 from dualslam.frontends.tracking.local_map import LocalMap, Prediction, covering_keyframes, trusted
 from dualslam.frontends.tracking.motion import Motion
-from dualslam.frontends.tracking.resection import resect
+from dualslam.frontends.tracking.resection import estimate_pose
 from dualslam.map.submap import NO_LANDMARK, Submap
 
 LOCAL_RADIUS_PX = 4.0
@@ -274,10 +274,16 @@ class Tracker:
                 continue
             ids = submap.landmark_of[k][has_landmark[matches.index[:, 0]]]
             feature = matches.index[:, 1]
-            xyz, uv = submap.landmarks["xyz_mu"][ids], view.features.uv_rect_px[feature]
-            sigma_px = float(np.median(view.features.sigma_px[feature]))
-            T_cam_submap = resect(submap.K, self._camera.size_px, uv, xyz, sigma_px, self._seed)
-            found = self._refine(view, T_cam_submap, ids, xyz, feature)
+            estimate = estimate_pose(
+                submap.K,
+                self._camera.size_px,
+                view.features.uv_rect_px[feature],
+                submap.landmarks["xyz_mu"][ids],
+                view.features.sigma_px[feature],
+                self._seed,
+                tolerance=GUIDE_TOLERANCE,
+            )
+            found = self._by_feature(view, estimate, ids, feature)
             if found:
                 return found
             assert isinstance(found, Failure)
@@ -319,11 +325,17 @@ class Tracker:
             features.sigma_px[feature],
             tolerance=GUIDE_TOLERANCE,
         )
+        return self._by_feature(view, estimate, ids, feature)
+
+    def _by_feature(
+        self, view: View, estimate: PoseEstimate | Failure, ids: IntArray, feature: IntArray
+    ) -> tuple[FloatArray, IntArray] | Failure:
+        """Return a pose with the landmark of each feature; a failure where too few agree."""
         if isinstance(estimate, Failure):
             return estimate
-        if estimate.n_inliers < minimum:
+        if estimate.n_inliers < self._config.min_inliers:
             return Failure(FailureReason.TOO_FEW_INLIERS, f"{estimate.n_inliers} inliers of {len(ids)} matches")
-        landmark_ids = np.full(len(features), NO_LANDMARK, np.int64)
+        landmark_ids = np.full(len(view.features), NO_LANDMARK, np.int64)
         landmark_ids[feature[estimate.inliers]] = ids[estimate.inliers]
         return estimate.T_cam_w, landmark_ids
 

@@ -203,6 +203,7 @@ def refine_pose(
     chi2_gate: float = CHI2_95[2],
     tolerance: float = 1e-4,
     counted: BoolArray | None = None,
+    consensus: BoolArray | None = None,
 ) -> PoseEstimate | Failure:
     """Refine a camera pose against known points, with outliers.
 
@@ -235,6 +236,8 @@ def refine_pose(
         the length of the step in standard deviations of the pose.
     counted : (N,) bool, optional
         Points that the pose is estimated from; the others are only judged by it.
+    consensus : (N,) bool, optional
+        Points that agree with the starting pose. The first round uses these alone; by default it uses all points.
 
     Returns
     -------
@@ -248,7 +251,8 @@ def refine_pose(
     T = T_prior = np.array(T_cam_w, np.float64)
     chi2 = problem.evaluate(T)
     counted = np.ones(n, np.bool_) if counted is None else counted
-    inliers = np.isfinite(chi2)  # the first round trusts Huber alone
+    # Without a consensus the first round relies on Huber's weights. Where most matches are wrong these are not enough.
+    inliers = np.isfinite(chi2) if consensus is None else np.isfinite(chi2) & consensus
     n_steps = 0
     for _ in range(n_rounds):
         largest_gain = 0.0

@@ -19,7 +19,7 @@ from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like, parallax_deg
 from dualslam.frontends.tracking.local_map import LocalMap
 from dualslam.frontends.tracking.mapper import Mapper, spread_choice
-from dualslam.frontends.tracking.resection import resect
+from dualslam.frontends.tracking.resection import estimate_pose, resect
 from dualslam.frontends.tracking.tracker import GivenPose
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.map.submap import NO_LANDMARK, Submap
@@ -522,17 +522,35 @@ def test_what_the_image_shows_is_looked_for_to_its_rim(camera: Camera) -> None:
     assert np.array_equal(local.predict(np.eye(4), camera.K, camera, 1.2, 8).rows, shown)
 
 
-@pytest.mark.parametrize("share_wrong", [0.0, 0.5])
-def test_resection_needs_no_guess(share_wrong: float) -> None:
+def matches_of_a_cloud(n: int, share_wrong: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a pose, points and their pixels with half a pixel of noise; some of these belong to other points."""
     rng = np.random.default_rng(0)
-    xyz = cloud(300)
+    xyz = cloud(n)
     T_w_cam: FloatArray = path(2, np.array([0.5, 0.2, 0.3]), np.array([0.1, 0.2, 0.3]))[1]
     p = se3.act(se3.inverse(T_w_cam), xyz)
     uv = CAMERA.project(p) + 0.5 * rng.normal(size=(len(xyz), 2))
     wrong = rng.random(len(xyz)) < share_wrong
     uv[wrong] = rng.uniform([0, 0], SIZE_PX, (int(wrong.sum()), 2))
-    T_cam_w = resect(CAMERA.K, SIZE_PX, uv, xyz, 0.5, 0)
-    error = se3.log(T_cam_w @ T_w_cam)
+    return T_w_cam, xyz, uv
+
+
+@pytest.mark.parametrize("share_wrong", [0.0, 0.5])
+def test_resection_needs_no_guess(share_wrong: float) -> None:
+    T_w_cam, xyz, uv = matches_of_a_cloud(300, share_wrong)
+    found = resect(CAMERA.K, SIZE_PX, uv, xyz, 0.5, 0)
+    error = se3.log(found.T_cam_w @ T_w_cam)
     assert np.linalg.norm(error[3:]) < POSITION_M
     assert np.linalg.norm(error[:3]) < ROTATION_RAD
-    assert np.array_equal(T_cam_w, resect(CAMERA.K, SIZE_PX, uv, xyz, 0.5, 0))
+    assert np.array_equal(found.T_cam_w, resect(CAMERA.K, SIZE_PX, uv, xyz, 0.5, 0).T_cam_w)
+
+
+@pytest.mark.parametrize("share_wrong", [0.5, 0.7, 0.8])
+def test_a_pose_without_a_guess_is_refined_from_what_agrees(share_wrong: float) -> None:
+    """Huber's weights alone leave the right pose where most matches are wrong."""
+    T_w_cam, xyz, uv = matches_of_a_cloud(120, share_wrong)
+    found = estimate_pose(CAMERA.K, SIZE_PX, uv, xyz, np.full(len(xyz), 0.5), 0)
+    assert not isinstance(found, Failure)
+    error = se3.log(found.T_cam_w @ T_w_cam)
+    assert np.linalg.norm(error[3:]) < 3 * POSITION_M
+    assert np.linalg.norm(error[:3]) < 3 * ROTATION_RAD
+    assert found.n_inliers > 0.8 * (1 - share_wrong) * len(xyz)
