@@ -94,7 +94,6 @@ def bundle_adjust_arrays(
     poses, points = np.unique(p.kf[row]), np.flatnonzero(adjusted)
     T, xyz = p.T_submap_kf.copy(), p.xyz_mu.copy()
     cost = (0.0, 0.0)
-    iterations, converged = 0, True
     if len(row):
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         # Tight priors: equality constraints make an iteration ten times as long.
@@ -121,9 +120,8 @@ def bundle_adjust_arrays(
         T[poses[free]] = batch.T_submap_kf[free]
         xyz[points] = batch.xyz_mu
         cost = (batch.cost_before, batch.cost_after)
-        iterations, converged = batch.iterations, batch.iterations < max_iterations
     after = compute_residuals(p.K, T, p.kf, xyz[p.point], p.uv_px, p.sigma_px)
-    return BundleResult(T, xyz, adjusted, after.chi2, *cost, iterations, converged)
+    return BundleResult(T, xyz, adjusted, after.chi2, *cost)
 
 
 def bundle_adjust(

@@ -164,13 +164,12 @@ class IncrementalSolver:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BatchOptimum:
-    """What `optimise_batch` found: poses (K, 4, 4) and points (L, 3) of ascending ids, costs, iterations."""
+    """What `optimise_batch` found: poses (K, 4, 4) and points (L, 3) of ascending ids, and costs."""
 
     T_submap_kf: FloatArray
     xyz_mu: FloatArray
     cost_before: float
     cost_after: float
-    iterations: int
 
 
 def optimise_batch(
@@ -210,9 +209,9 @@ def optimise_batch(
             optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
             result = optimizer.optimize()
         T, xyz = convert.poses_of(result), convert.points_of(result)
-        after, iterations = float(optimizer.error()), int(optimizer.iterations())
+        after = float(optimizer.error())
     except GTSAM_ERRORS as error:
         raise SolverFailure.of(error) from error
     if not (np.isfinite(T).all() and np.isfinite(xyz).all()):
         raise SolverFailure("the batch estimate is not finite")
-    return BatchOptimum(T, xyz, before, after, iterations)
+    return BatchOptimum(T, xyz, before, after)

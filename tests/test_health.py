@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dualslam.config.settings import HealthConfig
-from dualslam.core.estimates import GraphEstimate, KeyframeReport, MappingReport
+from dualslam.core.estimates import GraphEstimate, KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, Features, Track, View
 from dualslam.health import HealthMonitor, count_signs
@@ -48,7 +48,7 @@ def watch(n: int, sick: dict[int, dict[str, Any]], lost_from: int | None = None,
 def keyframe(chi2: float = 0.5, solver_failed: bool = False) -> KeyframeReport:
     none = np.zeros(0, np.int64)
     estimate = GraphEstimate(none, np.zeros((0, 4, 4)), none, np.zeros((0, 3)), none, chi2, 1.0, solver_failed, 0.0)
-    return KeyframeReport(MappingReport(0, 0, 0, 0), estimate, estimate, None, solver_failed)
+    return KeyframeReport(estimate, estimate, solver_failed)
 
 
 def test_a_sudden_loss_is_suspected_from_its_first_frame_on() -> None:

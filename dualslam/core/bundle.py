@@ -71,9 +71,6 @@ class BundleResult:
         Squared whitened residual of each observation; infinite where its point is behind the camera.
     cost_before, cost_after : float
         Sum of the Huber losses.
-    iterations : int
-    converged : bool
-        Whether it stopped before its iterations were used up.
     """
 
     T_submap_kf: FloatArray
@@ -82,8 +79,6 @@ class BundleResult:
     chi2: FloatArray
     cost_before: float
     cost_after: float
-    iterations: int
-    converged: bool
 
 
 class BundleAdjuster(Protocol):

@@ -125,36 +125,22 @@ class PreferredCamera:
     T_preferred: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class MappingReport:
-    """What one keyframe added and removed."""
-
-    n_new: int
-    n_merged: int
-    n_culled: int
-    n_extended: int
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeReport:
     """What a keyframe did to the map and how its graph took it.
 
     Attributes
     ----------
-    mapping : MappingReport
     posed : GraphEstimate
         With the keyframe's matches alone, before anything was placed from its pose.
     grown : GraphEstimate, optional
         With what was then added; None where the graph takes it in later.
-    culled_keyframe : int, optional
     solver_failed : bool
         It threw and had to be made anew.
     """
 
-    mapping: MappingReport
     posed: GraphEstimate
     grown: GraphEstimate | None
-    culled_keyframe: int | None
     solver_failed: bool = False
 
     @property

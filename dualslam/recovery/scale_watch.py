@@ -89,7 +89,7 @@ def lost_from(config: LinkingConfig) -> float:
 class ScaleWatch:
     """Asks about each group of a live map's keyframes, once, when `BEHIND` have come after it.
 
-    What the map held when it was first seen is not tested: a start is audited, a link has gates of its own.
+    What the map held when it was first seen is not tested: a link has gates of its own.
 
     Parameters
     ----------

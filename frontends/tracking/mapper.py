@@ -9,7 +9,6 @@ import numpy as np
 from dualslam.config.settings import MappingConfig
 from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_95
-from dualslam.core.estimates import MappingReport
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose
@@ -87,7 +86,7 @@ class Mapper:
         feature = feature[kept]
         submap.add_observations(view.index, feature, track.landmark_ids[feature])
 
-    def grow(self, track: Track, apart: Set[int] = frozenset(), noise2: float = 1.0) -> MappingReport:
+    def grow(self, track: Track, apart: Set[int] = frozenset(), noise2: float = 1.0) -> None:
         """Grow the map about the keyframe that a tracked frame has become, from the poses as they are now.
 
         `apart`: keyframes across a gap, with which nothing new is triangulated. What few landmarks tie to each other
@@ -98,16 +97,15 @@ class Mapper:
         view = track.view
         self._gate_chi2 = CHI2_95[2] * min(noise2, 1.0)
         self._n_inserted += 1
-        n_culled = self._cull_young()
+        self._cull_young()
         neighbours = self._neighbours(view.index)
-        n_extended, n_merged = self._search_neighbour_landmarks(view.index, neighbours, track.landmark_ids)
+        self._search_neighbour_landmarks(view.index, neighbours, track.landmark_ids)
         # Features whose landmark was left out are no candidates for a new one.
         on_this_side = self._on_this_side(view.index, neighbours, apart)
         new = self._triangulate(view.index, on_this_side, candidates=track.landmark_ids == NO_LANDMARK)
         self._search_new_in_neighbours(new, neighbours)
         self._young.append((self._n_inserted, new))
         self._refresh_descriptions(view.index)
-        return MappingReport(len(new), n_merged, n_culled, n_extended)
 
     # --- steps
 
@@ -131,9 +129,9 @@ class Mapper:
         near = [k for k in self._submap.keyframes_near(keyframe_id) if k not in apart and k != keyframe_id]
         return near[:TRIANGULATE_AGAINST]
 
-    def _cull_young(self) -> int:
+    def _cull_young(self) -> None:
         """Cull landmarks on probation that tracking does not find, or that too few keyframes came to see."""
-        submap, kept, n_culled = self._submap, [], 0
+        submap, kept = self._submap, []
         for born, ids in self._young:
             ids = ids[submap.landmarks["alive"][ids]]
             age = self._n_inserted - born
@@ -143,20 +141,18 @@ class Mapper:
             if age >= 2:
                 bad |= submap.n_observations(ids) < MIN_OBSERVATIONS
             submap.remove_landmarks(ids[bad])
-            n_culled += int(bad.sum())
             if age < YOUNG_KEYFRAMES:
                 kept.append((born, ids[~bad]))
         self._young = kept
-        return n_culled
 
-    def _search_neighbour_landmarks(self, k: int, neighbours: list[int], tracked: IntArray) -> tuple[int, int]:
+    def _search_neighbour_landmarks(self, k: int, neighbours: list[int], tracked: IntArray) -> None:
         """Look for neighbours' landmarks that tracking missed: new observations, or duplicates to merge."""
         submap = self._submap
         others = submap.landmarks_of_keyframes(neighbours)
         local = LocalMap.of_landmarks(submap, others[~submap.mask_of(tracked)[others]])
-        return self._observe_in(k, local)
+        self._observe_in(k, local)
 
-    def _observe_in(self, k: int, local: LocalMap) -> tuple[int, int]:
+    def _observe_in(self, k: int, local: LocalMap) -> None:
         """Search landmarks in a keyframe; a free feature becomes an observation, a taken one a pair to merge."""
         submap, frontend = self._submap, self._frontend
         features = submap.keyframes[k].features
@@ -186,7 +182,6 @@ class Mapper:
             n_seen = submap.n_observations(np.stack([ids, there]))
             swap = n_seen[0] > n_seen[1]
             submap.merge_landmarks(np.where(swap, ids, there), np.where(swap, there, ids))
-        return int(free.sum()), len(ids)
 
     def _grid(self, k: int, features: Features) -> FeatureGrid:
         """Return the grid of a keyframe's features: neighbours are searched again and again."""

@@ -257,13 +257,13 @@ class VisualFrontEnd:
             self._withdraw(track.view.index)
             detail = f"the map contradicts {n_refused} of {len(matched)} matches of keyframe {track.view.index}"
             return Failure(FailureReason.CHI_SQUARE, detail, {"n_refused": float(n_refused)})
-        mapping = self._mapper.grow(track, self._apart, posed.noise2)
+        self._mapper.grow(track, self._apart, posed.noise2)
         grown = self._graph_step(rebuild)
         self._meet(track.view.index)
-        culled = self._cull_keyframe()
+        self._cull_keyframe()
         self._tracker.refresh()
         failed = posed.rebuilt or (grown is not None and grown.rebuilt and not rebuild)
-        return KeyframeReport(mapping, posed, grown, culled, failed)
+        return KeyframeReport(posed, grown, failed)
 
     def _pose(self, track: Track, n_matched: int, pose_is_given: bool) -> GraphEstimate:
         """Pose the new keyframe, and drop what contradicts it."""
@@ -347,7 +347,7 @@ class VisualFrontEnd:
             self._reference_id = keyframe_id
             self._path.append(keyframe_id)
 
-    def _cull_keyframe(self) -> int | None:
+    def _cull_keyframe(self) -> None:
         """Cull at most one keyframe that has become redundant; those of the gauge stay."""
         submap = self.submap
         ids = submap.landmark_of[self._reference_id]
@@ -359,7 +359,6 @@ class VisualFrontEnd:
             if culled in self._path:
                 self._path.remove(culled)
             submap.remove_keyframe(culled, self._reference_id)
-        return culled
 
 
 def _moved_features(before: Submap, after: Submap) -> list[int]:

@@ -32,7 +32,6 @@ def test_exact_pixels_lead_back_to_the_truth():
     assert r.max() < 1e-5
     truth = scene.xyz_true[feeder.point_of_landmark()]
     assert np.median(np.linalg.norm(result.xyz_mu - truth, axis=1)[result.adjusted]) < 1e-5
-    assert result.converged
     assert result.cost_after < 1e-4 < result.cost_before
     np.testing.assert_array_equal(result.T_submap_kf[:2], problem.T_submap_kf[:2])
 
@@ -76,7 +75,6 @@ def test_nothing_to_adjust():
     empty = replace(problem, kf=none, point=none, uv_px=np.zeros((0, 2)), sigma_px=np.zeros(0))
     result = bundle_adjust_arrays(empty)
     np.testing.assert_array_equal(result.T_submap_kf, problem.T_submap_kf)
-    assert result.converged
 
 
 def test_no_fixed_pose_is_borne():
