@@ -314,7 +314,7 @@ class System:
             return track
         state.lost = []
         self.buffer.thaw()
-        broken = state.leaps.judge(view, track.wide, state.record, live.submap)
+        broken = state.motion_watch.judge(view, track.wide, state.record, live.submap)
         if broken is not None:
             self._endings.break_at(live, view, broken.first, broken.failure)
             self._begin_anew()

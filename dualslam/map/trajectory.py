@@ -49,21 +49,31 @@ class Path:
     def of(cls, poses: Iterable[FramePose], submap: Submap) -> Path:
         """Return the path of frames that are posed in a submap, as if none had been found again."""
         by_index = sorted(poses, key=lambda pose: pose.index)
-        falls = len(by_index) > 1 and by_index[-1].timestamp_s < by_index[-2].timestamp_s
-        sign = -1.0 if falls else 1.0
-        ordered = sorted(by_index, key=lambda pose: sign * pose.timestamp_s)
-        T = [submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam) for pose in ordered]
-        return cls(
-            np.array([pose.index for pose in ordered], np.int64),
-            np.array([sign * pose.timestamp_s for pose in ordered], np.float64),
-            np.array(T, np.float64).reshape(-1, 4, 4),
-            np.zeros(len(ordered), bool),
-        )
+        times_s = np.array([pose.timestamp_s for pose in by_index], np.float64)
+        T = [submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam) for pose in by_index]
+        index = np.array([pose.index for pose in by_index], np.int64)
+        return cls.of_trajectory(Trajectory(times_s, np.array(T, np.float64).reshape(-1, 4, 4), index))
+
+    @classmethod
+    def of_trajectory(cls, trajectory: Trajectory) -> Path:
+        """Return the path of frames that are ordered by index, as if none had been found again."""
+        t = trajectory.timestamps_s
+        times_s = -t if len(t) > 1 and t[-1] < t[-2] else t
+        order = times_s.argsort(kind="stable")
+        return cls(trajectory.index[order], times_s[order], trajectory.T_world_cam[order], np.zeros(len(t), bool))
+
+    def __len__(self) -> int:
+        return len(self.times_s)
 
     @property
     def centres(self) -> FloatArray:
         """Where the camera was, (N, 3)."""
         return self.T_map_cam[:, :3, 3]
+
+    def way_between(self, i: int, j: int) -> float:
+        """Return the length of the way between two frames, given by their indices."""
+        rows = (self.index >= min(i, j)) & (self.index <= max(i, j))
+        return float(np.linalg.norm(np.diff(self.centres[rows], axis=0), axis=1).sum())
 
     def take(self, rows: BoolArray) -> Path:
         """Return the path of some of the frames."""

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.atlas import Atlas
 from dualslam.map.record import Record
-from dualslam.map.trajectory import compose
+from dualslam.map.trajectory import Path, compose
 from dualslam.places.sightings import SAME_WITHIN, same_pose, turn_between
 from dualslam.places.verification import PlaceMatch
-from dualslam.recovery.leaps import refuse_leaps
+from dualslam.recovery.motion import DRIFT, join_slack, refuse_seams
 
 MAX_DRIFT, MAX_DRIFT_DEG, MAX_DRIFT_LOG_SCALE = 0.5, 60.0, float(np.log(3.0))
 """What a map that was never lost between two places can have drifted at most: a share of the way, a turn, a scale. Half
@@ -97,17 +99,28 @@ def plausible(record: Record, match: PlaceMatch) -> PlaceMatch | Failure:
 
 
 def reachable(record: Record, match: PlaceMatch) -> PlaceMatch | Failure:
-    """Refuse to join two maps of this run where the camera cannot have come from the one to the other meanwhile."""
-    a, b = match.place[0], match.query[0]
-    known = compose(record.own_poses(), record.atlas, {a: np.eye(4)}).in_time_order()
-    both = compose(record.own_poses(), record.atlas, {a: np.eye(4), b: match.S_place_query}).in_time_order()
-    refused = refuse_leaps(
-        both.timestamps_s,
-        both.T_world_cam[:, :3, 3],
-        known.timestamps_s,
-        known.T_world_cam[:, :3, 3],
-        record.are_refound(known.index.tolist()),
-    )
+    """Refuse to join two maps of this run where the camera cannot have come from one to the other (`recovery/motion`).
+
+    The maps are joined with all that each is linked with. Between the place and the seam both may have drifted.
+    """
+    (a, k_a), (b, k_b) = match.place, match.query
+    atlas, S_a = record.atlas, dict[int, FloatArray]()
+    for m, S_a_m in ((a, np.eye(4)), (b, match.S_place_query)):
+        component = atlas.component_of(m)
+        S_world = atlas.S_world_submap(component)
+        S_a |= {other: S_a_m @ sim3.inverse(S_world[m]) @ S_world[other] for other in component}
+    path = Path.of_trajectory(compose(record.own_poses(), atlas, S_a))
+    path = replace(path, refound=record.are_refound(path.index.tolist()))
+    of_place = set(atlas.component_of(a))
+    is_old = np.array([record.poses[i].submap_id in of_place for i in path.index.tolist()], bool)
+    old, new = path.take(is_old), path.take(~is_old)
+
+    def slack(i: int, j: int) -> float:
+        at_old, at_new = (i, j) if i in old.index else (j, i)
+        way = old.way_between(k_a, at_old) + new.way_between(k_b, at_new)
+        return DRIFT * way + join_slack(match.S_place_query, match.covariance, new.centres[new.index == at_new][0])
+
+    refused = refuse_seams(old, new, slack)
     return match if refused is None else refused
 
 

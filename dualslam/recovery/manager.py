@@ -9,6 +9,8 @@ from functools import partial
 from itertools import takewhile
 from typing import Any
 
+import numpy as np
+
 from dualslam.calibration.lens import Calibration, rectified_where_possible
 from dualslam.config.settings import RecoveryConfig
 from dualslam.core.errors import SolverError
@@ -29,9 +31,9 @@ from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.fusion import fuse, gauge_at_overlap, note_refused
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
-from dualslam.recovery.leaps import refuse_leaps
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.merge import merge_recovery
+from dualslam.recovery.motion import join_slack, refuse_gaps, refuse_seams
 from dualslam.recovery.schedule import RetrySchedule, as_far_as_it_leads, way_to_gaps
 
 
@@ -232,7 +234,7 @@ class Recoveries:
                     result = replace(result, link=None)
             if walk.again and not job.onsets and not self._poses_any(result):
                 continue  # the last one for these frames; what it would add to the map is not worth a solution
-            if not isinstance(result, Failure) and (refused := self._refuse_leaps(result)) is not None:
+            if not isinstance(result, Failure) and (refused := self._refuse_motion(result)) is not None:
                 self._note_events(result)
                 if result.link is not None:
                     note_refused(self._record, result.link, job.submap.id, refused, now)
@@ -251,16 +253,34 @@ class Recoveries:
                 needs_camera = not isinstance(result, Failure) and result.needs_camera
                 self._retries.leave_open(job.submap.id, walk.n_live, job.camera, needs_camera)
 
-    def _refuse_leaps(self, result: RecoveryResult) -> Failure | None:
-        """Return why a link is not to be believed whose walk has leapt as the lost map's camera never moved."""
+    def _refuse_motion(self, result: RecoveryResult) -> Failure | None:
+        """Return why a link is not believed by which the camera would have moved as it never does.
+
+        Across the gaps that reverse tracking has crossed, and where the new map follows on the old one.
+        """
         if result.link is None:
             return None
-        new, known = result.submap, self._path_in(result.link.old_id)
+        link = result.link.estimate
+        path = self._path_of(result)
+        known = self._path_in(result.link.old_id).moved(sim3.inverse(link.S_old_new))
+        newest = int(link.agreeing_keyframes[-1])
+        old, new = known.take(known.index <= newest), path.take(path.index > newest)
+        # The test is made in the unit of the new map, in which the link moves the old one.
+        S_new_old, Ad = sim3.inverse(link.S_old_new), sim3.adjoint(link.S_old_new)
+        moved = Ad @ link.covariance @ Ad.T
+
+        def slack(i: int, j: int) -> float:
+            return join_slack(S_new_old, moved, known.centres[np.isin(known.index, (i, j))][0])
+
+        refused = refuse_gaps(path, known)
+        return refused if refused is not None else refuse_seams(old, new, slack)
+
+    def _path_of(self, result: RecoveryResult) -> Path:
+        """Return the path of what reverse tracking has posed, and of the frames that it set out from."""
         walked = {frame.pose.index: frame.pose for frame in result.frames}
-        own = [p for p in self._record.own_poses() if p.submap_id == new.id and p.index not in walked]
-        path = Path.of([*(p for p in own if p.keyframe_id in new.keyframes), *walked.values()], new)
-        scale = float(sim3.scale(result.link.estimate.S_old_new))
-        return refuse_leaps(path.times_s, path.centres, known.times_s, known.centres / scale, known.refound)
+        own = [p for p in self._record.own_poses() if p.submap_id == result.submap.id and p.index not in walked]
+        own = [pose for pose in own if pose.keyframe_id in result.submap.keyframes]
+        return Path.of([*own, *walked.values()], result.submap)
 
     def _note_events(self, result: RecoveryResult) -> None:
         """Take over the events of a walk's attempts; each attempt says what was known of the loss, too."""

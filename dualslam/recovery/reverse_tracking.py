@@ -29,9 +29,9 @@ from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose, Path
 from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult, refusal_data
-from dualslam.recovery.leaps import WINDOW_FRAMES
 from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.linking import NO_BEND, Bend, LinkEstimate
+from dualslam.recovery.motion import WINDOW_FRAMES
 from dualslam.recovery.progress import Progress
 from dualslam.recovery.relinker import Linker, LinkTry, Relinker
 from dualslam.recovery.rivals import choose_by_velocity

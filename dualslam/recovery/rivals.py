@@ -1,23 +1,22 @@
 """Which of several poses beyond a gap, all of which the images allow, is one that the camera can have come to.
 
 What repeats itself leaves poses for many places, a period apart. The velocities before and after the gap, each known in
-its own map, tell how far off each of them is, as for any leap (`recovery/leaps.py`); and only where they leave no doubt
-is one of them believed.
+its own map, tell how far off each of them is, as in any motion test (`recovery/motion.py`). One of them
+is believed only where they leave no doubt.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
 from scipy.spatial.distance import pdist
 
-from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, FloatArray, Rival
 from dualslam.map.trajectory import Path
-from dualslam.recovery.leaps import ALLOWED, Leap, gaps_of, leap_by_other, leap_refusal
+from dualslam.recovery.motion import Motion, gaps_of, measure_motion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,31 +64,32 @@ def choose_by_velocity(walked: Path, known: Path, rivals: Sequence[Rival]) -> Ch
         measured = _measure(walked, known, beside)
         if measured is None:
             return Choice(Failure(FailureReason.LOOK_ALIKE, "beyond the gap several poses are alike"))
-        leaps, places = measured
-        own = leaps[0]
-        told = min(range(len(leaps)), key=lambda n: leaps[n].off_mu)
-        others = [leap for n, leap in enumerate(leaps) if n != told]
-        reach_mu = leaps[told].off_mu + ALLOWED * leaps[told].usual_mu
-        if not all(leap.is_refused for leap in others) or not reach_mu < pdist(places).min():
+        motions, places = measured
+        own = motions[0]
+        told = min(range(len(motions)), key=lambda n: motions[n].off_mu)
+        others = [motion for n, motion in enumerate(motions) if n != told]
+        reach_mu = motions[told].off_mu + motions[told].allowed_mu
+        if not all(motion.is_refused for motion in others) or not reach_mu < pdist(places).min():
             return _nothing_told(own)
         n_frames += 1
         if told > 0:
             better.append(beside[told - 1])
-            refusal = leap_refusal(own)
+            refusal = own.refusal
     if 0 < len(better) < n_frames:
         return _nothing_told(own)
     return Choice(refusal, tuple(better))
 
 
-def _nothing_told(own: Leap) -> Choice:
+def _nothing_told(own: Motion) -> Choice:
     detail = "beyond the gap several poses are alike, and velocities do not tell which the camera has come to"
-    return Choice(Failure(FailureReason.LOOK_ALIKE, detail, own.numbers))
+    return Choice(Failure(FailureReason.LOOK_ALIKE, detail, own.refusal.numbers))
 
 
-def _measure(walked: Path, known: Path, rivals: Sequence[Rival]) -> tuple[list[Leap], FloatArray] | None:
-    """Measure the leap over the gap that a frame lies beyond: as the walk has it, and as each rival of that frame.
+def _measure(walked: Path, known: Path, rivals: Sequence[Rival]) -> tuple[list[Motion], FloatArray] | None:
+    """Measure the motion across the gap behind a frame: under the walk's pose, and under each rival of that frame.
 
-    Returns these leaps, and where the last frame before the gap is by each (N, 3); None where nothing can be measured.
+    Returns these motions, and the place of the last frame before the gap by each (N, 3); None without a velocity on
+    both sides.
     """
     gaps = [i for i in gaps_of(walked.times_s).tolist() if walked.index[i] >= rivals[0].index]
     if not gaps:
@@ -97,12 +97,12 @@ def _measure(walked: Path, known: Path, rivals: Sequence[Rival]) -> tuple[list[L
     after_s = walked.times_s[gaps[0] + 1]
     path = known.take(known.times_s < after_s).then(walked)
     n_beyond = int(np.searchsorted(path.times_s, after_s))
-    leaps, places = [], []
+    motions, places = [], []
     for T_moves in (np.eye(4), *(rival.T_rival_walked for rival in rivals)):
-        centres = np.concatenate([se3.act(T_moves, path.centres[:n_beyond]), path.centres[n_beyond:]])
-        leap = leap_by_other(path.times_s, centres, n_beyond - 1, known.times_s, known.centres, known.refound)
-        if leap is None:
+        T = np.concatenate([T_moves @ path.T_map_cam[:n_beyond], path.T_map_cam[n_beyond:]])
+        motion = measure_motion(replace(path, T_map_cam=T), n_beyond - 1, known) if n_beyond else None
+        if motion is None or motion.n_sides < 2:
             return None
-        leaps.append(leap)
-        places.append(centres[n_beyond - 1])
-    return leaps, np.array(places)
+        motions.append(motion)
+        places.append(T[n_beyond - 1, :3, 3])
+    return motions, np.array(places)

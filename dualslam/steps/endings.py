@@ -87,7 +87,7 @@ class Endings:
             **failure.numbers,
         )
         self.archive(live, "track lost")
-        state.leaps.end()
+        state.motion_watch.end()
         self._recoveries.declare_lost(live.submap.id, onset, str(failure.reason), lost[0].index)
         state.live = None
         state.begin_health()
@@ -147,7 +147,7 @@ class Endings:
         record.event(EventKind.REINITIALISED, view, submap.id, first_view=loss.first, n_points=float(n))
         state.live = state.parts.new_odometry(submap, graph)
         state.live.start_at(view.index)
-        state.leaps.end()
+        state.motion_watch.end()
         self._recoveries.declare_lost(old.id, loss.since, str(FailureReason.SCALE_LOST), loss.first)
         first = next((buffered for buffered in state.buffer if buffered.index == loss.first), None)
         if first is not None:

@@ -134,7 +134,7 @@ class Starting:
 
     def _go_on(self, submap: Submap, since: View) -> None:
         """Go on in a submap that was found again, and doubt it until the camera's velocity has agreed."""
-        self._state.leaps.begin(since)
+        self._state.motion_watch.begin(since)
         self._recoveries.found_again(submap)
         self._state.buffer.thaw()
 

@@ -13,7 +13,7 @@ from dualslam.io.map_store import StoredMap
 from dualslam.map.record import Record
 from dualslam.pace import Pace
 from dualslam.recovery.frame_buffer import FrameBuffer
-from dualslam.recovery.leaps import LeapWatch
+from dualslam.recovery.motion_watch import MotionWatch
 from dualslam.recovery.relocaliser import Relocaliser
 from dualslam.steps.components import Components
 
@@ -37,7 +37,7 @@ class State:
         Looks for the map that was lost last.
     health : HealthMonitor
         Of the tracking in the live map, or of the attempts at one.
-    leaps : LeapWatch
+    motion_watch : MotionWatch
     audit : PhotometricAudit
     live : VisualOdometry or None
         The front end of the live submap; None while there is no map.
@@ -55,7 +55,7 @@ class State:
     health: HealthMonitor
     audit: PhotometricAudit
     pace: Pace = field(default_factory=Pace)
-    leaps: LeapWatch = field(default_factory=LeapWatch)
+    motion_watch: MotionWatch = field(default_factory=MotionWatch)
     live: VisualOdometry | None = None
     lost: list[View] = field(default_factory=list)
 

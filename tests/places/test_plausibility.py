@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import Failure, FailureReason, FloatArray
+from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
 from dualslam.map.atlas import Link, LinkKind
+from dualslam.map.frame_records import FrameRow
 from dualslam.map.record import Record
+from dualslam.map.trajectory import FramePose
 from dualslam.places.plausibility import agree, contradict, plausible
 from dualslam.places.verification import PlaceMatch
 from dualslam.testing.graph_scene import guessed_submap, make_scene
+from tests.recovery.test_motion import way
 
 N = 12
 STEP = 0.12
@@ -92,3 +97,22 @@ def test_matches_agree_where_they_put_the_keyframe_at_one_place_of_one_map() -> 
     assert agree(record.atlas, here, match((0, 1), (1, N - 1), aside(S_0_1, 0.001)))
     assert not agree(record.atlas, here, match((0, 1), (1, N - 1), aside(S_0_1, 1.0)))
     assert not agree(record.atlas, here, match((1, 0), (1, N - 1), S_0_1)), "of another map"
+
+
+@pytest.mark.parametrize("unit", [0.3, 1.0, 4.0])
+@pytest.mark.parametrize(("floors", "refused"), [(0.0, False), (1.0, True)])
+def test_two_maps_whose_frames_follow_on_each_other_are_joined_where_the_camera_can_have_moved_so(
+    unit: float, floors: float, refused: bool
+) -> None:
+    """Down a staircase: from frame 60 on, the second map shows what the first one has shown a floor above."""
+    record, S_0_1 = two_units(unit)
+    record.atlas.links.clear()
+    times_s, centres = way(120, 5, sway_m=0.01)
+    for i, (time_s, centre) in enumerate(zip(times_s, centres, strict=True)):
+        T_0_cam, m = se3.from_parts(np.eye(3), centre), int(i >= 60)
+        T_m_cam = sim3.act_on_pose(sim3.inverse(S_0_1) if m else np.eye(4), T_0_cam)
+        T_kf_cam = se3.inverse(record.atlas.submaps[m].T_submap_kf[0]) @ T_m_cam
+        record.poses[i] = FramePose(i, float(time_s), m, 0, T_kf_cam)
+        record.rows[i] = FrameRow(i, float(time_s), FrameStatus.TRACKED, m)
+    seen = replace(match((0, 8), (1, 11), aside(S_0_1, 2.0 * floors)), covariance=1e-6 * np.eye(7))
+    assert isinstance(plausible(record, seen), Failure) is refused

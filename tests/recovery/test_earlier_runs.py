@@ -20,11 +20,11 @@ from dualslam.places.plausibility import reachable
 from dualslam.recovery.bypass import drop_corrupted
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.job import RecoveryJob
-from dualslam.recovery.leaps import LeapWatch
 from dualslam.recovery.manager import Recoveries
+from dualslam.recovery.motion_watch import MotionWatch
 from dualslam.testing.graph_scene import guessed_submap, make_scene
 from dualslam.testing.point_world import CAMERA, random_features
-from tests.recovery.test_leaps import RATE_HZ, way
+from tests.recovery.test_motion import RATE_HZ, way
 
 N_EARLIER, FIRST = 80, 1000
 
@@ -58,7 +58,7 @@ def test_what_an_earlier_run_saw_at_this_time_of_its_clock_makes_no_leap(earlier
     if not earlier:
         enter(record, range(N_EARLIER))
     times_s, places = way(20, 3)
-    now, watch, said = range(FIRST, FIRST + 20), LeapWatch(), []
+    now, watch, said = range(FIRST, FIRST + 20), MotionWatch(), []
     watch.begin(View(FIRST, 4.5, random_features(np.random.default_rng(0), 1)))
     for n, i in enumerate(now):
         pose_frames(record, range(i, i + 1), 4.5 + times_s[n : n + 1], places[n : n + 1] - [5, 0, 0], 0)
@@ -80,7 +80,7 @@ def test_a_map_of_this_run_may_show_what_an_earlier_one_saw_moments_before_by_it
     enter(record, now, 1)
     if not earlier:
         enter(record, range(N_EARLIER))
-    match = Fake(place=(0, 3), query=(1, 3), S_place_query=np.eye(4))
+    match = Fake(place=(0, 3), query=(1, 3), S_place_query=np.eye(4), covariance=np.zeros((7, 7)))
     answer: object = reachable(record, match)  # type: ignore[arg-type]
     if earlier:
         assert answer is match

@@ -270,7 +270,7 @@ def test_the_lost_map_has_been_found_again_meanwhile(world: PointWorld, again: b
 
 def test_a_link_that_leaps_must_hold_anew(world: PointWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     leap = Failure(FailureReason.LEAP, "a leap 9 times further off than velocities lead elsewhere")
-    monkeypatch.setattr("dualslam.recovery.manager.refuse_leaps", lambda *_: leap)
+    monkeypatch.setattr("dualslam.recovery.manager.refuse_gaps", lambda *_: leap)
     monkeypatch.setattr("dualslam.recovery.link_tries.tightened", lambda *_: 0.0)  # sure as it may be, it holds twice
     system, frames = late_system(world, 12), iter(world.frames())
     tries = system._recoveries._tries
@@ -283,7 +283,7 @@ def test_a_link_that_leaps_must_hold_anew(world: PointWorld, monkeypatch: pytest
 
 def test_a_link_that_leaps_is_tried_again_as_its_map_grows(world: PointWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     leaps = [Failure(FailureReason.LEAP, "a leap 9 times further off than velocities lead elsewhere")]
-    monkeypatch.setattr("dualslam.recovery.manager.refuse_leaps", lambda *_: leaps.pop() if leaps else None)
+    monkeypatch.setattr("dualslam.recovery.manager.refuse_gaps", lambda *_: leaps.pop() if leaps else None)
     system = late_system(world, 1, recovery={"enabled": True, "retry_keyframes": [4]})
     for frame in world.frames():
         system.step(frame)

@@ -9,7 +9,7 @@ from dualslam.core.types import FailureReason, FloatArray, Rival
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose, Path
 from dualslam.recovery.rivals import choose_by_velocity
-from tests.recovery.test_leaps import RATE_HZ, way, without
+from tests.recovery.test_motion import RATE_HZ, way, without
 
 PERIOD_M = 1.5
 KNOWN = slice(0, 110)

@@ -105,6 +105,12 @@ def adjoint(S: ArrayLike) -> FloatArray:
     return Ad
 
 
+def displacement(point: ArrayLike) -> FloatArray:
+    """Return the derivative of ``exp(xi) @ point`` by xi at zero, (3,) -> (3, 7)."""
+    p = np.asarray(point, np.float64)
+    return np.column_stack([-so3.hat(p), np.eye(3), p])
+
+
 def left_jacobian(xi: ArrayLike) -> FloatArray:
     """Return J with ``exp(xi + d) ~= exp(J d) exp(xi)``, (..., 7) -> (..., 7, 7).
 

@@ -19,7 +19,7 @@ from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, Recove
 from dualslam.recovery.manager import Recoveries, _UnderWay
 from dualslam.testing.point_world import CAMERA
 from tests.recovery.test_earlier_runs import book, enter, pose_frames
-from tests.recovery.test_leaps import way, without
+from tests.recovery.test_motion import way, without
 
 FIRST = 1000
 FOUND_AFTER = 80  # frames of the lost map that the new one has not seen
@@ -42,7 +42,8 @@ def walk(unit: float, off: FloatArray, seed: int) -> tuple[Record, Recoveries, R
         T = np.eye(4)
         T[:3, 3] = centre
         frames.append(RecoveredFrame(FramePose(FIRST + FOUND_AFTER + i, float(time_s), 1, 0, T), 90, 80))
-    link = FoundLink(0, Fake(S_old_new=sim3.from_parts(unit, np.eye(3), np.zeros(3))), "live")  # type: ignore[arg-type]
+    S, agreeing = sim3.from_parts(unit, np.eye(3), np.zeros(3)), np.array([FIRST + 85])
+    link = FoundLink(0, Fake(S_old_new=S, agreeing_keyframes=agreeing, covariance=1e-8 * np.eye(7)), "live")  # type: ignore[arg-type]
     attempt = Event(EventKind.RECOVERY_ATTEMPT, FIRST + FOUND_AFTER, float(t_new[0]), 1, {"attempt": "live"})
     job = RecoveryJob(new, 0, {0: lost}, {0: FIRST + 99}, (), (), CAMERA, None)
     result = RecoveryResult(new, tuple(frames), link, (attempt,), 0.1, 0.1)
@@ -56,9 +57,9 @@ def walk(unit: float, off: FloatArray, seed: int) -> tuple[Record, Recoveries, R
 @pytest.mark.parametrize("seed", range(3))
 def test_a_right_walk_is_believed_and_one_that_is_a_period_off_is_not(unit: float, seed: int) -> None:
     _, recoveries, right = walk(unit, np.zeros(3), seed)
-    assert recoveries._refuse_leaps(right) is None
+    assert recoveries._refuse_motion(right) is None
     _, recoveries, wrong = walk(unit, np.array([-1.5, 0.0, 0.0]), seed)
-    assert getattr(recoveries._refuse_leaps(wrong), "reason", None) is FailureReason.LEAP
+    assert getattr(recoveries._refuse_motion(wrong), "reason", None) is FailureReason.LEAP
 
 
 def test_a_link_that_is_refused_for_its_leap_says_so_beside_what_the_walk_tried() -> None:
