@@ -55,9 +55,6 @@ class Correspondences:
         Shared keyframes with views, ascending: in order of time.
     view_pair, view_keyframe : (V,) int64
         Row of the pair, row of `keyframes`.
-    uv_old, uv_new : (V, 2)
-        Rectified pixels of the pair in either map's keyframe.
-    sigma_old, sigma_new : (V,)
     """
 
     landmark_old: IntArray
@@ -70,10 +67,6 @@ class Correspondences:
     keyframes: IntArray
     view_pair: IntArray
     view_keyframe: IntArray
-    uv_old: FloatArray
-    uv_new: FloatArray
-    sigma_old: FloatArray
-    sigma_new: FloatArray
 
     def __len__(self) -> int:
         return len(self.landmark_old)
@@ -94,8 +87,6 @@ class _Votes:
     """Candidate pairs, one row for each keyframe that proposes them."""
 
     keyframe: IntArray
-    feature_old: IntArray
-    feature_new: IntArray
     landmark_old: IntArray
     landmark_new: IntArray
     distance: FloatArray
@@ -173,8 +164,6 @@ def place_pairs(old: Submap, new: Submap, matched: MatchedLandmarks, old_before:
     keyframes, view_keyframe = np.unique(votes.keyframe[rows], return_inverse=True)
     shared = np.zeros(int(fixed.sum()), bool)
     shared[view_pair[votes.identical[rows]]] = True
-    uv_old, sigma_old = _pixels(old, votes.keyframe[rows], votes.feature_old[rows])
-    uv_new, sigma_new = _pixels(new, votes.keyframe[rows], votes.feature_new[rows])
     return Correspondences(
         landmark_old=landmark_old[fixed],
         landmark_new=landmark_new[fixed],
@@ -186,22 +175,7 @@ def place_pairs(old: Submap, new: Submap, matched: MatchedLandmarks, old_before:
         keyframes=keyframes,
         view_pair=view_pair,
         view_keyframe=view_keyframe,
-        uv_old=uv_old,
-        uv_new=uv_new,
-        sigma_old=sigma_old,
-        sigma_new=sigma_new,
     )
-
-
-def _pixels(submap: Submap, keyframe: IntArray, feature: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return rectified pixels (V, 2) and sigmas (V,) of features of keyframes."""
-    uv, sigma = np.empty((len(keyframe), 2)), np.empty(len(keyframe))
-    for k in np.unique(keyframe).tolist():
-        here = keyframe == k
-        features = submap.keyframes[k].features
-        uv[here] = features.uv_rect_px[feature[here]]
-        sigma[here] = features.sigma_px[feature[here]]
-    return uv, sigma
 
 
 def _n_same_features(a: Features, b: Features) -> int:
@@ -230,7 +204,7 @@ def _votes_of_keyframe(old: Submap, new: Submap, k: int, matcher: DescriptorMatc
         f_old, f_new = np.concatenate([same, rest_old[i]]), np.concatenate([same, rest_new[j]])
         distance = np.concatenate([distance, d])
     identical = np.arange(len(f_old)) < len(same)
-    return _Votes(np.full(len(f_old), k), f_old, f_new, in_old[f_old], in_new[f_new], distance, identical)
+    return _Votes(np.full(len(f_old), k), in_old[f_old], in_new[f_new], distance, identical)
 
 
 def _match_near(a: Features, b: Features, matcher: DescriptorMatcher) -> tuple[IntArray, IntArray, FloatArray]:
@@ -295,4 +269,4 @@ def _one_to_one(votes: _Votes, n_new: int) -> tuple[tuple[IntArray, IntArray], I
 def _concatenate(parts: list[_Votes]) -> _Votes:
     """Stack the votes of several keyframes."""
     ints, floats, bools = np.zeros(0, np.int64), np.zeros(0), np.zeros(0, bool)
-    return concatenate([_Votes(ints, ints, ints, ints, ints, floats, bools), *parts])
+    return concatenate([_Votes(ints, ints, ints, floats, bools), *parts])

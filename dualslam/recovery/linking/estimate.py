@@ -29,17 +29,16 @@ from dualslam.recovery.linking.correspondences import (
     match_landmarks,
     place_pairs,
 )
+from dualslam.recovery.linking.deformation import deformation_covariance, measure_deformation
 from dualslam.recovery.linking.gates import (
     LOOK_BACK,
     MAX_HYPOTHESES,
     MAX_MISFITS,
     MAX_SCALE,
-    MIN_MAJORITY,
     MIN_PAIRS_PER_KEYFRAME,
     PAIR_CHI2,
 )
 from dualslam.recovery.linking.pairs import PairModel
-from dualslam.recovery.linking.shape import Shape, deformation_covariance, measure_shape
 from dualslam.recovery.linking.timeline import KeyframeVotes, ask_keyframes, find_discontinuities, leading_run
 
 
@@ -211,17 +210,17 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
         refused = verify.check_parting(whole, consensus.estimate.S_dst_src, old, new, agreeing, parted)
         if refused is not None:
             return refused
-    # How far the maps' shapes differ beyond it: that is part of what is not known.
+    # How far the maps are bent against each other beyond it: that is part of what is not known.
     S_old_new = consensus.estimate.S_dst_src
-    shape = measure_shape(model, S_old_new, consensus.inliers, consensus.keyframes)
-    if isinstance(shape, Failure):
-        return shape
-    covariance = consensus.estimate.covariance + deformation_covariance(model, shape.deformation(config))
+    deformation = measure_deformation(model, S_old_new, consensus.inliers, consensus.keyframes, config)
+    covariance = consensus.estimate.covariance + deformation_covariance(model, deformation)
     # The gates.
-    refused = _verify(model, old, consensus, covariance, shape, config)
+    if len(agreeing) < config.min_keyframes:
+        return Failure(FailureReason.AGREEMENT, f"{len(agreeing)} keyframes agree, {config.min_keyframes} needed")
+    refused = verify.check_sigmas(model, S_old_new, covariance, config)
     if refused is not None:
         return refused
-    return _link(model, whole, later, consensus, covariance, shape, onset, limit, config)
+    return _link(model, whole, later, consensus, covariance, deformation, onset, limit)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -321,38 +320,15 @@ def _fit(model: PairModel, used: BoolArray, config: LinkingConfig, rng: Generato
     return Sim3Estimate(estimate.S_dst_src, estimate.covariance, inliers, estimate.n_iterations, estimate.chi2_per_dof)
 
 
-def _verify(
-    model: PairModel, old: Submap, consensus: _Consensus, covariance: FloatArray, shape: Shape, config: LinkingConfig
-) -> Failure | None:
-    """Pass a consensus through the gates."""
-    S, keyframes, inliers = consensus.estimate.S_dst_src, consensus.keyframes, consensus.inliers
-    ratio, n_agreeing = consensus.inlier_ratio, int(keyframes.sum())
-    if ratio <= MIN_MAJORITY:
-        detail = f"{ratio:.0%} of {int(consensus.seen.sum())} pairs agree"
-        return Failure(FailureReason.LOW_INLIER_RATIO, detail, {"inlier_ratio": ratio})
-    if n_agreeing < config.min_keyframes:
-        return Failure(FailureReason.AGREEMENT, f"{n_agreeing} keyframes agree, {config.min_keyframes} needed")
-    views = keyframes[model.pairs.view_keyframe]
-    refusals = (
-        verify.check_own_pixels(model, views),
-        verify.check_reprojection(model, S, views),
-        verify.check_spread(model, old, inliers, keyframes),
-        verify.check_sigmas(model, S, covariance, config),
-        verify.check_shape(shape, config),
-    )
-    return next((refused for refused in refusals if refused is not None), None)
-
-
 def _link(
     model: PairModel,
     whole: PairModel,
     later: KeyframeVotes,
     consensus: _Consensus,
     covariance: FloatArray,
-    shape: Shape,
+    deformation: float,
     onset: int | None,
     limit: int | None,
-    config: LinkingConfig,
 ) -> LinkEstimate:
     """Pack a verified consensus. `later`: how all keyframes agree with it, on all pairs as the maps hold them."""
     c, estimate, votes = model.pairs, consensus.estimate, consensus.votes
@@ -379,8 +355,7 @@ def _link(
         "keyframe_rotation_deg": float(np.degrees(votes.rotation_rad[on]).max()),
         "keyframe_centre": float(votes.centre[on].max()),
         "inlier_ratio": consensus.inlier_ratio,
-        "strain_chi2": shape.strain_chi2(config),
-        "deformation": shape.deformation(config),
+        "deformation": deformation,
     }
     return LinkEstimate(
         S_old_new=S,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dualslam.core.chi_square import CHI2_99, CHI2_999
+from dualslam.core.chi_square import CHI2_99
 
 GATE_SIGMAS = 3.0
 """Standard deviations at which such a comparison fails."""
@@ -10,11 +10,9 @@ PAIR_CHI2 = CHI2_99[3]
 """Gate of a matched pair's squared Mahalanobis distance: chi-square, 3 degrees of freedom, 99 %."""
 PIXEL_CHI2 = CHI2_99[2]
 """Gate of a squared whitened reprojection residual: chi-square, 2 degrees of freedom, 99 %."""
-STRAIN_CHI2 = CHI2_999[5]
-"""Gate of the stretching and shearing between the maps: chi-square, 5 degrees of freedom, 99.9 %."""
 MIN_MAJORITY = 0.5
-"""Share of the matched landmarks (over all, in a keyframe, in a map's own pixels) that must agree. Below a half the
-pairs that disagree could hold a second similarity with more support."""
+"""Share of the matched landmarks in a keyframe, and of observations of a map, that must agree. Below a half those that
+disagree could hold a second similarity with more support."""
 MIN_PAIRS_PER_KEYFRAME = 8
 """Matched landmarks that a keyframe must hold to have a say (four fix a similarity with one to spare)."""
 MAX_MISFITS = 1
@@ -31,9 +29,6 @@ LOOK_BACK = 10
 MIN_IMAGE_SPREAD = 0.25
 """Share of the image, along either axis, that the agreeing landmarks must cover (5 % to 95 % of them, against the
 keypoints of the same keyframes)."""
-MIN_DEPTH_SPREAD = 0.05
-"""Relative difference between near (10 %) and far (90 %) agreeing landmarks' depths in the shared keyframes: less than
-triangulation itself scatters is a single depth, which cannot tell scale from motion along the axis."""
 MAX_SCALE = 50.0
 """Largest scale, and inverse of the smallest: submaps start with a median depth of 1, so that the scale is the ratio
 of the depths at their starts."""

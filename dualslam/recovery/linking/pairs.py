@@ -1,4 +1,4 @@
-"""The matched pairs as measurements of a similarity: distances, reprojections, normal equations."""
+"""The matched pairs as measurements of a similarity: distances, normal equations."""
 
 from __future__ import annotations
 
@@ -8,18 +8,6 @@ from dualslam.core.geometry import se3, sim3, so3, symmetric3
 from dualslam.core.types import BoolArray, FloatArray
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking.correspondences import Correspondences
-
-_S3, _S2 = 1.0 / np.sqrt(3.0), 1.0 / np.sqrt(2.0)
-STRAINS = np.array(
-    [
-        np.diag([2.0, -1.0, -1.0]) * _S3 * _S2,
-        np.diag([0.0, 1.0, -1.0]) * _S2,
-        np.array([[0, 1, 0], [1, 0, 0], [0, 0, 0]]) * _S2,
-        np.array([[0, 0, 1], [0, 0, 0], [1, 0, 0]]) * _S2,
-        np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0]]) * _S2,
-    ]
-)
-"""Orthonormal basis of the symmetric traceless matrices: what an affine map can do beyond a similarity."""
 
 
 class PairModel:
@@ -70,46 +58,11 @@ class PairModel:
         T = T_kf_map[self.pairs.view_keyframe]
         return np.asarray((T[:, 2, :3] * xyz[self.pairs.view_pair]).sum(1) + T[:, 2, 3])
 
-    def reprojection2(self, S_old_new: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return squared whitened residuals (V,) of the new points in the old map's keyframes, and the other way.
-
-        The other map's point has its own covariance, which is added to the pixel's. Behind the camera: infinite.
-        """
-        c, S_new_old = self.pairs, sim3.inverse(S_old_new)
-        A, B = S_old_new[:3, :3], S_new_old[:3, :3]
-        v = c.view_pair
-        in_old = pixel_chi2(
-            self.K_old,
-            self.T_kf_old[c.view_keyframe],
-            sim3.act(S_old_new, c.xyz_new)[v],
-            (A @ self.covariance_new @ A.T)[v],
-            c.uv_old,
-            c.sigma_old,
-        )
-        in_new = pixel_chi2(
-            self.K_new,
-            self.T_kf_new[c.view_keyframe],
-            sim3.act(S_new_old, c.xyz_old)[v],
-            (B @ self.covariance_old @ B.T)[v],
-            c.uv_new,
-            c.sigma_new,
-        )
-        return in_old, in_new
-
-    def own_reprojection2(self) -> tuple[FloatArray, FloatArray]:
-        """Return squared whitened residuals (V,) of each map's points in its own keyframes, pixel noise alone."""
-        c, none = self.pairs, np.zeros((3, 3))
-        v, k = c.view_pair, c.view_keyframe
-        in_old = pixel_chi2(self.K_old, self.T_kf_old[k], c.xyz_old[v], none, c.uv_old, c.sigma_old)
-        in_new = pixel_chi2(self.K_new, self.T_kf_new[k], c.xyz_new[v], none, c.uv_new, c.sigma_new)
-        return in_old, in_new
-
     def normal_equations(self, S_old_new: FloatArray, used: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Return (H (12, 12), g (12,)) of the used pairs for a small change of the new map about its centre.
+        """Return (H (7, 7), g (7,)) of the used pairs for a small change of the new map about its centre.
 
-        The change is q -> q + w x q + u + l q + E q, q from `centre_new`: rotation (rad), translation (unit of new),
-        log-scale, and the five coordinates of the strain E in `STRAINS`. The first seven are a right perturbation of
-        ``S_old_new`` conjugated by the shift to the centre.
+        The change is q -> q + w x q + u + l q, q from `centre_new`: rotation (rad), translation (unit of new),
+        log-scale. It is a right perturbation of ``S_old_new`` conjugated by the shift to the centre.
         """
         A = S_old_new[:3, :3]
         q = self.pairs.xyz_new[used] - self.centre_new
@@ -117,14 +70,13 @@ class PairModel:
         covariance = self.covariance_old[used] + A @ self.covariance_new[used] @ A.T
         adj, det = symmetric3.adjugate(symmetric3.planes(covariance))
         information = symmetric3.matrices(adj / det)
-        local = np.empty((len(q), 3, 12))
+        local = np.empty((len(q), 3, 7))
         local[:, :, :3] = -so3.hat(q)
         local[:, :, 3:6] = np.eye(3)
         local[:, :, 6] = q
-        local[:, :, 7:] = np.einsum("aij,nj->nia", STRAINS, q)
         J = A @ local
-        WJ = (information @ J).reshape(-1, 12)
-        H = J.reshape(-1, 12).T @ WJ
+        WJ = (information @ J).reshape(-1, 7)
+        H = J.reshape(-1, 7).T @ WJ
         return 0.5 * (H + H.T), WJ.T @ residual.reshape(-1)
 
 

@@ -32,12 +32,6 @@ class KeyframeVotes:
 
     Attributes
     ----------
-    n_pairs : (K,) int64
-        Matched pairs seen there.
-    share : (K,)
-        Share of them whose points agree.
-    share_pixels : (K,)
-        Share of their pixels that agree: of the worst among either map's points in either map's keyframe.
     rotation_rad : (K,)
         Angle between the camera's orientations in the two maps.
     centre : (K,)
@@ -46,9 +40,6 @@ class KeyframeVotes:
     agrees, can_vote : (K,) bool
     """
 
-    n_pairs: IntArray
-    share: FloatArray
-    share_pixels: FloatArray
     rotation_rad: FloatArray
     centre: FloatArray
     agrees: BoolArray
@@ -56,15 +47,13 @@ class KeyframeVotes:
 
 
 def ask_keyframes(model: PairModel, S_old_new: FloatArray, config: LinkingConfig) -> KeyframeVotes:
-    """Ask each shared keyframe whether its matches, its pixels and its two poses agree with a similarity."""
+    """Ask each shared keyframe whether its matches and its two poses agree with a similarity."""
     c = model.pairs
     every = np.ones(len(c.view_pair), bool)
     n = c.count_by_keyframe(every)
     per = np.maximum(n, 1)
     near = model.mahalanobis2(S_old_new) < PAIR_CHI2
     share = c.count_by_keyframe(near[c.view_pair]) / per
-    residuals = (*model.reprojection2(S_old_new), *model.own_reprojection2())
-    share_pixels = np.min([c.count_by_keyframe(chi2 < PIXEL_CHI2) for chi2 in residuals], axis=0) / per
     T_moved = sim3.act_on_pose(S_old_new, model.T_new_kf)
     turn = so3.log(T_moved[:, :3, :3].swapaxes(1, 2) @ model.T_old_kf[:, :3, :3])
     rotation = np.sqrt((turn**2).sum(1))
@@ -74,9 +63,8 @@ def ask_keyframes(model: PairModel, S_old_new: FloatArray, config: LinkingConfig
     depth = np.array([np.median(distance[c.view_keyframe == k]) for k in range(len(c.keyframes))])
     reach = np.maximum(depth, np.linalg.norm(centres - model.centre_old, axis=1))
     bound = GATE_SIGMAS * config.deformation_sigma
-    agrees = (share > MIN_MAJORITY) & (share_pixels > MIN_MAJORITY)
-    agrees &= (rotation < bound) & (apart < bound * reach)
-    return KeyframeVotes(n, share, share_pixels, rotation, apart / reach, agrees, n >= MIN_PAIRS_PER_KEYFRAME)
+    agrees = (share > MIN_MAJORITY) & (rotation < bound) & (apart < bound * reach)
+    return KeyframeVotes(rotation, apart / reach, agrees, n >= MIN_PAIRS_PER_KEYFRAME)
 
 
 def leading_run(agrees: BoolArray, max_misfits: int) -> int:

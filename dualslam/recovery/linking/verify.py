@@ -1,4 +1,4 @@
-"""The gates of a link: a wide enough overlap, and the same shape of both maps there."""
+"""The gates of a link: the old map must have given way where the maps part, and the landmarks fix the similarity."""
 
 from __future__ import annotations
 
@@ -8,63 +8,11 @@ import numpy as np
 
 from dualslam.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
-from dualslam.recovery.linking.gates import (
-    GATE_SIGMAS,
-    MIN_DEPTH_SPREAD,
-    MIN_IMAGE_SPREAD,
-    MIN_MAJORITY,
-    PIXEL_CHI2,
-    STRAIN_CHI2,
-)
+from dualslam.recovery.linking.gates import GATE_SIGMAS, PIXEL_CHI2
 from dualslam.recovery.linking.pairs import PairModel
 from dualslam.recovery.linking.scale_observability import scale_sigma_between
-from dualslam.recovery.linking.shape import Shape
-
-
-def check_own_pixels(model: PairModel, views: BoolArray) -> Failure | None:
-    """Refuse where either map's points do not lie on that map's own pixels: mirrored or bent copies give way here."""
-    in_old, in_new = model.own_reprojection2()
-    for name, chi2 in (("old", in_old), ("new", in_new)):
-        share = float((chi2[views] < PIXEL_CHI2).mean())
-        if share <= MIN_MAJORITY:
-            detail = f"{share:.0%} of the {name} map's matched points lie on their own pixels"
-            return Failure(FailureReason.REPROJECTION, detail, {f"own_share_{name}": share})
-    return None
-
-
-def check_reprojection(model: PairModel, S_old_new: FloatArray, views: BoolArray) -> Failure | None:
-    """Refuse where the points of one map do not fall on the pixels of the other, in either direction."""
-    in_old, in_new = model.reprojection2(S_old_new)
-    for name, chi2 in (("old", in_old), ("new", in_new)):
-        share = float((chi2[views] < PIXEL_CHI2).mean())
-        if share <= MIN_MAJORITY:
-            detail = f"{share:.0%} of the points of the other map fall on the {name} map's pixels"
-            return Failure(FailureReason.REPROJECTION, detail, {f"share_in_{name}": share})
-    return None
-
-
-def check_spread(model: PairModel, old: Submap, pair_mask: BoolArray, keyframes: BoolArray) -> Failure | None:
-    """Refuse where the agreeing landmarks cover too little of the image, along either axis, or of depth."""
-    c = model.pairs
-    views = pair_mask[c.view_pair] & keyframes[c.view_keyframe]
-    ids = c.keyframes[keyframes]
-    features = np.concatenate([old.keyframes[k].features.uv_rect_px for k in ids.tolist()])
-    covered = np.ptp(np.percentile(c.uv_old[views], [5, 95], axis=0), axis=0)
-    share = covered / np.maximum(np.ptp(np.percentile(features, [5, 95], axis=0), axis=0), 1e-9)
-    numbers = {"spread_u": float(share[0]), "spread_v": float(share[1])}
-    if share.min() < MIN_IMAGE_SPREAD:
-        return Failure(FailureReason.SPREAD, f"{share.min():.0%} of the image is covered", numbers)
-    depth = model.depths_old()
-    ranges = []
-    for k in np.flatnonzero(keyframes).tolist():
-        near, middle, far = np.percentile(depth[views & (c.view_keyframe == k)], [10, 50, 90])
-        ranges.append((far - near) / middle)
-    numbers["spread_depth"] = float(np.median(ranges))
-    if np.median(ranges) < MIN_DEPTH_SPREAD:
-        return Failure(FailureReason.SPREAD, f"depths differ by {np.median(ranges):.1%}", numbers)
-    return None
 
 
 def check_parting(
@@ -129,18 +77,3 @@ def sigma_numbers(model: PairModel, S_old_new: FloatArray, covariance: FloatArra
         "sigma_trans_mu": float(sim3.scale(S_old_new)) * math.sqrt(np.linalg.eigvalsh(C[3:6, 3:6])[-1]),
         "depth_mu": float(np.median(distance)),
     }
-
-
-def check_shape(shape: Shape, config: LinkingConfig) -> Failure | None:
-    """Refuse maps of different shape: stretched or sheared as a whole, or parts that want another scale or rotation."""
-    chi2 = shape.strain_chi2(config)
-    if chi2 > STRAIN_CHI2:
-        strain = float(np.linalg.norm(shape.strain))
-        numbers = {"strain": strain, "strain_chi2": chi2}
-        return Failure(FailureReason.DEFORMED, f"stretched by {strain:.1%}", numbers)
-    for d in shape.parts:
-        if d.scale_deviates(config) or d.turn_deviates(config):
-            degrees = math.degrees(d.turn_rad)
-            detail = f"part of the maps ({d.part}) differs by {d.log_scale:+.1%} in scale, {degrees:.2f} deg"
-            return Failure(FailureReason.DEFORMED, detail, {"log_scale": d.log_scale, "rotation_deg": degrees})
-    return None

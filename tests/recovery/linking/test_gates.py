@@ -6,10 +6,11 @@ from scipy import stats
 
 from dualslam.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import Failure, FailureReason
-from dualslam.recovery.linking import propose_correspondences, shape, verify
-from dualslam.recovery.linking.gates import PAIR_CHI2, PIXEL_CHI2, STRAIN_CHI2
-from dualslam.recovery.linking.pairs import STRAINS, PairModel
+from dualslam.core.types import FailureReason
+from dualslam.recovery.linking import propose_correspondences, verify
+from dualslam.recovery.linking.deformation import measure_deformation
+from dualslam.recovery.linking.gates import PAIR_CHI2, PIXEL_CHI2
+from dualslam.recovery.linking.pairs import PairModel
 from dualslam.recovery.linking.timeline import ask_keyframes, find_discontinuities, leading_run
 from dualslam.testing.adversaries import ONSET_ID, corrupted_tail
 from dualslam.testing.link_worlds import Case, make_case
@@ -27,15 +28,9 @@ def everything(model: PairModel, S) -> tuple[np.ndarray, np.ndarray]:
     return model.mahalanobis2(S) < PAIR_CHI2, np.ones(len(model.pairs.keyframes), bool)
 
 
-def judge_shape(model: PairModel, S, inliers, keyframes) -> Failure | None:
-    measured = shape.measure_shape(model, S, inliers, keyframes)
-    return measured if isinstance(measured, Failure) else verify.check_shape(measured, CONFIG)
-
-
 def test_gates_are_the_quantiles_that_they_say():
     assert pytest.approx(stats.chi2.ppf(0.99, 3), abs=1e-3) == PAIR_CHI2
     assert pytest.approx(stats.chi2.ppf(0.99, 2), abs=1e-3) == PIXEL_CHI2
-    assert pytest.approx(stats.chi2.ppf(0.999, 5), abs=1e-3) == STRAIN_CHI2
 
 
 @pytest.mark.parametrize(
@@ -75,23 +70,15 @@ def test_normal_equations_are_the_derivatives():
     q = model.pairs.xyz_new[used] - model.centre_new
 
     def residual(x):
-        change = sim3.exp(x[:7]) @ se3.from_parts(np.eye(3) + np.einsum("a,aij->ij", x[7:], STRAINS), np.zeros(3))
+        change = sim3.exp(x)
         moved = q @ change[:3, :3].T + change[:3, 3] + model.centre_new
         return model.pairs.xyz_old[used] - sim3.act(case.S_old_new, moved)
 
     h = 1e-6
-    J = np.stack([(residual(h * e) - residual(-h * e)) / (2 * h) for e in np.eye(12)], -1)
-    r = residual(np.zeros(12))
+    J = np.stack([(residual(h * e) - residual(-h * e)) / (2 * h) for e in np.eye(7)], -1)
+    r = residual(np.zeros(7))
     np.testing.assert_allclose(H, np.einsum("nia,nij,njb->ab", J, W, J), rtol=1e-5, atol=1e-6 * np.abs(H).max())
     np.testing.assert_allclose(g, -np.einsum("nia,nij,nj->a", J, W, r), rtol=1e-4, atol=1e-6 * np.abs(g).max())
-
-
-def test_reprojection_both_ways_is_whitened():
-    """Without drift three in four of the pixels of a true link lie well within their gate, in both directions."""
-    case = make_case("street", 1, drift=0.0, outliers=0.0)
-    model = model_of(case)
-    for chi2 in model.reprojection2(case.S_old_new):
-        assert (chi2 < PIXEL_CHI2).mean() > 0.98
 
 
 def test_every_keyframe_of_a_true_link_agrees_and_none_of_a_wrong_one():
@@ -104,71 +91,24 @@ def test_every_keyframe_of_a_true_link_agrees_and_none_of_a_wrong_one():
         assert not ask_keyframes(model, wrong, CONFIG).agrees.any()
 
 
-@pytest.mark.parametrize("percent", [10.0, 30.0])
-@pytest.mark.parametrize("axis", range(3))
-def test_shape_gate_refuses_a_stretched_copy(percent, axis):
-    """Points alone, cameras left as they are: only the shape tells."""
-    case = make_case("room", 2, drift=0.0)
-    model = model_of(case, 0.01)
-    stretch = np.ones(3)
-    stretch[axis] += 0.01 * percent
-    xyz = model.pairs.xyz_new
-    xyz[:] = model.centre_new + (xyz - model.centre_new) * stretch
-    S = case.S_old_new @ sim3.exp(np.zeros(7))
-    inliers = np.ones(len(xyz), bool) & (model.mahalanobis2(S) < 1e4)
-    refused = judge_shape(model, S, inliers, np.ones(len(model.pairs.keyframes), bool))
-    assert refused is not None
-    assert refused.reason is FailureReason.DEFORMED
-
-
-def test_shape_gate_passes_healthy_maps():
-    for seed in range(3):
-        case = make_case("room", seed)
-        model = model_of(case)
-        assert judge_shape(model, case.S_old_new, *everything(model, case.S_old_new)) is None
-
-
-def test_shape_gate_refuses_halves_of_two_scales():
-    case = make_case("room", 1, drift=0.0)
+@pytest.mark.parametrize("bent", ["pairs", "path"])
+def test_maps_whose_scales_part_along_time_are_less_known(bent):
+    """The newer half of the pairs, or the cameras' path, is a tenth larger than the rest."""
+    case = make_case("street", 1, drift=0.0)
     model = model_of(case)
-    inliers, keyframes = everything(model, case.S_old_new)
-    halves = shape._halves(model, inliers, keyframes)
-    for name in ("left", "near", "late"):
-        xyz = model.pairs.xyz_new.copy()
-        part = halves[name]
-        centre = np.median(xyz[part], axis=0)
-        model.pairs.xyz_new[part] = centre + 1.1 * (xyz[part] - centre)
-        refused = judge_shape(model, case.S_old_new, inliers, keyframes)
-        model.pairs.xyz_new[:] = xyz
-        assert refused is not None, name
-        assert refused.reason is FailureReason.DEFORMED
-
-
-def test_camera_gate_refuses_a_path_of_another_scale():
-    case = make_case("street", 0)
-    model = model_of(case)
-    inliers, keyframes = everything(model, case.S_old_new)
-    assert judge_shape(model, case.S_old_new, inliers, keyframes) is None
-    centres = model.T_new_kf[:, :3, 3]
-    centres[:] = centres.mean(0) + 1.1 * (centres - centres.mean(0))
-    refused = judge_shape(model, case.S_old_new, inliers, keyframes)
-    assert refused is not None
-    assert refused.reason is FailureReason.DEFORMED
-
-
-def test_spread_gate_refuses_a_corner_of_the_image():
-    case = make_case("street", 0)
-    model = model_of(case)
-    inliers, keyframes = everything(model, case.S_old_new)
-    assert verify.check_spread(model, case.old, inliers, keyframes) is None
-    c = model.pairs
-    in_corner = (c.uv_old[:, 0] < 250) & (c.uv_old[:, 1] > 200)
-    corner = np.zeros(len(c), bool)
-    corner[c.view_pair[in_corner]] = True
-    corner[c.view_pair[~in_corner]] = False
-    refused = verify.check_spread(model, case.old, inliers & corner, keyframes)
-    assert refused is not None
-    assert refused.reason is FailureReason.SPREAD
+    sound = measure_deformation(model, case.S_old_new, *everything(model, case.S_old_new), CONFIG)
+    assert sound < CONFIG.deformation_sigma
+    if bent == "pairs":
+        c = model.pairs
+        time = np.bincount(c.view_pair, c.view_keyframe) / np.bincount(c.view_pair)
+        late = time > np.median(time)
+        centre = np.median(c.xyz_new[late], axis=0)
+        c.xyz_new[late] = centre + 1.1 * (c.xyz_new[late] - centre)
+    else:
+        centres = model.T_new_kf[:, :3, 3]
+        centres[:] = centres.mean(0) + 1.1 * (centres - centres.mean(0))
+    inliers, keyframes = np.ones(len(model.pairs), bool), np.ones(len(model.pairs.keyframes), bool)
+    assert 0.03 < measure_deformation(model, case.S_old_new, inliers, keyframes, CONFIG) < 0.12
 
 
 def test_sigma_gate_refuses_what_the_landmarks_do_not_fix():
@@ -183,17 +123,3 @@ def test_sigma_gate_refuses_what_the_landmarks_do_not_fix():
         refused = verify.check_sigmas(model, case.S_old_new, to_centre @ C @ to_centre.T, CONFIG)
         assert refused is not None
         assert refused.reason is reason
-
-
-def test_own_pixels_gate_refuses_a_map_that_does_not_lie_on_its_images():
-    case = make_case("street", 0)
-    model = model_of(case)
-    views = np.ones(len(model.pairs.view_pair), bool)
-    assert verify.check_own_pixels(model, views) is None
-    model.pairs.xyz_new[:] += 0.1 * np.std(model.pairs.xyz_new, axis=0)
-    refused = verify.check_own_pixels(model, views)
-    assert refused is not None
-    assert refused.reason is FailureReason.REPROJECTION
-    refused = verify.check_reprojection(model, case.S_old_new, views)
-    assert refused is not None
-    assert refused.reason is FailureReason.REPROJECTION
