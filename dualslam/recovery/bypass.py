@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
-from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.core.types import Failure, FloatArray, FrameStatus
 from dualslam.map.frame_observations import Change
 from dualslam.map.propagation import propagate_poses
 from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
-from dualslam.recovery.job import RecoveredFrame
+from dualslam.map.trajectory import Path
+from dualslam.recovery.job import RecoveredFrame, refusal_data
 from dualslam.recovery.merge import Merged
+from dualslam.recovery.motion import refuse_steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +130,8 @@ def absorb(
 
     A map of a few frames hardly knows its own scale, so that no similarity to it is sure. None is needed: what it saw
     has its place in the larger map. The smaller one stays archived, without frames. A lost map that holds more than
-    the new one stays: what a long map says is not given up for a short one that would not fit it.
+    the new one stays: what a long map says is not given up for a short one that would not fit it. So does one whose
+    frames would move as the camera does not (`recovery/motion.py`).
 
     Parameters
     ----------
@@ -152,6 +157,10 @@ def absorb(
         if len(frames) >= n_own:
             n_stay.append(len(frames))
             continue
+        refused = _refuse_motion(record, found, frames, new_id)
+        if refused is not None:
+            record.event(EventKind.LINK_REFUSED, now, new_id, **refusal_data("absorb", max(component), refused))
+            continue
         for i in frames:
             record.pose(found[i].pose, observations=found[i].observations, method=found[i].method)
             record.rows[i].status = FrameStatus.BYPASSED
@@ -160,6 +169,19 @@ def absorb(
             record.atlas.submaps[m].condemn(record.atlas.submaps[m].keyframes)
         record.event(EventKind.ABSORBED, now, new_id, old_submaps=component, frames=len(frames))
     return Absorption(gone, min(n_stay, default=None))
+
+
+def _refuse_motion(
+    record: Record, found: dict[int, RecoveredFrame], frames: Collection[int], new_id: int
+) -> Failure | None:
+    """Return why lost frames are not given their new poses, by the camera's motion at each of them."""
+    submap = record.atlas.submaps[new_id]
+    own = [pose for pose in record.own_poses() if pose.submap_id == new_id and pose.index not in found]
+    known = Path.of(own, submap)
+    known = replace(known, refound=record.are_refound(known.index.tolist()))
+    path = Path.of([*own, *(frame.pose for frame in found.values())], submap)
+    lost = np.isin(path.index, list(frames))
+    return refuse_steps(path, np.flatnonzero(lost[:-1] | lost[1:]), known)
 
 
 def n_frames(record: Record, submap_id: int) -> int:

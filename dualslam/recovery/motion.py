@@ -117,8 +117,13 @@ def measure_motion(path: Path, last_before: int, known: Path, slack_mu: float = 
 
 def refuse_gaps(path: Path, known: Path) -> Failure | None:
     """Return why a path cannot be the camera's, by its motion across its gaps (`measure_motion`)."""
+    return refuse_steps(path, gaps_of(path.times_s), known)
+
+
+def refuse_steps(path: Path, rows: IntArray, known: Path) -> Failure | None:
+    """Return why a path cannot be the camera's, by its motion behind some of its frames (`measure_motion`)."""
     fits, fits_known = _Fits.of(path), _Fits.of(known)
-    for i in gaps_of(path.times_s).tolist():
+    for i in rows.tolist():
         motion = _measure(fits, i, fits_known)
         if motion is not None and motion.is_refused:
             return motion.refusal

@@ -17,8 +17,10 @@ from dualslam.testing.graph_scene import guessed_submap, make_scene
 N_LOST = 8
 
 
-def pose(index: int, submap_id: int) -> FramePose:
-    return FramePose(index, 0.1 * index, submap_id, 0, np.eye(4))
+def pose(index: int, submap_id: int, off_m: float = 0.0) -> FramePose:
+    T_kf_cam = np.eye(4)
+    T_kf_cam[:3, 3] = [0.1 * index + off_m, 0.002 * np.sin(index), 0.0]
+    return FramePose(index, 0.1 * index, submap_id, 0, T_kf_cam)
 
 
 def book(n_new: int) -> Record:
@@ -65,3 +67,15 @@ def test_a_map_of_which_a_frame_was_not_posed_stays_for_good() -> None:
     record = book(N_LOST + 1)
     assert walked(record, N_LOST - 1) == Absorption([], None)
     assert not record.events.of_kind(EventKind.ABSORBED)
+
+
+@pytest.mark.parametrize("wrong", [[3], [0, 1, 2, 3], range(N_LOST)])
+def test_a_map_stays_whose_frames_would_jump(wrong: list[int]) -> None:
+    """One frame, those beyond a gap that was crossed wrongly, or all: half a metre off; a step is 0.1 m."""
+    record = book(40)
+    frames = [RecoveredFrame(pose(i, 1, 0.5 * (i in wrong)), 90, 80) for i in range(N_LOST)]
+    assert absorb(record, frames, 1, {0}, record.rows[N_LOST]) == Absorption([], None)
+    assert [record.poses[i].submap_id for i in range(N_LOST)] == [0] * N_LOST
+    assert not record.atlas.submaps[0].condemned
+    (event,) = record.events.of_kind(EventKind.LINK_REFUSED)
+    assert (event.data["old_submap"], event.data["reason"]) == (0, "leap")
