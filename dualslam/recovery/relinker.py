@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from dualslam.core.types import Failure
 from dualslam.map.submap import Submap
-from dualslam.recovery.linking import LinkEstimate
+from dualslam.recovery.linking import LinkEstimate, LinkRefusal
 from dualslam.recovery.linking.gates import TIE_WINDOW
 
 MIN_SHARED_KEYFRAMES = 4
@@ -93,13 +93,13 @@ class Relinker:
             n_healthy = sum(k < self._onsets[old.id] for k in shared)
             self.has_seen_enough |= n_healthy >= self._max_shared
             result = self._linker(old, self._submap, self._onsets[old.id])
-            self.has_seen_enough |= isinstance(result, Failure) and self._stays_torn(result)
+            self.has_seen_enough |= isinstance(result, LinkRefusal) and self._stays_torn(result)
             yield LinkTry(old.id, len(shared), result)
 
-    def _stays_torn(self, refused: Failure) -> bool:
+    def _stays_torn(self, refused: LinkRefusal) -> bool:
         """Whether the growing submap is torn where all keyframes are there that are asked about the place."""
-        torn = refused.numbers.get("torn")
-        return torn is not None and sum(k < torn for k in self._submap.keyframes) >= TIE_WINDOW
+        torn_at = refused.torn_at
+        return torn_at is not None and sum(k < torn_at for k in self._submap.keyframes) >= TIE_WINDOW
 
     def _is_due(self, old_id: int, n_shared: int) -> bool:
         if n_shared < MIN_SHARED_KEYFRAMES:

@@ -30,7 +30,7 @@ from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose, Path
 from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult, refusal_data
 from dualslam.recovery.link_tries import LinkTries
-from dualslam.recovery.linking import NO_BEND, Bend, LinkEstimate
+from dualslam.recovery.linking import NO_BEND, Bend, LinkEstimate, LinkRefusal
 from dualslam.recovery.motion import WINDOW_FRAMES
 from dualslam.recovery.progress import Progress
 from dualslam.recovery.relinker import Linker, LinkTry, Relinker
@@ -218,8 +218,7 @@ def _make_attempt(
                 break
             tries.note_try(tried.old_id, found.reason)
             progress.why_not_linked = found.detail
-            nothing_held = np.inf if "torn" in found.numbers else 0.0
-            progress.walk_sigma = found.numbers.get("sigma_scale_reverse", nothing_held)
+            progress.walk_sigma = found.walk_sigma if isinstance(found, LinkRefusal) else 0.0
             progress.needs_camera |= found.reason is FailureReason.CAMERA
             # A lost map of few keyframes hardly knows its scale: another way over the same ones knows it no better.
             at_overlap = isinstance(tried.result, Failure) and tried.result.reason is FailureReason.SCALE
@@ -230,7 +229,8 @@ def _make_attempt(
             progress.needs_live_end |= was_lost and not progress.took_short_cut
             progress.given_up |= progress.needs_camera or found.reason is FailureReason.SCALE_LOST
             # As long as the walk is not far enough beyond the gap nothing is measured, and more may tell.
-            progress.given_up |= found.reason in (FailureReason.LEAP, FailureReason.LOOK_ALIKE) and bool(found.numbers)
+            is_of_motion = found.reason in (FailureReason.LEAP, FailureReason.LOOK_ALIKE)
+            progress.given_up |= is_of_motion and progress.choice is not None and progress.choice.is_measured
             progress.events.append(_refusal(tried, found, attempt.name, step.view, submap.id))
         progress.given_up |= relinker.has_seen_enough
         if progress.link is not None or progress.given_up:
@@ -272,7 +272,7 @@ def _confirm(
     link = parts.propagate(found, submap, job.newest_id, bend)
     if isinstance(link, Failure):
         return link
-    again = tries.judge(tried.old_id, link.numbers["sigma_scale"], parts.max_scale_sigma)
+    again = tries.judge(tried.old_id, link.sigma_scale, parts.max_scale_sigma)
     if again is not None:
         return again
     refused = _refuse_rivalled(job, submap, progress, tried.old_id, link)

@@ -26,18 +26,16 @@ class Choice:
     Attributes
     ----------
     refusal : Failure or None
-        Why the walk is not to be believed, if it is not. Without numbers where nothing could be measured as yet.
+        Why the walk is not to be believed, if it is not.
     better : tuple of Rival
-        What it has to go by instead, if that is told: of several frames, all at one place.
+        What it has to go by instead, if that is known: of several frames, all at one place.
+    is_measured : bool
+        Whether the walk was far enough beyond the gap.
     """
 
     refusal: Failure | None
     better: tuple[Rival, ...] = ()
-
-    @property
-    def is_measured(self) -> bool:
-        """Whether the walk was far enough beyond the gap, and the lost map long enough."""
-        return self.refusal is None or bool(self.refusal.numbers)
+    is_measured: bool = True
 
 
 def choose_by_velocity(walked: Path, known: Path, rivals: Sequence[Rival]) -> Choice:
@@ -63,7 +61,8 @@ def choose_by_velocity(walked: Path, known: Path, rivals: Sequence[Rival]) -> Ch
         beside = list(of_frame)
         measured = _measure(walked, known, beside)
         if measured is None:
-            return Choice(Failure(FailureReason.LOOK_ALIKE, "beyond the gap several poses are alike"))
+            detail = "beyond the gap several poses are alike"
+            return Choice(Failure(FailureReason.LOOK_ALIKE, detail), is_measured=False)
         motions, places = measured
         own = motions[0]
         told = min(range(len(motions)), key=lambda n: motions[n].off_mu)

@@ -48,6 +48,7 @@ def fused(change_point: int | None = None) -> tuple[DriftingMap, Link, FloatArra
         agreeing_keyframes=np.array(SHARED[:3]),
         change_point=change_point,
         suspected_onset=ONSET,
+        sigma_scale=0.01,
         numbers={},
     )
     found = FoundLink(0, estimate, "gap")

@@ -12,6 +12,7 @@ from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, View
 from dualslam.lab.audits.link_audit import LinkAudit, audit_links
 from dualslam.map.atlas import LinkKind
+from dualslam.recovery.linking import LinkRefusal
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.system import System
 from dualslam.testing.frames_seen import residuals_px
@@ -224,8 +225,8 @@ def test_what_a_walk_may_ask_for_about_a_loss_is_foreseen() -> None:
 
 
 def test_a_walk_ends_at_a_tear_and_leaves_nothing_beyond_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    def torn(*_: object) -> Failure:
-        return Failure(FailureReason.DEFORMED, "the new map is torn", {"torn": float(max(COVERED) + 1)})
+    def torn(*_: object) -> LinkRefusal:
+        return LinkRefusal(FailureReason.DEFORMED, "the new map is torn", torn_at=max(COVERED) + 1, walk_sigma=np.inf)
 
     monkeypatch.setattr("dualslam.build.walks.estimate_link", torn)
     world = PointWorld(cloud(), hand_held(60), covered=COVERED)

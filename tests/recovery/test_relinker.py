@@ -9,6 +9,7 @@ import numpy as np
 
 from dualslam.core.types import Failure, FailureReason
 from dualslam.map.submap import Submap
+from dualslam.recovery.linking import LinkRefusal
 from dualslam.recovery.linking.gates import TIE_WINDOW
 from dualslam.recovery.relinker import Relinker
 
@@ -86,7 +87,7 @@ def test_a_map_that_is_torn_stays_so_once_all_is_there_that_is_asked_about_the_p
     old, new = holding(0, range(200)), holding(1, range(200, 210))
 
     def refuse(old: Submap, new: Submap, onset: int | None) -> Failure:
-        return Failure(FailureReason.DEFORMED, "torn", {"torn": 198.0})
+        return LinkRefusal(FailureReason.DEFORMED, "torn", torn_at=198)
 
     relinker = Relinker(new, {0: old}, {0: ONSET}, refuse)
     enough = []

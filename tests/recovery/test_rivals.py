@@ -69,7 +69,7 @@ def test_nothing_is_told_where_the_camera_may_have_come_to_two(off_m: float) -> 
     choice = choose_by_velocity(walk(t, p, 109, off_m), known, [*rivals, rival(109, PERIOD_M)])
     assert choice.refusal is not None
     assert choice.refusal.reason is FailureReason.LOOK_ALIKE
-    assert choice.refusal.numbers
+    assert choice.is_measured
     assert not choice.better
 
 

@@ -9,6 +9,7 @@ them `pairs`, the matches as measurements, and `scale_observability`, how firmly
 from dualslam.recovery.linking.camera_bend import NO_BEND, Bend, check_camera
 from dualslam.recovery.linking.correspondences import Correspondences, DescriptorMatcher, propose_correspondences
 from dualslam.recovery.linking.estimate import LinkEstimate, estimate_link
+from dualslam.recovery.linking.evidence import LinkRefusal
 from dualslam.recovery.linking.live_end import propagate_to_live_end
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "Correspondences",
     "DescriptorMatcher",
     "LinkEstimate",
+    "LinkRefusal",
     "check_camera",
     "estimate_link",
     "propagate_to_live_end",

@@ -114,7 +114,7 @@ def check_camera(
     if min(len(each) for each in rows) >= 2:
         bend = measure_bend(found.T_now, found.T_preferred, *rows).beyond_chance(found.distance2)
     turn_deg = math.degrees(bend.rotation_rad)
-    sigma = math.hypot(link.numbers["sigma_scale"], bend.log_scale)
+    sigma = math.hypot(link.sigma_scale, bend.log_scale)
     if sigma <= config.max_live_scale_sigma and turn_deg <= config.max_live_rotation_deg:
         return bend
     numbers = {

@@ -30,6 +30,7 @@ from dualslam.recovery.linking.correspondences import (
     place_pairs,
 )
 from dualslam.recovery.linking.deformation import deformation_covariance, measure_deformation
+from dualslam.recovery.linking.evidence import LinkRefusal
 from dualslam.recovery.linking.gates import (
     LOOK_BACK,
     MAX_HYPOTHESES,
@@ -63,6 +64,8 @@ class LinkEstimate:
         First shared keyframe at which the old map no longer fits the link: from there on it is to be by-passed.
     suspected_onset : int or None
         The onset that was told or found (the older), from which on no keyframe was trusted.
+    sigma_scale : float
+        Relative sigma of the scale: at the overlap, or at the live end once it is propagated there.
     numbers : dict
         For the event log.
     """
@@ -75,6 +78,7 @@ class LinkEstimate:
     agreeing_keyframes: IntArray
     change_point: int | None
     suspected_onset: int | None
+    sigma_scale: float
     numbers: dict[str, float]
 
 
@@ -126,7 +130,9 @@ def estimate_link(
         trusted &= pairs.keyframes >= discontinuities_new[-1]
         if np.count_nonzero(np.array(list(new.keyframes)) < discontinuities_new[-1]) > 1:
             detail = "the new map is torn among its older keyframes"
-            return Failure(FailureReason.DEFORMED, detail, {"torn": float(discontinuities_new[-1])})
+            torn_at = int(discontinuities_new[-1])
+            numbers = {"torn": float(torn_at)}
+            return LinkRefusal(FailureReason.DEFORMED, detail, numbers, torn_at, walk_sigma=np.inf)
     if np.count_nonzero(trusted) < config.min_keyframes:
         return _needs_older(int(np.count_nonzero(trusted)), config, onset)
     # 3. All of them, or the parts of a long overlap on which both maps have the same shape.
@@ -343,9 +349,10 @@ def _link(
     holds |= later.agrees & (every.keyframes < (np.inf if change_point is None else change_point))
     same = (whole.mahalanobis2(S) < PAIR_CHI2) & every.pairs_seen_in(holds)
     on = consensus.keyframes
+    sigmas = verify.sigma_numbers(model, S, covariance)
     numbers = {
         "scale": float(sim3.scale(S)),
-        **verify.sigma_numbers(model, S, covariance),
+        **sigmas,
         "chi2": estimate.chi2_per_dof,
         "n_pairs": float(len(every)),
         "n_shared_pixel": float(every.shared_pixel.sum()),
@@ -366,5 +373,6 @@ def _link(
         agreeing_keyframes=c.keyframes[on],
         change_point=change_point,
         suspected_onset=onset,
+        sigma_scale=sigmas["sigma_scale"],
         numbers=numbers,
     )

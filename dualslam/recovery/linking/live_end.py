@@ -13,6 +13,7 @@ from dualslam.core.types import Failure, FailureReason
 from dualslam.map.submap import Submap
 from dualslam.recovery.linking.camera_bend import NO_BEND, Bend
 from dualslam.recovery.linking.estimate import LinkEstimate
+from dualslam.recovery.linking.evidence import LinkRefusal
 from dualslam.recovery.linking.gates import PIXEL_CHI2
 from dualslam.recovery.linking.scale_observability import scale_sigma_between
 
@@ -45,12 +46,12 @@ def propagate_to_live_end(
     Returns
     -------
     LinkEstimate or Failure
-        With `sigma_scale` in its numbers as it is at the live end, the walk's share of it, `sigma_scale_reverse`, and
-        the camera's, `sigma_scale_camera`, where there is one.
+        With its `sigma_scale` at the live end. The numbers have the walk's share of it, `sigma_scale_reverse`, and the
+        camera's, `sigma_scale_camera`, where there is one.
     """
     live = np.array([k for k in new.keyframes if k >= live_since], np.int64)
     walk = scale_sigma_between(new, link.agreeing_keyframes, live, PIXEL_CHI2)
-    sigma = math.hypot(link.numbers["sigma_scale"], walk, bend.log_scale)
+    sigma = math.hypot(link.sigma_scale, walk, bend.log_scale)
     numbers = {"sigma_scale": sigma, "sigma_scale_reverse": walk}
     if bend.log_scale:
         numbers["sigma_scale_camera"] = abs(bend.log_scale)
@@ -60,10 +61,11 @@ def propagate_to_live_end(
             detail = f"scale known to {sigma:.1%} at the live end, {walk:.1%} of it by the walk"
         settled = len(link.agreeing_keyframes) >= SETTLED_KEYFRAMES
         hopeless = walk > (SETTLED if settled else HOPELESS) * config.max_live_scale_sigma
-        return Failure(FailureReason.SCALE_LOST if hopeless else FailureReason.SCALE, detail, numbers)
+        reason = FailureReason.SCALE_LOST if hopeless else FailureReason.SCALE
+        return LinkRefusal(reason, detail, numbers, walk_sigma=walk)
     # The live end grows and shrinks about the place where the maps overlap.
     held = [k for k in link.agreeing_keyframes.tolist() if k in new.keyframes]
     about = sim3.adjoint(se3.from_parts(np.eye(3), new.keyframe_poses(held)[:, :3, 3].mean(0)))
     lost = np.diag([bend.rotation_rad**2] * 3 + [0.0] * 3 + [walk**2 + bend.log_scale**2])
     covariance = link.covariance + about @ lost @ about.T
-    return replace(link, covariance=covariance, numbers=link.numbers | numbers)
+    return replace(link, covariance=covariance, sigma_scale=sigma, numbers=link.numbers | numbers)

@@ -107,7 +107,7 @@ def test_what_counts_is_the_bend_and_not_the_contradiction(
 def test_it_counts_beside_what_else_is_unknown(link: LinkEstimate) -> None:
     submap = make_submap(TRUE, turning=True, n=N)
     find = partial(found, log_scale=0.02, turn_deg=0.0)
-    unsure = replace(link, numbers=link.numbers | {"sigma_scale": 0.02})
+    unsure = replace(link, sigma_scale=0.02)
     assert isinstance(check_camera(submap, link, LIVE_SINCE, find, CONFIG, CALIBRATION), Bend)
     assert isinstance(check_camera(submap, unsure, LIVE_SINCE, find, CONFIG, CALIBRATION), Failure)
 
