@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from dualslam.cli import main
@@ -60,3 +61,14 @@ def test_a_black_out_on_the_road_ends_in_one_map(tmp_path: Path) -> None:
     assert summary["ate_rmse_m"] <= 0.6
     posed = {line.split()[0] for line in (out / "trajectory.txt").read_text().splitlines() if line[0] != "#"}
     assert len(posed) == round(summary["coverage"] * summary["frames"])
+
+
+def test_two_floors_that_look_alike_are_not_one(tmp_path: Path) -> None:
+    """Down a staircase. Merged, the camera moves by a floor between two frames: 58 times the median step."""
+    out = tmp_path / "run"
+    run(out, "phone_staircase", "--inline")
+    trajectory = np.loadtxt(out / "trajectory.txt")
+    steps = np.linalg.norm(np.diff(trajectory[:, 1:4], axis=0), axis=1)
+    assert steps.max() < 5 * np.median(steps)
+    n_posed = len(trajectory) + sum(len(np.loadtxt(path)) for path in (out / "submaps").glob("*.txt"))
+    assert n_posed >= 265
