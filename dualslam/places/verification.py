@@ -35,6 +35,7 @@ from dualslam.places.sides import (
     side_of,
     sigmas_at_pairs,
 )
+from dualslam.recovery.linking.evidence import Gate, first_refusal, sigma_gates
 from dualslam.recovery.linking.gates import (
     MAX_HYPOTHESES,
     MAX_SCALE,
@@ -156,10 +157,7 @@ class PlaceVerifier:
         look = self._matcher.look(submap, place.landmarks, T_cam_submap, submap.K, features, SEARCH_RADIUS_PX)
         own = self._own_found(place)
         numbers = {"found": look.share, "own_found": own, "n_visible": float(len(look.feature))}
-        if look.share < MIN_FOUND * own:
-            detail = f"{look.share:.0%} of what the place should show is there, {own:.0%} in its own keyframes"
-            return Failure(FailureReason.REPROJECTION, detail, numbers)
-        return None
+        return first_refusal([_found_gate(look.share, own)], numbers)
 
     # --- steps
 
@@ -268,7 +266,19 @@ class PlaceVerifier:
             "scale": float(sim3.scale(S)),
             **sigmas,
         }
-        refused = self._refuse(numbers)
+        n_least = min(len(keyframes_place), len(keyframes_query))
+        gates = [
+            Gate(n > MIN_MAJORITY * len(inliers), FailureReason.LOW_INLIER_RATIO, f"{n} of {len(inliers)} pairs agree"),
+            Gate(
+                n_least >= MIN_KEYFRAMES,
+                FailureReason.AGREEMENT,
+                f"{len(keyframes_place)} and {len(keyframes_query)} keyframes agree, {MIN_KEYFRAMES} needed",
+            ),
+            _found_gate(found, own),
+            Gate(spread >= MIN_IMAGE_SPREAD, FailureReason.SPREAD, f"{spread:.0%} of the image is covered"),
+            *sigma_gates(sigmas["sigma_scale"], sigmas["sigma_rot_deg"], sigmas["sigma_trans_rel"], self._config),
+        ]
+        refused = first_refusal(gates, numbers)
         if refused is not None:
             return refused
         second = self._second_pose(place, query, S, rng)
@@ -290,29 +300,6 @@ class PlaceVerifier:
             n,
             numbers,
         )
-
-    def _refuse(self, numbers: dict[str, float]) -> Failure | None:
-        """Hold what was measured against the gates."""
-        n, n_pairs = numbers["n_inliers"], numbers["n_matches"]
-        if n <= MIN_MAJORITY * n_pairs:
-            return Failure(FailureReason.LOW_INLIER_RATIO, f"{n:.0f} of {n_pairs:.0f} pairs agree", numbers)
-        n_place, n_query = numbers["n_keyframes_place"], numbers["n_keyframes_query"]
-        if min(n_place, n_query) < MIN_KEYFRAMES:
-            detail = f"{n_place:.0f} and {n_query:.0f} keyframes agree, {MIN_KEYFRAMES} needed"
-            return Failure(FailureReason.AGREEMENT, detail, numbers)
-        found, own = numbers["found"], numbers["own_found"]
-        if found < MIN_FOUND * own:
-            detail = f"{found:.0%} of what the place should show is there, {own:.0%} in its own keyframes"
-            return Failure(FailureReason.REPROJECTION, detail, numbers)
-        if numbers["spread"] < MIN_IMAGE_SPREAD:
-            return Failure(FailureReason.SPREAD, f"{numbers['spread']:.0%} of the image is covered", numbers)
-        if numbers["sigma_scale"] > self._config.max_scale_sigma:
-            return Failure(FailureReason.SCALE, f"scale known to {numbers['sigma_scale']:.1%}", numbers)
-        if numbers["sigma_rot_deg"] > self._config.max_rotation_sigma_deg:
-            return Failure(FailureReason.DEGENERATE, f"rotation known to {numbers['sigma_rot_deg']:.2f} deg", numbers)
-        if numbers["sigma_trans_rel"] > self._config.max_position_sigma:
-            return Failure(FailureReason.DEGENERATE, f"position known to {numbers['sigma_trans_rel']:.1%}", numbers)
-        return None
 
     def _second_pose(self, place: Side, query: Side, S: FloatArray, rng: Generator) -> SecondSimilarity | None:
         """Look for another similarity among all that looks alike, in the place and in the keyframe that asks."""
@@ -350,3 +337,9 @@ class PlaceVerifier:
             chi2_gate=PAIR_CHI2,
             max_hypotheses=MAX_HYPOTHESES,
         )
+
+
+def _found_gate(found: float, own: float) -> Gate:
+    """Return the gate of the share of a place's landmarks that an image shows, against the place's own images."""
+    detail = f"{found:.0%} of what the place should show is there, {own:.0%} in its own keyframes"
+    return Gate(found >= MIN_FOUND * own, FailureReason.REPROJECTION, detail)

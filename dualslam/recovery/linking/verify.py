@@ -10,6 +10,7 @@ from dualslam.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
+from dualslam.recovery.linking.evidence import first_refusal, sigma_gates
 from dualslam.recovery.linking.gates import GATE_SIGMAS, PIXEL_CHI2
 from dualslam.recovery.linking.pairs import PairModel
 from dualslam.recovery.linking.scale_observability import scale_sigma_between
@@ -57,13 +58,9 @@ def check_sigmas(
 ) -> Failure | None:
     """Refuse a similarity that the landmarks do not fix (collinear, all at one place), by its own covariance."""
     numbers = sigma_numbers(model, S_old_new, covariance)
-    if numbers["sigma_scale"] > config.max_scale_sigma:
-        return Failure(FailureReason.SCALE, f"scale known to {numbers['sigma_scale']:.1%}", numbers)
-    if numbers["sigma_rot_deg"] > config.max_rotation_sigma_deg:
-        return Failure(FailureReason.DEGENERATE, f"rotation known to {numbers['sigma_rot_deg']:.2f} deg", numbers)
-    if numbers["sigma_trans_mu"] > config.max_position_sigma * numbers["depth_mu"]:
-        return Failure(FailureReason.DEGENERATE, f"position known to {numbers['sigma_trans_mu']:.3g}", numbers)
-    return None
+    position = numbers["sigma_trans_mu"] / numbers["depth_mu"]
+    gates = sigma_gates(numbers["sigma_scale"], numbers["sigma_rot_deg"], position, config)
+    return first_refusal(gates, numbers)
 
 
 def sigma_numbers(model: PairModel, S_old_new: FloatArray, covariance: FloatArray) -> dict[str, float]:
