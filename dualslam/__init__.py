@@ -1,15 +1,13 @@
 """Monocular SLAM on GTSAM submaps that recovers from tracking failure by reverse tracking.
 
-The Python interface; each name is imported when it is first used, so ``import dualslam`` is light and sets nothing::
+The Python interface; each name is imported when it is first used, so ``import dualslam`` is light::
 
     import dualslam
 
-    dualslam.limit_threads()                      # before numpy is imported
-    sequence = dualslam.open_source("video.mp4", fov_degrees=70)
-    system = dualslam.build_system(dualslam.load_config(), sequence.camera)
-    for frame in sequence:
-        result = system.step(frame)
-    system.finish()
+    slam = dualslam.Slam(dualslam.Camera.read("calib.yaml"))
+    for image, t in frames:
+        r = slam.track(image, t)
+    slam.save("runs/walk")
 """
 
 from __future__ import annotations
@@ -23,6 +21,7 @@ if TYPE_CHECKING:
     from dualslam.build import build_system, create_frontend, recovery_parts
     from dualslam.config.files import config_from_dict, dump_config, load_config
     from dualslam.config.settings import Config
+    from dualslam.core.camera.base import Camera
     from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError, SolverError
     from dualslam.core.memory import keep_freed_memory
     from dualslam.core.threads import limit_threads
@@ -38,11 +37,13 @@ if TYPE_CHECKING:
     from dualslam.run.results import frame_rows, trajectories_of
     from dualslam.run.runner import run_sequence
     from dualslam.run.session import run_to_folder
+    from dualslam.run.slam import Slam
     from dualslam.run.sources import open_source
     from dualslam.system import System
     from dualslam.viewer.progress import Progress
 
 _WHERE = {
+    "Camera": "core.camera.base",
     "Config": "config.settings",
     "ConfigError": "core.errors",
     "DualSlamError": "core.errors",
@@ -52,6 +53,7 @@ _WHERE = {
     "InputError": "core.errors",
     "OutputError": "core.errors",
     "Progress": "viewer.progress",
+    "Slam": "run.slam",
     "SolverError": "core.errors",
     "System": "system",
     "build_system": "build",
@@ -80,6 +82,7 @@ _WHERE = {
 }
 
 __all__ = [
+    "Camera",
     "Config",
     "ConfigError",
     "DualSlamError",
@@ -89,6 +92,7 @@ __all__ = [
     "InputError",
     "OutputError",
     "Progress",
+    "Slam",
     "SolverError",
     "System",
     "__version__",
@@ -121,6 +125,8 @@ __all__ = [
 def __getattr__(name: str) -> object:
     if name not in _WHERE:
         raise AttributeError(f"module 'dualslam' has no attribute {name!r}")
+    if name == "Slam":  # a program of five lines calls nothing before it
+        import_module("dualslam.core.threads").limit_threads()
     value = getattr(import_module(f"dualslam.{_WHERE[name]}"), name)
     globals()[name] = value
     return value

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 from dualslam.config.problems import nearest_of
 from dualslam.config.settings import FrontendConfig
 from dualslam.core.errors import ConfigError, written
+from dualslam.core.extras import how_to_install
 from dualslam.core.interfaces import Frontend
 
 ENTRY_POINT_GROUP = "dualslam.frontends"
@@ -133,7 +134,7 @@ def _factory(name: str) -> FrontendFactory:
         found = _import(name)
     except (ImportError, AttributeError, ValueError, SyntaxError) as error:
         missing_extra = isinstance(error, ModuleNotFoundError) and name in EXTRAS
-        advice = f'; pip install -e ".[{EXTRAS[name]}]" in the checkout' if missing_extra else ""
+        advice = f"; {how_to_install(EXTRAS[name])}" if missing_extra else ""
         raise ConfigError(f"'{name}' cannot be imported: {error}{advice}", NAME) from error
     if not callable(getattr(found, "from_options", None)):
         raise ConfigError(f"'{name}' is no front end: it has no from_options", NAME)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
+from dualslam.core.extras import how_to_install
 from dualslam.lab.bench.record import TrialRecord, judge
 from dualslam.lab.bench.spec import BenchSpec
 from dualslam.lab.bench.table import ResultTable
@@ -21,7 +22,7 @@ def draw_figures(
 ) -> list[Path]:
     """Draw the figures into ``figures/``; return what was written: nothing without matplotlib, and the log says so."""
     if find_spec("matplotlib") is None:
-        log.warning('no figures: they need matplotlib (pip install -e ".[report]" in the checkout)')
+        log.warning("no figures: they need matplotlib (%s)", how_to_install("report"))
         return []
     from dualslam.report.bench_figures import draw_delays, draw_end_points, draw_rates, draw_statuses
 

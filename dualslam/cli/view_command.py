@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dualslam.cli.outputs import check_free
 from dualslam.core.errors import InputError
+from dualslam.core.extras import how_to_install
 from dualslam.io.atomic import atomic_file
 from dualslam.report.run_data import RunData, read_run
 from dualslam.viewer.window import has_display, open_viewer
@@ -38,5 +39,5 @@ def _record(run: RunData) -> bytes:
     try:
         from dualslam.viewer.recording import make_recording
     except ImportError as error:
-        raise InputError('dualslam view needs the Rerun viewer: pip install -e ".[view]" in the checkout.') from error
+        raise InputError(f"dualslam view needs the Rerun viewer: {how_to_install('view')}.") from error
     return make_recording(run)

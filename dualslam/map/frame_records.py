@@ -83,6 +83,26 @@ class FrameResult:
     doubt: str = ""
 
     @property
+    def pose(self) -> FloatArray | None:
+        """The same as `T_world_cam`."""
+        return self.T_world_cam
+
+    @property
+    def position(self) -> FloatArray | None:
+        """(3,) camera centre in the world, in its unit; None without a pose."""
+        T = self.T_world_cam
+        return None if T is None else T[:3, 3]
+
+    @property
+    def lost(self) -> str | None:
+        """Why the frame has no pose, in words; None where it has one."""
+        if self.T_submap_cam is not None:
+            return None
+        if self.failure is None:
+            return "there is no map yet"
+        return self.failure.detail or str(self.failure.reason).replace("_", " ")
+
+    @property
     def T_world_cam(self) -> FloatArray | None:
         """(4, 4) pose, camera to world, in the world's unit; None without one."""
         if self.T_submap_cam is None or self.S_world_submap is None:

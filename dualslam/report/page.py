@@ -59,6 +59,13 @@ def report_page(run: RunData | str | Path) -> str:
     return document(f"{sequence} - dualslam report", body)
 
 
+def notebook_cell(run: RunData) -> Markup:
+    """Return the head of the page and the trajectory from above, in a frame: its styles are not the notebook's."""
+    sequence = str(run.summary.get("sequence", run.name))
+    page = document(sequence, [_header(run, sequence), top_view(run)])
+    return tag("iframe", srcdoc=page, style="width: 100%; height: 640px; border: 0", title=f"run {run.name}")
+
+
 def _header(run: RunData, sequence: str) -> Markup:
     lead = tag("p", headline(run), cls="lead")
     return tag("header", tag("h1", sequence), _verdict(run), lead, _saved_map(run), _warnings(run), _tiles(run))

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.config import strict_yaml
 from dualslam.core.errors import InputError
+from dualslam.core.extras import how_to_install
 from dualslam.core.geometry import sim3
 from dualslam.core.types import BoolArray, FloatArray, FrameStatus, IntArray
 from dualslam.io import run_folder
@@ -21,6 +23,9 @@ from dualslam.io.run_folder import FrameRow, unlinked_submaps
 from dualslam.io.run_reading import read_events, read_frames, read_samples, read_summary
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate, read_text, read_tum
 from dualslam.map.atlas import joined
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MAX_POINTS = 2500
 MAX_VIEW_DISTANCE_MU = 8.0
@@ -89,6 +94,34 @@ class RunData:
     truth: PosedRows
     points: FloatArray
     samples: dict[int, bytes]
+
+    def __repr__(self) -> str:
+        return f"<run {self.path}: {len(self.main)} of {len(self.rows)} frames posed, {len(self.events)} events>"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the outcome and the trajectory from above."""
+        page = import_module("dualslam.report.page")  # by name: the pages are made of this
+        return str(page.notebook_cell(self))
+
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the trajectory from above, with matplotlib (extra `report`).
+
+        Parameters
+        ----------
+        path : path, optional
+            File to write, in the format of its ending: ``.pdf``, ``.svg``, ``.png``.
+
+        Raises
+        ------
+        InputError
+            If matplotlib is not installed, or no frame has a pose.
+        """
+        try:
+            plot = import_module("dualslam.report.plot")
+        except ImportError as error:
+            raise InputError(f"plot draws with matplotlib: {how_to_install('report')}.") from error
+        figure: Figure = plot.plot_run(self, path)
+        return figure
 
     @property
     def name(self) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
@@ -235,6 +235,50 @@ def run_to_folder(
                 raise report.bug from error  # the map of a system that broke may be in pieces
     _raise_what_ended(report, interrupts, out)
     return Outcome(Path(out), summary, report, system)
+
+
+def save_system(
+    system: System, config: Config, camera: Camera, report: RunReport, out: str | Path, *, overwrite: bool = False
+) -> None:
+    """Write the run folder of a finished system that a program fed by itself.
+
+    Parameters
+    ----------
+    system : System
+    config : Config
+    camera : Camera
+        As it was given.
+    report : RunReport
+    out : path
+    overwrite : bool
+
+    Raises
+    ------
+    OutputError
+    """
+    sequence = _Fed(camera)
+    check_out(out, overwrite=overwrite)
+    with RunFolder(out, overwrite=overwrite) as folder:
+        folder.write_config(dump_config(config))
+        _write_new_events(system, folder)
+        given = _given(sequence, False) | {"saved_map": None, "localise": False, "no_map": None}
+        _write_results(system, report, config, sequence, folder, given)
+        _write_pages(folder)
+
+
+class _Fed:
+    """What stands for the sequence where a program has fed a system."""
+
+    name, rate_hz = "python", 0.0
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+
+    def __len__(self) -> int:
+        return 0
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(())
 
 
 def _raise_what_ended(report: RunReport, interrupts: Interrupts, out: str | Path) -> None:

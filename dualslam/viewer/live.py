@@ -15,6 +15,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 
 from dualslam.core.errors import InputError, OutputError
+from dualslam.core.extras import how_to_install
 from dualslam.core.processes import start_undisturbed
 from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult
@@ -57,7 +58,7 @@ class LiveView:
 
     def __init__(self, port: int = 0) -> None:
         if importlib.util.find_spec("viser") is None:
-            raise InputError('--live needs the live viewer: pip install -e ".[live]" in the checkout.')
+            raise InputError(f"--live needs the live viewer: {how_to_install('live')}.")
         self.on_save: Callable[[str], None] | None = None
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()

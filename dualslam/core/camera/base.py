@@ -11,6 +11,8 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -72,6 +74,18 @@ class Camera(ABC):
     def _centre_zoom(self) -> float:
         """Return the derivative of distorted by undistorted coordinates on the axis."""
         return 1.0
+
+    @staticmethod
+    def read(path: str | Path) -> Camera:
+        """Read a calibration from a file of any known format (docs/calibration.md).
+
+        Raises
+        ------
+        InputError
+        """
+        reader = import_module("dualslam.io.camera_files")  # by name: readers of files stand above this room
+        camera: Camera = reader.read_camera_file(path)
+        return camera
 
     @property
     def K(self) -> FloatArray:

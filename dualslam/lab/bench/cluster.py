@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from dualslam.core.errors import InputError
+from dualslam.core.extras import how_to_install
 from dualslam.lab.bench.plan import Trial
 from dualslam.lab.bench.pool import RunTrial
 from dualslam.lab.bench.record import TrialOutcome, TrialRecord, blank_record
@@ -34,7 +35,7 @@ def run_on_cluster(run_trial: RunTrial, trials: Iterable[Trial], address: str) -
     try:
         from distributed import Client, as_completed
     except ImportError as error:
-        raise InputError('--scheduler needs dask.distributed: pip install -e ".[cluster]" in the checkout.') from error
+        raise InputError(f"--scheduler needs dask.distributed: {how_to_install('cluster')}.") from error
     try:
         client = Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:

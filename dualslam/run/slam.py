@@ -1,0 +1,172 @@
+"""The front door for a program of your own: give it images, read poses, save the map."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.build import build_system
+from dualslam.config.files import load_config
+from dualslam.config.settings import Config
+from dualslam.core.camera.base import Camera
+from dualslam.core.errors import InputError
+from dualslam.core.memory import peak_rss_mb
+from dualslam.core.trajectory import Trajectory
+from dualslam.core.types import Frame
+from dualslam.export.exported_map import ExportedMap, flatten
+from dualslam.io.map_store import StoredMap, load_atlas
+from dualslam.map.frame_records import FrameResult
+from dualslam.report.run_data import RunData, read_run
+from dualslam.run.results import trajectories_of
+from dualslam.run.runner import RunReport
+from dualslam.run.session import save_system
+from dualslam.system import System
+
+
+class Slam:
+    """Monocular SLAM, fed image by image.
+
+    >>> slam = dualslam.Slam(dualslam.Camera.read("calib.yaml"))  # doctest: +SKIP
+    >>> for image, t in frames:  # doctest: +SKIP
+    ...     r = slam.track(image, t)
+    >>> slam.save("runs/walk")  # doctest: +SKIP
+
+    Parameters
+    ----------
+    camera : Camera, or path
+        Calibrated; a path is read by `Camera.read`.
+    config : Config, optional
+        From `load_config`; the defaults if it is not given.
+    saved_map : path or StoredMap, optional
+        Run folder, or map, to continue.
+    localise : bool
+        Find poses in the saved map and add nothing to it.
+
+    Attributes
+    ----------
+    system : System
+        The state machine below: submaps, graphs, events.
+
+    Raises
+    ------
+    InputError, ConfigError
+    """
+
+    def __init__(
+        self,
+        camera: Camera | str | Path,
+        *,
+        config: Config | None = None,
+        saved_map: StoredMap | str | Path | None = None,
+        localise: bool = False,
+    ) -> None:
+        if localise and saved_map is None:
+            raise InputError("localise finds poses in a saved map: name it with saved_map.")
+        self._camera = camera if isinstance(camera, Camera) else Camera.read(camera)
+        self._config = load_config() if config is None else config
+        saved = load_atlas(saved_map) if isinstance(saved_map, str | Path) else saved_map
+        self.system: System = build_system(self._config, self._camera, saved=saved, localise=localise)
+        self._began, self._cpu_began = time.perf_counter(), time.process_time()
+        self._n_frames = 0
+        self._ended = False
+
+    def track(self, image: NDArray[np.uint8] | None, timestamp_s: float) -> FrameResult:
+        """Take the next image.
+
+        Parameters
+        ----------
+        image : (H, W) or (H, W, 3) RGB uint8, or None
+            None where the camera gave no image.
+        timestamp_s : float
+            Seconds; ascending.
+
+        Returns
+        -------
+        FrameResult
+            `pose`, `position`, `status`, `doubt`, and `lost`: why there is no pose, or None.
+
+        Raises
+        ------
+        InputError
+            If the image is no such array, or the map has been saved.
+        """
+        frame = Frame(self._n_frames, timestamp_s, image, "" if image is not None else "the camera gave no image")
+        result = self.system.step(frame)
+        self._n_frames += 1
+        return result
+
+    @property
+    def map(self) -> ExportedMap | None:
+        """The main map so far: `xyz` and `colour` of its points, `T_world_cam` of its keyframes; None without one."""
+        stored = self._stored()
+        return flatten(stored) if stored.main else None
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """All poses in the main map so far: `index`, `timestamps_s`, `T_world_cam`."""
+        return trajectories_of(self.system).main
+
+    def finish(self) -> None:
+        """End the mapping: wait for running recoveries, refine. No image is taken after it; `save` calls it."""
+        if not self._ended:
+            self._ended = True
+            self.system.finish()
+
+    def save(self, out: str | Path, *, overwrite: bool = False) -> RunData:
+        """Finish, and write a run folder: trajectory, frames, map, report.
+
+        Raises
+        ------
+        OutputError
+            If there is a run already and `overwrite` is not set, or the folder cannot be written.
+        """
+        self.finish()
+        save_system(self.system, self._config, self._camera, self._report(), out, overwrite=overwrite)
+        return read_run(out)
+
+    def localise(self) -> Slam:
+        """Finish, and return a `Slam` that finds poses in this map and adds nothing to it.
+
+        Raises
+        ------
+        InputError
+            If there is no map.
+        """
+        self.finish()
+        stored = self._stored()
+        if not stored.main:
+            raise InputError("there is no map to localise in: no frame has a pose.")
+        return Slam(self._camera, config=self._config, saved_map=stored, localise=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.system.desk.close()
+
+    def __repr__(self) -> str:
+        posed = len(self.system.poses)
+        return f"<Slam: {self._n_frames} frames, {posed} posed, {len(self.system.atlas.submaps)} submaps>"
+
+    def _stored(self) -> StoredMap:
+        return StoredMap(self.system.atlas, self.system.poses, self.system.camera)
+
+    def _report(self) -> RunReport:
+        latencies_ms = tuple(row.latency_ms for row in self.system.rows.values())
+        return RunReport(
+            n_frames=self._n_frames,
+            dropped=(),
+            latencies_ms=latencies_ms,
+            steps_ms=latencies_ms,
+            n_late=0,
+            wall_s=time.perf_counter() - self._began,
+            cpu_s=time.process_time() - self._cpu_began,
+            peak_rss_mb=peak_rss_mb(),
+            interrupted=False,
+            error=None,
+            bug=None,
+        )
