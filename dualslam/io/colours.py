@@ -1,4 +1,4 @@
-"""Colours of a map's landmarks, one file beside the map's arrays."""
+"""Colours of a map's landmarks, and small pictures of what it was made from: two files beside the map's arrays."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dualslam.io.map_files import load_arrays, save_arrays
 
-COLOURS = "colours.npz"
+COLOURS, PICTURES = "colours.npz", "pictures.npz"
 GREY = 128
 """Red, green and blue of a landmark that no colour image shows."""
 
@@ -41,3 +41,21 @@ def padded(colours: Colours, submap_id: int, n: int) -> NDArray[np.uint8]:
     """Return the colours (n, 3) of a submap's first `n` landmarks, `GREY` beyond those that have one."""
     known = colours.get(submap_id, np.zeros((0, 3), np.uint8))[:n]
     return np.concatenate([known, np.full((n - len(known), 3), GREY, np.uint8)])
+
+
+def save_pictures(map_folder: Path, pictures: Mapping[int, bytes]) -> None:
+    """Write JPEGs, by the index of their frame."""
+    arrays = {f"{index:06d}": np.frombuffer(jpeg, np.uint8) for index, jpeg in pictures.items()}
+    save_arrays(map_folder / PICTURES, arrays)
+
+
+def load_pictures(map_folder: Path) -> dict[int, bytes]:
+    """Return the pictures of a map; empty where it was saved without.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged.
+    """
+    path = map_folder / PICTURES
+    return {int(name): jpeg.tobytes() for name, jpeg in load_arrays(path).items()} if path.is_file() else {}

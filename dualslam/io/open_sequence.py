@@ -112,13 +112,14 @@ def open_sequence(
         calibration = str(camera_file)
         camera = read_camera_file(camera_file, lambda: image_size(recording.images, recording.name))
     if camera is None:
-        camera = _camera_from_fov(recording, fov_degrees)
+        camera, calibration = _camera_from_fov(recording, fov_degrees), f"a field of view of {fov_degrees:g} degrees"
     else:
         size_px = image_size(recording.images, recording.name, camera.size_px)
         camera = camera_of_size(camera, size_px, recording.name, calibration)
     recording, camera = _reduced(recording, camera, max_side_px)
     log.info("%s: %d frames, %s", recording.name, len(recording.images), camera)
-    return RecordedSequence(recording, camera, selection, grey=grey, source=str(Path(str(source)).resolve()))
+    place = str(Path(str(source)).resolve())
+    return RecordedSequence(recording, camera, selection, grey=grey, source=place, calibration=calibration)
 
 
 def _open_recording(source: Path, given: Given) -> Recording:

@@ -132,6 +132,8 @@ class RecordedSequence:
         Exposure times, where the source has them.
     source : str
         What it was opened from, by which it can be opened again; empty if that is not known.
+    calibration : str
+        Where the camera is from, for a person.
     """
 
     def __init__(
@@ -142,9 +144,10 @@ class RecordedSequence:
         *,
         grey: bool = True,
         source: str = "",
+        calibration: str = "",
     ) -> None:
         self._recording = recording
-        self.source = source
+        self.source, self.calibration = source, calibration
         self._grey = grey
         self.name = recording.name
         self.camera = camera

@@ -15,6 +15,7 @@ from dualslam.report.charts import beside_table, latency_histogram, pace_words, 
 from dualslam.report.event_words import event_words
 from dualslam.report.failures import failures_section, stories, verdict
 from dualslam.report.markup import Markup, cards, document, duration, join, number, table, tag
+from dualslam.report.next_steps import camera_words, next_steps
 from dualslam.report.places import places_section
 from dualslam.report.run_data import RunData, read_run
 from dualslam.report.statuses import WITHOUT_POSE, count, seen_again
@@ -46,6 +47,7 @@ def report_page(run: RunData | str | Path) -> str:
     body = [
         _header(run, str(sequence)),
         _section("Trajectory", [top_view(run), _map_link(run)]),
+        _section("What to do next", next_steps(run)),
         _section("Every frame", timeline(run)),
         _section("Failures and recoveries", failures_section(run)),
         _section("Trust", trust_section(run)),
@@ -68,7 +70,8 @@ def notebook_cell(run: RunData) -> Markup:
 
 def _header(run: RunData, sequence: str) -> Markup:
     lead = tag("p", headline(run), cls="lead")
-    return tag("header", tag("h1", sequence), _verdict(run), lead, _saved_map(run), _warnings(run), _tiles(run))
+    told = (_verdict(run), lead, _saved_map(run), _warnings(run), camera_words(run), _tiles(run))
+    return tag("header", tag("h1", sequence), *told)
 
 
 def _verdict(run: RunData) -> Markup | None:

@@ -18,7 +18,7 @@ MAX_PLACES = 12
 """Places seen again of which pictures are kept, and that have a card: a bound on the size of the report."""
 ALBUM_EVERY_S, ALBUM_SIZE = 0.5, 600
 """Time between two pictures that are remembered, and how many are: 5 to 10 MB."""
-WIDTH_PX = 320
+WIDTH_PX, THUMB_PX = 320, 160
 JPEG_QUALITY = 72
 POSED = frozenset({FrameStatus.TRACKED, FrameStatus.RECOVERED, FrameStatus.BYPASSED})
 
@@ -93,6 +93,11 @@ class PlaceAlbum:
             self._pictures = dict(list(self._pictures.items())[::2])
             self._every_s *= 2
 
+    def evenly(self, n: int) -> dict[int, bytes]:
+        """Return some of the pictures, smaller: at most `n`, evenly chosen."""
+        chosen = list(self._pictures.items())[:: max(1, -(-len(self._pictures) // n))]
+        return {index: smaller(jpeg) for index, jpeg in chosen}
+
     def show(self, indices: Sequence[int]) -> None:
         """Keep for good the pictures nearest to some frames, of one place; of earlier runs' frames there are none."""
         if self._n_shown == MAX_PLACES or not self._pictures:
@@ -103,10 +108,17 @@ class PlaceAlbum:
             self._keep(nearest, self._pictures[nearest])
 
 
-def thumbnail(image: NDArray[np.uint8]) -> bytes:
+def smaller(jpeg: bytes) -> bytes:
+    """Return a picture in the size of a thumb."""
+    return thumbnail(
+        cv2.cvtColor(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), THUMB_PX
+    )
+
+
+def thumbnail(image: NDArray[np.uint8], width_px: int = WIDTH_PX) -> bytes:
     """Return a small JPEG of an image (H, W) or (H, W, 3) RGB."""
     height, width = image.shape[:2]
-    factor = min(1.0, WIDTH_PX / width)
+    factor = min(1.0, width_px / width)
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     if small.ndim == 3:

@@ -112,7 +112,8 @@ def _inlier_lane(run: RunData) -> Markup:
         y = 100 * (1 - threshold / top)
         shapes.append(tag("path", cls="threshold", d=f"M0 {coordinate(y)}H{len(run.rows)}"))
         note += f"; dashed: {threshold} needed"
-    return _lane("landmarks", note, stretched(len(run.rows), 100, shapes, "Landmarks matched and agreeing"))
+    drawing = stretched(len(run.rows), 100, shapes, "Landmarks matched and agreeing")
+    return _lane("landmarks", note, drawing, _values(number(top), "0"))
 
 
 def _error_lane(run: RunData, scene: PlacedRun) -> Markup | None:
@@ -125,7 +126,8 @@ def _error_lane(run: RunData, scene: PlacedRun) -> Markup | None:
     top = float(np.nanmax(error))
     note = f"distance from the truth after alignment, each map by itself, up to {number(top)} m"
     shape = _curve(error, max(top, 1e-12), "error")
-    return _lane("error", note, stretched(len(run.rows), 100, shape, "Position error"))
+    svg = stretched(len(run.rows), 100, shape, "Position error")
+    return _lane("error", note, svg, _values(f"{number(top)} m", "0"))
 
 
 def _latency_lane(run: RunData) -> Markup:
@@ -134,20 +136,27 @@ def _latency_lane(run: RunData) -> Markup:
     low, top = 1.0, max(float(latency.max()), 10.0)
     height = np.log10(np.clip(latency, low, None) / low)
     svg = stretched(len(latency), 100, _area(height, float(np.log10(top / low)), "latency"), "Latency of each frame")
-    return _lane("latency", f"wall time of each frame, logarithmic from 1 ms to {duration(top)}", svg)
+    return _lane("latency", "wall time of each frame, logarithmic", svg, _values(duration(top), duration(low)))
 
 
 def _axis(run: RunData) -> Markup:
-    n, first, last = len(run.rows), run.rows[0].index, run.rows[-1].index
+    words = frame_ticks([row.index for row in run.rows])
+    n = len(run.rows)
+    seconds = abs(run.rows[-1].timestamp_s - run.rows[0].timestamp_s)
+    note = f"{n} frames, {number(seconds)} s"
+    return _lane("frame", note, tag("div", cls="empty-lane"), words, "axis")
+
+
+def frame_ticks(indices: Sequence[int]) -> list[Markup]:
+    """Return round frame numbers below a drawing that has one column for each of some frames."""
+    n, first, last = len(indices), indices[0], indices[-1]
     words = []
     for value in ticks(min(first, last), max(first, last), 6):
         if abs(value - round(value)) > ROUNDING:  # of a few frames
             continue
         share = (value - first) / (last - first) if last != first else 0.0
         words.append(_at(100 * (share * (n - 1) + 0.5) / n, number(value, 6), "tick"))
-    seconds = abs(run.rows[-1].timestamp_s - run.rows[0].timestamp_s)
-    note = f"{n} frames, {number(seconds)} s"
-    return _lane("frame", note, tag("div", cls="empty-lane"), words, "axis")
+    return words
 
 
 # --- pieces
@@ -156,6 +165,11 @@ def _axis(run: RunData) -> Markup:
 def _lane(name: str, note: str, drawing: Markup, words: Sequence[Markup] = (), cls: str = "") -> Markup:
     head = tag("div", tag("b", name), " ", tag("small", note), cls="lane-name")
     return tag("div", head, tag("div", drawing, words, cls="lane-body"), cls=f"lane {cls or name}")
+
+
+def _values(top: str, bottom: str) -> list[Markup]:
+    """Return the values at the upper and the lower end of a lane."""
+    return [tag("span", text, cls=f"at value {place}") for text, place in ((top, "top"), (bottom, "bottom"))]
 
 
 def _block(start: int, length: int, title: str, cls: str) -> Markup:

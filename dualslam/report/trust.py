@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from dualslam.core.types import FloatArray
-from dualslam.report.markup import Markup, cards, join, number, stretched, tag
+from dualslam.report.markup import Markup, cards, coordinate, join, number, stretched, tag
 from dualslam.report.run_data import RunData
+from dualslam.report.timeline import frame_ticks
 
 LOOSE_SCALE = 0.05
 """From here on a scale counts as wrong (`linking.wrong_scale`): it may have been lost there."""
@@ -33,7 +34,8 @@ def trust_section(run: RunData) -> Markup:
             run,
             [row.sigma_scale for row in run.rows],
             "sigma of the scale across a frame",
-            f"Where it is above {LOOSE_SCALE:g} the scale may have changed unseen.",
+            "Above it the scale may have changed unseen.",
+            LOOSE_SCALE,
         ),
         _strip(
             run,
@@ -66,14 +68,14 @@ def _row(event: dict[str, Any], what: str, outcome: str) -> tuple[str, ...]:
     return str(event["frame"]), "-" if submap is None else str(submap), what, outcome
 
 
-def _strip(run: RunData, sigmas: list[float | None], name: str, note: str) -> Markup:
+def _strip(run: RunData, sigmas: list[float | None], name: str, note: str, threshold: float | None = None) -> Markup:
     """Return the largest claim of each stretch of frames as bars, on a logarithmic scale."""
     values = np.array([np.nan if sigma is None else sigma for sigma in sigmas])
     known = values[np.isfinite(values) & (values > 0)]
     if not len(known):
         return tag("p", f"No {name} is known.", cls="empty")
     low, high = np.floor(np.log10(known.min())), np.ceil(np.log10(known.max()) + 1e-9)
-    high = max(high, low + 1)
+    high = max(high, low + 1, np.ceil(np.log10(threshold)) if threshold else high)
     bars = []
     parts = np.array_split(values, min(N_BINS, len(values)))
     first = 0
@@ -85,10 +87,19 @@ def _strip(run: RunData, sigmas: list[float | None], name: str, note: str) -> Ma
             share = max(share, 0.01)
             bars.append(tag("rect", title, x=float(i), y=100 * (1 - share), width=0.9, height=100 * share, cls="bar"))
         first += len(part)
+    if threshold is not None:
+        y = 100 * (1 - (np.log10(threshold) - low) / (high - low))
+        bars.append(tag("path", cls="threshold", d=f"M0 {coordinate(y)}H{len(parts)}"))
     svg = stretched(len(parts), 100, bars, f"{name}, frame by frame")
     median, p95 = (number(float(np.percentile(known, q)), 2) for q in (50, 95))
-    caption = f"The {name}: median {median}, 95 % below {p95}; bars from {10.0**low:g} to {10.0**high:g}. {note}"
-    return tag("figure", tag("div", svg, cls="histogram"), tag("figcaption", caption))
+    dashed = "" if threshold is None else f" Dashed: {threshold:g}."
+    caption = f"The {name} (no unit, logarithmic) over the frames: median {median}, 95 % below {p95}.{dashed} {note}"
+    up = [
+        tag("span", f"{10.0**d:g}", cls="at value", style=f"top:{100 * (high - d) / (high - low):.1f}%")
+        for d in np.arange(low, high + 1)
+    ]
+    along = frame_ticks([row.index for row in run.rows])
+    return tag("figure", tag("div", svg, up, along, cls="histogram axes"), tag("figcaption", caption))
 
 
 def _worst(part: FloatArray) -> float | None:

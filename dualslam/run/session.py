@@ -22,7 +22,7 @@ from dualslam.core.interfaces import Sequence
 from dualslam.core.threads import spare_cores
 from dualslam.core.types import Frame
 from dualslam.export.colours import keyframe_indices, landmark_colours
-from dualslam.io.colours import Colours, save_colours
+from dualslam.io.colours import Colours, save_colours, save_pictures
 from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.run_folder import RunFolder, RunRecord, check_vacant
 from dualslam.io.sequence import RecordedSequence, Selection
@@ -46,6 +46,8 @@ SEARCHED_SIGMA = 0.031
 that it has no model for. With it the errors of eight pieces of recordings come to what is claimed (docs/notes, "A
 camera of which nothing is known")."""
 
+N_PICTURES = 60
+"""On ``map.html``, beside the slider: 200 KB."""
 SEEN_AGAIN = (EventKind.LOOP_CLOSED, EventKind.MERGED, EventKind.RELOCALISED)
 """Of these places pictures are kept."""
 
@@ -202,7 +204,8 @@ def run_to_folder(
         prepare = system.features_beside() if realtime and spare_cores(1) else None
         if realtime and isinstance(system.desk, WorkerDesk):
             system.desk.wait_until_ready()
-        watched = _Watched(system, SampleKeeper(folder.write_sample), PlaceAlbum(folder.write_sample), watcher)
+        album = PlaceAlbum(folder.write_sample)
+        watched = _Watched(system, SampleKeeper(folder.write_sample), album, watcher)
         with Interrupts() as interrupts:
             report = run_sequence(
                 watched,
@@ -225,6 +228,7 @@ def run_to_folder(
                 summary = _write_results(system, report, config, sequence, folder, given)
                 if isinstance(recorded, RecordedSequence) and not report.interrupted:
                     _write_colours(system, recorded, folder, colours)
+                save_pictures(folder.map_path, album.evenly(N_PICTURES))
                 _write_pages(folder)
             except (OutputError, KeyboardInterrupt) as end:
                 end.add_note(folder.what_is_there())
@@ -314,6 +318,7 @@ def _given(sequence: Sequence, realtime: bool) -> dict[str, Any]:
     return {
         "sequence": sequence.name,
         "source": getattr(sequence, "source", "") or None,
+        "calibration": getattr(sequence, "calibration", "") or None,
         "selection": None if selection is None else asdict(selection),
         "realtime": realtime,
         "camera": sequence.camera.to_dict(),

@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import camera_from_dict
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure, FloatArray, FrameStatus, IntArray
+from dualslam.io.colours import load_colours, padded
 from dualslam.io.map_files import METADATA, load_arrays
 from dualslam.io.map_store import submap_path
 from dualslam.io.run_folder import MAP, SUMMARY, FrameRow
@@ -41,11 +43,14 @@ class Appearing:
         The frame at which each appears, ascending: a row of `Playback.rows`.
     xyz : (N, 3) float64
     submap : (N,) int64
+    rgb : (N, 3) uint8
+        Their colours in the images; of keyframes, and where none are known, `GREY`.
     """
 
     row: IntArray
     xyz: FloatArray
     submap: IntArray
+    rgb: NDArray[np.uint8]
 
     def __len__(self) -> int:
         return len(self.row)
@@ -157,23 +162,27 @@ def _map_parts(run: RunData, rows: Sequence[FrameRow], submap: int | None) -> tu
     row_of = dict.fromkeys(range(first_id), 0)  # what earlier runs have left in the saved map was there from the start
     row_of |= {number_of(row.index): i for i, row in enumerate(rows)}
     keyframes, landmarks = [], []
+    colours = load_colours(folder)
     for m in component:
         arrays, S = load_arrays(submap_path(folder, m), _ARRAYS, (CONDEMNED,)), S_world_submap[m]
         shown = are_shown(arrays)
-        keyframes.append((m, arrays["kf_id"], sim3.act(S, arrays["kf_T_submap_kf"][:, :3, 3])))
-        landmarks.append((m, arrays["landmarks_first_kf"][shown], sim3.act(S, arrays["landmarks_xyz_mu"][shown])))
+        kf_id, xyz = arrays["kf_id"], sim3.act(S, arrays["kf_T_submap_kf"][:, :3, 3])
+        keyframes.append((m, kf_id, xyz, padded({}, m, len(kf_id))))
+        rgb = padded(colours, m, len(shown))[shown]
+        landmarks.append((m, arrays["landmarks_first_kf"][shown], sim3.act(S, arrays["landmarks_xyz_mu"][shown]), rgb))
     try:
         return _appear(keyframes, row_of), _appear(landmarks, row_of)
     except KeyError as error:
         raise InputError(f"{folder} is not the map of this run: its keyframe {error} is no frame of it.") from None
 
 
-def _appear(parts: Sequence[tuple[int, IntArray, FloatArray]], row_of: dict[int, int]) -> Appearing:
-    row = np.array([row_of[k] for _, frames, _ in parts for k in frames.tolist()], np.int64)
-    xyz = np.concatenate([_NO_XYZ, *(xyz for _, _, xyz in parts)])
-    submap = np.concatenate([np.zeros(0, np.int64), *(np.full(len(frames), m) for m, frames, _ in parts)])
+def _appear(parts: Sequence[tuple[int, IntArray, FloatArray, NDArray[np.uint8]]], row_of: dict[int, int]) -> Appearing:
+    row = np.array([row_of[k] for _, frames, _, _ in parts for k in frames.tolist()], np.int64)
+    xyz = np.concatenate([_NO_XYZ, *(part[2] for part in parts)])
+    rgb = np.concatenate([np.zeros((0, 3), np.uint8), *(part[3] for part in parts)])
+    submap = np.concatenate([np.zeros(0, np.int64), *(np.full(len(part[1]), part[0]) for part in parts)])
     order = np.argsort(row, kind="stable")
-    return Appearing(row[order], xyz[order], submap[order])
+    return Appearing(row[order], xyz[order], submap[order], rgb[order])
 
 
 def _camera(run: RunData) -> Camera:
