@@ -19,6 +19,7 @@ from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.errors import DualSlamError, InputError, NoCalibrationError
 from dualslam.io.atomic import atomic_file
 from dualslam.io.reduced import MAX_SIDE_PX
+from dualslam.io.run_folder import MAP_PAGE, REPORT
 from dualslam.io.sequence import RecordedSequence
 from dualslam.run.focal import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
 from dualslam.run.session import Outcome, Watchers, check_out, run_to_folder
@@ -71,19 +72,23 @@ def _run(args: argparse.Namespace, config: Config) -> int:
     if not has_camera:
         _tell(focal, args.quiet)
     logs.release()
-    with live_view(args) as live, progress(sequence, args.quiet) as shown:
-        outcome = run_to_folder(
-            config,
-            sequence,
-            args.out,
-            overwrite=args.overwrite,
-            realtime=args.realtime,
-            saved_map=args.map,
-            localise=args.localise,
-            focal=focal,
-            watcher=Watchers([each for each in (live, shown) if each is not None]),
-        )
-    status = conclude(outcome, args)
+    with live_view(args) as live:
+        with progress(sequence, args.quiet) as shown:
+            outcome = run_to_folder(
+                config,
+                sequence,
+                args.out,
+                overwrite=args.overwrite,
+                realtime=args.realtime,
+                saved_map=args.map,
+                localise=args.localise,
+                focal=focal,
+                watcher=Watchers([each for each in (live, shown) if each is not None]),
+            )
+        status = conclude(outcome, args)
+        if outcome.has_map and not args.quiet:
+            print(f"open {outcome.out / REPORT} and {outcome.out / MAP_PAGE}", flush=True)
+        stay_open(live)
     may_go_on = outcome.report.interrupted and outcome.has_map and not args.reverse and not args.localise
     if isinstance(sequence, RecordedSequence) and may_go_on and not args.quiet:
         following = outcome.system.numbers.index_of(max(outcome.system.rows)) + args.stride
@@ -111,7 +116,7 @@ def naming_frontend(config: Config) -> Iterator[None]:
 
 @contextmanager
 def live_view(args: argparse.Namespace) -> Iterator[LiveView | None]:
-    """Open the view that --live asks for; where a person sits, it stays after the run until they end it."""
+    """Open the view that --live asks for."""
     if args.live is None:
         yield None
         return
@@ -120,11 +125,15 @@ def live_view(args: argparse.Namespace) -> Iterator[LiveView | None]:
     print(f"live view: {live.url}", flush=True)
     try:
         yield live
-        if sys.stdin is not None and sys.stdin.isatty() and live.alive:
-            print(f"the live view stays at {live.url} until you press Ctrl-C", flush=True)
-            live.wait()
     finally:
         live.close()
+
+
+def stay_open(live: LiveView | None) -> None:
+    """Keep the live view after the run, where a person sits, until they end it."""
+    if live is not None and sys.stdin is not None and sys.stdin.isatty() and live.alive:
+        print(f"the live view stays at {live.url} until you press Ctrl-C", flush=True)
+        live.wait()
 
 
 def _keep_page(path: Path, page: str) -> None:

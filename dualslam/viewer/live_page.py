@@ -29,8 +29,24 @@ from dualslam.viewer.messages import EventWords, Message
 HOST = "127.0.0.1"
 N_EVENTS = 8
 """Lines of the newest events."""
-NOT_TOLD = frozenset({"atlas_solved", "graph_rebuilt", "recovery_attempt"})
-"""Events that only the report tells of: too many, or too fine, to be read as they pass."""
+TOLD = {
+    "initialised": "map started",
+    "reinitialised": "new map started",
+    "failed": "track lost",
+    "gap_relocalised": "found again",
+    "relocalised": "place found again",
+    "recovery_started": "tracking in reverse",
+    "recovery_failed": "no link found by reverse tracking",
+    "linked": "maps joined",
+    "merged": "maps joined by a place that both show",
+    "loop_closed": "loop closed",
+    "link_refused": "link refused",
+    "cut": "wrong start cut off",
+    "connection_rejected": "connection rejected",
+    "unreadable": "image unreadable",
+    "interrupted": "interrupted",
+}
+"""Events that are listed as they pass, in words; the report has the others too."""
 POINT_SHARE = 0.15
 """Size of a landmark, of a keyframe's."""
 WHOLE, FOLLOW, FREE = "the whole map", "follow the camera", "free"
@@ -148,8 +164,6 @@ class Page:
 
     def _as_page(self) -> str:
         """Return the scene as HTML that needs nothing else, and opens on the whole map."""
-        first = self._server.initial_camera
-        first.up, first.look_at, first.position = UP, *self._scene.viewpoint()
         return str(self._server.scene.as_html(dark_mode=True))
 
     def show(self, message: Message) -> None:
@@ -206,6 +220,8 @@ class Page:
         self._show_camera(self._camera, T, STATUS_COLOURS[message.status])
         step = np.zeros(3) if self._was_at is None else T[:3, 3] - self._was_at
         self._was_at = T[:3, 3].copy()
+        first = self._server.initial_camera  # of pages that are opened from now on
+        first.up, first.look_at, first.position = UP, *self._scene.viewpoint()
         outgrown = not SHRUNK * self._shown <= self._scene.extent <= GROWN * self._shown
         for client in self._server.get_clients().values():
             if self._view.value == FOLLOW:
@@ -246,11 +262,12 @@ class Page:
         client.camera.up_direction = UP
         window = client.camera
         covered = COVERED if window.image_width <= NARROW_PX else 0.0
-        window.look_at, window.position = self._scene.viewpoint(window.fov, window.aspect, covered)
+        look_at, window.position = self._scene.viewpoint(window.fov, window.aspect, covered)
+        window.look_at = look_at  # after the position, which moves it along
 
     def _tell(self, message: Message) -> None:
         for event in message.events:
-            if event.kind not in NOT_TOLD:
+            if event.kind in TOLD:
                 self._note_event(event)
         submaps = [f"{count(len(message.components), 'map')} of {count(len(self._scene.drawn), 'submap')}"]
         at = {walk.submap_id: f" ({walk.words})" for walk in self._scene.walks}
@@ -278,7 +295,7 @@ class Page:
 def _as_line(event: EventWords, n: int) -> str:
     where = "" if event.submap is None else f", submap {event.submap}"
     times = "" if n == 1 else f" {n} times, last"
-    return f"- **{event.kind.replace('_', ' ')}**{times} at frame {event.frame}{where}"
+    return f"- **{TOLD[event.kind]}**{times} at frame {event.frame}{where}"
 
 
 def _key(statuses: list[str]) -> str:

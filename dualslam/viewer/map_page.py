@@ -138,7 +138,7 @@ def _frusta(spaces: list[Space], poses: tuple[FloatArray, IntArray], corners: Fl
 
 def _grid(low: FloatArray, high: FloatArray) -> tuple[float, FloatArray]:
     """Return the step of a level grid under the map (y points down), and the ends of its lines (2 N, 3)."""
-    step = nice_step(2 * float(max(high[0] - low[0], high[2] - low[2])) / GRID_LINES)
+    step = nice_step(2 * max(float(high[0] - low[0]), float(high[2] - low[2]), 1e-3) / GRID_LINES)  # or a still camera
     x, z = (np.arange(np.floor(low[i] / step), np.ceil(high[i] / step) + 1) * step for i in (0, 2))
     y = high[1]
     along = [[(u, y, z[0]), (u, y, z[-1])] for u in x] + [[(x[0], y, v), (x[-1], y, v)] for v in z]

@@ -36,6 +36,13 @@ class RunState:
         self._system: System | None = None
         self._last: FrameResult | None = None
         self._walk: WalkNews | None = None
+        self._began_s = time.monotonic()
+
+    def time_left(self, now: float) -> str | None:
+        """Return how long the rest takes at the rate so far, as m:ss; None where that is not known."""
+        if not self.n_frames or not 0 < self.n_done < self.n_frames:
+            return None
+        return _duration((now - self._began_s) * (self.n_frames / self.n_done - 1.0))
 
     def begin(self, system: System) -> None:
         """Learn of the system."""
@@ -100,7 +107,7 @@ class Progress(RunState):
         super().__init__(n_frames)
         self._stream = stream or sys.stderr
         self._in_place = self._stream.isatty() or type(self._stream).__module__.startswith("ipykernel")
-        self._began_s = self._said_s = time.monotonic()
+        self._said_s = self._began_s
         self._width = 0
 
     def changed(self) -> None:
@@ -128,9 +135,8 @@ class Progress(RunState):
         counted = f"frame {self.n_done}"
         if self.n_frames:
             counted = f"{self.n_done} of {self.n_frames} frames"
-            if 0 < self.n_done < self.n_frames:
-                left_s = (now - self._began_s) * (self.n_frames / self.n_done - 1.0)
-                counted += f", {_duration(left_s)} left"
+            if (left := self.time_left(now)) is not None:
+                counted += f", {left} left"
         return f"{counted}: {self.words}"
 
 

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import io
+import re
 import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from dualslam.cli.console import final_line, no_map_line, progress, verdict_line, waiting
 from dualslam.core.types import Frame, FrameStatus
 from dualslam.map.frame_records import FrameResult
+from dualslam.recovery.walk_news import WalkNews
 from dualslam.run.sources import open_source
-from dualslam.viewer.progress import FINISHING
+from dualslam.viewer.progress import FINISHING, RunState
 
 SOURCE = "synthetic:street,frames=3,seed=1,width=160,height=120"
 
@@ -107,3 +110,27 @@ def test_the_verdict_is_one_line(tmp_path: Path) -> None:
     assert verdict_line(outcome) == "verdict: doubtful. It jumps. Look there."  # type: ignore[arg-type]
     outcome.summary["verdict"] = {"level": "good", "reasons": []}
     assert verdict_line(outcome) == "verdict: good."  # type: ignore[arg-type]
+
+
+class LongRecording:
+    name = "a_recording_with_a_name_of_many_words"
+
+    def __len__(self) -> int:
+        return 9000
+
+
+def test_80_columns_have_room_for_bar_count_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(sys, "stderr", screen := Screen())
+    with progress(LongRecording(), quiet=False) as shown:  # type: ignore[arg-type]
+        assert isinstance(shown, RunState)
+        shown._system = SimpleNamespace(is_tracking_in_reverse=lambda _: True)  # type: ignore[assignment]
+        shown._walk = WalkNews(12, "live", 8123, True, 456, None, np.zeros((0, 3), np.float32))
+        shown.after(Frame(0, 0.0, None), tracked(0))
+        shown._bars.refresh()  # type: ignore[attr-defined]
+    lines = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.getvalue()).replace("\r", "\n").splitlines()
+    counted = [line for line in lines if "1/9000" in line]
+    assert counted
+    assert all("━" in line and line.rstrip().endswith("left") and len(line) <= 80 for line in counted)
+    assert any(line.startswith("tracked, submap 0, 80 landmarks; tracking in reverse") for line in lines)
+    assert max(map(len, lines)) <= 80

@@ -48,10 +48,11 @@ def test_a_run_leaves_all_that_it_should(
     assert main(["run", str(folder), "--out", str(out), "--seed", "3"]) == 0
     captured = capsys.readouterr()
     assert captured.err == ""
-    line, verdict = captured.out.splitlines()
+    line, verdict, pages = captured.out.splitlines()
     assert f"coverage 100.0 % ({N_FRAMES} of {N_FRAMES} frames), 1 submap, 0 failures, ATE" in line
     assert line.endswith(f"results in {out}")
     assert verdict == "verdict: good."
+    assert pages == f"open {out / 'report.html'} and {out / 'map.html'}"
     assert json.loads((out / "summary.json").read_text())["verdict"] == {"level": "good", "reasons": []}
     assert len(rows_of(out)) == len((out / "trajectory.txt").read_text().splitlines()) == N_FRAMES
     assert all(row["in_main_map"] == "1" and row["status"] == "tracked" for row in rows_of(out))
@@ -214,7 +215,7 @@ def test_an_interrupted_run_keeps_what_it_has(
     before = signal.getsignal(number)
     assert main(["run", str(folder), "--out", str(tmp_path / "run")]) == 130
     assert signal.getsignal(number) is before
-    told, _, how = capsys.readouterr().out.splitlines()
+    told, _, _, how = capsys.readouterr().out.splitlines()
     assert told.startswith("interrupted: coverage 100.0 % (7 of 7 frames)")
     assert f"--start 7, --map {tmp_path / 'run'}" in how
     assert len(rows_of(tmp_path / "run")) == 7
@@ -250,7 +251,7 @@ def test_who_leaves_the_end_of_a_run_keeps_the_pictures_of_its_last_gap_and_no_w
     closed: list[bool] = []
     monkeypatch.setattr(InlineDesk, "close", lambda _: closed.append(True))
     assert main(["run", str(folder), "--out", str(tmp_path / "run")]) == 130
-    told, _ = capsys.readouterr().out.splitlines()  # and nothing of how to go on: all frames were seen
+    told, _, _ = capsys.readouterr().out.splitlines()  # and nothing of how to go on: all frames were seen
     assert told.startswith("interrupted: coverage ")
     kept = sorted(int(path.stem) for path in (tmp_path / "run" / "samples").iterdir())
     assert kept == [N_FRAMES - 3, N_FRAMES - 2, N_FRAMES - 1]

@@ -12,6 +12,7 @@ import urllib.request
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ import pytest
 from dualslam.cli import main
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.geometry import sim3
-from dualslam.core.types import Frame, FrameStatus
+from dualslam.core.types import FloatArray, Frame, FrameStatus
 from dualslam.map.frame_records import FrameResult
 from dualslam.recovery import walk_news
 from dualslam.recovery.walk_news import WalkNews
@@ -338,3 +339,34 @@ def test_the_view_of_a_whole_run(folder: Path, tmp_path: Path, capsys: pytest.Ca
 def test_a_port_that_is_none(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", str(folder), "--out", str(tmp_path / "run"), "--live", "99999"]) == 2
     assert "99999" in one_sentence(capsys)
+
+
+class Window:
+    """A camera of viser's: to move it moves what it looks at along."""
+
+    fov, aspect, image_width, up_direction = 1.3, 1.5, 1400, (0.0, 1.0, 0.0)
+
+    def __init__(self) -> None:
+        self._position, self.look_at = np.array([3.0, 3.0, 3.0]), np.zeros(3)
+
+    @property
+    def position(self) -> FloatArray:
+        return self._position
+
+    @position.setter
+    def position(self, position: FloatArray) -> None:
+        self.look_at = self.look_at + position - self._position
+        self._position = np.asarray(position)
+
+
+def test_a_page_that_is_opened_late_shows_the_whole_map() -> None:
+    pytest.importorskip("viser", reason="viser, an extra, is not installed")
+    from dualslam.viewer.live_page import Page
+
+    page = Page.__new__(Page)
+    page._scene = LiveScene()
+    window = Window()
+    page._look(SimpleNamespace(camera=window))  # type: ignore[arg-type]
+    look_at, position = page._scene.viewpoint(window.fov, window.aspect)
+    np.testing.assert_allclose(window.look_at, look_at)
+    np.testing.assert_allclose(window.position, position)
