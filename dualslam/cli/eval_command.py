@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import argparse
 import json
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dualslam.core.errors import InputError
+from dualslam.core.types import FloatArray
 from dualslam.io.map_files import to_plain
+from dualslam.io.map_store import load_atlas
+from dualslam.io.run_folder import FRAMES, SUMMARY, TRAJECTORY
+from dualslam.io.run_reading import read_frames, read_numbers, read_summary
+from dualslam.io.trajectory_files import read_tum
 from dualslam.io.video import is_live
-from dualslam.lab.metrics.trajectory_metrics import evaluate_run
-from dualslam.run.sources import ANY_FOV_DEG, SYNTHETIC, open_source
+from dualslam.lab.metrics.trajectory_metrics import end_to_start, evaluate_run
+from dualslam.run.sources import ANY_FOV_DEG, SYNTHETIC, open_images_of_run, open_source
+
+MAX_GREY_LEVELS = 5.0
+"""Mean difference between two copies of an image, one of them compressed again."""
 
 
 def execute(args: argparse.Namespace) -> int:
@@ -21,18 +32,66 @@ def execute(args: argparse.Namespace) -> int:
         raise InputError(f"{args.sequence} is live: it has no ground truth.")
     # No camera is asked for a score: a sequence without a calibration has times and true poses all the same.
     fov_degrees = None if args.sequence.startswith(SYNTHETIC) else ANY_FOV_DEG
-    sequence = open_source(args.sequence, fov_degrees=fov_degrees, time_unit=args.time_unit)
-    score = evaluate_run(args.run, sequence)  # type: ignore[arg-type]
+    sequence = open_source(args.sequence, fov_degrees=fov_degrees, time_unit=args.time_unit, **_selection(args.run))
+    _refuse_other_images(args.run, args.sequence)
+    times_s = _keyframe_times(args.run) if args.keyframes_only else None
+    score: dict[str, Any] = {}
+    if not args.returns or getattr(sequence, "ground_truth", None) is not None:
+        score = evaluate_run(args.run, sequence, keyframe_times_s=times_s)  # type: ignore[arg-type]
+    if args.returns:
+        path = args.run / TRAJECTORY if args.run.is_dir() else args.run
+        score |= end_to_start(read_tum(path, allow_empty=True))
     print(json.dumps(to_plain(score)) if args.json else score_text(score), flush=True)
     return 0
 
 
 def score_text(score: dict[str, Any]) -> str:
     """Return a score as lines for a person."""
-    lines = _one("main map", score)
-    for submap in score["submaps"]:
+    lines = _one("main map", score) if "coverage_pct" in score else []
+    if "end_to_start_pct" in score:
+        lines.append(
+            f"  the end is {score['end_to_start_pct']:.2f} % of the way from the start, "
+            f"and turned by {score['end_to_start_deg']:.2f} deg"
+        )
+    if (keyframes := score.get("keyframes")) is not None:
+        known = "ate_rmse_m" in keyframes
+        error = f"ATE {keyframes['ate_rmse_m']:.4f} m RMSE" if known else "too few for an error"
+        lines.append(f"  keyframes only: {error} ({keyframes['posed']} poses)")
+    for submap in score.get("submaps", ()):
         lines += _one(f"submap {submap['submap']}, not linked", submap)
     return "\n".join(lines)
+
+
+def _selection(run: Path) -> dict[str, Any]:
+    """Return which frames of the source a run was made of; all where it does not say so."""
+    selection = read_summary(run).get("selection") if (run / SUMMARY).is_file() else None
+    return selection or {}
+
+
+def _refuse_other_images(run: Path, sequence: str) -> None:
+    """Refuse a sequence of other images: many have the same times. Says nothing where the run's source has gone."""
+    summary = read_summary(run) if (run / SUMMARY).is_file() else {}
+    source, camera = summary.get("source"), summary.get("camera") or {}
+    if (
+        not source
+        or source in (sequence, str(Path(sequence).resolve()))
+        or not (":" in source or Path(source).exists())
+    ):
+        return
+    size_px = camera.get("width", 0), camera.get("height", 0)
+    index = summary.get("first_index") or 0
+    frames = [next(iter(open_images_of_run(each, size_px).in_colour([index])), None) for each in (source, sequence)]
+    a, b = (None if f is None or f.image is None else f.image.reshape(*f.image.shape[:2], -1).mean(-1) for f in frames)
+    if a is not None and b is not None and np.abs(a - b).mean() > MAX_GREY_LEVELS:
+        raise InputError(f"{run} was made of {source}, and {sequence} shows other images; give the same sequence.")
+
+
+def _keyframe_times(run: Path) -> FloatArray:
+    """Return the times of a run's keyframes in its main map."""
+    stored = load_atlas(run)
+    kept = {k for m in stored.main for k in stored.atlas.submaps[m].keyframes}
+    numbers = read_numbers(run)
+    return np.array([row.timestamp_s for row in read_frames(run / FRAMES) if numbers[row.index] in kept])
 
 
 def _one(title: str, score: dict[str, Any]) -> list[str]:

@@ -188,6 +188,10 @@ def _add_eval(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser, _ = _command(commands, "eval", "Score a run against ground truth: coverage first, then ATE and RPE.")
     parser.add_argument("run", metavar="RUN", type=_path, help="a run folder, or a trajectory in TUM format")
     parser.add_argument("sequence", metavar="SEQUENCE", type=_source, help="the sequence with its ground truth")
+    parser.add_argument("--keyframes-only", action="store_true", help="the error of keyframes, besides all frames'")
+    parser.add_argument(
+        "--returns", action="store_true", help="the sequence ends where it began: an error that needs no ground truth"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--time-unit", choices=TIME_UNITS, help="unit of the sequence's own times, as the run had it")
 

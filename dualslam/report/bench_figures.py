@@ -1,4 +1,4 @@
-"""The figures of a bench, as PNG: initialisation delay, the status of every frame, failure rates, end-point errors.
+"""The figures of a bench, as PNG and PDF: initialisation delay, frames' statuses, failure rates, end-point errors.
 
 They are drawn with matplotlib (extra `report`); what they show is handed over as plain numbers and letters.
 """
@@ -167,3 +167,5 @@ def _figure(n_panels: int, size: tuple[float, float]) -> tuple[Figure, list[Axes
 def _save(figure: Figure, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=_DPI, metadata={"Software": None})
+    # Without a date, so that the same numbers give the same file.
+    figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})

@@ -14,9 +14,10 @@ from dualslam.core.types import Failure, FloatArray, FrameStatus
 from dualslam.report.canvas import Canvas
 from dualslam.report.markup import Markup, document, join, number, number_row, stretched, table, tag
 from dualslam.report.page import headline
-from dualslam.report.placement import Placed, align, extent, plane_from_above
+from dualslam.report.placement import Placed, align, extent, place, plane_from_above
 from dualslam.report.run_data import PosedRows, RunData, read_run
 from dualslam.report.statuses import MEANING, WITHOUT_POSE, count, span, stretches
+from dualslam.report.timeline import curve, frame_ticks, lane, lane_values
 
 N_STYLES = 6
 """Ways of drawing a run: colour, dash and width each differ."""
@@ -52,6 +53,7 @@ def _page(runs: Sequence[RunData]) -> str:
         tag("header", tag("h1", "Runs compared"), tag("ul", leads)),
         tag("section", tag("h2", "Trajectories"), _overlay(runs, names)),
         tag("section", tag("h2", "Every frame"), _strips(runs, names)),
+        _errors(runs, names),
         tag("section", tag("h2", "Numbers"), _number_table(runs)),
         tag("section", tag("h2", "Configuration"), _config_table(runs, names)),
     ]
@@ -207,6 +209,29 @@ def _on_rows_of(reference: RunData, run: RunData) -> PosedRows:
 
 
 # --- frames and numbers
+
+
+def _errors(runs: Sequence[RunData], names: Sequence[str]) -> Markup | None:
+    """Draw each run's position error over its frames, all to one scale; None where no run has a truth."""
+    errors = []
+    for run in runs:
+        error = np.full(len(run.rows), np.nan)
+        for placed in place(run).placed:
+            error[placed.row] = placed.error
+        errors.append(error)
+    known = [error for error in errors if np.isfinite(error).any()]
+    if not known:
+        return None
+    top = max(float(np.nanmax(error)) for error in known)
+    lanes = []
+    for run, name, error in zip(runs, names, errors, strict=True):
+        svg = stretched(len(error), 100, curve(error, max(top, 1e-12), "error"), f"Position error of {name}")
+        seconds = abs(run.rows[-1].timestamp_s - run.rows[0].timestamp_s) if run.rows else 0.0
+        note = "no ground truth" if not np.isfinite(error).any() else f"over {number(seconds)} s"
+        lanes.append(lane(name, note, svg, [*lane_values(f"{number(top)} m", "0")], "error"))
+    lanes.append(lane("frame", "", tag("div", cls="empty-lane"), frame_ticks([r.index for r in runs[0].rows]), "axis"))
+    words = "Distance from the truth after alignment, each map by itself; all runs to one scale."
+    return tag("section", tag("h2", "Error over time"), tag("p", words), tag("div", lanes, cls="lanes"))
 
 
 def _strips(runs: Sequence[RunData], names: Sequence[str]) -> Markup:

@@ -41,7 +41,7 @@ def timeline(run: RunData) -> Markup:
         return tag("p", "The source gave no frame.", cls="empty")
     lanes = [*_status_lanes(run), _submap_lane(run), _event_lane(run), _inlier_lane(run)]
     error = _error_lane(run, place(run))
-    lanes += [lane for lane in (error, _latency_lane(run), _axis(run)) if lane is not None]
+    lanes += [each for each in (error, _latency_lane(run), _axis(run)) if each is not None]
     return tag("div", lanes, cls="lanes")
 
 
@@ -59,7 +59,7 @@ def _status_lanes(run: RunData) -> list[Markup]:
         block = _block(stretch.start, len(stretch), f"{frames}: {value}", f"st-{value}")
         by_status[value].append(block)
     return [
-        _lane(str(s), count(run.count(s), "frame"), stretched(len(status), 1, by_status[s], f"{s}: {MEANING[s]}"))
+        lane(str(s), count(run.count(s), "frame"), stretched(len(status), 1, by_status[s], f"{s}: {MEANING[s]}"))
         for s in found
     ]
 
@@ -79,7 +79,7 @@ def _submap_lane(run: RunData) -> Markup:
             centre = stretch.start + len(stretch) / 2
             words.append(_at(100 * centre / n, str(submap) if in_main else f"({submap})", "on-block"))
     note = "in brackets: not linked"
-    return _lane("submap", note if run.unlinked else "", stretched(n, 1, shapes, "Submap of each frame"), words)
+    return lane("submap", note if run.unlinked else "", stretched(n, 1, shapes, "Submap of each frame"), words)
 
 
 def _owner_class(in_main: bool) -> str:
@@ -98,7 +98,7 @@ def _event_lane(run: RunData) -> Markup:
         row = row_of.get(event.get("lost_since", event["frame"]))
         if row is not None:
             marks.append(_at(_percent(run, row), failure_letter(i), "break", f"failure {i}, lost since here"))
-    return _lane("events", "A failure, ○ new map, ◆ link, ↺ found again", tag("div", cls="empty-lane"), marks)
+    return lane("events", "A failure, ○ new map, ◆ link, ↺ found again", tag("div", cls="empty-lane"), marks)
 
 
 def _inlier_lane(run: RunData) -> Markup:
@@ -113,7 +113,7 @@ def _inlier_lane(run: RunData) -> Markup:
         shapes.append(tag("path", cls="threshold", d=f"M0 {coordinate(y)}H{len(run.rows)}"))
         note += f"; dashed: {threshold} needed"
     drawing = stretched(len(run.rows), 100, shapes, "Landmarks matched and agreeing")
-    return _lane("landmarks", note, drawing, _values(number(top), "0"))
+    return lane("landmarks", note, drawing, lane_values(number(top), "0"))
 
 
 def _error_lane(run: RunData, scene: PlacedRun) -> Markup | None:
@@ -125,9 +125,9 @@ def _error_lane(run: RunData, scene: PlacedRun) -> Markup | None:
         return None
     top = float(np.nanmax(error))
     note = f"distance from the truth after alignment, each map by itself, up to {number(top)} m"
-    shape = _curve(error, max(top, 1e-12), "error")
+    shape = curve(error, max(top, 1e-12), "error")
     svg = stretched(len(run.rows), 100, shape, "Position error")
-    return _lane("error", note, svg, _values(f"{number(top)} m", "0"))
+    return lane("error", note, svg, lane_values(f"{number(top)} m", "0"))
 
 
 def _latency_lane(run: RunData) -> Markup:
@@ -136,7 +136,7 @@ def _latency_lane(run: RunData) -> Markup:
     low, top = 1.0, max(float(latency.max()), 10.0)
     height = np.log10(np.clip(latency, low, None) / low)
     svg = stretched(len(latency), 100, _area(height, float(np.log10(top / low)), "latency"), "Latency of each frame")
-    return _lane("latency", "wall time of each frame, logarithmic", svg, _values(duration(top), duration(low)))
+    return lane("latency", "wall time of each frame, logarithmic", svg, lane_values(duration(top), duration(low)))
 
 
 def _axis(run: RunData) -> Markup:
@@ -144,7 +144,7 @@ def _axis(run: RunData) -> Markup:
     n = len(run.rows)
     seconds = abs(run.rows[-1].timestamp_s - run.rows[0].timestamp_s)
     note = f"{n} frames, {number(seconds)} s"
-    return _lane("frame", note, tag("div", cls="empty-lane"), words, "axis")
+    return lane("frame", note, tag("div", cls="empty-lane"), words, "axis")
 
 
 def frame_ticks(indices: Sequence[int]) -> list[Markup]:
@@ -162,12 +162,13 @@ def frame_ticks(indices: Sequence[int]) -> list[Markup]:
 # --- pieces
 
 
-def _lane(name: str, note: str, drawing: Markup, words: Sequence[Markup] = (), cls: str = "") -> Markup:
+def lane(name: str, note: str, drawing: Markup, words: Sequence[Markup] = (), cls: str = "") -> Markup:
+    """Return a named lane with its drawing, and words over it."""
     head = tag("div", tag("b", name), " ", tag("small", note), cls="lane-name")
     return tag("div", head, tag("div", drawing, words, cls="lane-body"), cls=f"lane {cls or name}")
 
 
-def _values(top: str, bottom: str) -> list[Markup]:
+def lane_values(top: str, bottom: str) -> list[Markup]:
     """Return the values at the upper and the lower end of a lane."""
     return [tag("span", text, cls=f"at value {place}") for text, place in ((top, "top"), (bottom, "bottom"))]
 
@@ -203,7 +204,7 @@ def _area(values: FloatArray, top: float, cls: str) -> Markup:
     return tag("path", cls=cls, d=f"M0 100{points}L{len(values)} 100Z")
 
 
-def _curve(values: FloatArray, top: float, cls: str) -> Markup:
+def curve(values: FloatArray, top: float, cls: str) -> Markup:
     """Return a line that is broken where there is no value."""
     x, y = _columns(values)
     finite = np.isfinite(y).tolist()

@@ -422,7 +422,45 @@ def test_eval_against_another_sequence_is_bad_input(
     assert main(["eval", str(run), str(later)]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert f"{run}: no pose is at the time of any frame" in captured.err
+    assert "has frames at other times" in captured.err
+    shutil.copytree(folder, tmp_path / "mirrored")
+    for path in sorted((tmp_path / "mirrored" / "images").iterdir()):
+        cv2.imwrite(str(path), cv2.imread(str(path))[:, ::-1])
+    assert main(["eval", str(run), str(tmp_path / "mirrored")]) == 2
+    assert "shows other images" in capsys.readouterr().err
+
+
+def test_eval_honours_the_frames_that_were_chosen(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = str(tmp_path / "run")
+    chosen = ["--start", "3", "--stride", "2", "--max-frames", "10"]
+    assert main(["run", str(folder), "--out", run, "--quiet", *chosen]) == 0
+    assert main(["eval", run, str(folder)]) == 0
+    assert capsys.readouterr().out.startswith("main map: coverage 100.0 % (10 of 10 frames)")
+
+
+def test_eval_of_keyframes_and_of_a_camera_that_returns(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = str(tmp_path / "run")
+    assert main(["run", str(folder), "--out", run, "--quiet"]) == 0
+    n_keyframes = len({k for submap in load_atlas(run).atlas.submaps.values() for k in submap.keyframes})
+    assert main(["eval", run, str(folder), "--keyframes-only", "--json"]) == 0
+    score = json.loads(capsys.readouterr().out)
+    assert (score["posed"], score["keyframes"]["posed"]) == (N_FRAMES, n_keyframes)
+    assert main(["eval", run, str(folder), "--keyframes-only"]) == 0
+    assert f"({n_keyframes} poses)" in capsys.readouterr().out
+    (folder / "groundtruth_tum.txt").rename(tmp_path / "truth")
+    try:
+        assert main(["eval", run, str(folder), "--returns", "--json"]) == 0
+    finally:
+        (tmp_path / "truth").rename(folder / "groundtruth_tum.txt")
+    score = json.loads(capsys.readouterr().out)
+    xyz = np.loadtxt(tmp_path / "run" / "trajectory.txt")[:, 1:4]
+    way = np.linalg.norm(np.diff(xyz, axis=0), axis=1).sum()
+    assert score["end_to_start_pct"] == pytest.approx(100 * np.linalg.norm(xyz[-1] - xyz[0]) / way, rel=1e-6)
+    assert 0 <= score["end_to_start_deg"] <= 180
 
 
 def test_eval_needs_no_calibration(

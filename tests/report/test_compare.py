@@ -57,6 +57,15 @@ def test_the_same_frame_stands_at_the_same_place_in_each_strip(pair: list[Path])
     assert {a["x"] for a in found.of_class("st-tracked") if a.get("width") == str(N_FRAMES)} == {"20"}
 
 
+def test_errors_over_time_are_to_one_scale(pair: list[Path]) -> None:
+    runs = [read_run(path) for path in pair]
+    found = Outline(comparison_page(runs))
+    assert "Error over time" in found.text
+    assert len(found.of_class("error")) >= len(runs)
+    nothing = replace(runs[0].truth, row=runs[0].truth.row[:0], T_map_cam=runs[0].truth.T_map_cam[:0])
+    assert "Error over time" not in comparison_page([replace(run, truth=nothing) for run in runs])
+
+
 def test_what_is_no_run_is_named(pair: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", str(pair[0]), str(tmp_path), "--out", str(tmp_path / "x.html")]) == 2
     assert "is not the folder of a finished run" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""A table that is written twice: for people (Markdown) and for programs (CSV)."""
+"""A table that is written three times: for people (Markdown), for programs (CSV), and for papers (LaTeX)."""
 
 from __future__ import annotations
 
@@ -45,6 +45,26 @@ class ResultTable:
         writer.writerow(self.columns)
         writer.writerows(["" if cell is None else cell for cell in row] for row in self.rows)
         return text.getvalue()
+
+    def latex(self) -> str:
+        """Return a ``tabular`` for LaTeX with the package booktabs; numbers with three digits, to the right."""
+        numeric = [all(isinstance(row[i], int | float | None) for row in self.rows) for i in range(len(self.columns))]
+        lines = [f"% {self.title}. {self.note}".replace("\n", " ")]
+        lines += [rf"\begin{{tabular}}{{{''.join('r' if each else 'l' for each in numeric)}}}", r"\toprule"]
+        lines += [_latex_line(self.columns), r"\midrule"]
+        lines += [_latex_line([_shown(cell) for cell in row]) for row in self.rows]
+        return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+
+
+_LATEX = str.maketrans(
+    {c: f"\\{c}" for c in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    | {"⊗": r"$\otimes$", "↷": r"$\curvearrowright$", "±": r"$\pm$", "≥": r"$\geq$", "≤": r"$\leq$"}
+)
+
+
+def _latex_line(cells: Sequence[str]) -> str:
+    return " & ".join(cell.translate(_LATEX) for cell in cells) + r" \\"
 
 
 def _line(cells: Sequence[str]) -> str:

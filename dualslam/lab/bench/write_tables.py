@@ -25,7 +25,7 @@ _COLUMNS = (
 def write_tables(
     spec: BenchSpec, tables: Sequence[ResultTable], records: Sequence[TrialRecord], out: Path, command: str
 ) -> list[Path]:
-    """Write ``tables.md``, ``tables/*.csv`` and ``tables/trials.csv``; return what was written.
+    """Write ``tables.md``, ``tables/*.csv`` and ``*.tex``, and ``tables/trials.csv``; return what was written.
 
     Parameters
     ----------
@@ -41,8 +41,9 @@ def write_tables(
     write_text(page, heading + "\n".join(table.markdown() for table in tables))
     files = [page]
     for table in tables:
-        files.append(folder / f"{table.name}.csv")
-        write_text(files[-1], table.csv())
+        for ending, text in (("csv", table.csv()), ("tex", table.latex())):
+            files.append(folder / f"{table.name}.{ending}")
+            write_text(files[-1], text)
     files.append(folder / "trials.csv")
     write_text(files[-1], _trials_csv(spec, records))
     return files

@@ -14,8 +14,8 @@ import numpy as np
 
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, IntArray
-from dualslam.io.run_folder import SUMMARY, TRAJECTORY, unlinked_submaps
-from dualslam.io.run_reading import read_summary
+from dualslam.io.run_folder import FRAMES, SUMMARY, TRAJECTORY, unlinked_submaps
+from dualslam.io.run_reading import read_frames, read_summary
 from dualslam.io.trajectory_files import MAX_BEGIN_GAP_S, MAX_DT_S, Trajectory, associate, nearest_in_time, read_tum
 from dualslam.lab.audits.silent_breaks import find_silent_breaks
 from dualslam.lab.metrics.alignment import align_points
@@ -26,6 +26,10 @@ Alignment = Literal["sim3", "se3"]
 
 MIN_POSES = 10
 """Fewer poses with ground truth than this are counted, but not scored."""
+SAME_FRAME_S = 1e-3
+"""Between two readings of one frame's time: clocks are written to a millisecond at least."""
+MIN_SAME = 0.5
+"""Share of a run's frames that have a time in its sequence: all, but for frames whose clock was disturbed."""
 RPE_INTERVAL_S = 1.0
 # Pairs in which the true camera moved less than this share of the median motion have no meaningful error in percent.
 _MIN_MOTION = 0.05
@@ -209,23 +213,55 @@ def relative_error(
     return fields
 
 
-def evaluate_run(
-    run: str | Path, sequence: EvaluationSequence, *, alignment: Alignment = "sim3", max_dt_s: float = MAX_DT_S
-) -> dict[str, Any]:
-    """Score a run folder: the main map's trajectory, and each unlinked submap with an alignment of its own.
-
-    A run that was made of another sequence is scored all the same, and told by a warning.
+def end_to_start(trajectory: Trajectory) -> dict[str, float]:
+    """Return how far the last pose is from the first, for a camera that came back: an error that needs no truth.
 
     Returns
     -------
     dict
-        The fields of `TrajectoryScore` of the main map, and ``submaps``: a list of the same with ``submap``, its id.
+        ``end_to_start_pct``: of the length of the way; ``end_to_start_deg``: between the two directions.
 
     Raises
     ------
     InputError
-        If the run has no trajectory or the sequence no ground truth, or no pose is at the time of any frame; if a
-        trajectory that is given by itself is empty; if either is something else, such as a list of poses.
+        If the camera has hardly a way.
+    """
+    ordered = trajectory.in_time_order()
+    xyz = _positions(ordered)
+    length = float(np.linalg.norm(np.diff(xyz, axis=0), axis=1).sum()) if len(xyz) > 1 else 0.0
+    if not length > 0:
+        raise InputError("there is no way from which to come back: fewer than two frames have a pose.")
+    R = ordered.T_world_cam[0, :3, :3].T @ ordered.T_world_cam[-1, :3, :3]
+    turn = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
+    return {
+        "end_to_start_pct": 100 * float(np.linalg.norm(xyz[-1] - xyz[0])) / length,
+        "end_to_start_deg": float(turn),
+    }
+
+
+def evaluate_run(
+    run: str | Path,
+    sequence: EvaluationSequence,
+    *,
+    alignment: Alignment = "sim3",
+    max_dt_s: float = MAX_DT_S,
+    keyframe_times_s: FloatArray | None = None,
+) -> dict[str, Any]:
+    """Score a run folder: the main map's trajectory, and each unlinked submap with an alignment of its own.
+
+    With `keyframe_times_s` the main map's poses at these times are scored by themselves, too, as published tables do.
+
+    Returns
+    -------
+    dict
+        The fields of `TrajectoryScore` of the main map, and ``submaps``: a list of the same with ``submap``, its id;
+        ``keyframes``: the same of keyframes alone, where these are given.
+
+    Raises
+    ------
+    InputError
+        If the run has no trajectory, was made of another sequence, or has no pose at the time of any frame; if the
+        sequence has no ground truth; if a trajectory that is given by itself is empty; if either is something else.
     """
     if not isinstance(run, str | Path):
         raise InputError(f"the run is a {type(run).__name__}; give the path of its folder or of its trajectory.")
@@ -234,7 +270,7 @@ def evaluate_run(
     truth = sequence.ground_truth
     if truth is None:
         raise InputError(f"{sequence.name} has no ground truth; a run is evaluated against one.")
-    _tell_other_sequence(Path(run), sequence.name)
+    _refuse_other_sequence(Path(run), sequence)
     is_run = Path(run).is_dir()
     path = Path(run) / TRAJECTORY if is_run else Path(run)
 
@@ -248,17 +284,34 @@ def evaluate_run(
         **scored(path),
         "submaps": [{"submap": m, **scored(file)} for m, file in unlinked_submaps(path.parent).items()],
     }
+    if keyframe_times_s is not None:
+        whole = read_tum(path, allow_empty=is_run)
+        _, chosen = associate(keyframe_times_s, whole.timestamps_s, SAME_FRAME_S)
+        kept = Trajectory(whole.timestamps_s[chosen], whole.T_world_cam[chosen])
+        score["keyframes"] = score_trajectory(
+            kept, truth, sequence.frame_timestamps, alignment=alignment, max_dt_s=max_dt_s
+        ).as_dict()
     parts = [score, *score["submaps"]]
     if any(part["off_clock"] for part in parts) and not any(part["posed"] for part in parts):
         raise InputError(f"{run}: no pose is at the time of any frame of {sequence.name}; is it of another sequence?")
     return score
 
 
-def _tell_other_sequence(run: Path, name: str) -> None:
-    """Warn where a run says that it was made of another sequence."""
-    made_of = read_summary(run).get("sequence", name) if (run / SUMMARY).is_file() else name
-    if made_of != name:
-        log.warning("%s was made of %s, and is scored against %s", run, made_of, name)
+def _refuse_other_sequence(run: Path, sequence: EvaluationSequence) -> None:
+    """Refuse a sequence whose frames have other times than the run's; warn where it has another name alone."""
+    if not (run / SUMMARY).is_file():
+        return
+    made_of = read_summary(run).get("sequence", sequence.name)
+    rows = read_frames(run / FRAMES) if (run / FRAMES).is_file() else []
+    own = np.array([row.timestamp_s for row in rows])
+    _, known = associate(np.sort(sequence.frame_timestamps), own, SAME_FRAME_S)
+    if rows and known.mean() < MIN_SAME:
+        raise InputError(
+            f"{run} was made of {made_of}, or of other frames of it: {sequence.name} has frames at other times; "
+            f"to score it all the same, give {run / TRAJECTORY}."
+        )
+    if made_of != sequence.name:
+        log.warning("%s was made of %s, and is scored against %s", run, made_of, sequence.name)
 
 
 def _positions(trajectory: Trajectory) -> FloatArray:

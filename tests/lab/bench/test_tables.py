@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,25 @@ def tables() -> dict[str, ResultTable]:
 
 def rows_of(table: ResultTable) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(table.csv())))
+
+
+def test_latex_has_the_cells_of_markdown_and_nothing_that_latex_reads_as_a_command(
+    tables: dict[str, ResultTable],
+) -> None:
+    for table in tables.values():
+        begin, top, *lines, bottom, end, last = table.latex().split("\n")[1:]
+        assert begin == rf"\begin{{tabular}}{{{begin[16:-1]}}}"
+        assert len(begin[16:-1]) == len(table.columns)
+        assert (top, lines[1], bottom, end, last) == (r"\toprule", r"\midrule", r"\bottomrule", r"\end{tabular}", "")
+        rows = [lines[0], *lines[2:]]
+        assert len(rows) == 1 + len(table.rows)
+        for row in rows:
+            assert row.endswith(r" \\")
+            assert row.isascii()
+            assert len(re.findall(r"(?<!\\)&", row)) == len(table.columns) - 1
+            assert not re.search(r"(?<!\\)[%#_]", row)
+    table = ResultTable("t", "T", ("a_b", "n"), [["50 % & more", 0.123456], ["x", None]], "note")
+    assert table.latex().split("\n")[3:7] == [r"a\_b & n \\", r"\midrule", r"50 \% \& more & 0.123 \\", r"x & - \\"]
 
 
 def test_table_1(tables: dict[str, ResultTable]) -> None:

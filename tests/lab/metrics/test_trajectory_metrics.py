@@ -18,6 +18,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import so3
 from dualslam.io import Trajectory, write_tum
+from dualslam.io.run_folder import FRAME_COLUMNS
 from dualslam.lab.metrics.alignment import align_points
 from dualslam.lab.metrics.trajectory_metrics import evaluate_run, score_trajectory
 
@@ -224,7 +225,32 @@ def test_evaluate_run_with_an_unlinked_submap(run: tuple[Path, KnownSequence]) -
     json.dumps(result)
 
 
-def test_a_run_of_another_sequence_is_told(run: tuple[Path, KnownSequence], caplog: pytest.LogCaptureFixture) -> None:
+def test_keyframes_are_scored_by_themselves_too(run: tuple[Path, KnownSequence]) -> None:
+    folder, sequence = run
+    chosen = sequence.frame_timestamps[:60:5]
+    result = evaluate_run(folder, sequence, keyframe_times_s=chosen)
+    assert result["keyframes"]["posed"] == len(chosen)
+    assert {name: value for name, value in result.items() if name != "keyframes"} == evaluate_run(folder, sequence)
+
+
+def test_a_run_of_another_sequence_is_refused_by_its_times(run: tuple[Path, KnownSequence]) -> None:
+    folder, sequence = run
+    (folder / "summary.json").write_text('{"sequence": "curve"}')
+    for shift_s, refused in ((0.0, False), (0.0004, False), (0.013, True)):
+        rows = [
+            f"{i},{t + shift_s!r},tracked,0,1,90,80,5.0,," for i, t in enumerate(sequence.frame_timestamps.tolist())
+        ]
+        (folder / "frames.csv").write_text("\n".join([",".join(FRAME_COLUMNS[:10]), *rows, ""]))
+        if refused:
+            with pytest.raises(InputError, match=r"frames at other times; .*trajectory\.txt"):
+                evaluate_run(folder, sequence)
+        else:
+            evaluate_run(folder, sequence)
+
+
+def test_a_run_of_a_sequence_with_another_name_is_told(
+    run: tuple[Path, KnownSequence], caplog: pytest.LogCaptureFixture
+) -> None:
     folder, sequence = run
     (folder / "summary.json").write_text('{"sequence": "curve"}')
     evaluate_run(folder, sequence)
