@@ -17,7 +17,7 @@ from dualslam.core.types import FloatArray, IntArray
 from dualslam.export.colours import keyframe_indices, landmark_colours
 from dualslam.export.exported_map import flatten, read_stored, with_frames
 from dualslam.export.formats import FORMATS
-from dualslam.export.images import with_images
+from dualslam.export.images import mask_of, with_images
 from dualslam.export.metric import by_distance
 from dualslam.io.atomic import write_text
 from dualslam.io.map_store import StoredMap
@@ -67,7 +67,7 @@ def _execute(args: argparse.Namespace) -> int:
     if source is not None and chosen.has_images:
         assert stored.camera is not None
         images = source.in_colour(exported.rows_by_index(numbers))
-        exported = with_images(exported, stored.camera, images, numbers, args.out)
+        exported = with_images(exported, stored.camera, images, numbers, args.out, mask_of(args.run))
     chosen.write(exported, args.out)
     if not args.quiet:
         errors = exported.reprojection_errors_px()

@@ -16,7 +16,7 @@ from dualslam.export.colmap import image_name, mask_path
 from dualslam.export.exported_map import ExportedMap
 from dualslam.io.atomic import atomic_file
 
-FOLDER = "images"
+FOLDER, MASK = "images", "mask.png"
 
 
 def with_images(
@@ -72,6 +72,12 @@ def with_images(
     if not has_image.any():
         raise InputError("--images has the image of no keyframe: name the source that the run was made of.")
     return exported.of_views(has_image)
+
+
+def mask_of(run: Path) -> NDArray[np.uint8] | None:
+    """Return a run's mask (H, W), 0 where its images show nothing of the scene; None where it has none."""
+    path = run / MASK
+    return None if not path.is_file() else np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
 def undistortion(

@@ -21,7 +21,7 @@ from dualslam.export.colours import keyframe_indices, landmark_colours
 from dualslam.export.decimals import decimals
 from dualslam.export.exported_map import ExportedMap, flatten, with_frames
 from dualslam.export.g2o import write_g2o
-from dualslam.export.images import with_images
+from dualslam.export.images import mask_of, with_images
 from dualslam.export.nerfstudio import write_nerfstudio
 from dualslam.export.ply import write_ply
 from dualslam.io.colours import GREY, load_colours, save_colours
@@ -237,6 +237,9 @@ def test_posed_frames_that_are_no_keyframes_are_exported_on_request(stored: Stor
 def test_masks_are_of_what_the_camera_did_not_see(exported: ExportedMap, tmp_path: Path) -> None:
     mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
     mask[:100] = 0
+    assert mask_of(tmp_path) is None
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    np.testing.assert_array_equal(mask_of(tmp_path), mask)  # type: ignore[arg-type]
     frames = [Frame(i, 0.1 * i, np.zeros_like(mask)) for i in range(60)]
     write_nerfstudio(with_images(exported, CAMERA, frames, {i: i for i in range(60)}, tmp_path, mask), tmp_path)
     for each in json.loads((tmp_path / "transforms.json").read_text())["frames"]:
