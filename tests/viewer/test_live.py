@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import signal
 import socket
 import sys
@@ -19,6 +20,7 @@ import pytest
 
 from dualslam.cli import main
 from dualslam.core.errors import InputError, OutputError
+from dualslam.core.extras import how_to_install
 from dualslam.core.geometry import sim3
 from dualslam.core.types import FloatArray, Frame, FrameStatus
 from dualslam.map.frame_records import FrameResult
@@ -322,7 +324,7 @@ def test_a_port_that_is_taken_is_one_sentence() -> None:
 def test_without_the_extra_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "viser" else find(name))
-    with pytest.raises(InputError, match=r'pip install -e "\.\[live\]"'):
+    with pytest.raises(InputError, match=re.escape(how_to_install("live"))):
         LiveView()
 
 

@@ -19,6 +19,7 @@ from rerun.chunk import RrdReader
 
 from dualslam.cli import main
 from dualslam.core.errors import OutputError
+from dualslam.core.extras import how_to_install
 from dualslam.core.geometry import sim3, so3
 from dualslam.core.types import FrameStatus, Keyframe
 from dualslam.io.map_store import load_atlas, save_atlas
@@ -266,7 +267,7 @@ def test_without_rerun_it_says_how_to_get_it(
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.delitem(sys.modules, "dualslam.viewer.recording")
     assert main(["view", str(broken_run.path), "--save", str(tmp_path / "run.rrd")]) == 2
-    assert 'pip install -e ".[view]"' in one_sentence(capsys)
+    assert how_to_install("view") in one_sentence(capsys)
     assert list(tmp_path.iterdir()) == []
 
 
