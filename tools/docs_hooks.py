@@ -1,17 +1,20 @@
-"""What the documentation is built with beside mkdocs: equations as MathML, and the configuration from its models.
+"""What the documentation is built with besides mkdocs: equations as MathML, the configuration, and the notebooks.
 
-mkdocs calls the two functions named ``on_...`` for each page. Equations are written as on GitHub: ``$...$`` within a
+mkdocs calls the functions named ``on_...`` for each page. Equations are written as on GitHub: ``$...$`` within a
 line, ``$$...$$`` on lines of their own.
 """
 
 from __future__ import annotations
 
 import html
+import json
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, get_args
 
 from latex2mathml.converter import convert
+from mkdocs.structure.files import File, Files
 from pydantic import BaseModel
 
 from dualslam.config.settings import Config
@@ -20,6 +23,32 @@ FIELDS = "<!-- every field of the configuration -->"
 # Code comes first: what looks like an equation in it is none.
 _PIECES = re.compile(r"(```.*?```|`[^`\n]*`)|\$\$(.+?)\$\$|(?<![\w$\\])\$([^\s$](?:[^$\n]*[^\s$])?)\$(?!\w)", re.DOTALL)
 _TOKEN = "equation{}of{}"
+
+
+def on_files(files: Files, config: Any, **_: Any) -> Files:
+    """Add the notebooks, with what they print and draw, as pages."""
+    for path in sorted((Path(config.config_file_path).parent / "notebooks").glob("*.ipynb")):
+        content = notebook_page(json.loads(path.read_text(encoding="utf-8")), path.name)
+        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=content))
+    return files
+
+
+def notebook_page(notebook: dict[str, Any], name: str) -> str:
+    """Return a notebook as Markdown."""
+    parts = []
+    for cell in notebook["cells"]:
+        source = "".join(cell["source"])
+        parts.append(f"```python\n{source}\n```" if cell["cell_type"] == "code" else source)
+        for output in cell.get("outputs", ()):
+            data = output.get("data", {})
+            if "image/png" in data:
+                picture = "".join(data["image/png"]).replace("\n", "")
+                parts.append(f"![what this cell draws](data:image/png;base64,{picture})")
+            else:
+                text = "".join(output.get("text") or data.get("text/plain", ""))
+                parts.append(f"```text\n{text.rstrip()}\n```")
+    parts.insert(1, f"*This page is `notebooks/{name}`, with what it printed and drew.*")
+    return "\n\n".join(parts) + "\n"
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
