@@ -27,10 +27,10 @@ MAX_PORT = 65535
 SHORTEST_M, LONGEST_M = 1e-6, 1e9
 """Of a known length: a mistyped exponent, and nothing that a camera could see, lies outside."""
 SOURCE_HELP = (
-    "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours); a folder of images or a video file, whose camera is "
-    "searched for without --camera or --fov; with one of these a webcam's number, or the address of a stream "
-    "(rtsp://..., http://...); or an embedded world: synthetic:street, room, circuit, eight, terrace, corridors, "
-    "posters, board, parked, takeoff, standstill, hover, with options as in "
+    "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours); a ROS bag or MCAP; a folder of images or a video "
+    "file, whose camera is searched for without --camera or --fov; with one of these a webcam's number, or the address "
+    "of a stream (rtsp://..., http://...); or an embedded world: synthetic:street, room, circuit, eight, terrace, "
+    "corridors, posters, board, parked, takeoff, standstill, hover, with options as in "
     "synthetic:street,frames=300,seed=1,events=FILE"
 )
 EXIT_STATUSES = (
@@ -132,6 +132,7 @@ def _late(name: str) -> Callable[[argparse.Namespace], int]:
 def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser, talk = _command(commands, "run", "Run on a source of frames and write a run folder.")
     parser.add_argument("source", metavar="SOURCE", type=_source, help=SOURCE_HELP)
+    parser.add_argument("--topic", metavar="NAME", help="topic of the images, where SOURCE is a bag of several")
     _add_output(parser)
     talk.add_argument("--profile", action="store_true", help="print where the time went, stage by stage")
     _add_configuration(parser)

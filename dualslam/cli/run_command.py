@@ -52,6 +52,7 @@ def _run(args: argparse.Namespace, config: Config) -> int:
         "reverse": args.reverse,
         "rate_hz": args.rate,
         "time_unit": args.time_unit,
+        "topic": args.topic,
         "max_side_px": None if args.full_size else MAX_SIDE_PX,
     }
     focal: FocalSearch | None = None

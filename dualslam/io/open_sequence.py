@@ -14,7 +14,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import camera_from_fov
 from dualslam.core.errors import InputError, NoCalibrationError
 from dualslam.core.missing import check_exists
-from dualslam.io import dataset_folder, euroc, folder, kitti, tum_mono, tum_rgbd, video
+from dualslam.io import bags, dataset_folder, euroc, folder, kitti, tum_mono, tum_rgbd, video
 from dualslam.io.camera_build import make_camera
 from dualslam.io.camera_files import read_camera_file
 from dualslam.io.reduced import MAX_SIDE_PX, ReducedImages, reduced_camera, reduction
@@ -42,7 +42,7 @@ NOT_READ = frozenset({".avif", ".cr2", ".dng", ".exr", ".gif", ".heic", ".heif",
 """Images that no reader of ours opens, by how their files end."""
 
 # The surer the sign, the earlier; the plain folder of images takes what no other does.
-FORMATS: tuple[SourceFormat, ...] = (euroc, tum_rgbd, kitti, tum_mono, dataset_folder, folder)
+FORMATS: tuple[SourceFormat, ...] = (bags, euroc, tum_rgbd, kitti, tum_mono, dataset_folder, folder)
 
 
 def open_sequence(
@@ -57,6 +57,7 @@ def open_sequence(
     times: str | Path | ArrayLike | None = None,
     rate_hz: float | None = None,
     time_unit: str | None = None,
+    topic: str | None = None,
     grey: bool = True,
     max_side_px: int | None = MAX_SIDE_PX,
 ) -> RecordedSequence | WebcamSequence:
@@ -81,6 +82,8 @@ def open_sequence(
         Frames a second, instead of the source's own times.
     time_unit : {"s", "ms", "us", "ns"}, optional
         Of the source's own times. Where it is not given they must make the rate of a camera as seconds.
+    topic : str, optional
+        Of the images of a bag that has several.
     grey : bool
         Decode to (H, W) grey; otherwise (H, W, 3) RGB.
     max_side_px : int or None
@@ -98,7 +101,7 @@ def open_sequence(
     selection = Selection(start, stride, max_frames, reverse)
     if time_unit is not None and time_unit not in UNITS:
         raise InputError(f"The unit of the times is {time_unit!r}; it must be one of {', '.join(UNITS)}.")
-    given = Given(camera_file is not None or fov_degrees is not None, times, rate_hz)
+    given = Given(camera_file is not None or fov_degrees is not None, times, rate_hz, topic)
     if video.is_live(source):
         if time_unit is not None:
             raise InputError(f"{source} is live and has times of its own; leave out the unit of the times.")
@@ -106,6 +109,8 @@ def open_sequence(
         device = int(name) if name.isdigit() else name
         of_file = None if camera_file is None else read_camera_file(camera_file)
         return video.open_webcam(device, of_file, fov_degrees, selection, given, grey)
+    if topic is not None and not bags.is_bag_file(Path(str(source))) and not bags.recognises(Path(str(source))):
+        raise InputError(f"{source} is no bag, and has no topics; leave out the topic.")
     recording = _with_clock(_open_recording(Path(str(source)), given), rate_hz, time_unit)
     camera, calibration = recording.camera, recording.calibration
     if camera_file is not None:
@@ -126,6 +131,8 @@ def _open_recording(source: Path, given: Given) -> Recording:
     check_exists(source)
     if not source.is_file() and not source.is_dir():
         raise InputError(f"{source} is neither a file nor a folder (a pipe?); give one, or the address of a stream.")
+    if source.is_file() and bags.is_bag_file(source):
+        return bags.open_recording(source, given)
     if source.is_file():
         return video.open_recording(source, given)
     for known in FORMATS:

@@ -69,11 +69,14 @@ class Given:
         A file of seconds, one a line, or the numbers.
     rate_hz : float or None
         Frames a second of a source that has no times, or none that are right.
+    topic : str or None
+        Of the images, where the source is a bag.
     """
 
     camera: bool = False
     times: str | Path | ArrayLike | None = None
     rate_hz: float | None = None
+    topic: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,6 +39,7 @@ def open_source(
     reverse: bool = False,
     rate_hz: float | None = None,
     time_unit: str | None = None,
+    topic: str | None = None,
     max_side_px: int | None = MAX_SIDE_PX,
 ) -> Sequence:
     """Open a source of frames.
@@ -52,8 +53,8 @@ def open_source(
         Calibration of a source that has none.
     start, stride, max_frames, reverse : optional
         Which frames, counted in the source.
-    rate_hz, time_unit : optional
-        Rate of the frames, or unit of their times (see `dualslam.io.open_sequence`).
+    rate_hz, time_unit, topic : optional
+        Rate of the frames, unit of their times, topic of a bag's images (see `dualslam.io.open_sequence`).
     max_side_px : int or None
         Larger recorded images are read smaller, by a whole factor; None: never.
 
@@ -78,6 +79,7 @@ def open_source(
         reverse=reverse,
         rate_hz=rate_hz,
         time_unit=time_unit,
+        topic=topic,
         max_side_px=max_side_px,
     )
 
