@@ -22,7 +22,7 @@ from dualslam.build.workers import features_beside, inline_handlers, worker_desk
 from dualslam.calibration.lens import Calibration
 from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
-from dualslam.core.camera.corrected import CorrectedCamera
+from dualslam.core.camera.mapped import MappedCamera, camera_for_map
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Frontend, SubmapGraph
 from dualslam.core.types import View
@@ -92,7 +92,9 @@ def build_system(
     new_graph = new_graph or graph_maker(config)
     frontend = create_frontend(config.frontend)
     known = camera if saved is None else _camera_of(saved, camera)
-    is_known = saved is not None and known is saved.camera
+    is_known = saved is not None and saved.camera is not None
+    if isinstance(known, MappedCamera):
+        camera = known
     if is_known:  # its camera is its own: to change it would part what is there from what comes
         config = config.model_copy(update={"calibration": config.calibration.model_copy(update={"refine": False})})
     calibration = new_calibration(config, known)
@@ -185,16 +187,13 @@ class LiveParts:
 
 
 def _camera_of(saved: StoredMap, camera: Camera) -> Camera:
-    """Return the camera that made a saved map, where it is the one that is given, perhaps corrected since.
-
-    Where it is another one, the given: frames are not looked for in submaps of other intrinsics.
-    """
-    known = saved.camera or camera
-    given = known.base if isinstance(known, CorrectedCamera) else known
-    if given.to_dict() == camera.to_dict():
-        return known
-    log.warning("the saved map was made with another camera: single frames cannot be posed in it")
-    return camera
+    """Return the camera that made a saved map, perhaps corrected since; another one is brought to the map's pixels."""
+    if saved.camera is None:
+        return camera
+    found = camera_for_map(saved.camera, camera)
+    if found is not saved.camera:
+        log.warning("the saved map was made with another camera: this one's pixels are brought to the map's")
+    return found
 
 
 def _foresee(desk: Desk, view: View) -> None:

@@ -1,8 +1,10 @@
-"""Large images read smaller: by whole factors, each pixel the mean of those that it covers."""
+"""Images in another size: large ones read smaller by whole factors, and frames resized to those of a saved map."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,6 +12,8 @@ from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import ToldFocal
+from dualslam.core.interfaces import Sequence
+from dualslam.core.types import Frame
 from dualslam.io.images import ImageReader, ImageStore, UnreadableImageError
 
 MAX_SIDE_PX = 2048
@@ -80,3 +84,33 @@ class _ReducedReader:
 
     def close(self) -> None:
         self._reader.close()
+
+
+class ResizedFrames:
+    """The frames of a sequence, whole and in another size. What else it has is the sequence's.
+
+    Parameters
+    ----------
+    sequence : Sequence
+    size_px : (width, height)
+    """
+
+    def __init__(self, sequence: Sequence, size_px: tuple[int, int]) -> None:
+        self._sequence = sequence
+        self.camera = sequence.camera.resized(*size_px)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._sequence, name)
+
+    def __len__(self) -> int:
+        return len(self._sequence)
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame in self._sequence:
+            if frame.image is None:
+                yield frame
+                continue
+            shrinks = frame.image.shape[1] > self.camera.width
+            interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+            image = cv2.resize(frame.image, self.camera.size_px, interpolation=interpolation)
+            yield replace(frame, image=np.asarray(image, np.uint8))

@@ -8,12 +8,12 @@ from typing import Any
 
 from dualslam.build import find_focal
 from dualslam.config.settings import Config
-from dualslam.core.camera.corrected import given_camera
 from dualslam.core.camera.focal import FocalSearch
+from dualslam.core.camera.mapped import own_camera
 from dualslam.core.errors import InputError
 from dualslam.core.types import Failure
 from dualslam.io.map_store import load_camera
-from dualslam.io.sequence import RecordedSequence
+from dualslam.io.sequence import RecordedSequence, camera_of_size
 from dualslam.run.sources import ANY_FOV_DEG, open_source
 
 SEARCHED_FRAMES = 200
@@ -62,7 +62,8 @@ def with_camera_found(config: Config, sequence: RecordedSequence) -> tuple[Recor
 def with_camera_of_map(saved_map: str | Path, sequence: RecordedSequence) -> RecordedSequence | None:
     """Return a sequence with the camera, as it was given, that a saved map was made by.
 
-    None where the map has no camera, or one of images of another size: then it was another.
+    Images of another size and the same shape are taken for the same camera's. None where the map has no camera, or one
+    of images of another shape: then it was another.
 
     Raises
     ------
@@ -72,9 +73,11 @@ def with_camera_of_map(saved_map: str | Path, sequence: RecordedSequence) -> Rec
     camera = load_camera(saved_map)
     if camera is None:
         return None
-    given = given_camera(camera)
-    same_size = given.size_px == sequence.camera.size_px
-    return sequence.with_camera(given) if same_size else None
+    try:
+        of_map = camera_of_size(own_camera(camera), sequence.camera.size_px, sequence.name, f"the map of {saved_map}")
+    except InputError:
+        return None
+    return sequence.with_camera(of_map)
 
 
 def with_prior(config: Config, found: FocalSearch) -> Config:

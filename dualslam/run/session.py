@@ -27,11 +27,13 @@ from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.run_folder import RunFolder, RunRecord, check_vacant
 from dualslam.io.sequence import RecordedSequence, Selection
 from dualslam.io.trajectory_files import Trajectory
+from dualslam.io.video import WebcamSequence
 from dualslam.lab.disturbances import corrupted
 from dualslam.map.frame_records import FrameResult
 from dualslam.report import PlaceAlbum, SampleKeeper, read_run, report_page
 from dualslam.run.interrupts import Interrupts
 from dualslam.run.judgement import judge_run
+from dualslam.run.map_camera import camera_that_fits, in_size_of_map
 from dualslam.run.no_map import StartRefusals
 from dualslam.run.results import frame_rows, summarise, trajectories_of, truth_of_frames
 from dualslam.run.runner import RunReport, run_sequence
@@ -185,9 +187,14 @@ def run_to_folder(
     check_out(out, overwrite=overwrite, saved_map=saved_map)
     colours: Colours = {}
     if saved_map is not None:
+        comes_once = isinstance(sequence, WebcamSequence)
+        sequence = in_size_of_map(sequence, saved_map)
+        camera = sequence.camera
+        if not comes_once:
+            camera = camera_that_fits(config, sequence, camera, saved_map)
         saved = load_atlas(saved_map)
         colours = saved.colours
-        system = build_system(config, sequence.camera, saved=saved, localise=localise)
+        system = build_system(config, camera, saved=saved, localise=localise)
     else:
         system = (build or build_system)(config, sequence.camera)
     with closing(system.desk), RunFolder(out, overwrite=overwrite) as folder:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
-from dualslam.core.camera.models import PinholeCamera
+from dualslam.core.camera.models import PinholeCamera, camera_from_fov
+from dualslam.core.types import Frame
 from dualslam.io import open_sequence
-from dualslam.io.reduced import MAX_SIDE_PX, reduced_camera, reduction
+from dualslam.io.reduced import MAX_SIDE_PX, ResizedFrames, reduced_camera, reduction
 
 CALIB = "50 52 20.5 14.5 43 31\n"
 
@@ -23,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
     image = np.tile(np.arange(43, dtype=np.uint8), (31, 1))
     for i in range(3):
         cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), image)
-    (tmp_path / "times.txt").write_text("0\n1\n2\n")
+    (tmp_path / "times.txt").write_text("0\n0.1\n0.2\n")
     (tmp_path / "calib.txt").write_text(CALIB)
     return tmp_path
 
@@ -74,3 +76,19 @@ def test_small_images_and_those_that_are_wanted_whole_stay_as_they_are(
     for sequence in (open_sequence(folder), open_sequence(folder, max_side_px=None)):
         assert sequence.camera.width == 43
     assert not caplog.text
+
+
+def test_frames_resized_show_the_same_rays(tmp_path: Path) -> None:
+    """Whole images, with a camera whose pixels look where theirs did; what is unreadable stays so."""
+    image = np.zeros((24, 32), np.uint8)
+    image[8:16, 8:16] = 200
+    frames = [Frame(0, 0.0, image), Frame(1, 0.1, None, "torn")]
+    source = SimpleNamespace(name="walk", rate_hz=10.0, camera=camera_from_fov(32, 24, 60.0))
+    source_class = type("Source", (SimpleNamespace,), {"__iter__": lambda _: iter(frames), "__len__": lambda _: 2})
+    sequence = ResizedFrames(source_class(**vars(source)), (64, 48))
+    first, second = sequence
+    assert (len(sequence), sequence.name, sequence.rate_hz) == (2, "walk", 10.0)
+    assert first.image.shape == (48, 64)
+    assert first.image[20:28, 20:28].min() == 200
+    assert second is frames[1]
+    np.testing.assert_allclose(sequence.camera.unproject([[31.5, 23.5]]), source.camera.unproject([[15.5, 11.5]]))

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import logging
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from dualslam.cli import main
+from dualslam.config.settings import Config
 from dualslam.report.run_data import read_run
+from dualslam.run.map_camera import camera_that_fits, own_focal_px
+from dualslam.run.sources import open_source
 from dualslam.viewer.playback import play
 
 SOURCE = "synthetic:street,frames=80,seed=3,width=320,height=240"
@@ -43,3 +50,21 @@ def test_a_run_on_a_saved_map_ends_with_all_its_pages(first: Path, localise: boo
     there = (space.keyframes.row == 0).sum()
     assert there >= len(before.keyframes.row), "the first run's keyframes are in the picture from the start"
     assert (len(space.keyframes.row) == there) == localise
+
+
+@pytest.mark.slow
+def test_a_zoomed_camera_that_is_said_to_be_the_maps_is_found_out(
+    first: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its frames fit the map from farther off, metres wrong; the map's points tell the focal length."""
+    config = Config.model_validate({"frontend": {"n_features": 500}})
+    source = open_source(SOURCE, start=20, max_frames=30)
+    zoom, (width, height) = 1.25, source.camera.size_px
+    shift = [0.5 * (1 - zoom) * (width - 1), 0.5 * (1 - zoom) * (height - 1)]
+    A = np.array([[zoom, 0, shift[0]], [0, zoom, shift[1]]])
+    frames = [replace(f, image=cv2.warpAffine(f.image, A, (width, height))) for f in source]
+    with caplog.at_level(logging.WARNING):
+        found = camera_that_fits(config, frames, source.camera, first)
+    assert own_focal_px(found) == pytest.approx(zoom * source.camera.fx, rel=0.02)
+    assert "it is taken for theirs" in caplog.text
+    assert camera_that_fits(config, list(source), source.camera, first) is source.camera

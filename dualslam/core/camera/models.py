@@ -234,9 +234,12 @@ def camera_from_dict(values: Mapping[str, Any]) -> Camera:
     InputError
         Names the field that is missing, unknown or senseless.
     """
-    from dualslam.core.camera.corrected import CorrectedCamera  # it stands on this module
+    from dualslam.core.camera.corrected import CorrectedCamera  # they stand on this module
+    from dualslam.core.camera.mapped import MappedCamera
 
     name = values.get("model")
+    if name == MappedCamera.model:
+        return MappedCamera.from_dict(values)
     if name == CorrectedCamera.model:
         return CorrectedCamera.from_dict(values)
     if not isinstance(name, str) or name not in MODELS:
