@@ -320,6 +320,12 @@ class System:
             self._begin_anew()
             state.lost = []
             return broken.failure
+        if (first := self.audit.broken_since(live.submap.id)) is not None:
+            failure = Failure(FailureReason.PHOTOMETRIC, f"the images disagree with the map since frame {first}")
+            self._endings.break_at(live, view, first, failure)
+            self._begin_anew()
+            state.lost = []
+            return failure
         if (found := self._places.seen_from(live, track)) is not None:
             return self._go_over(found, live, view)
         if live.reference_id == view.index:
@@ -412,7 +418,7 @@ class System:
             T_submap_cam = self.atlas.submaps[pose.submap_id].resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
         failure = outcome if isinstance(outcome, Failure) else None
         S_world_submap, world_id = (None, None) if pose is None else self._worlds.of(pose.submap_id)
-        is_doubtful = pose is not None and self.audit.is_doubtful
+        is_doubtful = pose is not None and self.audit.broken_since(pose.submap_id) is not None
         return FrameResult(
             self.numbers.index_of(frame.index),
             row.status,

@@ -91,10 +91,14 @@ class PhotometricAudit:
         if view.index in submap.keyframes:
             self._patches.remember(submap, view)
 
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether the newest samples disagree."""
-        return bool(disagreeing_stretches(self.samples[-MIN_SAMPLES:]))
+    def broken_since(self, submap_id: int) -> int | None:
+        """Return the frame since which the images disagree with a map, after the last sample that agreed, if any."""
+        newest = self.samples[-MIN_SAMPLES:]
+        if not disagreeing_stretches(newest) or newest[0].submap_id != submap_id:
+            return None
+        before = self.samples[-MIN_SAMPLES - 1 : -MIN_SAMPLES]
+        agreed = before and before[0].submap_id == newest[0].submap_id
+        return before[0].index + 1 if agreed else newest[0].index
 
 
 def disagreeing_stretches(samples: Iterable[Sample]) -> list[Stretch]:

@@ -333,6 +333,7 @@ class FailureReason(StrEnum):
     UNCONFIRMED = "unconfirmed"
     LOOK_ALIKE = "look_alike"
     LEAP = "leap"
+    PHOTOMETRIC = "photometric"
     TIMEOUT = "timeout"
     WORKER = "worker"
     BUSY = "busy"

@@ -18,6 +18,7 @@ _HEADS = ("frame", "submap", "what", "outcome")
 _DOUBTS = {
     "look_alike": "two poses explain what is seen",
     "leap": "the camera cannot have moved so",
+    "photometric": "the images disagree with the map",
     "ambiguous_model": "two places, or two poses, look alike",
     "contradiction": "the rest of the map contradicts it",
     "unconfirmed": "nothing has confirmed it",

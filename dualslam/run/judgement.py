@@ -153,7 +153,7 @@ def _photometric(system: System, trajectories: Trajectories) -> list[Reason]:
     text = (
         f"From frame {first} to {last} the images disagree with the map: {100 * worst.agreement:.0f} % of the patches "
         "look as predicted. Something that moves may have been followed, or a turn lost. Do not use the poses there, "
-        "nor how what follows lies to what came before; mask what moves."
+        "nor how what follows lies to what came before. Mask what moves."
     )
     return [Reason(ReasonCode.PHOTOMETRIC, Level.DOUBTFUL, text, first, last)]
 

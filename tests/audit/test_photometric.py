@@ -55,7 +55,7 @@ def test_frames_are_sampled_by_their_times_and_doubt_is_there_while_they_disagre
     submap, doubtful = Submap(0, np.eye(3), np.zeros(32, np.uint8)), []
     for i in range(180):
         audit.take(submap, track(i, rate_hz=30.0))
-        if audit.is_doubtful:
+        if audit.broken_since(0) is not None:
             doubtful.append(i)
     assert len(audit.samples) == 28, "every sixth frame, from the first that could be compared"
     assert doubtful == list(range(72, 120)), "from the third sample that disagrees to the next that agrees"
