@@ -418,7 +418,7 @@ class System:
             T_submap_cam = self.atlas.submaps[pose.submap_id].resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
         failure = outcome if isinstance(outcome, Failure) else None
         S_world_submap, world_id = (None, None) if pose is None else self._worlds.of(pose.submap_id)
-        is_doubtful = pose is not None and self.audit.broken_since(pose.submap_id) is not None
+        is_doubtful = pose is not None and self.audit.doubts(pose.submap_id)
         return FrameResult(
             self.numbers.index_of(frame.index),
             row.status,

@@ -91,6 +91,11 @@ class PhotometricAudit:
         if view.index in submap.keyframes:
             self._patches.remember(submap, view)
 
+    def doubts(self, submap_id: int) -> bool:
+        """Whether the newest sample disagrees with a map."""
+        newest = self.samples[-1:]
+        return bool(newest) and newest[0].submap_id == submap_id and newest[0].agreement < MIN_AGREEMENT
+
     def broken_since(self, submap_id: int) -> int | None:
         """Return the frame since which the images disagree with a map, after the last sample that agreed, if any."""
         newest = self.samples[-MIN_SAMPLES:]

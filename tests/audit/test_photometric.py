@@ -52,13 +52,18 @@ def test_a_stretch_is_of_one_map() -> None:
 def test_frames_are_sampled_by_their_times_and_doubt_is_there_while_they_disagree() -> None:
     agreement: dict[int, float | None] = {i: 0.0 if 60 <= i < 120 else None if i < 12 else 0.7 for i in range(180)}
     audit = PhotometricAudit(Script(agreement))
-    submap, doubtful = Submap(0, np.eye(3), np.zeros(32, np.uint8)), []
+    submap, doubtful, broken = Submap(0, np.eye(3), np.zeros(32, np.uint8)), [], []
     for i in range(180):
         audit.take(submap, track(i, rate_hz=30.0))
-        if audit.broken_since(0) is not None:
+        if audit.doubts(0):
             doubtful.append(i)
+        if audit.broken_since(0) is not None:
+            broken.append((i, audit.broken_since(0)))
+        assert not audit.doubts(1)
+        assert audit.broken_since(1) is None
     assert len(audit.samples) == 28, "every sixth frame, from the first that could be compared"
-    assert doubtful == list(range(72, 120)), "from the third sample that disagrees to the next that agrees"
+    assert doubtful == list(range(60, 120)), "from the first sample that disagrees to the next that agrees"
+    assert broken[0] == (72, 55), "with the third, since the last that agreed"
     (stretch,) = disagreeing_stretches(audit.samples)
     assert (stretch.first, stretch.last) == (60, 114)
 
