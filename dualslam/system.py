@@ -14,7 +14,7 @@ from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import VisualOdometry
-from dualslam.core.types import Failure, FailureReason, Frame, FrameStatus, Start, Track, View
+from dualslam.core.types import BoolArray, Failure, FailureReason, Frame, FrameStatus, Start, Track, View
 from dualslam.health import HealthMonitor
 from dualslam.io.map_store import StoredMap
 from dualslam.map.connections import Connections
@@ -32,6 +32,7 @@ from dualslam.recovery.walk_news import WalkNews
 from dualslam.steps.components import Components
 from dualslam.steps.endings import Endings
 from dualslam.steps.graphs import GraphKeeping
+from dualslam.steps.masking import Masking
 from dualslam.steps.places import PlaceKeeping
 from dualslam.steps.starting import Starting
 from dualslam.steps.state import State
@@ -133,6 +134,7 @@ class System:
         self._places = PlaceKeeping(self._state, self._revisits, self._recoveries, handover)
         self._tracking = Tracking(self._state, self._places)
         self._starting = Starting(self._state, self._tracking, self._recoveries, sightings)
+        self._masking = Masking(self._state, self._starting)
         self._endings = Endings(self._state, self._recoveries, self._connections, sightings, earlier)
 
     @property
@@ -149,6 +151,11 @@ class System:
     def log_focal_sigma(self) -> float | None:
         """Standard deviation of the logarithm of that camera's focal length; None where it is as it was given."""
         return self._state.parts.calibration.log_focal_sigma
+
+    @property
+    def hidden(self) -> BoolArray | None:
+        """Pixels (H, W) that were found to stand still in the image, and are left out; None while there are none."""
+        return self._state.parts.scene.hidden
 
     @property
     def world(self) -> int | None:
@@ -236,6 +243,7 @@ class System:
             self.blank.add(frame.index)
         else:
             view = replace(view, index=frame.index)
+            self._masking.follow(view)
             self.buffer.append(view)
             # 3. Without a live submap, look for the lost one, or try to start one; with one, track.
             outcome = self._without_map(view) if state.live is None else self._with_map(state.live, view)

@@ -11,6 +11,7 @@ from dualslam.core.interfaces import Frontend, Shutter
 from dualslam.core.types import Failure, FailureReason, Frame, View
 from dualslam.frontends.asking import checked
 from dualslam.frontends.features.images import to_grey
+from dualslam.frontends.scene_mask import Cover, SceneMask
 
 
 class FrameReader:
@@ -24,25 +25,52 @@ class FrameReader:
     model_sigma_px : float
         Error of the camera model itself, see `CameraConfig.model_sigma_px`.
     shutter : Shutter
+    scene : SceneMask
+        Which pixels show the scene.
     """
 
     def __init__(
-        self, frontend: Frontend, camera: Callable[[], Camera], model_sigma_px: float, shutter: Shutter
+        self,
+        frontend: Frontend,
+        camera: Callable[[], Camera],
+        model_sigma_px: float,
+        shutter: Shutter,
+        scene: SceneMask,
     ) -> None:
-        self._frontend, self._camera, self._shutter = frontend, camera, shutter
+        self._frontend, self._camera, self._shutter, self._scene = frontend, camera, shutter, scene
         self._model_sigma_px = model_sigma_px
 
     def __call__(self, frame: Frame) -> View | Failure:
         """Return the frame's view; a failure where there is no image, or one of another size."""
         camera = self._camera()
-        # 1. Features of the image (in real time found beside the tracking), and 2. the lens taken out of their pixels.
-        view = view_of(frame, self._frontend, camera, self._model_sigma_px)
-        # 3. The rows' times taken out, where the shutter is known to roll.
+        if (unusable := _unusable(frame, camera)) is not None:
+            return unusable
+        # 1. Which pixels show the scene.
+        self._scene.look(frame)
+        cover = self._scene.cover_of(frame)
+        # 2. Features of these (in real time found beside the tracking), and 3. the lens taken out of their pixels.
+        view = view_of(frame, self._frontend, camera, self._model_sigma_px, cover)
+        # 4. The rows' times taken out, where the shutter is known to roll.
         return view if isinstance(view, Failure) else self._shutter.shutter_corrected(view, camera)
 
 
-def view_of(frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: float) -> View | Failure:
-    """Find a frame's features and take the lens distortion out of them."""
+def view_of(
+    frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: float, cover: Cover | None = None
+) -> View | Failure:
+    """Find a frame's features and take the lens distortion out of them; `cover` hides parts of its image."""
+    if (unusable := _unusable(frame, camera)) is not None:
+        return unusable
+    assert frame.image is not None, "an image that is missing is unusable"
+    image = frame.image if cover is None else cover.paint(frame.image)
+    found = checked(frontend, frontend.extract(image) if frame.features is None else frame.features)
+    if cover is not None:
+        found = found.take(cover.shows(found))
+    features = rectify(found, camera, model_sigma_px)
+    return View(frame.index, frame.timestamp_s, features, GreyImage.of(to_grey(image)))
+
+
+def _unusable(frame: Frame, camera: Camera) -> Failure | None:
+    """Return why a frame has no view: it has no image, or one of another size."""
     if frame.image is None:
         return Failure(FailureReason.UNREADABLE, frame.error)
     height, width = frame.image.shape[:2]
@@ -51,6 +79,4 @@ def view_of(frame: Frame, frontend: Frontend, camera: Camera, model_sigma_px: fl
             FailureReason.UNREADABLE,
             f"frame {frame.index} is {width}x{height}, the calibration is for {camera.width}x{camera.height}",
         )
-    found = frontend.extract(frame.image) if frame.features is None else frame.features
-    features = rectify(checked(frontend, found), camera, model_sigma_px)
-    return View(frame.index, frame.timestamp_s, features, GreyImage.of(to_grey(frame.image)))
+    return None

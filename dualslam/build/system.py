@@ -30,6 +30,8 @@ from dualslam.frontends.direct.patch_audit import PatchAudit
 from dualslam.frontends.frame_reader import FrameReader
 from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.registry import create_frontend
+from dualslam.frontends.scene_mask import SceneMask
+from dualslam.frontends.still_pixels import StillPixels
 from dualslam.frontends.tracking.initialiser import Initialiser
 from dualslam.frontends.tracking.rolling_shutter import RollingShutter
 from dualslam.frontends.tracking.visual import VisualFrontEnd
@@ -104,7 +106,8 @@ def build_system(
     if saved is not None and not localise:
         saved = replace(saved, poses=tidy(saved.atlas, saved.poses))
     live = LiveParts(config, frontend, calibration, camera, 0 if saved is None else saved.next_id)
-    reader = FrameReader(frontend, live.camera, config.camera.model_sigma_px, shutter)
+    scene = SceneMask(StillPixels(camera.size_px) if config.camera.find_still_pixels else None)
+    reader = FrameReader(frontend, live.camera, config.camera.model_sigma_px, shutter, scene)
 
     workers = config.recovery.workers
     if recovery is None:
@@ -118,6 +121,7 @@ def build_system(
         else InlineDesk(inline_handlers(config, places.verifier, new_graph))
     )
     graphs = BesideGraphs(desk, window_solver(config)) if workers else None
+    opens = partial(features_beside, desk, config.frontend, scene.painted) if isinstance(desk, WorkerDesk) else None
     foresees = workers and recovery is None and config.recovery.enabled
     if recovery is None:
         recovery = DeskExecutor(desk) if workers else faults.around_inline(InlineExecutor(parts, watch))
@@ -131,6 +135,7 @@ def build_system(
             new_relocaliser=faults.around_odometry(live.new_relocaliser),
             calibration=calibration,
             shutter=shutter,
+            scene=scene,
             recovery=recovery,
             walk_watch=watch,
             desk=desk,
@@ -139,7 +144,7 @@ def build_system(
             patches=PatchAudit(live.camera),
             graphs=graphs,
             places=places,
-            open_features=partial(features_beside, desk, config.frontend) if isinstance(desk, WorkerDesk) else None,
+            open_features=opens,
             foresee=partial(_foresee, desk) if foresees else None,
         ),
         config,

@@ -12,7 +12,7 @@ from dualslam.config.settings import Config, FrontendConfig
 from dualslam.core.camera.base import Camera
 from dualslam.core.interfaces import SubmapGraph
 from dualslam.core.threads import spare_cores
-from dualslam.core.types import Failure
+from dualslam.core.types import Failure, Frame
 from dualslam.frontends.registry import create_frontend
 from dualslam.frontends.tracking.map_readout import answer_readout
 from dualslam.lab.disturbances import FaultScript
@@ -137,7 +137,7 @@ def worker_desk(config: Config, camera: Camera, faults: FaultScript, watch: Walk
     return WorkerDesk([live_map, walks], recovery.finish_wait_s, faults.kill_worker, watch)
 
 
-def features_beside(desk: WorkerDesk, config: FrontendConfig) -> FeaturesBeside:
+def features_beside(desk: WorkerDesk, config: FrontendConfig, painted: Callable[[Frame], Frame]) -> FeaturesBeside:
     """Start the process that finds the features of the frame to come."""
     desk.open(Lane("features", (JobKind.FEATURES,), partial(feature_handlers, config), 1, FEATURES_LIMIT_S))
-    return FeaturesBeside(desk)
+    return FeaturesBeside(desk, painted)

@@ -43,6 +43,9 @@ def _overrides(args: argparse.Namespace) -> list[Override]:
         overrides.append(Override(("recovery", "workers"), 0, "--inline"))
     elif getattr(args, "workers", None) is not None:
         overrides.append(Override(("recovery", "workers"), args.workers, f"--workers {args.workers}"))
+    mask: Path | None = getattr(args, "mask", None)
+    if mask is not None:
+        overrides.append(Override(("camera", "mask"), str(mask), f"--mask {mask}"))
     corrupt: Path | None = getattr(args, "corrupt", None)
     if corrupt is not None:
         overrides.append(Override(("corruptions",), _read_corruptions(corrupt), f"--corrupt {corrupt}"))

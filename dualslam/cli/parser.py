@@ -152,6 +152,12 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
         type=_angle,
         help="field of view along the longer side of the images, without a calibration",
     )
+    images.add_argument(
+        "--mask",
+        metavar="FILE",
+        type=_path,
+        help="image whose black pixels show no scene; or a folder with one for each frame (camera.mask)",
+    )
     images.add_argument("--full-size", action="store_true", help="read images of more than 2048 pixels as they are")
     clock = parser.add_argument_group("clock").add_mutually_exclusive_group()
     clock.add_argument("--rate", metavar="HZ", type=_rate, help="frames a second, instead of the source's own times")

@@ -34,6 +34,12 @@ class CameraConfig(StrictModel):
     the first Kinect, negative where images were turned upside down since, so that the last row was read first. None:
     the frames in which there is no map are asked for it, and where one that rolls is likely, no map starts from a fast
     turn until it is known."""
+    find_still_pixels: bool = True
+    """Find pixels that stand still in the image while the rest moves (a bonnet, black bars, a logo), and leave them
+    out. No map starts while the camera itself stands still."""
+    mask: str | None = None
+    """Image whose black pixels show no scene, of the frames' size; or a folder with one for each frame, named as the
+    frames, or in their order."""
 
 
 class InitialiserConfig(StrictModel):

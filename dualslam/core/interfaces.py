@@ -16,7 +16,19 @@ from dualslam.core.estimates import (
     GraphEstimate,
     KeyframeReport,
 )
-from dualslam.core.types import Failure, Features, FloatArray, Frame, IntArray, Matches, Rival, Start, Track, View
+from dualslam.core.types import (
+    BoolArray,
+    Failure,
+    Features,
+    FloatArray,
+    Frame,
+    IntArray,
+    Matches,
+    Rival,
+    Start,
+    Track,
+    View,
+)
 
 if TYPE_CHECKING:
     from dualslam.core.camera.base import Camera
@@ -271,6 +283,32 @@ class Shutter(Protocol):
         self, readout_s: float, rates_rad_s: Mapping[int, FloatArray], latest: Iterable[View], K: FloatArray
     ) -> None:
         """Go on with the readout time that a map has told."""
+        ...
+
+
+class Scene(Protocol):
+    """Knows which pixels show the scene, and which stand still in the image."""
+
+    @property
+    def hidden(self) -> BoolArray | None:
+        """Return the pixels (H, W) that were found to stand still: a new array whenever they change, or None."""
+        ...
+
+    @property
+    def camera_stands(self) -> bool:
+        """Whether most of the image stands still, and something moves through it."""
+        ...
+
+    def refuse_start(self) -> Failure | None:
+        """Return why no map should start now; None where one may."""
+        ...
+
+    def shows(self, features: Features) -> BoolArray:
+        """Return which features (N,) of any frame are not of pixels that stand still."""
+        ...
+
+    def masked(self, view: View) -> View:
+        """Return a view of an earlier frame without what stands still."""
         ...
 
 

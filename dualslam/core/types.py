@@ -61,6 +61,8 @@ class Frame:
         Empty, or the reason why the image is missing.
     features : Features or None
         What was found in the image already, as the front end's `extract` returns it.
+    hidden : (H, W) bool or None
+        Pixels that show no scene, such as a gripper: no feature is taken from them.
 
     Raises
     ------
@@ -73,6 +75,7 @@ class Frame:
     image: NDArray[np.uint8] | None
     error: str = ""
     features: Features | None = None
+    hidden: BoolArray | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be a frame."""
@@ -89,6 +92,12 @@ class Frame:
             raise InputError(
                 f"frame {self.index}: its image is {self.image.shape} {self.image.dtype}; "
                 "it must be (H, W) or (H, W, 3) RGB uint8, values from 0 to 255."
+            )
+        hidden = self.hidden
+        if hidden is not None and (hidden.dtype != np.bool_ or hidden.shape != self.image.shape[:2] or hidden.all()):
+            raise InputError(
+                f"frame {self.index}: its mask is {hidden.shape} {hidden.dtype}; it must be bool, of the image's size "
+                f"{self.image.shape[:2]}, and leave some pixels."
             )
 
 
@@ -316,6 +325,7 @@ class FailureReason(StrEnum):
     MOTION_JUMP = "motion_jump"
     CHI_SQUARE = "chi_square"
     LOW_PARALLAX = "low_parallax"
+    CAMERA_STANDS = "camera_stands"
     AMBIGUOUS_MODEL = "ambiguous_model"
     DOUBTFUL_INITIALISATION = "doubtful_initialisation"
     DEGENERATE = "degenerate"

@@ -126,6 +126,11 @@ class ImageFiles:
     def __len__(self) -> int:
         return len(self.paths)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the files' names without suffix."""
+        return tuple(path.stem for path in self.paths)
+
     def reader(self, grey: bool) -> ImageReader:
         """Return a reader of these files."""
         if self._bits is None:

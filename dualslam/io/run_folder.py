@@ -14,10 +14,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
+import cv2
+import numpy as np
 import yaml
 
 from dualslam.core.errors import OutputError
 from dualslam.core.events import Event
+from dualslam.core.types import BoolArray
 from dualslam.io.atomic import atomic_file, write_text
 from dualslam.io.folder_lock import FolderLock
 from dualslam.io.map_files import METADATA, to_plain
@@ -36,6 +39,7 @@ CONFIG = "config.yaml"
 REPORT = "report.html"
 MAP_PAGE = "map.html"
 GROUND_TRUTH = "groundtruth.txt"
+MASK = "mask.png"
 SUBMAPS = "submaps"
 SAMPLES = "samples"
 MAP = "map"
@@ -55,10 +59,11 @@ _FILES = (
     REPORT,
     MAP_PAGE,
     GROUND_TRUTH,
+    MASK,
 )
-_RESULTS = (CONFIG, EVENTS, FRAMES, TRAJECTORY, f"{SUBMAPS}/", SUMMARY, GROUND_TRUTH, f"{MAP}/", MAP_PAGE, REPORT)
+_RESULTS = (CONFIG, EVENTS, FRAMES, TRAJECTORY, f"{SUBMAPS}/", SUMMARY, GROUND_TRUTH, MASK, f"{MAP}/", MAP_PAGE, REPORT)
 """In the order in which a person is told of them."""
-_NOT_OF_EVERY_RUN = frozenset({f"{SUBMAPS}/", GROUND_TRUTH, MAP_PAGE})
+_NOT_OF_EVERY_RUN = frozenset({f"{SUBMAPS}/", GROUND_TRUTH, MASK, MAP_PAGE})
 _SUBMAP_NAME = re.compile(r"\d+\.txt")
 SAMPLE_NAME = re.compile(r"\d+\.jpg")
 _MAP_NAME = re.compile(r"[\w.-]+\.(npz|json)")
@@ -178,6 +183,12 @@ class RunFolder:
         """Write a small picture of a frame."""
         with atomic_file(self.path / SAMPLES / f"{index:06d}.jpg") as file:
             file.write(jpeg)
+
+    def write_mask(self, hidden: BoolArray) -> None:
+        """Write ``mask.png``: 0 for the pixels (H, W) that show no scene, 255 for the others."""
+        encoded = cv2.imencode(".png", np.where(hidden, 0, 255).astype(np.uint8))[1]
+        with atomic_file(self.path / MASK) as file:
+            file.write(encoded.tobytes())
 
     def write_map_page(self, page: str) -> None:
         """Write ``map.html``."""

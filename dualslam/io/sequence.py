@@ -170,6 +170,12 @@ class RecordedSequence:
         """Return the focal length that the source's own data tell, or None."""
         return self._recording.images.told_focal()
 
+    @property
+    def image_names(self) -> tuple[str, ...] | None:
+        """Return the names, without suffix, of the files of all frames of the source; None where it has no such."""
+        names: tuple[str, ...] | list[str] | None = getattr(self._recording.images, "names", None)
+        return None if names is None else tuple(Path(name).stem for name in names)
+
     def __len__(self) -> int:
         return len(self.source_indices)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 from dualslam.config.settings import Config
 from dualslam.core.types import FrameStatus
-from dualslam.io.run_folder import EVENTS, MAP_PAGE
+from dualslam.io.run_folder import EVENTS, MAP_PAGE, MASK
 from dualslam.report.atlas_table import atlas_section
 from dualslam.report.charts import beside_table, latency_histogram, pace_words, stage_table
 from dualslam.report.event_words import event_words
@@ -70,7 +71,7 @@ def notebook_cell(run: RunData) -> Markup:
 
 def _header(run: RunData, sequence: str) -> Markup:
     lead = tag("p", headline(run), cls="lead")
-    told = (_verdict(run), lead, _saved_map(run), _warnings(run), camera_words(run), _tiles(run))
+    told = (_verdict(run), lead, _saved_map(run), _mask(run), _warnings(run), camera_words(run), _tiles(run))
     return tag("header", tag("h1", sequence), *told)
 
 
@@ -128,12 +129,27 @@ def _saved_map(run: RunData) -> Markup | None:
     return tag("p", f"{words} Frames below 0 are those of earlier runs, -1 their last.", cls="note")
 
 
+def _mask(run: RunData) -> Markup | None:
+    """Show which pixels were left out."""
+    if run.mask is None:
+        return None
+    share = f"{100 * run.summary.get('hidden_share', 0.0):.1f} %"
+    words = (
+        f"{share} of the image shows no scene and was left out (black): it stands still, or the run was given a mask."
+    )
+    source = f"data:image/png;base64,{base64.b64encode(run.mask).decode()}"
+    image = tag("img", src=source, alt=f"Mask: {share} of the image is left out", width="240")
+    return tag("figure", image, tag("figcaption", f"{words} {MASK} is ready for --mask.", cls="note"))
+
+
 def _warnings(run: RunData) -> Markup:
     words = []
     if run.summary.get("interrupted"):
         words.append("This run was interrupted: the page shows what it had found by then.")
     if run.summary.get("crashed"):
         words.append("This run crashed: the page shows what it had found by then.")
+    if run.events_of("camera_stands"):
+        words.append("The camera stood still for a while, as something moved before it: no map was started of that.")
     unreadable, dropped = run.count(FrameStatus.UNREADABLE), run.count(FrameStatus.DROPPED)
     if unreadable:
         words.append(f"{count(unreadable, 'image')} could not be read.")

@@ -81,6 +81,8 @@ class RunData:
         Some of the main map's landmarks.
     samples : dict of int to bytes
         Small JPEGs of frames around the gaps, by frame index.
+    mask : bytes or None
+        The run's mask as a PNG; None where nothing was left out.
     """
 
     path: Path
@@ -94,6 +96,7 @@ class RunData:
     truth: PosedRows
     points: FloatArray
     samples: dict[int, bytes]
+    mask: bytes | None = None
 
     def __repr__(self) -> str:
         return f"<run {self.path}: {len(self.main)} of {len(self.rows)} frames posed, {len(self.events)} events>"
@@ -174,6 +177,7 @@ def read_run(path: str | Path) -> RunData:
         truth=_truth_on_rows(read_tum(truth_file, allow_empty=True), times) if truth_file.exists() else _no_rows(),
         points=_map_points(path / run_folder.MAP, {row.submap for row in rows if row.in_main_map}),
         samples=read_samples(path),
+        mask=(path / run_folder.MASK).read_bytes() if (path / run_folder.MASK).is_file() else None,
     )
 
 

@@ -29,6 +29,7 @@ WORDS = {
     FailureReason.TOO_FEW_INLIERS: (
         "what the images have in common fits no motion of one camera: things that move, or a wrong calibration"
     ),
+    FailureReason.CAMERA_STANDS: "the camera stands still, and something moves before it",
     FailureReason.AMBIGUOUS_MODEL: "two motions explain the images alike: it moves little, or sees a plane alone",
     FailureReason.DOUBTFUL_INITIALISATION: REFUSED,
     FailureReason.CHI_SQUARE: REFUSED,

@@ -24,6 +24,7 @@ from dualslam.core.types import Frame
 from dualslam.export.colours import keyframe_indices, landmark_colours
 from dualslam.io.colours import Colours, save_colours, save_pictures
 from dualslam.io.map_store import load_atlas, save_atlas
+from dualslam.io.masks import hidden_pixels, masked
 from dualslam.io.run_folder import RunFolder, RunRecord, check_vacant
 from dualslam.io.sequence import RecordedSequence, Selection
 from dualslam.io.trajectory_files import Trajectory
@@ -183,7 +184,7 @@ def run_to_folder(
     }
     if focal is not None:
         given["focal_search"] = focal.as_dict()
-    recorded, sequence = sequence, corrupted(sequence, config.corruptions)
+    recorded, sequence = sequence, corrupted(masked(sequence, config.camera.mask), config.corruptions)
     check_out(out, overwrite=overwrite, saved_map=saved_map)
     colours: Colours = {}
     if saved_map is not None:
@@ -356,6 +357,10 @@ def _write_results(
         | {"refined": refined_camera(system, "focal_search" in given)}
         | summarise(system, report, trajectories, config, truth, verdict)
     )
+    hidden = hidden_pixels(sequence, system.hidden)
+    summary["hidden_share"] = 0.0 if hidden is None else float(hidden.mean())
+    if hidden is not None:
+        folder.write_mask(hidden)
     folder.write(RunRecord(rows, trajectories.main, trajectories.unlinked, summary))
     if truth is not None and "no_errors" not in summary:
         folder.write_truth(truth_of_frames(truth, rows))

@@ -7,7 +7,16 @@ from dataclasses import dataclass
 
 from dualslam.calibration.lens import Calibration
 from dualslam.core.atlas_problem import AtlasSolver
-from dualslam.core.interfaces import FinalRefiner, MapStarter, PatchCheck, Seeker, Shutter, SubmapGraph, VisualOdometry
+from dualslam.core.interfaces import (
+    FinalRefiner,
+    MapStarter,
+    PatchCheck,
+    Scene,
+    Seeker,
+    Shutter,
+    SubmapGraph,
+    VisualOdometry,
+)
 from dualslam.core.types import Failure, FloatArray, Frame, View
 from dualslam.map.graph_beside import BesideGraphs
 from dualslam.map.submap import Submap
@@ -38,6 +47,7 @@ class Components:
     new_relocaliser: Callable[[Submap, SubmapGraph], Seeker]
     calibration: Calibration
     shutter: Shutter
+    scene: Scene
     recovery: RecoveryExecutor
     walk_watch: WalkWatch
     atlas_solver: AtlasSolver

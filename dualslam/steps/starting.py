@@ -144,6 +144,9 @@ class Starting:
         """Look for the start of a map that ends at this frame, or at one before it if it was looked for meanwhile."""
         self._foresee_from(view)
         state, shutter = self._state, self._state.parts.shutter
+        if (refused := state.parts.scene.refuse_start()) is not None:
+            self._starter.collect(view)
+            return refused
         if self._since_s is None:
             self._since_s = view.timestamp_s
         with state.record.timer.measure("shutter"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 
 from dualslam.core.errors import ConfigError
@@ -23,10 +24,13 @@ class FeaturesBeside:
     ----------
     desk : WorkerDesk
         With a lane for features.
+    painted : callable
+        Returns a frame as the front end is to see it.
     """
 
-    def __init__(self, desk: WorkerDesk) -> None:
+    def __init__(self, desk: WorkerDesk, painted: Callable[[Frame], Frame]) -> None:
         self._desk = desk
+        self._painted = painted
         self._gave_up = False
 
     def __call__(self, frame: Frame) -> Frame:
@@ -34,7 +38,7 @@ class FeaturesBeside:
         if frame.image is None or self._gave_up:
             return frame
         try:
-            found = self._desk.ask(JobKind.FEATURES, frame.image).result
+            found = self._desk.ask(JobKind.FEATURES, self._painted(frame).image).result
         except ConfigError as error:
             log.warning("no more features are found beside the tracking: %s", error)
             self._gave_up = True

@@ -62,7 +62,7 @@ class FakeSystem:
         self.n_finished = 0
         self.numbers = FrameNumbers()
         self.audit, self.blank = PhotometricAudit(NoPatches()), set[int]()
-        self.world = self.saved = self.camera = self.log_focal_sigma = None
+        self.world = self.saved = self.camera = self.log_focal_sigma = self.hidden = None
         self.was_interrupted = False
         self._truth, self._lost, self._before_step = truth, lost, before_step
         self._submap: Submap | None = None

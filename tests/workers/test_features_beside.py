@@ -19,9 +19,13 @@ def frame(index: int, brightness: int) -> Frame:
     return Frame(index, index / 30, np.full((20, 30), brightness, np.uint8))
 
 
+def as_it_is(frame: Frame) -> Frame:
+    return frame
+
+
 def test_a_frame_comes_back_with_its_features() -> None:
     with working(lane(JobKind.FEATURES)) as desk:
-        found = [FeaturesBeside(desk)(frame(i, i + 1)) for i in range(3)]
+        found = [FeaturesBeside(desk, as_it_is)(frame(i, i + 1)) for i in range(3)]
     assert [f.index for f in found] == [0, 1, 2]
     assert [int(f.features.descriptors[0, 0]) for f in found if f.features is not None] == [1, 2, 3]
     assert desk.statistics[JobKind.FEATURES].n_done == 3
@@ -29,7 +33,7 @@ def test_a_frame_comes_back_with_its_features() -> None:
 
 def test_a_process_that_dies_costs_no_frame() -> None:
     with working(lane(JobKind.FEATURES)) as desk:
-        find = FeaturesBeside(desk)
+        find = FeaturesBeside(desk, as_it_is)
         dead, after = find(frame(0, 0)), find(frame(1, 9))
     assert dead.features is None
     assert dead.image is not None
@@ -39,7 +43,7 @@ def test_a_process_that_dies_costs_no_frame() -> None:
 
 def test_processes_that_end_as_they_start_cost_no_frame_and_are_asked_no_more() -> None:
     with working(Lane("features", (JobKind.FEATURES,), end_at_once, 1, 60.0)) as desk:
-        find, n = FeaturesBeside(desk), MAX_STILLBORN + 3
+        find, n = FeaturesBeside(desk, as_it_is), MAX_STILLBORN + 3
         frames = [find(frame(i, 9)) for i in range(n)]
     assert [f.index for f in frames if f.features is None and f.image is not None] == list(range(n))
     assert desk.statistics[JobKind.FEATURES].n_done == MAX_STILLBORN + 1
@@ -48,7 +52,7 @@ def test_processes_that_end_as_they_start_cost_no_frame_and_are_asked_no_more() 
 def test_a_frame_without_an_image_stays_as_it_is() -> None:
     with working(lane(JobKind.FEATURES)) as desk:
         unread = Frame(0, 0.0, None, "cut off")
-        assert FeaturesBeside(desk)(unread) is unread
+        assert FeaturesBeside(desk, as_it_is)(unread) is unread
 
 
 def test_a_lane_opens_later_and_whoever_asks_waits_for_the_answer() -> None:

@@ -1,0 +1,139 @@
+"""Masks that come with a sequence: which pixels show no scene, in all frames or in each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from dualslam.core.errors import InputError
+from dualslam.core.interfaces import Sequence
+from dualslam.core.types import BoolArray, Frame
+from dualslam.io.images import list_images
+
+SCENE = 128
+"""Grey level from which on a mask's pixel is scene: lossy files have more than two levels."""
+MAX_FACTOR = 16
+"""By which a mask may be larger than the frames, which were read smaller."""
+
+
+def masked(sequence: Sequence, path: str | Path | None) -> Sequence:
+    """Return a sequence whose frames have masks; itself without any.
+
+    Parameters
+    ----------
+    sequence : Sequence
+    path : path or None
+        An image of the size of the frames, 0 where no scene is. A folder has one for each frame of the source. They
+        are named as the frames, or in their order.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, a frame has no mask, or the first mask cannot be used.
+    """
+    if path is None:
+        return sequence
+    where = Path(path)
+    if not where.exists():
+        raise InputError(f"mask {where} does not exist; give an image, or a folder with one for each frame.")
+    if where.is_dir():
+        paths = _by_frame(sequence, where)
+        read_mask(paths[min(paths)], sequence.camera.size_px)
+        return MaskedSequence(sequence, lambda index: read_mask(paths[index], sequence.camera.size_px))
+    mask = read_mask(where, sequence.camera.size_px)
+    return MaskedSequence(sequence, lambda index: mask, mask)
+
+
+def read_mask(path: Path, size_px: tuple[int, int]) -> BoolArray:
+    """Return the pixels (H, W) that a mask hides in images of a size (width, height).
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, is of another size, or hides all.
+    """
+    width, height = size_px
+    data = np.fromfile(path, np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
+    if image is None:
+        raise InputError(f"mask {path} cannot be read as an image.")
+    factor = next((n for n in range(1, MAX_FACTOR + 1) if (image.shape[1] // n, image.shape[0] // n) == size_px), None)
+    if factor is None:
+        raise InputError(f"mask {path} is {image.shape[1]} x {image.shape[0]} pixels, the frames {width} x {height}.")
+    scene = (image[: height * factor, : width * factor] >= SCENE).astype(np.uint8)
+    whole = scene.reshape(height, factor, width, factor).min(axis=(1, 3))
+    if not whole.any():
+        raise InputError(f"mask {path} is black: it leaves no pixel of the frames; the scene is white.")
+    return np.asarray(whole == 0)
+
+
+def _by_frame(sequence: Sequence, folder: Path) -> Mapping[int, Path]:
+    """Return a mask's path for each frame that is read, by its index."""
+    paths, indices = list_images(folder), getattr(sequence, "source_indices", None)
+    if indices is None:
+        raise InputError(f"masks {folder}: a live source takes one mask for all its frames, an image.")
+    names: tuple[str, ...] | None = getattr(sequence, "image_names", None)
+    by_name = {path.stem: path for path in paths}
+    if names is not None and names and names[int(indices[0])] in by_name:
+        found = {index: by_name.get(names[index]) for index in indices.tolist()}
+    else:
+        found = dict(enumerate(paths))
+    for index in indices.tolist():
+        if found.get(index) is None:
+            named = f" ({names[index]})" if names is not None and index < len(names) else ""
+            raise InputError(f"masks {folder}: frame {index}{named} has none; there are {len(paths)} masks.")
+    return {index: path for index, path in found.items() if path is not None}
+
+
+def hidden_pixels(sequence: Sequence, found: BoolArray | None) -> BoolArray | None:
+    """Return what is hidden in all frames of a sequence: by its one mask, and as was found; None for nothing."""
+    given: BoolArray | None = getattr(sequence, "hidden", None)
+    if given is None or found is None:
+        return found if given is None else given
+    return given | found
+
+
+class MaskedSequence:
+    """Frames of another sequence with their masks. All else about it is that sequence's.
+
+    Parameters
+    ----------
+    sequence : Sequence
+    mask_of : callable
+        Returns what is hidden in the frame of an index.
+    hidden : (H, W) bool or None
+        The same, where it is the same in all frames.
+    """
+
+    def __init__(
+        self, sequence: Sequence, mask_of: Callable[[int], BoolArray], hidden: BoolArray | None = None
+    ) -> None:
+        self.hidden = hidden
+        self._sequence = sequence
+        self._mask_of = mask_of
+        self.name = sequence.name
+        self.camera = sequence.camera
+        self.rate_hz = sequence.rate_hz
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self._sequence, name)
+
+    def __len__(self) -> int:
+        return len(self._sequence)
+
+    def __iter__(self) -> Iterator[Frame]:
+        frames = iter(self._sequence)
+        try:
+            for frame in frames:
+                yield frame if frame.image is None else replace(frame, hidden=self._mask_of(frame.index))
+        finally:
+            close = getattr(frames, "close", None)
+            if close is not None:
+                close()
