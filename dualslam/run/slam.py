@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.audit.verdict import Verdict
 from dualslam.build import build_system
 from dualslam.config.files import load_config
 from dualslam.config.settings import Config
@@ -21,7 +22,8 @@ from dualslam.export.exported_map import ExportedMap, flatten
 from dualslam.io.map_store import StoredMap, load_atlas
 from dualslam.map.frame_records import FrameResult
 from dualslam.report.run_data import RunData, read_run
-from dualslam.run.results import trajectories_of
+from dualslam.run.judgement import judge_run
+from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.run.runner import RunReport
 from dualslam.run.session import save_system
 from dualslam.system import System
@@ -109,6 +111,12 @@ class Slam:
     def trajectory(self) -> Trajectory:
         """All poses in the main map so far: `index`, `timestamps_s`, `T_world_cam`."""
         return trajectories_of(self.system).main
+
+    @property
+    def verdict(self) -> Verdict:
+        """How far to trust the map so far: `level` (good, usable, doubtful) and `reasons`."""
+        trajectories = trajectories_of(self.system)
+        return judge_run(self.system, trajectories, frame_rows(self.system, trajectories.main))
 
     def finish(self) -> None:
         """End the mapping: wait for running recoveries, refine. No image is taken after it; `save` calls it."""

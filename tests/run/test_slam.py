@@ -57,6 +57,12 @@ def test_the_map_is_arrays(tracked: tuple[dualslam.Slam, list[FrameResult]]) -> 
     assert len(repr(slam)) < 200
 
 
+def test_the_verdict_is_that_of_the_run_folder(folder: Path, tracked: tuple[dualslam.Slam, list[FrameResult]]) -> None:
+    verdict = tracked[0].verdict
+    assert verdict.as_dict() == read_run(folder).summary["verdict"]
+    assert verdict.level == "good"
+
+
 def test_what_is_saved_is_a_run_folder(folder: Path, tracked: tuple[dualslam.Slam, list[FrameResult]]) -> None:
     slam = tracked[0]
     run = read_run(folder)
