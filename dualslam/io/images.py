@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import zipfile
 import zlib
@@ -18,6 +19,10 @@ from dualslam.core.errors import InputError
 from dualslam.io import exif
 from dualslam.io.bit_depth import WHOLE, decoded, other_type, used_bits
 
+log = logging.getLogger(__name__)
+
+SHARE_OF_DEPTH = 0.5
+"""Depth images for each other one: a few names with the word mean something else."""
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
 # How the files of a format end; a file without its ending was cut off, which decoders fill with grey and do not tell.
 _ENDINGS = {b"\xff\xd8\xff": b"\xff\xd9", b"\x89PNG": b"IEND\xaeB`\x82"}
@@ -76,7 +81,17 @@ def list_images(folder: Path) -> list[Path]:
     found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
     if not found:
         raise InputError(f"{folder} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))}); check the path.")
-    return sorted(found, key=lambda p: natural_key(p.name))
+    return sorted(_without_depth(found), key=lambda p: natural_key(p.name))
+
+
+def _without_depth(paths: list[Path]) -> list[Path]:
+    """Leave out depth images, by their names, where they lie among as many others: 7-Scenes, ScanNet, Azure Kinect."""
+    others = [p for p in paths if "depth" not in p.stem.lower()]
+    n_depth = len(paths) - len(others)
+    if not others or n_depth < SHARE_OF_DEPTH * len(others):
+        return paths
+    log.warning("%s: %d images called depth are left out", paths[0].parent, n_depth)
+    return others
 
 
 def fill_gaps(paths: Sequence[Path], expected: int) -> list[Path]:

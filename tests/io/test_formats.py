@@ -63,6 +63,19 @@ def test_a_calibration_for_another_size_is_scaled(dataset: Path, tmp_path: Path,
             open_sequence(dataset, camera_file=path)
 
 
+def test_depth_among_colour_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """As 7-Scenes has them; a folder of depth alone is what it is."""
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"frame-{i:06d}.color.png"), np.full((24, 32), 100 + i, np.uint8))
+        cv2.imwrite(str(tmp_path / f"frame-{i:06d}.depth.png"), np.full((24, 32), 2000, np.uint16))
+    frames = list(open_sequence(tmp_path, fov_degrees=60))
+    assert [int(f.image[0, 0]) for f in frames] == [100, 101, 102]
+    assert "3 images called depth are left out" in caplog.text
+    for path in tmp_path.glob("*.color.png"):
+        path.unlink()
+    assert len(open_sequence(tmp_path, fov_degrees=60)) == 3
+
+
 @pytest.mark.parametrize(("unit", "per_second"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
 def test_times_of_another_unit_are_seconds(dataset: Path, unit: str, per_second: float) -> None:
     """A stated unit; times since 1970, which can be no seconds, without one, with the truth's."""
