@@ -206,7 +206,8 @@ class CameraTable:
         if images_px is None:
             raise InputError(f"{self.where} does not say the size of the images; add image_width and image_height.")
         size = images_px()
-        cx, cy = (numbers.get(name, 0.0) for name in ("cx", "cy"))
+        # Without one it is the middle.
+        cx, cy = (numbers.get(name, 0.5 * side) for name, side in zip(("cx", "cy"), size, strict=True))
         if not all(MIDDLE[0] <= (c + 0.5) / side <= MIDDLE[1] for c, side in zip((cx, cy), size, strict=True)):
             raise InputError(
                 f"{self.where} does not say the size of its images, and its principal point ({cx:g}, {cy:g}) is not "

@@ -672,6 +672,13 @@ def test_coefficients_by_any_of_their_names(tmp_path: Path, key: str) -> None:
     assert read_camera_file(path) == FIVE
 
 
+def test_blenders_synthetic_scenes_have_an_angle_and_no_size(tmp_path: Path) -> None:
+    path = tmp_path / "transforms_train.json"
+    path.write_text(json.dumps({"camera_angle_x": np.pi / 2, "frames": [{"file_path": "./train/r_0"}]}))
+    camera = read_camera_file(path, lambda: (800, 800))
+    assert camera.to_dict() == pytest.approx(PinholeCamera(800, 800, 400.0, 400.0, 399.5, 399.5).to_dict())
+
+
 def test_a_file_that_does_not_say_the_size_of_its_images(tmp_path: Path) -> None:
     """ORB-SLAM2's files for one camera: the images say it, if the principal point is in their middle."""
     text = ORB_SLAM.format(type="PinHole", fx=458.0, fy=457.0, lens=ORB_RADTAN)
