@@ -157,7 +157,7 @@ def test_what_is_written(tmp_path: Path) -> None:
     page = (tmp_path / "tables.md").read_text()
     assert "`dualslam bench fake.yaml`: 30 trials of the reporting half, seed 0" in page
     assert "| a | blackout | - | ⊗ 3/3 | 0.55 | ↷ 1/3 |" in page
-    assert len(written) == len(tables) + 2
+    assert len(written) == 2 * len(tables) + 2
     trials = list(csv.DictReader(io.StringIO((tmp_path / "tables" / "trials.csv").read_text())))
     assert len(trials) == 30
     crashed = [t for t in trials if t["failed"] == "crashed"]
