@@ -16,9 +16,6 @@ from dataclasses import dataclass
 
 BEHIND_S = 1 / 30
 """A frame that is a frame of 30 Hz late was held up by more than chance: the step before it was too long."""
-MAX_LAG_KEYFRAMES = 4
-"""Keyframes that the graph beside may not know yet where there is no clock: a job on its way, and what comes until it
-ends."""
 FAR_BEHIND_KEYFRAMES = 30
 """Keyframes that it may not know in real time: those of a second in which each frame is one, as long as a batch over a
 full submap takes. Below that its lag ends by itself, since five keyframes at once cost a graph half of what five cost
@@ -76,14 +73,15 @@ class Pace:
         """Note by how much more a frame is late, since what was found beside the tracking came in before it."""
         self._late_s += seconds
 
-    def may_lag(self, n_keyframes: int) -> bool:
-        """Note how many keyframes the graph beside does not know yet; return whether the tracking may go on meanwhile.
-
-        In real time it always does. Without a clock there is no reason to be further ahead than real time would be.
-        """
+    def note_lag(self, n_keyframes: int) -> None:
+        """Note how many keyframes the graph beside does not know yet."""
         self._lag = n_keyframes
         self.statistics.max_lag_keyframes = max(self.statistics.max_lag_keyframes, n_keyframes)
-        return self.in_real_time or n_keyframes <= MAX_LAG_KEYFRAMES
+
+    @property
+    def late_s(self) -> float:
+        """How late the frame in hand is (s); 0 without a clock."""
+        return self._late_s
 
     @property
     def behind(self) -> bool:

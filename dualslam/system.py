@@ -13,7 +13,7 @@ from dualslam.calibration.shutter_watch import ShutterWatch
 from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
 from dualslam.core.events import EventKind
-from dualslam.core.interfaces import VisualOdometry
+from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import BoolArray, Failure, FailureReason, Frame, FrameStatus, Start, Track, View
 from dualslam.health import HealthMonitor
 from dualslam.io.map_store import StoredMap
@@ -21,6 +21,7 @@ from dualslam.map.connections import Connections
 from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameResult, FrameRow
 from dualslam.map.record import FrameStamp, Record
+from dualslam.map.submap import Submap
 from dualslam.map.worlds import Worlds
 from dualslam.places.handover import Handover
 from dualslam.places.revisits import Revisits
@@ -37,7 +38,8 @@ from dualslam.steps.places import PlaceKeeping
 from dualslam.steps.starting import Starting
 from dualslam.steps.state import State
 from dualslam.steps.tracking import Tracking
-from dualslam.workers.jobs import Desk, JobKind
+from dualslam.workers.jobs import JobKind
+from dualslam.workers.scheduled_desk import ScheduledDesk
 
 SETTLED_A_FRAME = 10
 """Buffered views that follow a change of the camera at each frame: 3 to 4 ms, where all of 10 s would take 100."""
@@ -107,7 +109,7 @@ class System:
         self._recoveries = Recoveries(
             record,
             self.buffer,
-            components.recovery,
+            components.desk,
             components.new_graph,
             components.calibration,
             self._connections,
@@ -138,7 +140,7 @@ class System:
         self._endings = Endings(self._state, self._recoveries, self._connections, sightings, earlier)
 
     @property
-    def desk(self) -> Desk:
+    def desk(self) -> ScheduledDesk:
         """Where work beside the tracking is done."""
         return self._state.parts.desk
 
@@ -178,6 +180,18 @@ class System:
     @on_pose.setter
     def on_pose(self, on_pose: Callable[[Track], None] | None) -> None:
         self._tracking.on_pose = on_pose
+
+    def graph_of(self, submap: Submap) -> SubmapGraph:
+        """Return a factor graph of a submap as it is, live or archived, which tells its covariances.
+
+        It is made anew, in batch, for the caller: the system does not use it.
+
+        Raises
+        ------
+        SolverError
+            If the submap cannot be solved.
+        """
+        return self._state.parts.open_graph(submap)
 
     def features_beside(self) -> Callable[[Frame], Frame] | None:
         """Start a process that finds the features of the frame to come while another is tracked.
@@ -223,6 +237,9 @@ class System:
         source, frame = frame, self.numbers.numbered(frame)
         self.rows[frame.index] = FrameRow(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
         # 1. What was found beside the tracking meanwhile comes into the map between two frames.
+        if (recorded := self.desk.recorded_lateness(source.index)) is not None:
+            state.pace.note(recorded.late_s)
+        self.desk.begin_frame(source.index, state.pace.in_real_time)
         self._graphs.collect(frame)
         self._places.collect(frame)
         in_map = state.relocaliser.relocaliser if state.live is None else state.live
@@ -232,7 +249,9 @@ class System:
             elif state.lost:
                 self._begin_anew()
         self._recoveries.collect(state.live, frame)
-        state.pace.hold_up(time.perf_counter() - started)
+        if state.pace.in_real_time:
+            held_s = time.perf_counter() - started
+            state.pace.hold_up(self.desk.lateness(source.index, state.pace.late_s, held_s).held_s)
         if not state.pace.behind:
             self.buffer.settle(SETTLED_A_FRAME)
         # 2. Features, into the buffer that reverse tracking will read.
@@ -260,6 +279,7 @@ class System:
             Someone is waiting: leave out the last walk, which the growth of the live map would earn, and refinement.
         """
         self.numbers.end()
+        self.desk.begin_end(interrupted)
         state, last = self._state, next(reversed(self.rows.values()), None)
         self._graphs.finish(last)
         if state.live is not None and last is not None:

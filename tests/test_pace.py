@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dualslam.pace import BEHIND_S, FAR_BEHIND_KEYFRAMES, MAX_LAG_KEYFRAMES, MAX_PUT_OFF, Pace
+from dualslam.pace import BEHIND_S, FAR_BEHIND_KEYFRAMES, MAX_PUT_OFF, Pace
 from dualslam.places.revisits import Revisits
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
 
@@ -13,8 +13,7 @@ MANY, WEAK = 300, 60
 
 def test_without_real_time_no_keyframe_is_put_off() -> None:
     pace = Pace()
-    assert not pace.may_lag(100)
-    assert pace.may_lag(MAX_LAG_KEYFRAMES)
+    pace.note_lag(100)
     assert not pace.behind
     assert not pace.puts_off(MANY, WEAK)
 
@@ -62,9 +61,9 @@ def test_buffered_views_follow_a_change_while_frames_come_in_time(late_s: float 
 def test_nor_while_the_graph_has_much_to_learn() -> None:
     pace = Pace()
     pace.note(0.0)
-    assert pace.may_lag(FAR_BEHIND_KEYFRAMES)
+    pace.note_lag(FAR_BEHIND_KEYFRAMES)
     assert not pace.behind
-    assert pace.may_lag(FAR_BEHIND_KEYFRAMES + 1)
+    pace.note_lag(FAR_BEHIND_KEYFRAMES + 1)
     assert pace.puts_off(MANY, WEAK)
     assert pace.statistics.max_lag_keyframes == FAR_BEHIND_KEYFRAMES + 1
 

@@ -18,7 +18,14 @@ from dualslam.build.parts import (
     window_solver,
 )
 from dualslam.build.walks import recovery_parts
-from dualslam.build.workers import features_beside, inline_handlers, worker_desk
+from dualslam.build.workers import (
+    MAP_KINDS,
+    WORKER_BUDGET,
+    features_beside,
+    inline_handlers,
+    map_handlers,
+    worker_desk,
+)
 from dualslam.calibration.lens import Calibration
 from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
@@ -38,14 +45,16 @@ from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.io.map_store import StoredMap
 from dualslam.lab.disturbances import FaultScript
 from dualslam.map.graph_beside import BesideGraphs
+from dualslam.map.solving import open_graph
 from dualslam.map.submap import Submap
 from dualslam.map.tidying import tidy
-from dualslam.recovery.executor import DeskExecutor, InlineExecutor, RecoveryExecutor
 from dualslam.recovery.walk_news import WalkWatch
 from dualslam.steps.components import Components
 from dualslam.system import System
 from dualslam.workers.desk import WorkerDesk
-from dualslam.workers.jobs import Desk, InlineDesk, JobKind
+from dualslam.workers.jobs import InlineDesk, JobKind
+from dualslam.workers.schedule import AT_ONCE, After, Policy, Recorded
+from dualslam.workers.scheduled_desk import ScheduledDesk
 from dualslam.workers.start_beside import StartBeside
 
 log = logging.getLogger(__name__)
@@ -54,10 +63,11 @@ log = logging.getLogger(__name__)
 def build_system(
     config: Config,
     camera: Camera,
-    recovery: RecoveryExecutor | None = None,
     saved: StoredMap | None = None,
     localise: bool = False,
     new_graph: Callable[[], SubmapGraph] | None = None,
+    schedule: Policy | None = None,
+    in_process: bool = False,
 ) -> System:
     """Build a system from its config.
 
@@ -66,8 +76,6 @@ def build_system(
     config : Config
     camera : Camera
         Lens model and size of the images that `System.step` will be given.
-    recovery : RecoveryExecutor, optional
-        Takes the recovery jobs instead of what the config says: to look at them one by one.
     saved : StoredMap, optional
         A map to find frames in and to extend (`load_atlas`); it becomes the system's own. Its camera, as it was found
         out, is taken as known.
@@ -75,6 +83,12 @@ def build_system(
         Find poses in the saved map, and add nothing to it.
     new_graph : callable, optional
         Makes the factor graph of a submap, each time anew, in the place of `ISam2SubmapGraph`; in one process alone.
+    schedule : Policy, optional
+        When answers of background work are used (`dualslam/workers/schedule.py`): `After` so many frames, or as
+        `Recorded` by another run. By default at once without workers, else after `DELAYS`, and in real time as they
+        come.
+    in_process : bool
+        Whether the workers' jobs are done in this process; the schedule is the same. So they are for `Recorded`.
 
     Returns
     -------
@@ -110,42 +124,50 @@ def build_system(
     reader = FrameReader(frontend, live.camera, config.camera.model_sigma_px, shutter, scene)
 
     workers = config.recovery.workers
-    if recovery is None:
-        # Built here in any case: a mistake in the config is told at once, not by a worker.
-        parts = recovery_parts(config, camera, frontend=frontend, new_graph=new_graph)
+    # Built here in any case: a mistake in the config is told at once, not by a worker.
+    parts = recovery_parts(config, camera, frontend=frontend, new_graph=new_graph)
     places = place_parts(config, frontend, camera)
     watch = WalkWatch()
-    desk = (
-        worker_desk(config, camera, faults, watch)
-        if workers
-        else InlineDesk(inline_handlers(config, places.verifier, new_graph))
+    in_process = in_process or not workers or isinstance(schedule, Recorded)
+    executor: InlineDesk | WorkerDesk
+    if in_process:
+        handlers = inline_handlers(config, parts, places.verifier, new_graph)
+        if workers:
+            handlers |= map_handlers(config, camera.size_px)
+        # A record says by itself which jobs were lost.
+        is_lost = None if isinstance(schedule, Recorded) else faults.loses
+        executor = InlineDesk(handlers, watch, is_lost, MAP_KINDS)
+    else:
+        executor = worker_desk(config, camera, faults, watch)
+    schedule = schedule or (After() if workers else AT_ONCE)
+    budget_s = WORKER_BUDGET * config.recovery.time_limit_s
+    desk = ScheduledDesk(executor, schedule, config.recovery.finish_wait_s, budget_s)
+    open_one = partial(open_graph, new_graph=new_graph)
+    graphs = BesideGraphs(desk, window_solver(config), open_one) if workers else None
+    opens = (
+        partial(features_beside, executor, config.frontend, scene.painted) if isinstance(executor, WorkerDesk) else None
     )
-    graphs = BesideGraphs(desk, window_solver(config)) if workers else None
-    opens = partial(features_beside, desk, config.frontend, scene.painted) if isinstance(desk, WorkerDesk) else None
-    foresees = workers and recovery is None and config.recovery.enabled
-    if recovery is None:
-        recovery = DeskExecutor(desk) if workers else faults.around_inline(InlineExecutor(parts, watch))
 
     return System(
         Components(
             view_of=faults.around_views(reader),
-            new_starter=partial(_starter_beside, desk, live) if isinstance(desk, WorkerDesk) else live.new_starter,
+            new_starter=partial(_starter_beside, desk, live) if workers else live.new_starter,
             new_graph=graphs.new_graph if graphs is not None else new_graph,
             new_odometry=faults.around_odometry(live.new_odometry),
             new_relocaliser=faults.around_odometry(live.new_relocaliser),
             calibration=calibration,
             shutter=shutter,
             scene=scene,
-            recovery=recovery,
             walk_watch=watch,
             desk=desk,
+            open_graph=open_one,
             atlas_solver=atlas_solver(config),
             refine_at_end=partial(refine_submap, robust_k=config.graph.robust_k),
             patches=PatchAudit(live.camera),
             graphs=graphs,
             places=places,
             open_features=opens,
-            foresee=partial(_foresee, desk) if foresees else None,
+            foresee=partial(_foresee, desk) if not in_process and config.recovery.enabled else None,
         ),
         config,
         saved,
@@ -201,11 +223,11 @@ def _camera_of(saved: StoredMap, camera: Camera) -> Camera:
     return found
 
 
-def _foresee(desk: Desk, view: View) -> None:
+def _foresee(desk: ScheduledDesk, view: View) -> None:
     """Have a worker, which has nothing else to do, look at a frame."""
     desk.poll(JobKind.FORESIGHT)  # what it has found stays there
     desk.submit(JobKind.FORESIGHT, view)
 
 
-def _starter_beside(desk: WorkerDesk, live: LiveParts) -> StartBeside:
+def _starter_beside(desk: ScheduledDesk, live: LiveParts) -> StartBeside:
     return StartBeside(desk, live.new_starter(), live.camera().K)

@@ -45,12 +45,11 @@ def _preferred_camera(
 def recovery_parts(
     config: Config,
     camera: Camera,
-    budget_s: float | None = None,
     frontend: Frontend | None = None,
     n_threads: int = FEATURE_THREADS,
     new_graph: Callable[[], SubmapGraph] | None = None,
 ) -> RecoveryParts:
-    """Build what reverse tracking is made of, for a camera as it was given; see `RecoveryParts.budget_s`.
+    """Build what reverse tracking is made of, for a camera as it was given.
 
     `frontend`: the live one, where this process has it already: it may hold networks. `n_threads`: that find other
     front ends' features beside the walk; the results do not depend on it. `new_graph`: instead of `ISam2SubmapGraph`.
@@ -92,7 +91,6 @@ def recovery_parts(
         judge=lambda track: judge_track(track, config.health),
         config=config.recovery,
         foresee=foresee,
-        budget_s=budget_s,
     )
 
 

@@ -20,12 +20,12 @@ from dualslam.map.atlas_beside import atlas_handlers
 from dualslam.map.graph_beside import GraphServer
 from dualslam.places import PlaceVerifier
 from dualslam.places.search import search_places
-from dualslam.recovery.reverse_tracking import recover_in_steps
+from dualslam.recovery.reverse_tracking import RecoveryParts, recover_in_steps
 from dualslam.recovery.scale_watch import SCALE_HANDLERS
 from dualslam.recovery.walk_news import WalkWatch
 from dualslam.workers.desk import Lane, WorkerDesk
 from dualslam.workers.features_beside import FeaturesBeside
-from dualslam.workers.jobs import Handlers, JobKind
+from dualslam.workers.jobs import Handler, Handlers, JobKind
 from dualslam.workers.start_beside import StartServer
 
 WORKER_BUDGET = 0.75
@@ -34,6 +34,8 @@ GRAPH_LIMIT_S = 30.0
 """After which the process that has the graphs counts as hung: a batch over a full submap takes a second."""
 FEATURES_LIMIT_S = 10.0
 """After which the process that finds features counts as hung: networks take a second or two on a large image."""
+MAP_KINDS = (JobKind.START, JobKind.GRAPH)
+"""What the worker for the live map does, in order; it keeps a state from job to job."""
 GRAPH_NICENESS, WALK_NICENESS = 3, 8
 """Of the process that has the graphs, and of those for long work: half and a sixth of the share of what tracks,
 where cores are short."""
@@ -57,9 +59,12 @@ READOUT_HANDLERS: Handlers = {JobKind.READOUT: answer_readout}
 """What tells how long images were read."""
 
 
-def inline_handlers(config: Config, verifier: PlaceVerifier, new_graph: Callable[[], SubmapGraph]) -> Handlers:
-    """Build what is done at once where there are no workers; reverse tracking has an executor of its own."""
+def inline_handlers(
+    config: Config, parts: RecoveryParts, verifier: PlaceVerifier, new_graph: Callable[[], SubmapGraph]
+) -> dict[JobKind, Handler]:
+    """Build what does the long work in this process."""
     return {
+        JobKind.WALK: lambda job: recover_in_steps(job, parts),
         **atlas_handlers(atlas_solver(config)),
         **SCALE_HANDLERS,
         **READOUT_HANDLERS,
@@ -73,7 +78,7 @@ def graph_handlers(config: Config) -> Handlers:
     return {JobKind.GRAPH: GraphServer(graph_maker(config))}
 
 
-def map_handlers(config: Config, size_px: tuple[int, int]) -> Handlers:
+def map_handlers(config: Config, size_px: tuple[int, int]) -> dict[JobKind, Handler]:
     """Build what the worker for the live map does: it looks for its start, and has its graph from then on."""
     frontend = create_frontend(config.frontend)
     return {
@@ -84,9 +89,8 @@ def map_handlers(config: Config, size_px: tuple[int, int]) -> Handlers:
 
 def walk_handlers(config: Config, camera: Camera, n_threads: int) -> Handlers:
     """Build what a worker for long work does: reverse tracking, calibrations, the search for places, the atlas."""
-    budget_s = WORKER_BUDGET * config.recovery.time_limit_s
     frontend = create_frontend(config.frontend)
-    parts = recovery_parts(config, camera, budget_s, frontend, n_threads)
+    parts = recovery_parts(config, camera, frontend, n_threads)
     verifier = place_parts(config, frontend, camera).verifier
     return {
         JobKind.WALK: lambda job: recover_in_steps(job, parts),
@@ -128,7 +132,7 @@ def worker_desk(config: Config, camera: Camera, faults: FaultScript, watch: Walk
     )
     live_map = Lane(
         "map",
-        (JobKind.START, JobKind.GRAPH),
+        MAP_KINDS,
         partial(map_handlers, config, camera.size_px),
         1,
         GRAPH_LIMIT_S,

@@ -11,7 +11,9 @@ from typing import Any
 from dualslam.config import strict_yaml
 from dualslam.config.files import Override, load_config
 from dualslam.config.settings import Config
-from dualslam.core.errors import ConfigError
+from dualslam.core.errors import ConfigError, InputError
+from dualslam.io.run_folder import CONFIG, SCHEDULE
+from dualslam.workers.schedule import Recorded
 
 
 def config_of(args: argparse.Namespace) -> Config:
@@ -24,10 +26,31 @@ def config_of(args: argparse.Namespace) -> Config:
     ConfigError
     """
     if getattr(args, "resolved", None) is None:
+        take_selection(args)
         args.overrides = _overrides(args)
-        args.resolved = load_config(args.config, args.overrides)
+        replay: Path | None = getattr(args, "replay", None)
+        file = replay / CONFIG if args.config is None and replay is not None else args.config
+        args.resolved = load_config(file, args.overrides)
     config: Config = args.resolved
     return config
+
+
+def take_selection(args: argparse.Namespace) -> None:
+    """Take the frames of the run that `--replay` repeats, where the options select none.
+
+    Raises
+    ------
+    InputError
+        If there is no such run, or the options say that it is not repeated in one process.
+    """
+    if getattr(args, "replay", None) is None:
+        return
+    if args.realtime or args.inline or args.workers is not None:
+        raise InputError("--replay repeats a run in one process: leave out --realtime, --inline and --workers.")
+    selection = Recorded.read(args.replay / SCHEDULE).header.get("selection")
+    if selection and (args.start, args.stride, args.max_frames, args.reverse) == (0, 1, None, False):
+        for name in ("start", "stride", "max_frames", "reverse"):
+            setattr(args, name, selection[name])
 
 
 def _overrides(args: argparse.Namespace) -> list[Override]:

@@ -174,6 +174,12 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
         help="frames come at the source's rate and are dropped when late; otherwise every frame, as fast as it goes",
     )
     mode.add_argument(
+        "--replay",
+        metavar="RUN",
+        type=_path,
+        help="repeat a run in one process, to the bit, by the schedule in its folder; SOURCE and --map as it had them",
+    )
+    mode.add_argument(
         "--live",
         metavar="PORT",
         type=_port,

@@ -44,7 +44,9 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace, config: Config) -> int:
-    check_out(args.out, overwrite=args.overwrite, saved_map=args.map)  # before a search for the camera
+    check_out(
+        args.out, overwrite=args.overwrite, saved_map=args.map, replay=args.replay
+    )  # before a search for the camera
     selection = {
         "start": args.start,
         "stride": args.stride,
@@ -84,6 +86,7 @@ def _run(args: argparse.Namespace, config: Config) -> int:
                 saved_map=args.map,
                 localise=args.localise,
                 focal=focal,
+                replay=args.replay,
                 watcher=Watchers([each for each in (live, shown) if each is not None]),
             )
         status = conclude(outcome, args)
@@ -161,6 +164,10 @@ def conclude(outcome: Outcome, args: argparse.Namespace) -> int:
     """Print what a run found, and return the exit status."""
     if args.profile:
         print(stage_table(outcome))
+    if (replay := outcome.summary.get("replay")) is not None and not args.quiet:
+        same = "the same trajectory, bit for bit" if replay["same_trajectory"] else "another trajectory"
+        apart = "" if replay["departure"] is None else f"; it comes apart at {replay['departure']}"
+        print(f"replay of {replay['run']}: {same}{apart}", flush=True)
     if not args.quiet:
         print(final_line(outcome), flush=True)
         if outcome.has_map:

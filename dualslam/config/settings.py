@@ -187,7 +187,7 @@ class RecoveryConfig(StrictModel):
     workers: int = Field(0, ge=0, le=16)
     """Processes for long work beside the tracking, which never waits for it (`--workers`): reverse tracking and
     self-calibration. With any there is one more, which solves the live map's graph. 0: inline, in the tracking process,
-    which waits: the only way in which the same seed gives the same trajectory."""
+    which waits."""
     time_limit_s: float = Field(120.0, gt=0)
     """Time after which a worker counts as hung, and its recovery as failed. A walk over a full buffer of 10 s takes
     about a tenth of it on a free core."""

@@ -34,6 +34,7 @@ TRAJECTORY_KITTI = "trajectory_kitti.txt"
 TRAJECTORY_KITTI_FRAMES = "trajectory_kitti_frames.txt"
 FRAMES = "frames.csv"
 EVENTS = "events.jsonl"
+SCHEDULE = "schedule.jsonl"
 SUMMARY = "summary.json"
 CONFIG = "config.yaml"
 REPORT = "report.html"
@@ -54,6 +55,7 @@ _FILES = (
     TRAJECTORY_KITTI_FRAMES,
     FRAMES,
     EVENTS,
+    SCHEDULE,
     SUMMARY,
     CONFIG,
     REPORT,
@@ -61,7 +63,20 @@ _FILES = (
     GROUND_TRUTH,
     MASK,
 )
-_RESULTS = (CONFIG, EVENTS, FRAMES, TRAJECTORY, f"{SUBMAPS}/", SUMMARY, GROUND_TRUTH, MASK, f"{MAP}/", MAP_PAGE, REPORT)
+_RESULTS = (
+    CONFIG,
+    EVENTS,
+    SCHEDULE,
+    FRAMES,
+    TRAJECTORY,
+    f"{SUBMAPS}/",
+    SUMMARY,
+    GROUND_TRUTH,
+    MASK,
+    f"{MAP}/",
+    MAP_PAGE,
+    REPORT,
+)
 """In the order in which a person is told of them."""
 _NOT_OF_EVERY_RUN = frozenset({f"{SUBMAPS}/", GROUND_TRUTH, MASK, MAP_PAGE})
 _SUBMAP_NAME = re.compile(r"\d+\.txt")
@@ -116,6 +131,7 @@ class RunFolder:
     def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
         self.path = Path(path)
         self._events: IO[str] | None = None
+        self._schedule: IO[str] | None = None
         self._config: str | None = None
         self.n_events = 0
         check_vacant(self.path, overwrite=overwrite)
@@ -174,6 +190,17 @@ class RunFolder:
             self._events.flush()
         except OSError as e:
             raise OutputError(f"{self.path / EVENTS} cannot be written: {e.strerror or e}.") from e
+
+    def append_schedule(self, row: Mapping[str, Any]) -> None:
+        """Append a line to ``schedule.jsonl``; nothing once the folder is closed."""
+        if self._events is None:
+            return
+        try:
+            if self._schedule is None:
+                self._schedule = (self.path / SCHEDULE).open("w", encoding="utf-8", newline="\n")
+            self._schedule.write(json.dumps(to_plain(row), allow_nan=False) + "\n")
+        except OSError as e:
+            raise OutputError(f"{self.path / SCHEDULE} cannot be written: {e.strerror or e}.") from e
 
     def write_truth(self, truth: Trajectory) -> None:
         """Write the true poses that belong to the run's frames, so that the folder can be judged by itself."""
@@ -248,13 +275,14 @@ class RunFolder:
         return f"In {self.path} are {', '.join(there)}; not written: {', '.join(missing) or 'nothing'}."
 
     def close(self) -> None:
-        """Close the event file and let another run in; more than once does no harm."""
-        events, self._events = self._events, None
+        """Close the files and let another run in; more than once does no harm."""
+        files = [file for file in (self._events, self._schedule) if file is not None]
+        self._events = self._schedule = None
         try:
-            if events is not None:
-                events.close()
+            for file in files:
+                file.close()
         except OSError as e:
-            raise OutputError(f"{self.path / EVENTS} cannot be written: {e.strerror or e}.") from e
+            raise OutputError(f"{self.path} cannot be written to: {e.strerror or e}.") from e
         finally:
             self._lock.release()
 

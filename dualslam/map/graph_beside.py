@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import count
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from dualslam.map.dead_rows import drop_dead_rows
 from dualslam.map.late_estimate import apply_late
 from dualslam.map.submap import Submap
 from dualslam.map.submap_delta import SubmapDelta, SubmapMirror
-from dualslam.workers.jobs import Desk, JobKind, awaited
+from dualslam.workers.jobs import Desk, JobKind
 
 log = logging.getLogger(__name__)
 
@@ -80,6 +81,10 @@ class GraphServer:
         self._new_graph = new_graph
         self._graphs: dict[int, tuple[Submap, SubmapGraph]] = {}
 
+    def forget(self) -> None:
+        """Forget all graphs, as if the process had been started anew."""
+        self._graphs = {}
+
     def __call__(self, job: GraphJob) -> GraphAnswer | Failure:
         """Do a job; a failure forgets the graph, and the next job must bring the whole submap."""
         known = self._graphs.pop(job.graph_id, None)
@@ -117,6 +122,8 @@ class BesideGraph:
         Told, whenever there is something to send, of which submap.
     in_real_time : callable
         Whether frames come by a clock.
+    open_graph : callable
+        Makes a graph of a submap in this process, solved.
     """
 
     def __init__(
@@ -125,6 +132,7 @@ class BesideGraph:
         window: Callable[[Submap], GraphEstimate | Failure],
         register: Callable[[Submap, BesideGraph], None],
         in_real_time: Callable[[], bool],
+        open_graph: Callable[[Submap], SubmapGraph],
     ) -> None:
         self.id = graph_id
         self.is_behind = False
@@ -135,6 +143,9 @@ class BesideGraph:
         self._window = window
         self._register = register
         self._in_real_time = in_real_time
+        self._open_graph = open_graph
+        self._submap: Submap | None = None  # the last that it was asked about
+        self._opened: SubmapGraph | None = None  # a graph of it in this process
 
     def update(self, submap: Submap) -> GraphEstimate:
         """Adjust the window; the graph will take in what has changed."""
@@ -166,12 +177,43 @@ class BesideGraph:
         return GraphEstimate(ids, T, alive, xyz, none, float("nan"), self.noise2, rebuilt=False, seconds=0.0)
 
     def pose_covariance(self, keyframe_id: int) -> FloatArray:
-        """Raise `SolverError`: the graph is elsewhere."""
-        raise SolverError("the graph is in another process, which gives no covariances")
+        """Return (6, 6); see `opened`."""
+        graph: SubmapGraph = self.opened()
+        return graph.pose_covariance(keyframe_id)
 
     def point_covariances(self, landmark_ids: IntArray) -> FloatArray:
-        """Raise `SolverError`: the graph is elsewhere."""
-        raise SolverError("the graph is in another process, which gives no covariances")
+        """Return (L, 3, 3); see `opened`."""
+        graph: SubmapGraph = self.opened()
+        return graph.point_covariances(landmark_ids)
+
+    @property
+    def factor_rows(self) -> IntArray:
+        """Rows of the submap's observations that are factors; see `opened`."""
+        rows: IntArray = self.opened().factor_rows
+        return rows
+
+    @property
+    def statistics(self) -> Any:
+        """What the solver reports; see `opened`."""
+        return self.opened().statistics
+
+    def bayes_tree(self) -> Any:
+        """Return the solver's tree; see `opened`."""
+        return self.opened().bayes_tree()
+
+    def opened(self) -> Any:
+        """Return a graph of the submap in this process: made in batch, at the first question after a change.
+
+        Raises
+        ------
+        SolverError
+            If there is no submap yet, or it cannot be solved.
+        """
+        if self._submap is None:
+            raise SolverError("the graph is empty: update it with its submap first")
+        if self._opened is None:
+            self._opened = self._open_graph(self._submap)
+        return self._opened
 
     def rows_out(self, submap: Submap) -> IntArray:
         """Return the rows of dead observations that the process is done with, if it has answered all that was sent."""
@@ -182,7 +224,7 @@ class BesideGraph:
         self.mirror.keep_rows(rows)
 
     def _ask(self, submap: Submap) -> None:
-        self.is_behind = True
+        self.is_behind, self._submap, self._opened = True, submap, None
         self._register(submap, self)
 
 
@@ -202,6 +244,8 @@ class BesideGraphs:
     ----------
     desk : Desk
     window : WindowSolver
+    open_graph : callable
+        Makes a graph of a submap in this process, solved.
 
     Attributes
     ----------
@@ -209,8 +253,9 @@ class BesideGraphs:
         Whether frames come by a clock.
     """
 
-    def __init__(self, desk: Desk, window: WindowSolver) -> None:
+    def __init__(self, desk: Desk, window: WindowSolver, open_graph: Callable[[Submap], SubmapGraph]) -> None:
         self._desk = desk
+        self._open_graph = open_graph
         self._window = window
         self._ids = count()
         self._graphs: dict[int, BesideGraph] = {}  # by the submap's id: the one that it has now
@@ -220,7 +265,7 @@ class BesideGraphs:
 
     def new_graph(self) -> SubmapGraph:
         """Make the graph of a submap."""
-        return BesideGraph(next(self._ids), self._adjust, self._note, lambda: self.in_real_time)
+        return BesideGraph(next(self._ids), self._adjust, self._note, lambda: self.in_real_time, self._open_graph)
 
     def _adjust(self, submap: Submap) -> GraphEstimate | Failure:
         return self._window(submap, list(submap.keyframes)[: -N_WINDOW - 1 : -1])
@@ -235,13 +280,6 @@ class BesideGraphs:
             if (moved := self._take(ended.result, submaps)) is not None:
                 yield moved
         self._send(submaps)
-
-    def wait(self, submaps: Mapping[int, Submap]) -> Iterator[Moved]:
-        """Wait for what is under way, as a run does that has no clock to keep up with, and collect."""
-        for ended in awaited(self._desk, JobKind.GRAPH):
-            if (moved := self._take(ended.result, submaps)) is not None:
-                yield moved
-        yield from self.collect(submaps)
 
     def finish(self, submaps: Mapping[int, Submap]) -> Iterator[Moved]:
         """Let all graphs take in what they lack, as long as that ends soon; one that fails is left behind."""

@@ -2,8 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from dualslam.core.interfaces import SubmapGraph
 from dualslam.map.submap import Submap
+
+
+def open_graph(submap: Submap, new_graph: Callable[[], SubmapGraph]) -> SubmapGraph:
+    """Return a graph of a submap as it is, solved in batch, from which covariances can be asked.
+
+    The submap stays as it is.
+
+    Raises
+    ------
+    SolverError
+    """
+    graph = new_graph()
+    graph.rebuild(submap.copy(), near_optimum=True)
+    return graph
 
 
 def solve(submap: Submap, graph: SubmapGraph, near_optimum: bool = False) -> int:

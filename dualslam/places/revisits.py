@@ -23,7 +23,7 @@ from dualslam.places.plausibility import agree, contradict, plausible
 from dualslam.places.search import PlaceSearch, follow_maps, poses_of
 from dualslam.places.sightings import N_SECONDS, PlaceParts, Sightings, record_refusal
 from dualslam.places.verification import PlaceMatch
-from dualslam.workers.jobs import Desk, Ended, JobKind, awaited
+from dualslam.workers.jobs import Desk, Ended, JobKind
 
 ASK_EVERY = 2
 """Keyframes between two searches, where nothing is provisional: neighbours show the same."""
@@ -145,10 +145,6 @@ class Revisits:
         named = {submap.id, *(candidate.submap_id for candidate in candidates)} if candidates else set()
         search = PlaceSearch(submap.id, keyframe_id, candidates, {m: submaps[m].copy() for m in sorted(named)})
         self._desk.submit(JobKind.LOOP, search, of=submap.id)
-
-    def wait(self, live: VisualOdometry, now: FrameStamp) -> None:
-        """Wait for the search that is under way: without a clock none is left out for one that is not over."""
-        self._take_answers(awaited(self._desk, JobKind.LOOP), live, now)
 
     def take_solution(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
         """Let the maps follow what has been solved meanwhile.

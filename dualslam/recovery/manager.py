@@ -27,7 +27,6 @@ from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 from dualslam.map.trajectory import Path
 from dualslam.recovery.bypass import absorb, n_frames, pose_frames
-from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.fusion import fuse, gauge_at_overlap, note_refused
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
@@ -35,6 +34,7 @@ from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.merge import merge_recovery
 from dualslam.recovery.motion import join_slack, refuse_gaps, refuse_seams
 from dualslam.recovery.schedule import RetrySchedule, as_far_as_it_leads, way_to_gaps
+from dualslam.workers.jobs import Desk, Ended, JobKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,8 @@ class Recoveries:
     ----------
     record : Record
     buffer : FrameBuffer
-    executor : RecoveryExecutor
+    desk : Desk
+        Where the walks are made.
     new_graph : callable
     calibration : Calibration
     connections : Connections
@@ -79,7 +80,7 @@ class Recoveries:
         self,
         record: Record,
         buffer: FrameBuffer,
-        executor: RecoveryExecutor,
+        desk: Desk,
         new_graph: Callable[[], SubmapGraph],
         calibration: Calibration,
         connections: Connections,
@@ -88,7 +89,7 @@ class Recoveries:
     ) -> None:
         self._record = record
         self._buffer = buffer
-        self._executor = executor
+        self._desk = desk
         self._new_graph = new_graph
         self._calibration = calibration
         self._connections = connections
@@ -192,7 +193,7 @@ class Recoveries:
         self._retries.start_of(submap, newest.index)
         n_live = self._retries.n_live(submap, (now or newest).index)
         self._under_way[submap.id] = _UnderWay(time.perf_counter(), n_live, again=now is not None)
-        self._executor.submit(job)
+        self._desk.submit(JobKind.WALK, job)
 
     def _path_in(self, submap_id: int) -> Path:
         poses = [pose for pose in self._record.own_poses() if pose.submap_id == submap_id]
@@ -207,22 +208,23 @@ class Recoveries:
 
     def collect(self, live: VisualOdometry | None, now: FrameStamp) -> None:
         """Merge the walks that have ended. `live` goes on in its submap as it is after that."""
-        self._take(self._executor.poll(), live, now)
+        self._take(self._desk.poll(JobKind.WALK), live, now)
 
     def finish(self, live: VisualOdometry | None, last: FrameStamp | None, interrupted: bool) -> None:
-        """Track in reverse once more, merge what is under way after the last frame if it ends soon; end the executor.
+        """Track in reverse once more, and merge what is under way after the last frame.
 
         `interrupted`: no walk is begun any more.
         """
         if live is not None and last is not None and not interrupted:
             self.collect(live, last)
             self.retry(live.submap, last, last_chance=True)
-        outcomes = self._executor.finish()
         if last is not None:
-            self._take(outcomes, live, last)
+            self._take(self._desk.drain(JobKind.WALK), live, last)
 
-    def _take(self, outcomes: list[Outcome], live: VisualOdometry | None, now: FrameStamp) -> None:
-        for job, result in outcomes:
+    def _take(self, answers: Iterable[Ended], live: VisualOdometry | None, now: FrameStamp) -> None:
+        for ended in answers:
+            job: RecoveryJob = ended.work
+            result: RecoveryResult | Failure = ended.result
             walk = self._under_way.pop(job.submap.id)
             if isinstance(result, Failure):
                 self._failed(job, now, result, time.perf_counter() - walk.began_s)

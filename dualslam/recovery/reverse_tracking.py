@@ -14,7 +14,7 @@ import logging
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -37,11 +37,14 @@ from dualslam.recovery.relinker import Linker, LinkTry, Relinker
 from dualslam.recovery.rivals import choose_by_velocity
 from dualslam.recovery.schedule import way_to_gaps
 from dualslam.recovery.walk_news import WalkNews, WalkTrace
-from dualslam.workers.jobs import result_of
+from dualslam.workers.jobs import Limit, result_of
 
 log = logging.getLogger(__name__)
 
 Judge = Callable[[Track | Failure], Track | Failure]
+Outcome = TypeVar("Outcome")
+Steps = Generator[WalkNews | None, bool | None, Outcome]
+"""Yields at each step how far the walk has come, and is sent whether its time is over."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +68,6 @@ class RecoveryParts:
     `posing`: the way back where there is no lost map, but frames without a pose.
     `max_scale_sigma`: of a link, at the live end.
     `foresee`: finds beforehand what a walk over a gap may ask for in a frame.
-    `budget_s`: wall time after which it comes to an end with what it has, where it does not run inline.
     """
 
     attempts: tuple[Attempt, ...]
@@ -78,35 +80,33 @@ class RecoveryParts:
     judge: Judge
     config: RecoveryConfig
     foresee: Callable[[View], None] = lambda view: None
-    budget_s: float | None = None
 
 
 def run_recovery(
-    job: RecoveryJob, parts: RecoveryParts, tell: Callable[[WalkNews], None] | None = None
+    job: RecoveryJob, parts: RecoveryParts, tell: Callable[[WalkNews], None] | None = None, limit: Limit | None = None
 ) -> RecoveryResult | Failure:
     """Track in reverse from the job's submap until a link to a lost one passes its gates, or no frames are left.
 
     The job is left as it was. Where there is no map to link with, the live features pose the frames before the start.
-    `tell` is called now and then with how far it has come.
+    `tell` is called now and then with how far it has come; `limit`: after which it returns what it has.
     """
-    return result_of(recover_in_steps(job, parts), tell)
+    return result_of(recover_in_steps(job, parts), tell, limit)
 
 
-def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNews, None, RecoveryResult | Failure]:
-    """Do what `run_recovery` does; yields how far it has come, and nothing depends on who takes notice."""
+def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Steps[RecoveryResult | Failure]:
+    """Do what `run_recovery` does, in steps: yields how far it has come, and is sent whether its time is over."""
     started, cpu_started = time.perf_counter(), time.process_time()
     best: Progress | None = None
     problem = Failure(FailureReason.SOLVER)
     events: list[Event] = []
     looks_alike, needs_camera, tries = False, False, job.tries.copy()
-    until = np.inf if parts.budget_s is None else started + parts.budget_s
     ways = list(parts.attempts if job.lost else (parts.posing,))
     thorough: Attempt | None = None
     while ways:
         attempt = ways.pop(0)
-        if best is not None and time.perf_counter() > until:
+        if best is not None and best.out_of_time:
             break
-        progress = yield from _make_told_apart(job, parts, attempt, until, tries)
+        progress = yield from _make_told_apart(job, parts, attempt, tries)
         if isinstance(progress, Failure):
             problem = progress
             continue
@@ -126,45 +126,43 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Generator[WalkNe
     if best is None:
         return problem
     if (gap := best.lost_scale_from(parts.max_scale_sigma)) is not None:
-        best = yield from _as_far_as(gap, job, parts, way, until)
+        best = yield from _as_far_as(gap, job, parts, way)
     seconds, cpu_s = time.perf_counter() - started, time.process_time() - cpu_started
     frames = tuple(best.frames.values())
     ending = looks_alike, needs_camera, tries
     return RecoveryResult(best.submap, frames, best.link, tuple(events), seconds, cpu_s, *ending)
 
 
-def _as_far_as(
-    gap: int, job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float
-) -> Generator[WalkNews, None, Progress]:
+def _as_far_as(gap: int, job: RecoveryJob, parts: RecoveryParts, attempt: Attempt) -> Steps[Progress]:
     """Walk again, no farther than to the frame before a gap.
 
     Later walks go by the keyframes that an earlier one has left. From beyond a gap they would be tied to a crossing
     that a young map has made, and the grown one can make it more firmly.
     """
     near = replace(job, views=tuple(view for view in job.views if view.index >= gap))
-    kept = yield from _make_attempt(near, parts, attempt, until, job.tries.copy())
+    kept = yield from _make_attempt(near, parts, attempt, job.tries.copy())
     return Progress(job.submap) if isinstance(kept, Failure) else kept
 
 
 def _make_told_apart(
-    job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float, tries: LinkTries
-) -> Generator[WalkNews, None, Progress | Failure]:
+    job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, tries: LinkTries
+) -> Steps[Progress | Failure]:
     """Make one attempt; where a pose beyond a gap has rivals, again by the one that the velocities tell to be right.
 
     Where they tell none, again as far as the gap: what lies beyond it is not to be believed.
     """
-    progress = yield from _make_attempt(job, parts, attempt, until, walked := tries.copy())
+    progress = yield from _make_attempt(job, parts, attempt, walked := tries.copy())
     events: list[Event] = []
     has_rivals = not isinstance(progress, Failure) and bool(progress.rivals)
     if not isinstance(progress, Failure) and (better := _find_better(job, progress)):
         events += progress.events
         expected = {rival.index: rival.T_cam_rival for rival in better}
         by_better = replace(job, expected=expected)
-        progress = yield from _make_attempt(by_better, parts, attempt, until, walked := tries.copy())
+        progress = yield from _make_attempt(by_better, parts, attempt, walked := tries.copy())
     if not isinstance(progress, Failure) and progress.link is None and has_rivals:
         events += progress.events
         as_far = replace(job, notes_rivals=False)
-        progress = yield from _make_attempt(as_far, parts, attempt, until, walked := tries.copy())
+        progress = yield from _make_attempt(as_far, parts, attempt, walked := tries.copy())
     tries.restore(walked)
     if not isinstance(progress, Failure):
         progress.events[:0] = events
@@ -172,9 +170,9 @@ def _make_told_apart(
 
 
 def _make_attempt(
-    job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, until: float, tries: LinkTries
-) -> Generator[WalkNews, None, Progress | Failure]:
-    """Make one attempt, from a copy of the job's submap; it stops at the time `until`."""
+    job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, tries: LinkTries
+) -> Steps[Progress | Failure]:
+    """Make one attempt, from a copy of the job's submap."""
     started = time.perf_counter()
     submap, graph = job.submap.copy(), parts.new_graph()
     try:
@@ -192,12 +190,10 @@ def _make_attempt(
     views = job.views if job.lost else _there_and_back(job.views, progress)
     trace = WalkTrace(submap.id, attempt.name, job.newest_id, submap.T_submap_kf[job.newest_id][:3, 3])
     for step in track_in_reverse(reverse_tracker, views, parts.judge, relinker.keyframe_ids, max_gap_frames):
-        progress.out_of_time = time.perf_counter() > until
+        progress.out_of_time = bool((yield trace.news()))
         if progress.out_of_time:
             break
         trace.note(step.view, step.track)
-        if (news := trace.news()) is not None:
-            yield news
         progress.rivals = reverse_tracker.rivals
         if isinstance(step.track, Failure):
             progress.note_unusable(step.track)

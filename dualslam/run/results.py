@@ -244,7 +244,7 @@ def _posed(system: System, S_world_submap: dict[int, FloatArray]) -> Trajectory:
 
 def _beside(system: System) -> dict[str, Any]:
     """Statistics of the jobs in processes of their own, by kind: counts, the longest queue and wait, CPU time."""
-    desk = system.desk
+    desk = system.desk.executor
     return {str(kind): asdict(each) for kind, each in desk.statistics.items()} if isinstance(desk, WorkerDesk) else {}
 
 

@@ -16,7 +16,8 @@ from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult
 from dualslam.pace import Pace
 from dualslam.run.interrupts import Interrupts
-from dualslam.run.schedule import Schedule, prepared
+from dualslam.run.schedule import Schedule, as_recorded, prepared
+from dualslam.workers.schedule import Recorded
 
 PAUSE_S = 0.05
 """Between two looks at whether a run is to go on."""
@@ -93,6 +94,7 @@ def run_sequence(
     on_frame: Callable[[FrameResult], None] | None = None,
     is_paused: Callable[[], bool] | None = None,
     interrupts: Interrupts | None = None,
+    repeats: Recorded | None = None,
     clock: Callable[[], float] = time.perf_counter,
     sleep: Callable[[float], None] = time.sleep,
 ) -> RunReport:
@@ -122,6 +124,8 @@ def run_sequence(
         Asked before each frame; the run waits for as long as it says so, or until a signal ends it.
     interrupts : Interrupts, optional
         Entered already, where the caller has more to do that signals must not end.
+    repeats : Recorded, optional
+        The schedule of a run that is repeated: its frames are given, without those that it dropped.
     clock, sleep : callables
         For tests.
 
@@ -140,7 +144,8 @@ def run_sequence(
     began, cpu_began = clock(), _cpu_s()
     source = iter(sequence)
     schedule = Schedule(clock, sleep)
-    frames: Iterator[tuple[Frame, float]] = ((frame, 0.0) for frame in source)
+    given = source if repeats is None else as_recorded(source, repeats, dropped)
+    frames: Iterator[tuple[Frame, float]] = ((frame, 0.0) for frame in given)
     if realtime:
         frames = prepared(schedule.hand_out(source, dropped), prepare, schedule, clock)
     steps = _Steps(system, schedule if realtime else None, pace, on_frame, clock)
@@ -159,7 +164,7 @@ def run_sequence(
             raise InputError(f"{sequence.name} gave no frame; check the source and which frames were asked for.")
         try:
             with stop.leave_at_second():
-                system.finish(interrupted=interrupted)
+                system.finish(interrupted=interrupted or (repeats is not None and repeats.interrupted))
         except OutputError as problem:
             steps.error = steps.error or problem
         except Exception as problem:

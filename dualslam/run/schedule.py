@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 
 from dualslam.core.types import Frame
 from dualslam.io.read_ahead import read_ahead
+from dualslam.workers.schedule import Recorded
 
 MAX_LATE_S = 1 / 15
 """So late a frame may be while the next one waits: two frames of a camera at 30 Hz, which most often are what a
@@ -73,6 +74,17 @@ class Schedule:
         if came - asked > LATE_S:
             self._in_time_at = came
         return frame
+
+
+def as_recorded(frames: Iterator[Frame], recorded: Recorded, dropped: list[tuple[int, float]]) -> Iterator[Frame]:
+    """Yield the frames that a recorded run has looked at, and note as dropped those that it dropped."""
+    for frame in frames:
+        if frame.index in recorded.dropped:
+            dropped.append((frame.index, frame.timestamp_s))
+        else:
+            yield frame
+        if frame.index == recorded.last_frame:
+            return
 
 
 def prepared(

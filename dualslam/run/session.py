@@ -7,10 +7,12 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
+from hashlib import sha256
 from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
+from dualslam import __version__
 from dualslam.build import build_system
 from dualslam.config.files import dump_config
 from dualslam.config.settings import Config
@@ -25,7 +27,7 @@ from dualslam.export.colours import keyframe_indices, landmark_colours
 from dualslam.io.colours import Colours, save_colours, save_pictures
 from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.masks import hidden_pixels, masked
-from dualslam.io.run_folder import RunFolder, RunRecord, check_vacant
+from dualslam.io.run_folder import SCHEDULE, TRAJECTORY, RunFolder, RunRecord, check_vacant
 from dualslam.io.sequence import RecordedSequence, Selection
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.io.video import WebcamSequence
@@ -41,6 +43,7 @@ from dualslam.run.runner import RunReport, run_sequence
 from dualslam.system import System
 from dualslam.viewer.map_page import map_page
 from dualslam.workers.desk import WorkerDesk
+from dualslam.workers.schedule import Recorded, header_of
 
 log = logging.getLogger(__name__)
 
@@ -144,6 +147,7 @@ def run_to_folder(
     localise: bool = False,
     focal: FocalSearch | None = None,
     watcher: Watcher | None = None,
+    replay: str | Path | None = None,
 ) -> Outcome:
     """Run on a sequence and write a run folder. What an interrupted run, or one that crashed, has found is kept.
 
@@ -166,6 +170,8 @@ def run_to_folder(
     focal : FocalSearch, optional
         How the camera was found, where nothing was known of it; for the summary.
     watcher : Watcher, optional
+    replay : path, optional
+        Run folder whose schedule is repeated, in one process: when answers were used, and which frames were dropped.
 
     Raises
     ------
@@ -184,8 +190,9 @@ def run_to_folder(
     }
     if focal is not None:
         given["focal_search"] = focal.as_dict()
-    recorded, sequence = sequence, corrupted(masked(sequence, config.camera.mask), config.corruptions)
-    check_out(out, overwrite=overwrite, saved_map=saved_map)
+    source, sequence = sequence, corrupted(masked(sequence, config.camera.mask), config.corruptions)
+    check_out(out, overwrite=overwrite, saved_map=saved_map, replay=replay)
+    recorded = None if replay is None else Recorded.read(Path(replay) / SCHEDULE)
     colours: Colours = {}
     if saved_map is not None:
         comes_once = isinstance(sequence, WebcamSequence)
@@ -195,11 +202,18 @@ def run_to_folder(
             camera = camera_that_fits(config, sequence, camera, saved_map)
         saved = load_atlas(saved_map)
         colours = saved.colours
-        system = build_system(config, camera, saved=saved, localise=localise)
+        system = build_system(config, camera, saved=saved, localise=localise, schedule=recorded)
+    elif recorded is not None:
+        system = build_system(config, sequence.camera, schedule=recorded)
     else:
         system = (build or build_system)(config, sequence.camera)
     with closing(system.desk), RunFolder(out, overwrite=overwrite) as folder:
         folder.write_config(dump_config(config))
+        origin = _origin(config, given)
+        system.desk.on_record = folder.append_schedule
+        folder.append_schedule(header_of(system.desk.policy, realtime, **origin))
+        if recorded is not None:
+            warn_of_differences(recorded, origin)
 
         refusals = StartRefusals()
 
@@ -210,8 +224,8 @@ def run_to_folder(
                 on_frame(result)
 
         prepare = system.features_beside() if realtime and spare_cores(1) else None
-        if realtime and isinstance(system.desk, WorkerDesk):
-            system.desk.wait_until_ready()
+        if realtime and isinstance(system.desk.executor, WorkerDesk):
+            system.desk.executor.wait_until_ready()
         album = PlaceAlbum(folder.write_sample)
         watched = _Watched(system, SampleKeeper(folder.write_sample), album, watcher)
         with Interrupts() as interrupts:
@@ -224,18 +238,27 @@ def run_to_folder(
                 on_frame=after_frame,
                 is_paused=None if watcher is None else watcher.is_paused,
                 interrupts=interrupts,
+                repeats=recorded,
             )
             system.desk.close()  # a system that broke, or was left, has not come to it
-            if report.interrupted and system.rows:
+            for index, _ in report.dropped:
+                folder.append_schedule({"dropped": index})
+            if system.rows:
                 last = next(reversed(system.rows.values()))
+                ended = system.numbers.index_of(last.index)
+                folder.append_schedule({"ended": ended, "interrupted": report.interrupted})
+            if report.interrupted and system.rows:
                 system.events.add(EventKind.INTERRUPTED, last.index, last.timestamp_s, last.submap)
             try:
                 folder.restore()
                 _write_new_events(system, folder)
                 given["no_map"] = None if system.poses or saved_map is not None else refusals.sentence()
                 summary = _write_results(system, report, config, sequence, folder, given)
-                if isinstance(recorded, RecordedSequence) and not report.interrupted:
-                    _write_colours(system, recorded, folder, colours)
+                if recorded is not None and replay is not None:
+                    summary["replay"] = _compared(folder, Path(replay), recorded)
+                    folder.write_summary(summary)
+                if isinstance(source, RecordedSequence) and not report.interrupted:
+                    _write_colours(system, source, folder, colours)
                 save_pictures(folder.map_path, album.evenly(N_PICTURES))
                 _write_pages(folder)
             except (OutputError, KeyboardInterrupt) as end:
@@ -308,13 +331,46 @@ def _raise_what_ended(report: RunReport, interrupts: Interrupts, out: str | Path
         raise type(report.error)(f"{report.error} What was found until then is in {out}.")
 
 
-def check_out(out: str | Path, *, overwrite: bool = False, saved_map: str | Path | None = None) -> None:
+def _origin(config: Config, given: dict[str, Any]) -> dict[str, Any]:
+    """Return what a run's trajectory depends on besides its schedule, for the schedule's first line."""
+    return {
+        "version": __version__,
+        "sequence": given["sequence"],
+        "selection": given["selection"],
+        "workers": config.recovery.workers,
+        "config": sha256(dump_config(config).encode()).hexdigest()[:16],
+    }
+
+
+def warn_of_differences(recorded: Recorded, origin: dict[str, Any]) -> None:
+    """Tell in what a repetition differs from the recorded run before it begins."""
+    for name, value in origin.items():
+        if recorded.header.get(name) != value:
+            log.warning("the recorded run has another %s: %s, not %s", name, recorded.header.get(name), value)
+
+
+def _compared(folder: RunFolder, replay: Path, recorded: Recorded) -> dict[str, Any]:
+    """Return whether a repetition has come to the same trajectory, and where it has come apart."""
+    files = [path / TRAJECTORY for path in (folder.path, replay)]
+    same = files[1].is_file() and files[0].read_bytes() == files[1].read_bytes()
+    return {"run": str(replay), "same_trajectory": same, "departure": recorded.departure or None}
+
+
+def check_out(
+    out: str | Path,
+    *,
+    overwrite: bool = False,
+    saved_map: str | Path | None = None,
+    replay: str | Path | None = None,
+) -> None:
     """Refuse a folder that a run must not write to. `run_to_folder` asks too: this is for who computes before it.
 
     Raises
     ------
     InputError, OutputError
     """
+    if replay is not None and Path(out).resolve() == Path(replay).resolve():
+        raise InputError(f"{out} holds the run that is to be repeated; give another folder to write to.")
     if saved_map is not None and Path(out).resolve() == Path(saved_map).resolve():
         raise InputError(f"{out} holds the map that this run is to continue; give another folder to write to.")
     check_vacant(Path(out), overwrite=overwrite)

@@ -21,9 +21,8 @@ from dualslam.core.types import Failure, FloatArray, Frame, View
 from dualslam.map.graph_beside import BesideGraphs
 from dualslam.map.submap import Submap
 from dualslam.places.sightings import PlaceParts
-from dualslam.recovery.executor import RecoveryExecutor
 from dualslam.recovery.walk_news import WalkWatch
-from dualslam.workers.jobs import Desk
+from dualslam.workers.scheduled_desk import ScheduledDesk
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +30,10 @@ class Components:
     """The parts that the composition root puts in: the system itself knows neither front end nor solver.
 
     `new_relocaliser`: a front end that finds its submap again wherever it is seen, and tracks from there.
-    `walk_watch`: hears of reverse tracking that is under way. `desk`: does the work beside the tracking; reverse
-    tracking has an executor of its own, which may use the same desk. `graphs`: carries changes to submaps' graphs in
-    another process and back, if they are solved there. `refine_at_end`: has the last word on each submap.
-    `patches`: compares frames with the images of older keyframes.
+    `walk_watch`: hears of reverse tracking that is under way. `desk`: does the work beside the tracking. `graphs`:
+    carries changes to submaps' graphs in another process and back, if they are solved there. `refine_at_end`: has the
+    last word on each submap. `patches`: compares frames with the images of older keyframes.
+    `open_graph`: makes a graph of a submap in this process, solved.
     `open_features`: starts one more process, and returns a function that has the features of a frame found there.
     `foresee`: has found beside the tracking what reverse tracking may ask for in a frame; none where nothing is done
     beside it.
@@ -48,13 +47,13 @@ class Components:
     calibration: Calibration
     shutter: Shutter
     scene: Scene
-    recovery: RecoveryExecutor
     walk_watch: WalkWatch
     atlas_solver: AtlasSolver
     refine_at_end: FinalRefiner
     patches: PatchCheck
     places: PlaceParts
-    desk: Desk
+    desk: ScheduledDesk
+    open_graph: Callable[[Submap], SubmapGraph]
     graphs: BesideGraphs | None = None
     open_features: Callable[[], Callable[[Frame], Frame]] | None = None
     foresee: Callable[[View], None] | None = None

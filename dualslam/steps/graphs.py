@@ -31,8 +31,8 @@ class GraphKeeping:
             return
         graphs.in_real_time = state.pace.in_real_time
         with state.record.timer.measure("graph (late)"):
-            if state.live is not None and not state.pace.may_lag(graphs.lag(state.live.submap)):
-                self._follow(graphs.wait(submaps), now)
+            if state.live is not None:
+                state.pace.note_lag(graphs.lag(state.live.submap))
             self._follow(graphs.collect(submaps), now)
 
     def finish(self, last: FrameStamp | None) -> None:

@@ -82,8 +82,6 @@ class PlaceKeeping:
         """Link the live map where its newest keyframe shows a place again."""
         self._is_due = False
         with self._state.record.timer.measure("places"):
-            if not self._state.pace.in_real_time and not self._recoveries.is_under_way(live.submap):
-                self._revisits.wait(live, view)
             self._revisits.note_keyframe(live, TAKEN_IN_A_FRAME if self._state.pace.in_real_time else None)
         self._link(view)
 

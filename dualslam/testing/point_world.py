@@ -13,6 +13,7 @@ from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Frame, View
 from dualslam.system import System
+from dualslam.workers.schedule import Policy
 
 CAMERA = PinholeCamera(640, 480, 450.0, 450.0, 319.5, 239.5)
 SIZE_PX = (CAMERA.width, CAMERA.height)
@@ -112,13 +113,16 @@ def hand_held(n: int) -> FloatArray:
     return se3.from_parts(R, np.column_stack([1.2 * np.sin(2.5 * s), 0.4 * np.sin(3.5 * s), 0.6 * np.sin(1.5 * s)]))
 
 
-def system_in(world: PointWorld, **settings: object) -> System:
-    """Build the real system, with the world's features instead of those of an image; no other ones are to be had."""
+def system_in(world: PointWorld, schedule: Policy | None = None, **settings: object) -> System:
+    """Build the real system, with the world's features instead of those of an image; no other ones are to be had.
+
+    `schedule`: when answers of background work are used; all of it is done in this process then.
+    """
     recovery: Any = settings.get("recovery", {"enabled": False})
     fixed = {"camera": {"model_sigma_px": 0.0}, "calibration": {"refine": False}}
     fixed["tracking"] = {"max_lost_s": GIVEN_UP_S}
     config = Config.model_validate(fixed | settings | {"recovery": {"attempts": ["live"]} | recovery})
-    system = build_system(config, CAMERA)
+    system = build_system(config, CAMERA, schedule=schedule, in_process=schedule is not None)
 
     def view_of(frame: Frame) -> View | Failure:
         if frame.index in world.unreadable:

@@ -23,7 +23,7 @@ from typing import Any
 
 from dualslam.core.errors import ConfigError
 from dualslam.core.types import Failure, FailureReason
-from dualslam.workers.jobs import Ended, JobKind
+from dualslam.workers.jobs import Ended, JobKind, Limit
 from dualslam.workers.worker import STOP_S, Answer, MakeHandlers, Worker
 
 log = logging.getLogger(__name__)
@@ -74,6 +74,7 @@ class _Job:
     work: Any
     submitted_s: float
     of: int | None
+    limit: Limit | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,7 +143,7 @@ class QueueStatistics:
 
 
 class WorkerDesk:
-    """The `dualslam.workers.jobs.Desk` whose jobs run in processes of their own.
+    """The executor whose jobs run in processes of their own.
 
     Parameters
     ----------
@@ -199,14 +200,14 @@ class WorkerDesk:
             self._look(queue, wait=True)
         return ended[0]
 
-    def submit(self, kind: JobKind, work: Any, of: int | None = None) -> None:
+    def submit(self, kind: JobKind, work: Any, of: int | None = None, limit: Limit | None = None) -> None:
         """Give the job to an idle worker, or let it wait for one."""
         queue = self._by_kind[kind]
         n_waiting = sum(job.kind is kind for job in queue.waiting)
         if n_waiting >= queue.lane.max_waiting:
             self._end(kind, Ended(work, Failure(FailureReason.BUSY, f"{n_waiting} jobs wait for a {kind} already")))
             return
-        queue.waiting.append(_Job(kind, work, time.monotonic(), of))
+        queue.waiting.append(_Job(kind, work, time.monotonic(), of, limit))
         self._hand_out(queue)
         statistics = self.statistics[kind]
         statistics.max_waiting = max(statistics.max_waiting, sum(job.kind is kind for job in queue.waiting))
@@ -229,16 +230,17 @@ class WorkerDesk:
         for queue in self._queues:
             queue.waiting = [job for job in queue.waiting if job.of != of]
 
-    def drain(self, kind: JobKind) -> list[Ended]:
+    def drain(self, kind: JobKind, wait_s: float | None = None) -> list[Ended]:
         """Wait, for a limited time, for what is under way; what has not ended by then ends as a `Failure`.
 
         Other workers take the places of those that were busy with it, for what else waits or is still to come.
         """
+        wait_s = self._finish_wait_s if wait_s is None else wait_s
         queue, ended, began_s = self._by_kind[kind], self.poll(kind), time.monotonic()
-        while self.n_open(kind) and (queue.busy or queue.idle) and time.monotonic() - began_s < self._finish_wait_s:
+        while self.n_open(kind) and (queue.busy or queue.idle) and time.monotonic() - began_s < wait_s:
             time.sleep(PAUSE_S)
             ended += self.poll(kind)
-        late = Failure(FailureReason.TIMEOUT, f"the run ended, and {self._finish_wait_s:g} s later its {kind} had not")
+        late = Failure(FailureReason.TIMEOUT, f"the run ended, and {wait_s:g} s later its {kind} had not")
         open_jobs = [*(task.job for task in queue.busy if task.job.kind is kind), *queue.waiting]
         ended += [Ended(job.work, late) for job in open_jobs if job.kind is kind]
         queue.waiting = [job for job in queue.waiting if job.kind is not kind]
@@ -247,6 +249,9 @@ class WorkerDesk:
             queue.idle.append(queue.replaced(task.worker))
         self._hand_out(queue)
         return ended
+
+    def lose(self, kind: JobKind) -> None:
+        """Do nothing: a process that ends loses what it keeps by itself."""
 
     def close(self) -> None:
         """End the workers."""
@@ -270,7 +275,8 @@ class WorkerDesk:
                 continue
             queue.busy.remove(task)
             wall_s = time.monotonic() - task.job.submitted_s
-            self._end(task.job.kind, Ended(task.job.work, answer.result, answer.cpu_s, wall_s))
+            ended = Ended(task.job.work, answer.result, answer.cpu_s, wall_s, answer.stopped_after)
+            self._end(task.job.kind, ended)
             statistics = self.statistics[task.job.kind]
             statistics.peak_rss_mb = max(statistics.peak_rss_mb, answer.peak_rss_mb)
             queue.idle.append(queue.replaced(task.worker) if _is_lost(answer.result) else task.worker)
@@ -293,7 +299,7 @@ class WorkerDesk:
                 worker = queue.replaced(worker)
             job = min(queue.waiting, key=lambda job: queue.lane.kinds.index(job.kind))  # the first of equals
             queue.waiting.remove(job)
-            worker.give(job.kind, job.work)
+            worker.give(job.kind, job.work, job.limit)
             queue.busy.append(_Task(job, worker, time.monotonic()))
             if self.on_start is not None:
                 self.on_start(job.kind, job.work, worker.pid)

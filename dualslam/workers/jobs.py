@@ -1,22 +1,23 @@
 """Work beside the tracking: one mechanism for all that the next frame does not need.
 
 A job is a snapshot of arrays that nobody else changes, and its kind says what is made of it. What comes back is a
-change, which the part that asked for it merges, between two frames, into a map that has grown meanwhile. The desk
-decides where the work is done: `InlineDesk` does it at once, in the process that tracks, so that the same seed gives
-the same run to the bit; `dualslam/workers/desk.py` has the one with processes. A job may fail: then its outcome is a
-`Failure`, and nothing else has changed.
+change, which the part that asked for it merges, between two frames, into a map that has grown meanwhile. An executor
+does the work: `InlineDesk` at once, in the process that tracks, `WorkerDesk` (`dualslam/workers/desk.py`) in others.
+The schedule (`dualslam/workers/schedule.py`) says when the results are used: the same one gives the same run to the
+bit. A job may fail: then its outcome is a `Failure`, and nothing else has changed.
 """
 
 from __future__ import annotations
 
+import pickle
 import time
 from collections import defaultdict
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Container, Generator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Protocol, TypeVar
 
-from dualslam.core.types import Failure
+from dualslam.core.types import Failure, FailureReason
 
 Result = TypeVar("Result")
 
@@ -40,20 +41,54 @@ class JobKind(StrEnum):
 Handler = Callable[[Any], Any]
 """Makes a result, which can be pickled, or a `Failure` of the work. One that keeps a state is asked in order.
 
-One that is a generator function yields how far it has come, for those who look on, and returns its result."""
+One that is a generator function yields at each step: how far it has come, for those who look on, or None. It is sent
+whether its time is over, and returns its result."""
 Handlers = Mapping[JobKind, Handler]
 
 
-def result_of(work: Generator[Any, None, Result], tell: Callable[[Any], None] | None) -> Result:
-    """Do work that yields how far it has come, tell that, and return what comes of it."""
+@dataclass(slots=True)
+class Limit:
+    """When a job that works in steps is told that its time is over; by default never.
+
+    Attributes
+    ----------
+    after_s : float or None
+        Wall time.
+    after_steps : int or None
+        Steps: the same on every machine.
+    steps : int or None
+        After which it was told.
+    """
+
+    after_s: float | None = None
+    after_steps: int | None = None
+    steps: int | None = None
+
+    def is_over(self, n_steps: int, seconds: float) -> bool:
+        """Return whether the time is over, and note when it was for the first time."""
+        if self.steps is None and (
+            (self.after_s is not None and seconds > self.after_s)
+            or (self.after_steps is not None and n_steps >= self.after_steps)
+        ):
+            self.steps = n_steps
+        return self.steps is not None
+
+
+def result_of(
+    work: Generator[Any, bool | None, Result], tell: Callable[[Any], None] | None = None, limit: Limit | None = None
+) -> Result:
+    """Do work in steps, report how far it has come, and return its result."""
+    began_s, n_steps, is_over = time.monotonic(), 0, None
     while True:
         try:
-            news = next(work)
+            news = work.send(is_over)
         except StopIteration as end:
             result: Result = end.value
             return result
-        if tell is not None:
+        if tell is not None and news is not None:
             tell(news)
+        is_over = limit is not None and limit.is_over(n_steps, time.monotonic() - began_s)
+        n_steps += 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,16 +104,19 @@ class Ended:
         CPU time of the process that did it; 0 inline, where the caller's own clock has run.
     wall_s : float
         From when it was submitted, the time in the queue included; 0 inline.
+    stopped_after : int or None
+        Steps, where it was told that its time was over.
     """
 
     work: Any
     result: Any | Failure
     cpu_s: float = 0.0
     wall_s: float = 0.0
+    stopped_after: int | None = None
 
 
 class Desk(Protocol):
-    """Takes work on and gives results out: nobody waits for anything before the run ends."""
+    """Takes work on and gives results out, when its schedule says so."""
 
     def submit(self, kind: JobKind, work: Any, of: int | None = None) -> None:
         """Take a job on; one too many ends at once, as a `Failure`.
@@ -88,19 +126,47 @@ class Desk(Protocol):
         ...
 
     def poll(self, kind: JobKind) -> list[Ended]:
-        """Return what has ended of a kind since the last call, in the order in which it ended; never wait."""
+        """Return what has been given out of a kind since the last call."""
         ...
 
     def n_open(self, kind: JobKind, of: int | None = None) -> int:
-        """Count the jobs of a kind that wait or run; `of`: those that are of use to this submap alone."""
+        """Count the jobs of a kind whose results are still to come; `of`: that are of use to this submap alone."""
         ...
 
     def withdraw(self, of: int) -> None:
-        """Drop the jobs that wait and are of use to this submap alone: it is no longer live."""
+        """Drop the jobs that are of use to this submap alone: it is no longer live."""
         ...
 
     def drain(self, kind: JobKind) -> list[Ended]:
-        """Wait, for a limited time, for the jobs of a kind that are under way, and return their outcomes."""
+        """Wait for the open jobs of a kind, for a limited time where there is a clock, and return their outcomes."""
+        ...
+
+    def close(self) -> None:
+        """End the processes, and what they do."""
+        ...
+
+
+class Executor(Protocol):
+    """Does the jobs of a desk, in this process or in others, and knows nothing of frames."""
+
+    def submit(self, kind: JobKind, work: Any, of: int | None = None, limit: Limit | None = None) -> None:
+        """Take a job on."""
+        ...
+
+    def poll(self, kind: JobKind) -> list[Ended]:
+        """Return what has ended of a kind since the last call; never wait."""
+        ...
+
+    def withdraw(self, of: int) -> None:
+        """Drop the jobs that have not begun and are of use to this submap alone."""
+        ...
+
+    def drain(self, kind: JobKind, wait_s: float | None = None) -> list[Ended]:
+        """Wait so long for the jobs of a kind; those that have not ended by then are lost, and end as a `Failure`."""
+        ...
+
+    def lose(self, kind: JobKind) -> None:
+        """Forget what the handler of a kind keeps from job to job, as a process that has ended does."""
         ...
 
     def close(self) -> None:
@@ -112,30 +178,46 @@ PAUSE_S = 1e-3
 """Between two looks at whether a job has ended, where a run waits for it."""
 
 
-def awaited(desk: Desk, kind: JobKind) -> Iterator[Ended]:
-    """Wait for all jobs of a kind, as a run does that has no clock to keep up with, and yield each as it ends."""
-    while desk.n_open(kind):
-        ended = desk.poll(kind)
-        yield from ended
-        if not ended:
-            time.sleep(PAUSE_S)
-
-
 class InlineDesk:
     """Does each job when it is submitted: one process, deterministic.
 
     Parameters
     ----------
     handlers : mapping of JobKind to Handler
+        One that keeps a state from job to job may have a method `forget`.
+    tell : callable, optional
+        Called, during a job that works in steps, with how far it has come.
+    is_lost : callable, optional
+        Whether a job (its kind and its work) is to end as if its process had died: where the failure lab takes hold.
+    copied : set of JobKind
+        Kinds whose handlers keep what they are given, which is therefore copied, as into another process.
     """
 
-    def __init__(self, handlers: Handlers) -> None:
+    def __init__(
+        self,
+        handlers: Handlers,
+        tell: Callable[[Any], None] | None = None,
+        is_lost: Callable[[JobKind, Any], bool] | None = None,
+        copied: Container[JobKind] = (),
+    ) -> None:
         self._handlers = handlers
+        self._tell = tell
+        self._is_lost = is_lost
+        self._copied = copied
         self._done: defaultdict[JobKind, list[Ended]] = defaultdict(list)
 
-    def submit(self, kind: JobKind, work: Any, of: int | None = None) -> None:
+    def submit(self, kind: JobKind, work: Any, of: int | None = None, limit: Limit | None = None) -> None:
         """Do the job."""
-        self._done[kind].append(Ended(work, self._handlers[kind](work)))
+        if self._is_lost is not None and self._is_lost(kind, work):
+            lost = Failure(FailureReason.WORKER, "the failure lab takes this job away")
+            self._done[kind].append(Ended(work, lost))
+            return
+        given = pickle.loads(pickle.dumps(work, protocol=5)) if kind in self._copied else work
+        result = self._handlers[kind](given)
+        if isinstance(result, Generator):
+            result = result_of(result, self._tell, limit)
+        stopped = None if limit is None else limit.steps
+        self._done[kind].append(Ended(work, result, stopped_after=stopped))
 
     def poll(self, kind: JobKind) -> list[Ended]:
         """Return what was done since the last call."""
@@ -148,9 +230,15 @@ class InlineDesk:
     def withdraw(self, of: int) -> None:
         """Do nothing: no job waits."""
 
-    def drain(self, kind: JobKind) -> list[Ended]:
+    def drain(self, kind: JobKind, wait_s: float | None = None) -> list[Ended]:
         """Return what was done since the last call."""
         return self.poll(kind)
+
+    def lose(self, kind: JobKind) -> None:
+        """Let the handler of a kind forget what it keeps."""
+        forget = getattr(self._handlers.get(kind), "forget", None)
+        if forget is not None:
+            forget()
 
     def close(self) -> None:
         """Do nothing."""

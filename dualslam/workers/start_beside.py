@@ -54,6 +54,10 @@ class StartServer:
         self._session = -1
         self._starter: MapStarter | None = None
 
+    def forget(self) -> None:
+        """Forget what was collected, as if the process had been started anew."""
+        self._session, self._starter = -1, None
+
     def __call__(self, question: StartQuestion) -> Start | Failure:
         """Try the newest frame."""
         if self._starter is None or question.session != self._session:

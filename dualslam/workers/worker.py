@@ -16,7 +16,7 @@ from typing import Any
 from dualslam.core.memory import keep_freed_memory, peak_rss_mb
 from dualslam.core.processes import start_undisturbed
 from dualslam.core.types import Failure, FailureReason
-from dualslam.workers.jobs import Handlers, JobKind, result_of
+from dualslam.workers.jobs import Handlers, JobKind, Limit, result_of
 from dualslam.workers.transport import Channel
 
 MakeHandlers = Callable[[], Handlers]
@@ -32,6 +32,7 @@ class Answer:
     result: Any | Failure
     cpu_s: float = 0.0
     peak_rss_mb: float = 0.0
+    stopped_after: int | None = None  # steps, where it was told that its time was over
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +62,7 @@ class Worker:
         self._process = process
         start_undisturbed(process)
         theirs.close()
-        self._jobs: SimpleQueue[tuple[JobKind, Any] | None] = SimpleQueue()
+        self._jobs: SimpleQueue[tuple[JobKind, Any, Limit | None] | None] = SimpleQueue()
         self._results: SimpleQueue[Answer] = SimpleQueue()
         self._news: Any = None  # of the job in hand: the newest
         self._ready = Event()
@@ -74,9 +75,9 @@ class Worker:
         """Of the process."""
         return self._process.pid
 
-    def give(self, kind: JobKind, work: Any) -> None:
+    def give(self, kind: JobKind, work: Any, limit: Limit | None = None) -> None:
         """Hand over a job; one at a time."""
-        self._jobs.put((kind, work))
+        self._jobs.put((kind, work, limit))
 
     def news(self) -> Any:
         """Return what the job in hand has told since the last call, the newest of it; None where nothing."""
@@ -152,15 +153,16 @@ def serve(connection: Connection, make_handlers: MakeHandlers, niceness: int = 0
         return
     while True:
         try:
-            kind, work = channel.receive()
+            kind, work, limit = channel.receive()
         except (EOFError, ConnectionError):
             return
         began_s = time.process_time()
         result = handlers[kind](work)
         if isinstance(result, Generator):
-            result = result_of(result, tell)
+            result = result_of(result, tell, limit)
+        stopped = None if limit is None else limit.steps
         try:
-            channel.send(Answer(result, time.process_time() - began_s, peak_rss_mb()))
+            channel.send(Answer(result, time.process_time() - began_s, peak_rss_mb(), stopped))
         except ConnectionError:  # nobody waits for it any more
             return
         del work, result  # as they go with the next job, what they held may go

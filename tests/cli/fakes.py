@@ -20,6 +20,7 @@ from dualslam.map.trajectory import FramePose
 from dualslam.pace import Pace
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.workers.jobs import InlineDesk
+from dualslam.workers.scheduled_desk import ScheduledDesk
 
 NO_FEATURES = Features(
     np.zeros((0, 2)),
@@ -58,7 +59,7 @@ class FakeSystem:
         self.timer = StageTimer()
         self.buffer = FrameBuffer(1.0, 1.0)
         self.pace = Pace()
-        self.desk = InlineDesk({})
+        self.desk = ScheduledDesk(InlineDesk({}))
         self.n_finished = 0
         self.numbers = FrameNumbers()
         self.audit, self.blank = PhotometricAudit(NoPatches()), set[int]()

@@ -286,7 +286,7 @@ def test_who_leaves_the_writing_of_results_is_told_what_is_there(
     assert main(["run", str(folder), "--out", str(out)]) == 130
     *warned, last = capsys.readouterr().err.splitlines()
     assert len(warned) == 2
-    there = "config.yaml, events.jsonl, frames.csv, trajectory.txt, summary.json, groundtruth.txt"
+    there = "config.yaml, events.jsonl, schedule.jsonl, frames.csv, trajectory.txt, summary.json, groundtruth.txt"
     assert last == f"dualslam: interrupted. In {out} are {there}; not written: map/, report.html."
     assert len(rows_of(out)) == N_FRAMES
 

@@ -98,6 +98,7 @@ def test_a_run_that_posed_nothing(tmp_path: Path) -> None:
 def test_what_a_run_that_was_cut_off_has_left(tmp_path: Path) -> None:
     with RunFolder(tmp_path / "run") as run:
         run.write_config({"seed": 3})
+        run.append_schedule({"schedule": 1})
         run.write(record())
         run.write_truth(posed([2]))
         (run.path / "map").mkdir()
@@ -105,7 +106,9 @@ def test_what_a_run_that_was_cut_off_has_left(tmp_path: Path) -> None:
         words = run.what_is_there()
         run.write_map_page("<html>")
         later = run.what_is_there()
-    there = "config.yaml, events.jsonl, frames.csv, trajectory.txt, submaps/, summary.json, groundtruth.txt"
+    there = (
+        "config.yaml, events.jsonl, schedule.jsonl, frames.csv, trajectory.txt, submaps/, summary.json, groundtruth.txt"
+    )
     assert words == f"In {run.path} are {there}; not written: map/, report.html."
     assert f"{there}, map.html;" in later
 

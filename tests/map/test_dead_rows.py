@@ -234,7 +234,11 @@ def test_answers_that_come_late_name_the_rows_that_were_sent() -> None:
         return answer
 
     desk = LateDesk(InlineDesk({JobKind.GRAPH: solve}), 2)
-    graphs = BesideGraphs(desk, lambda submap, k: Failure(FailureReason.SOLVER, "no window"))
+    graphs = BesideGraphs(
+        desk,
+        lambda submap, k: Failure(FailureReason.SOLVER, "no window"),
+        lambda submap: ISam2SubmapGraph(GraphConfig()),
+    )
     feeder = begun()
     submap, graph, n = feeder.submap, graphs.new_graph(), 0
     for k in range(4, N):

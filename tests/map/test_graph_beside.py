@@ -6,6 +6,7 @@ import os
 import pickle
 import signal
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.build import build_system, graph_handlers, window_solver
 from dualslam.calibration.lens import change_camera
 from dualslam.config.settings import Config
+from dualslam.core.errors import SolverError
 from dualslam.core.types import Failure, FailureReason, FrameStatus
 from dualslam.map.graph_beside import BesideGraph, BesideGraphs, GraphAnswer, GraphJob, GraphServer
+from dualslam.map.solving import open_graph
 from dualslam.map.submap import Submap
 from dualslam.map.submap_delta import SubmapMirror
 from dualslam.run.results import trajectories_of
@@ -79,11 +82,19 @@ def test_with_another_camera_a_replica_is_made_anew() -> None:
     assert_follows(again.apply(replica), submap)
 
 
+def new_isam2() -> ISam2SubmapGraph:
+    return ISam2SubmapGraph(Config().graph)
+
+
+def no_window(submap: Submap, keyframe_ids: list[int]) -> Failure:
+    return Failure(FailureReason.SOLVER, "no window")
+
+
 def beside(world: PointWorld, polls: int, **settings: object) -> System:
     """A system whose graphs are solved inline, but come back late, by way of a delta as to another process."""
     system = system_in(world, **settings)
     desk = LateDesk(InlineDesk(graph_handlers(system._state.config)), polls)
-    graphs = BesideGraphs(desk, window_solver(system._state.config))
+    graphs = BesideGraphs(desk, window_solver(system._state.config), partial(open_graph, new_graph=new_isam2))
     system._state.parts = replace(system._state.parts, new_graph=graphs.new_graph, graphs=graphs)
     system._recoveries._new_graph = graphs.new_graph
     system._calibrations._new_graph = graphs.new_graph
@@ -152,9 +163,7 @@ def test_a_graph_that_fails_at_the_end_keeps_no_other_from_being_solved(reason: 
     def solve(job: GraphJob) -> GraphAnswer | Failure:
         return Failure(reason, "as it was told") if job.graph_id in failing else server(job)
 
-    graphs = BesideGraphs(
-        InlineDesk({JobKind.GRAPH: solve}), lambda submap, k: Failure(FailureReason.SOLVER, "no window")
-    )
+    graphs = BesideGraphs(InlineDesk({JobKind.GRAPH: solve}), no_window, partial(open_graph, new_graph=new_isam2))
     submaps = {m: guessed_submap(scene, pose_noise=0.02) for m, scene in enumerate(scenes)}
     for m, submap in submaps.items():
         submap.id = m
@@ -172,7 +181,7 @@ def test_a_graph_that_fails_at_the_end_keeps_no_other_from_being_solved(reason: 
 
 def test_what_a_graph_was_solving_when_its_submap_was_bent_straightens_nothing() -> None:
     desk = LateDesk(InlineDesk({JobKind.GRAPH: GraphServer(lambda: ISam2SubmapGraph(Config().graph))}), 1)
-    graphs = BesideGraphs(desk, lambda submap, k: Failure(FailureReason.SOLVER, "no window"))
+    graphs = BesideGraphs(desk, no_window, partial(open_graph, new_graph=new_isam2))
     submap = guessed_submap(make_scene(6, noise_px=0.5), pose_noise=0.02)
     graphs.new_graph().update(submap)
     assert not list(graphs.collect({submap.id: submap}))
@@ -192,7 +201,7 @@ def test_a_process_that_is_killed_costs_the_map_nothing(world: PointWorld) -> No
     config = Config.model_validate(DENSE | settings | {"camera": {"model_sigma_px": 0.0}})
     system = build_system(config, CAMERA)
     system._state.parts = replace(system._state.parts, view_of=lambda frame: world.view(frame.index))
-    desk = system.desk
+    desk = system.desk.executor
     assert isinstance(desk, WorkerDesk)
     for frame in world.frames():
         system.step(frame)
@@ -211,6 +220,7 @@ def test_a_known_graph_near_its_optimum_is_not_made_anew_in_real_time(in_real_ti
     graphs = BesideGraphs(
         desk,
         lambda submap, k: windows.append(k) or Failure(FailureReason.SOLVER, "no window"),  # type: ignore[func-returns-value]
+        partial(open_graph, new_graph=new_isam2),
     )
     graphs.in_real_time = in_real_time
     submap = guessed_submap(make_scene(6, noise_px=0.5), pose_noise=0.02)
@@ -223,3 +233,28 @@ def test_a_known_graph_near_its_optimum_is_not_made_anew_in_real_time(in_real_ti
     assert any(each.rebuilt for each in graphs.finish({submap.id: submap})) == (not in_real_time)
     graph.rebuild(submap)  # far from it
     assert any(each.rebuilt for each in graphs.finish({submap.id: submap}))
+
+
+def test_a_graph_in_another_process_keeps_the_promises_of_one_in_this() -> None:
+    """Covariances, factors and the tree are those of a graph that is made here, of the submap as it is."""
+    submap = guessed_submap(make_scene(6, noise_px=0.5), pose_noise=0.02)
+    here = new_isam2()
+    submap.apply_estimate(*here.update(submap).values)
+    graphs = BesideGraphs(InlineDesk({}), no_window, partial(open_graph, new_graph=new_isam2))
+    graph = graphs.new_graph()
+    with pytest.raises(SolverError, match="empty"):
+        graph.pose_covariance(3)
+    graph.update(submap)
+    before = submap.copy()
+    np.testing.assert_allclose(graph.pose_covariance(3), here.pose_covariance(3), rtol=0.2, atol=1e-9)
+    ids = np.arange(5)
+    np.testing.assert_allclose(graph.point_covariances(ids), here.point_covariances(ids), rtol=0.2, atol=1e-8)
+    assert isinstance(graph, BesideGraph)
+    np.testing.assert_array_equal(graph.factor_rows, here.factor_rows)
+    assert graph.statistics
+    assert len(graph.bayes_tree().parent) > 0
+    np.testing.assert_array_equal(submap.keyframe_poses(range(6)), before.keyframe_poses(range(6)))
+    opened = graph.opened()
+    assert graph.opened() is opened
+    graph.update(submap)
+    assert graph.opened() is not opened

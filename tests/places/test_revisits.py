@@ -201,14 +201,6 @@ def test_a_loop_that_is_being_solved_when_the_run_ends_is_closed_then() -> None:
     assert len(system.events.of_kind(EventKind.LOOP_CLOSED)) == 1
 
 
-def test_without_a_clock_no_search_is_left_out_for_one_that_takes_long() -> None:
-    """A film whose frames come faster than places are searched for loses no loop."""
-    system = late_lap("_revisits", 150)
-    system.finish()
-    first, loop = (each.events.of_kind(EventKind.LOOP_CLOSED)[0] for each in (closed_lap(), system))
-    assert (loop.data["keyframe"], loop.data["other_frame"]) == (first.data["keyframe"], first.data["other_frame"])
-
-
 def test_a_worker_that_dies_over_a_search_costs_that_search_alone() -> None:
     """The first two searches that would have found the loop come to nothing; those after them close it."""
     world = lap()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,12 +28,13 @@ from dualslam.map.atlas import Link, LinkKind
 from dualslam.map.atlas_report import AtlasReport
 from dualslam.map.connections import Connections
 from dualslam.map.record import FrameStamp
-from dualslam.recovery.executor import InlineExecutor, Outcome
-from dualslam.recovery.job import RecoveryJob, RecoveryResult
+from dualslam.recovery.job import RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, random_features, system_in
+from dualslam.testing.walks import KeptWalks, replace_walks
+from dualslam.workers.jobs import JobKind, Limit
 from tests.workers.test_worker import assert_same
 
 COVERED = frozenset(range(35, 50))
@@ -191,20 +193,14 @@ class OutOfTimeAtFirst:
     """Gives the first jobs that have a lost map to look for no time at all."""
 
     def __init__(self, system: System, n_failing: int) -> None:
-        self._inline = system._recoveries._executor
-        assert isinstance(self._inline, InlineExecutor)
-        self._parts, self._n_failing = self._inline._parts, n_failing
+        self._submit, self._n_failing = system.desk.executor.submit, n_failing
+        system.desk.executor.submit = self.submit  # type: ignore[method-assign]
 
-    def submit(self, job: RecoveryJob) -> None:
-        if job.lost:
-            self._inline._parts = replace(self._parts, budget_s=0.0 if self._n_failing > 0 else None)
+    def submit(self, kind: JobKind, work: Any, of: int | None = None, limit: Limit | None = None) -> None:
+        if kind is JobKind.WALK and work.lost:
+            limit = Limit(after_steps=0) if self._n_failing > 0 else None
             self._n_failing -= 1
-        self._inline.submit(job)
-
-    def poll(self) -> list[Outcome]:
-        return self._inline.poll()
-
-    finish = poll
+        self._submit(kind, work, of, limit)
 
 
 class TestRetry:
@@ -212,7 +208,7 @@ class TestRetry:
     def run(n_failing: int, n_frames: int = 90) -> System:
         world = PointWorld(cloud(), hand_held(n_frames), covered=COVERED)
         system = system_in(world, recovery={"attempts": ["live"], "retry_keyframes": [4]})
-        system._recoveries._executor = OutOfTimeAtFirst(system, n_failing)
+        OutOfTimeAtFirst(system, n_failing)
         for frame in world.frames():
             system.step(frame)
         system.finish()
@@ -276,7 +272,7 @@ class TestRetry:
     def test_nothing_is_looked_for_that_the_buffer_does_not_hold(self) -> None:
         world = PointWorld(cloud(), hand_held(90), covered=COVERED)
         system = system_in(world, recovery={"attempts": ["live"], "retry_keyframes": [4]}, buffer={"duration_s": 0.2})
-        system._recoveries._executor = OutOfTimeAtFirst(system, 9)
+        OutOfTimeAtFirst(system, 9)
         for frame in world.frames():
             system.step(frame)
         assert len(system.events.of_kind(EventKind.RECOVERY_STARTED)) == 1
@@ -328,8 +324,7 @@ def test_the_result_is_the_same_whatever_the_threads() -> None:
     world = make_sequence("street", 52, seed=3, events=[Corruption(kind=SpoilKind.BLACKOUT, start=26, length=10)])
     config = Config.model_validate({"recovery": {"attempts": ["gap"]}, "calibration": {"refine": False}})
     system = build_system(config, world.camera)
-    jobs: list[RecoveryJob] = []
-    system._recoveries._executor.submit = jobs.append  # type: ignore[method-assign]
+    jobs = replace_walks(system, lambda _: KeptWalks()).jobs
     for i in range(6, 52):
         system.step(world.frame(i))
     job = next(job for job in jobs if job.lost)

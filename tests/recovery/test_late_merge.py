@@ -13,11 +13,11 @@ from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, View
 from dualslam.map.trajectory import compose
-from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.job import RecoveryJob
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, random_features, system_in
+from dualslam.testing.walks import Outcome, Walks, replace_walks
 from tests.backend.test_self_calibration import wrong_camera
 from tests.calibration.test_lens import CalibrationWorld as CalibrationWorld
 from tests.map.test_submap import assert_consistent
@@ -29,7 +29,7 @@ POSITION_M, ROTATION_RAD = 0.08, 0.01
 class LateExecutor:
     """Gives each result out only after so many more polls (there is one with each frame)."""
 
-    def __init__(self, inner: RecoveryExecutor, polls: int) -> None:
+    def __init__(self, inner: Walks, polls: int) -> None:
         self.inner, self.polls = inner, polls
         self.waiting: list[tuple[int, Outcome]] = []
         self.n_polls = 0
@@ -65,7 +65,7 @@ class FailingExecutor(LateExecutor):
 
 def late_system(world: PointWorld, polls: int, **settings: object) -> System:
     system = system_in(world, **({"recovery": {"enabled": True}} | settings))
-    system._recoveries._executor = LateExecutor(system._recoveries._executor, polls)
+    replace_walks(system, lambda inner: LateExecutor(inner, polls))
     return system
 
 
@@ -195,7 +195,7 @@ def test_the_camera_has_been_refined_meanwhile() -> None:
     }
     covered = range(12, 26)
     system, world = miscalibrated(1.03, covered, settings)
-    system._recoveries._executor = LateExecutor(system._recoveries._executor, 34)
+    replace_walks(system, lambda inner: LateExecutor(inner, 34))
     for i in range(75):
         system.step(Frame(i, i / 30, None))
     system.finish()
@@ -294,7 +294,7 @@ def test_a_link_that_leaps_is_tried_again_as_its_map_grows(world: PointWorld, mo
 
 def test_a_recovery_that_fails_costs_its_link_only(world: PointWorld) -> None:
     system = system_in(world, recovery={"enabled": True})
-    system._recoveries._executor = FailingExecutor(system._recoveries._executor, 5)
+    replace_walks(system, lambda inner: FailingExecutor(inner, 5))
     for frame in world.frames():
         system.step(frame)
     system.finish()
@@ -337,7 +337,7 @@ def test_what_the_live_map_knew_stays_as_it_was(world: PointWorld) -> None:
 class UnsteadyExecutor(LateExecutor):
     """Gives results out after delays of all kinds, in any order, and loses some."""
 
-    def __init__(self, inner: RecoveryExecutor, seed: int) -> None:
+    def __init__(self, inner: Walks, seed: int) -> None:
         super().__init__(inner, 0)
         self.rng = np.random.default_rng(seed)
 
@@ -361,7 +361,7 @@ def test_any_schedule_leaves_a_consistent_atlas(seed: int) -> None:
         at += length + int(rng.integers(8, 40))
     world = PointWorld(cloud(), hand_held(n), covered=frozenset(covered), seed=seed)
     system = system_in(world, recovery={"enabled": True}, graph={"max_keyframes": 20, "rollover_keyframes": 6}, **DENSE)
-    system._recoveries._executor = UnsteadyExecutor(system._recoveries._executor, seed)
+    replace_walks(system, lambda inner: UnsteadyExecutor(inner, seed))
     for frame in world.frames():
         system.step(frame)
     system.finish()

@@ -21,7 +21,7 @@ from dualslam.recovery.motion import (
     refuse_seams,
 )
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
-from tests.recovery.test_schedule import Watched
+from dualslam.testing.walks import WatchedWalks, replace_walks
 
 RATE_HZ = 20.0
 
@@ -211,7 +211,7 @@ def test_what_a_map_saw_beyond_its_leap_takes_no_part_in_a_link() -> None:
     T[90:, 0, 3] += 2.5
     world = PointWorld(cloud(), T)
     system = system_in(world, recovery={"attempts": ["live"]})
-    system._recoveries._executor = watched = Watched(system._recoveries._executor)
+    watched = replace_walks(system, WatchedWalks)
     for frame in world.frames():
         if not 80 <= frame.index < 90:
             system.step(frame)

@@ -15,8 +15,7 @@ from dualslam.core.types import FloatArray, FrameStatus, Keyframe, View
 from dualslam.frontends.tracking.local_map import covering_keyframes
 from dualslam.map.submap import Submap
 from dualslam.map.trajectory import FramePose
-from dualslam.recovery.executor import Outcome, RecoveryExecutor
-from dualslam.recovery.job import RecoveryJob, RecoveryResult
+from dualslam.recovery.job import RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.recovery.schedule import RetrySchedule, as_far_as_it_leads, way_to_gaps
 from dualslam.run.results import trajectories_of
@@ -30,6 +29,7 @@ from dualslam.testing.point_world import (
     random_features,
     system_in,
 )
+from dualslam.testing.walks import WatchedWalks, replace_walks
 from tests.recovery.test_late_merge import LateExecutor
 
 POSITION_M, ROTATION_RAD = 0.1, 0.01  # over a way of 5 m, with a turn of 120 degrees
@@ -61,28 +61,9 @@ def away_first(covered: frozenset[int] = frozenset()) -> PointWorld:
     return PointWorld(ring(), T_world_cam, covered=covered)
 
 
-class Watched:
-    """Notes the jobs that it hands on."""
-
-    def __init__(self, inner: RecoveryExecutor) -> None:
-        self.inner = inner
-        self.jobs: list[RecoveryJob] = []
-
-    def submit(self, job: RecoveryJob) -> None:
-        self.jobs.append(job)
-        self.inner.submit(job)
-
-    def poll(self) -> list[Outcome]:
-        return self.inner.poll()
-
-    def finish(self) -> list[Outcome]:
-        return self.inner.finish()
-
-
-def watched_system(world: PointWorld, polls: int = 0, **recovery: object) -> tuple[System, Watched]:
+def watched_system(world: PointWorld, polls: int = 0, **recovery: object) -> tuple[System, WatchedWalks]:
     system = system_in(world, recovery=recovery)
-    inner = system._recoveries._executor
-    system._recoveries._executor = watched = Watched(LateExecutor(inner, polls) if polls else inner)
+    watched = replace_walks(system, lambda inner: WatchedWalks(LateExecutor(inner, polls) if polls else inner))
     return system, watched
 
 
@@ -335,7 +316,7 @@ def test_a_walk_reads_no_frame_that_is_older_than_the_lost_map() -> None:
         "mapping": {"redundant_ratio": 1.0},
     }
     system = system_in(world, **settings)
-    system._recoveries._executor = watched = Watched(system._recoveries._executor)
+    watched = replace_walks(system, WatchedWalks)
     for frame in world.frames():
         system.step(frame)
     job = next(job for job in watched.jobs if job.lost)

@@ -223,17 +223,17 @@ def test_the_pace_is_told_how_late_frames_are_in_real_time_alone() -> None:
     class Told(Pace):
         def __init__(self) -> None:
             super().__init__()
-            self.late_s: list[float] = []
+            self.told_s: list[float] = []
 
         def note(self, late_s: float) -> None:
-            self.late_s.append(late_s)
+            self.told_s.append(late_s)
 
     clock, pace = Clock(), Told()
     system = FakeSystem(EVERYWHERE, before_step=lambda frame: clock.sleep(0.13))
     run_sequence(system, Frames([0, 1, 2]), realtime=True, pace=pace, clock=clock, sleep=clock.sleep)  # type: ignore[arg-type]
-    assert pace.late_s == pytest.approx([0, 0.03, 0.06])
+    assert pace.told_s == pytest.approx([0, 0.03, 0.06])
     run_sequence(system, Frames([0, 1, 2]), pace=pace, clock=clock, sleep=clock.sleep)  # type: ignore[arg-type]
-    assert len(pace.late_s) == 3
+    assert len(pace.told_s) == 3
 
 
 def test_in_real_time_backwards() -> None:

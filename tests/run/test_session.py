@@ -21,6 +21,7 @@ from dualslam.map.frame_records import FrameResult
 from dualslam.run.session import run_to_folder
 from dualslam.testing.point_world import CAMERA
 from dualslam.workers.jobs import InlineDesk
+from dualslam.workers.scheduled_desk import ScheduledDesk
 from tests.cli.fakes import FakeSystem
 
 
@@ -38,7 +39,7 @@ class Unplugged:
         raise OSError("unplugged")
 
 
-class ClosedDesk(InlineDesk):
+class ClosedDesk(ScheduledDesk):
     is_closed = False
 
     def close(self) -> None:
@@ -48,7 +49,7 @@ class ClosedDesk(InlineDesk):
 @pytest.fixture
 def system() -> FakeSystem:
     system = FakeSystem({i: np.eye(4) for i in range(100)})
-    system.desk = ClosedDesk({})
+    system.desk = ClosedDesk(InlineDesk({}))
     return system
 
 
@@ -129,7 +130,7 @@ def test_a_truth_that_is_of_no_use_costs_its_errors_alone(
 
 def test_a_truth_of_no_numbers_costs_a_run_without_a_map_nothing(tmp_path: Path) -> None:
     nowhere = FakeSystem({}, lost=tuple(range(12)))
-    nowhere.desk = ClosedDesk({})
+    nowhere.desk = ClosedDesk(InlineDesk({}))
     partly = STILL.copy()
     partly[:6] = np.nan
     sequence = WithTruth(TIMES_S, partly, 1 / 30)
@@ -145,7 +146,7 @@ def test_no_process_outlives_a_run_that_ends_before_its_first_frame_or_has_no_fo
     with pytest.raises(OSError, match="unplugged"):
         run_to_folder(Config(), Unplugged(0), tmp_path / "run", build=build)  # type: ignore[arg-type]
     assert system.desk.is_closed  # type: ignore[attr-defined]
-    system.desk = ClosedDesk({})
+    system.desk = ClosedDesk(InlineDesk({}))
     (tmp_path / "file").touch()
     with pytest.raises(OutputError):
         run_to_folder(Config(), Unplugged(5), tmp_path / "file" / "run", build=build)  # type: ignore[arg-type]

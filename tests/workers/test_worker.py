@@ -16,13 +16,13 @@ from dualslam.build import recovery_parts, walk_handlers
 from dualslam.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.types import Failure, FailureReason
-from dualslam.recovery.executor import Outcome
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.run.results import trajectories_of
 from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, pose_errors, system_in
+from dualslam.testing.walks import KeptWalks, replace_walks
 from dualslam.workers.desk import Lane, WorkerDesk
-from dualslam.workers.jobs import JobKind
+from dualslam.workers.jobs import JobKind, Limit
 
 COVERED = frozenset(range(35, 50))
 MAKE_PARTS = partial(recovery_parts, Config(), CAMERA)
@@ -30,30 +30,15 @@ MAKE_HANDLERS = partial(walk_handlers, Config(), CAMERA, 1)
 PATIENCE_S = 120.0  # of the test, on a busy machine
 
 
-class Catcher:
-    """Notes the jobs that a system submits; nothing comes of them."""
-
-    def __init__(self) -> None:
-        self.jobs: list[RecoveryJob] = []
-
-    def submit(self, job: RecoveryJob) -> None:
-        self.jobs.append(job)
-
-    def poll(self) -> list[Outcome]:
-        return []
-
-    finish = poll
-
-
 @pytest.fixture(scope="module")
 def job() -> RecoveryJob:
     """Reverse tracking that ends with a link."""
     world = PointWorld(cloud(), hand_held(60), covered=COVERED)
-    system, catcher = system_in(world, recovery={"enabled": True}), Catcher()
-    system._recoveries._executor = catcher
+    system = system_in(world, recovery={"enabled": True})
+    kept = replace_walks(system, lambda _: KeptWalks())
     for frame in world.frames():
         system.step(frame)
-    _, job = catcher.jobs
+    _, job = kept.jobs
     return job
 
 
@@ -102,7 +87,7 @@ def assert_same(a: RecoveryResult | Failure, b: RecoveryResult | Failure) -> Non
 
 
 def test_a_recovery_out_of_time_gives_what_it_has(job: RecoveryJob) -> None:
-    result = run_recovery(job, recovery_parts(Config(), CAMERA, budget_s=0.0))
+    result = run_recovery(job, recovery_parts(Config(), CAMERA), limit=Limit(after_steps=0))
     assert isinstance(result, RecoveryResult)
     assert result.link is None
     (attempt,) = result.events

@@ -19,9 +19,8 @@ from dualslam.core.errors import SolverError
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import so3
 from dualslam.core.interfaces import Seeker, SubmapGraph, VisualOdometry
-from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, Track, View
+from dualslam.core.types import Failure, FloatArray, Frame, Track, View
 from dualslam.map.submap import Submap
-from dualslam.recovery.executor import Outcome, RecoveryExecutor
 from dualslam.recovery.job import RecoveryJob
 from dualslam.workers.jobs import JobKind
 
@@ -62,13 +61,13 @@ class FaultScript:
             return new_odometry
         return lambda submap, graph: cast(Seeker, _FaultyOdometry(new_odometry(submap, graph), self))
 
-    def around_inline(self, executor: RecoveryExecutor) -> RecoveryExecutor:
-        """Return what runs recoveries in this process, with one of them taken away where the script says so."""
-        return _FaultyInline(executor, self) if self._faults else executor
+    def loses(self, kind: JobKind, job: Any) -> bool:
+        """Whether a job ends as if its process had been killed."""
+        return kind is JobKind.WALK and self.worker_dies(job)
 
     def kill_worker(self, kind: JobKind, job: Any, pid: int | None) -> None:
         """Kill the process that has begun a recovery, where the script says so."""
-        if kind is JobKind.WALK and pid is not None and self.worker_dies(job):
+        if pid is not None and self.loses(kind, job):
             os.kill(pid, signal.SIGKILL)
 
     def active(self, kind: CorruptionKind, timestamp_s: float) -> Corruption | None:
@@ -132,27 +131,6 @@ class _FaultyOdometry:
         if self._script.solver_fails(track.view.timestamp_s):
             raise SolverError(f"frame {track.view.index}: the failure lab lets the solver fail here")
         return self._inner.insert_keyframe(track)
-
-
-class _FaultyInline:
-    """What runs recoveries inline, one of which ends as if its process had been killed."""
-
-    def __init__(self, inner: RecoveryExecutor, script: FaultScript) -> None:
-        self._inner, self._script = inner, script
-        self._lost: list[Outcome] = []
-
-    def submit(self, job: RecoveryJob) -> None:
-        if self._script.worker_dies(job):
-            self._lost.append((job, Failure(FailureReason.WORKER, "the failure lab takes this recovery away")))
-        else:
-            self._inner.submit(job)
-
-    def poll(self) -> list[Outcome]:
-        lost, self._lost = self._lost, []
-        return lost + self._inner.poll()
-
-    def finish(self) -> list[Outcome]:
-        return self.poll() + self._inner.finish()
 
 
 def wrong_pose(track: Track, submap: Submap, fault: Corruption) -> FloatArray:

@@ -16,7 +16,6 @@ from dualslam.run.session import run_to_folder
 from dualslam.run.sources import open_source
 from dualslam.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
-from dualslam.testing.waiting import wait_until
 from dualslam.workers.desk import WorkerDesk
 from tests.cli.conftest import _own_environment  # noqa: F401 (used by every test)
 
@@ -143,15 +142,13 @@ def test_a_killed_worker_costs_its_recovery_and_nothing_else(workers: int) -> No
     system = system_in(world, recovery={"enabled": True, "workers": workers})
     script = FaultScript([Corruption.model_validate({"kind": "kill_worker", "start": 30})])
     system._state.parts = replace(system._state.parts, view_of=script.around_views(system._state.parts.view_of))
-    desk = system._state.parts.desk
-    if isinstance(desk, WorkerDesk):
-        desk.on_start = script.kill_worker
+    executor = system.desk.executor
+    if isinstance(executor, WorkerDesk):
+        executor.on_start = script.kill_worker
     else:
-        system._recoveries._executor = script.around_inline(system._recoveries._executor)
+        executor._is_lost = script.loses  # type: ignore[attr-defined]
     for frame in world.frames():
         system.step(frame)
-        if isinstance(desk, WorkerDesk):  # frames here take no time, and a camera's do
-            wait_until(lambda: not any(task.worker._results.empty() for queue in desk._queues for task in queue.busy))
     system.finish()
     (failed,) = system.events.of_kind(EventKind.RECOVERY_FAILED)
     assert failed.data["reason"] == "worker"

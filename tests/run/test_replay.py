@@ -1,0 +1,81 @@
+"""A run repeated from its folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from dualslam.build import build_system
+from dualslam.cli import main
+from dualslam.config.files import load_config
+from dualslam.config.settings import Config
+from dualslam.core.camera.base import Camera
+from dualslam.core.types import Frame
+from dualslam.run.schedule import as_recorded
+from dualslam.run.session import Outcome, run_to_folder
+from dualslam.run.sources import open_source
+from dualslam.system import System
+from dualslam.testing.lossy import Lossy
+from dualslam.workers.jobs import JobKind
+from dualslam.workers.schedule import After, Recorded
+
+SOURCE = "synthetic:street,frames=46,seed=5"
+LOSS = ["recovery.workers=1", "corruptions=[{kind: blackout, start: 22, length: 6}]", "tracking.max_lost_s=0.1"]
+
+
+def test_a_repetition_sees_the_frames_that_the_run_has_seen() -> None:
+    record = Recorded({}, {}, dropped=frozenset({1, 3}), last_frame=4)
+    dropped: list[tuple[int, float]] = []
+    frames = as_recorded(iter([Frame(i, i / 10, None) for i in range(9)]), record, dropped)
+    assert [frame.index for frame in frames] == [0, 2, 4]
+    assert dropped == [(1, 0.1), (3, 0.3)]
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--realtime"], "leave out --realtime"),
+        (["--workers", "2"], "leave out --realtime"),
+        ([], "takes the folder of a run that has left its schedule"),
+    ],
+)
+def test_what_cannot_be_repeated_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], says: str
+) -> None:
+    replay = ["--replay", str(tmp_path / "none"), "--out", str(tmp_path / "out")]
+    assert main(["run", SOURCE, *replay, *options]) == 2
+    assert says in capsys.readouterr().err
+
+
+def lossy_run(folder: Path) -> Outcome:
+    """A run with a loss, under a schedule of its own, of whose jobs some are lost."""
+
+    def build(config: Config, camera: Camera) -> System:
+        schedule = After({JobKind.GRAPH: 3, JobKind.CALIBRATION: 7, JobKind.WALK: 4, JobKind.LOOP: 2})
+        system = build_system(config, camera, schedule=schedule, in_process=True)
+        system.desk.executor = Lossy([JobKind.GRAPH, JobKind.LOOP], every=5).around(system.desk.executor)
+        return system
+
+    return run_to_folder(load_config(None, LOSS), open_source(SOURCE), folder, build=build)
+
+
+@pytest.mark.slow
+def test_a_run_is_repeated_to_the_bit_and_another_source_comes_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    lossy_run(run)
+    rows = [json.loads(line) for line in (run / "schedule.jsonl").read_text().splitlines()]
+    assert {"ok", "worker"} <= {row["outcome"] for row in rows if "outcome" in row}
+    assert main(["run", SOURCE, "--replay", str(run), "--out", str(tmp_path / "again")]) == 0
+    assert "the same trajectory, bit for bit" in capsys.readouterr().out
+    assert (run / "trajectory.txt").read_bytes() == (tmp_path / "again" / "trajectory.txt").read_bytes()
+    other = SOURCE.replace("seed=5", "seed=6")
+    main(["run", other, "--replay", str(run), "--out", str(tmp_path / "other")])
+    told = capsys.readouterr()
+    assert "another trajectory; it comes apart at frame" in told.out
+    replay = json.loads((tmp_path / "other" / "summary.json").read_text())["replay"]
+    assert not replay["same_trajectory"]
+    assert replay["departure"].startswith("frame ")

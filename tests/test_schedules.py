@@ -1,0 +1,132 @@
+"""Whatever the schedule of the background work: a run with a loss ends in one right map, and repeats to the bit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dualslam.core.types import FailureReason
+from dualslam.run.results import trajectories_of
+from dualslam.system import System
+from dualslam.testing.lossy import Lossy
+from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
+from dualslam.workers.jobs import JobKind
+from dualslam.workers.schedule import DELAYS, After, Policy, Recorded, header_of, never
+
+COVERED = frozenset(range(35, 44))
+N = 80
+POSITION_M, ROTATION_RAD = 0.08, 0.01
+SETTINGS = {
+    "recovery": {"enabled": True, "workers": 1},
+    "keyframes": {"max_parallax_deg": 1.0},
+    "mapping": {"redundant_ratio": 1.0},
+}
+GRAPH, CALIBRATION, WALK = JobKind.GRAPH, JobKind.CALIBRATION, JobKind.WALK
+
+
+def run(
+    schedule: Policy, lossy: Lossy | None = None, covered: frozenset[int] = COVERED, seed: int = 0, n: int = N
+) -> tuple[System, PointWorld, Recorded]:
+    """A run and its record."""
+    world = PointWorld(cloud(), hand_held(n), covered=covered, seed=seed)
+    system, rows = system_in(world, schedule, seed=seed, **SETTINGS), list[dict[str, Any]]()
+    system.desk.on_record = rows.append
+    if lossy is not None:
+        system.desk.executor = lossy.around(system.desk.executor)
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
+    return system, world, Recorded.of([header_of(schedule, False), *rows])
+
+
+def poses_of(system: System) -> tuple[list[int], np.ndarray]:
+    main = trajectories_of(system).main
+    return main.index.tolist(), main.T_world_cam
+
+
+def assert_one_right_map(system: System, world: PointWorld, covered: frozenset[int] = COVERED) -> None:
+    index, T = poses_of(system)
+    n = len(world.T_world_cam)
+    assert set(index) == set(range(n)) - covered
+    translation, rotation = pose_errors(T, world.T_world_cam[index])
+    assert translation.max() < POSITION_M
+    assert rotation.max() < ROTATION_RAD
+
+
+def assert_repeats(system: System, record: Recorded, **how: Any) -> None:
+    again, _, record_again = run(record, **how)
+    assert not record.departure
+    for mine, theirs in zip(poses_of(again), poses_of(system), strict=True):
+        assert np.array_equal(mine, theirs)
+    assert record_again.answers == record.answers
+
+
+def all_after(frames: float) -> After:
+    return After(dict.fromkeys(DELAYS, frames))
+
+
+def test_a_run_with_a_loss_is_right_under_a_schedule_and_repeats_to_the_bit() -> None:
+    covered = frozenset(range(24, 34))
+    how = {"covered": covered, "n": 48}
+    system, world, record = run(all_after(5), **how)
+    assert_one_right_map(system, world, covered)
+    assert_repeats(system, record, **how)
+
+
+@pytest.mark.slow
+def test_so_it_is_by_default() -> None:
+    system, world, record = run(After())
+    assert_one_right_map(system, world)
+    assert_repeats(system, record)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frames", [0, 1, 5, 20, math.inf])
+def test_however_late_all_answers_are(frames: float) -> None:
+    system, world, record = run(all_after(frames))
+    assert_one_right_map(system, world)
+    assert_repeats(system, record)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [GRAPH, CALIBRATION, WALK, JobKind.LOOP, JobKind.EDGES, JobKind.ATLAS])
+def test_whichever_answers_come_at_the_end_alone(kind: JobKind) -> None:
+    system, world, record = run(never(kind))
+    assert_one_right_map(system, world)
+    assert_repeats(system, record)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reason", [FailureReason.WORKER, FailureReason.TIMEOUT])
+@pytest.mark.parametrize("kinds", [[GRAPH], [JobKind.LOOP, JobKind.EDGES, JobKind.ATLAS], [GRAPH, CALIBRATION]])
+def test_whichever_workers_die_or_hang(kinds: Sequence[JobKind], reason: FailureReason) -> None:
+    """Walks are not among them: a link needs one that ends."""
+    lossy = Lossy(kinds, every=2, reason=reason)
+    system, world, record = run(After(), lossy)
+    assert lossy.n_lost
+    assert_one_right_map(system, world)
+    assert_repeats(system, record)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_answers_for_maps_that_are_gone(seed: int) -> None:
+    """Three losses, the second map is hardly begun when it is lost; walks end long after their maps."""
+    rng = np.random.default_rng(seed)
+    covered = frozenset({*range(30, 40), *range(52, 62), *range(90, 100)})
+    delays = {kind: float(rng.choice([0, 1, 5, 20, 40, math.inf])) for kind in DELAYS}
+    lossy = Lossy(list(DELAYS), every=7, seed=seed)
+    how = {"covered": covered, "seed": seed, "n": 120}
+    system, world, record = run(After(delays), lossy, **how)
+    for submap in system.atlas.submaps.values():
+        assert submap.keyframes.keys() == submap.T_submap_kf.keys() == submap.landmark_of.keys()
+    for component in trajectories_of(system).unlinked.values():
+        assert np.isfinite(component.T_world_cam).all()
+    index, T = poses_of(system)
+    translation, _ = pose_errors(T, world.T_world_cam[index])
+    assert translation.max() < 2 * POSITION_M
+    assert_repeats(system, record, **how)
