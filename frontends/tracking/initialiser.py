@@ -17,6 +17,7 @@ from dualslam.core.bundle import BundleAdjuster, BundleProblem
 from dualslam.core.chi_square import CHI2_95, CHI2_99, MEDIAN_CHI2
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
+from dualslam.core.geometry.projection import refine_pose
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.interfaces import START_REACH, Frontend
 from dualslam.core.types import (
@@ -33,7 +34,7 @@ from dualslam.core.types import (
 from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
 from dualslam.frontends.tracking.direction import direction_angle_deg, direction_sigma_deg
 from dualslam.frontends.tracking.near_points import N_PROOF, nearer_than_proven, stands_before
-from dualslam.frontends.tracking.resection import estimate_pose
+from dualslam.frontends.tracking.resection import resect
 from dualslam.frontends.tracking.two_view_hypotheses import MIN_NOISE2, RelativePoses
 
 MAX_CHI2 = 2.5
@@ -298,7 +299,9 @@ class Initialiser:
         leads = ~stands_before(xyz[point, 2], xyz[:, 2])
         if np.count_nonzero(~leads) < N_POSING:
             leads[:] = True
-        estimate = estimate_pose(self._K, self._size_px, uv_px, xyz[point], sigma_px, self._seed, counted=leads)
+        sigma = float(np.median(sigma_px))
+        start = resect(self._K, self._size_px, uv_px[leads], xyz[point[leads]], sigma, self._seed)
+        estimate = refine_pose(self._K, start.T_cam_w, xyz[point], uv_px, sigma_px, counted=leads)
         if isinstance(estimate, Failure):
             return estimate
         features = np.full(len(xyz), -1, np.int64)

@@ -83,7 +83,6 @@ def estimate_pose(
     *,
     min_inliers: int = 6,
     tolerance: float = 1e-4,
-    counted: BoolArray | None = None,
 ) -> PoseEstimate | Failure:
     """Estimate a pose without a guess: RANSAC, then a refinement that starts from its inliers.
 
@@ -93,18 +92,15 @@ def estimate_pose(
         As for `resect`.
     sigma_px : (N,) float64
         Standard deviation of each pixel coordinate.
-    min_inliers, tolerance, counted
-        As for `refine_pose`; points that do not count are left out of RANSAC, too.
+    min_inliers, tolerance
+        As for `refine_pose`.
 
     Returns
     -------
     PoseEstimate or Failure
         As `refine_pose` returns it.
     """
-    rows = np.arange(len(xyz)) if counted is None else np.flatnonzero(counted)
-    start = resect(K, size_px, uv_px[rows], xyz[rows], float(np.median(sigma_px)), seed)
-    consensus = np.zeros(len(xyz), np.bool_)
-    consensus[rows[start.inliers]] = True
+    start = resect(K, size_px, uv_px, xyz, float(np.median(sigma_px)), seed)
     return refine_pose(
         K,
         start.T_cam_w,
@@ -113,6 +109,5 @@ def estimate_pose(
         sigma_px,
         min_inliers=min_inliers,
         tolerance=tolerance,
-        counted=counted,
-        consensus=consensus if consensus.sum() >= MIN_SAMPLE else None,
+        consensus=start.inliers if start.inliers.sum() >= MIN_SAMPLE else None,
     )
