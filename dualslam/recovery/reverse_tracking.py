@@ -190,10 +190,10 @@ def _make_attempt(
     views = job.views if job.lost else _there_and_back(job.views, progress)
     trace = WalkTrace(submap.id, attempt.name, job.newest_id, submap.T_submap_kf[job.newest_id][:3, 3])
     for step in track_in_reverse(reverse_tracker, views, parts.judge, relinker.keyframe_ids, max_gap_frames):
+        trace.note(step.view, step.track)
         progress.out_of_time = bool((yield trace.news()))
         if progress.out_of_time:
             break
-        trace.note(step.view, step.track)
         progress.rivals = reverse_tracker.rivals
         if isinstance(step.track, Failure):
             progress.note_unusable(step.track)

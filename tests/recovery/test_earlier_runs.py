@@ -103,7 +103,7 @@ def test_reverse_tracking_is_told_the_ways_of_this_run_alone() -> None:
     view = View(FIRST + 129, 6.45, random_features(np.random.default_rng(0), 1))
     buffer.append(view)
     jobs: list[RecoveryJob] = []
-    parts = (Fake(submit=jobs.append), None, Fake(camera=CAMERA, covariance=None), None)
+    parts = (Fake(submit=lambda kind, job: jobs.append(job)), None, Fake(camera=CAMERA, covariance=None), None)
     recoveries = Recoveries(record, buffer, *parts, RecoveryConfig(), list)  # type: ignore[arg-type]
     recoveries.declare_lost(0, FIRST + 28, "inliers", FIRST + 30)
     recoveries.start(live, view)

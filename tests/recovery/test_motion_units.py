@@ -18,6 +18,7 @@ from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult
 from dualslam.recovery.manager import Recoveries, _UnderWay
 from dualslam.testing.point_world import CAMERA
+from dualslam.workers.jobs import Ended
 from tests.recovery.test_earlier_runs import book, enter, pose_frames
 from tests.recovery.test_motion import way, without
 
@@ -47,8 +48,8 @@ def walk(unit: float, off: FloatArray, seed: int) -> tuple[Record, Recoveries, R
     attempt = Event(EventKind.RECOVERY_ATTEMPT, FIRST + FOUND_AFTER, float(t_new[0]), 1, {"attempt": "live"})
     job = RecoveryJob(new, 0, {0: lost}, {0: FIRST + 99}, (), (), CAMERA, None)
     result = RecoveryResult(new, tuple(frames), link, (attempt,), 0.1, 0.1)
-    executor = Fake(submit=lambda job: None, poll=lambda: [(job, result)])
-    parts = (executor, None, Fake(camera=CAMERA, covariance=None), None)
+    desk = Fake(poll=lambda kind: [Ended(job, result)])
+    parts = (desk, None, Fake(camera=CAMERA, covariance=None), None)
     recoveries = Recoveries(record, FrameBuffer(10.0, 100.0), *parts, RecoveryConfig(), list)  # type: ignore[arg-type]
     return record, recoveries, result
 
