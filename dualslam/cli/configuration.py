@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from dualslam.config import strict_yaml
-from dualslam.config.files import Override, load_config
+from dualslam.config.files import CONFIG, Override, load_config
 from dualslam.config.settings import Config
 from dualslam.core.errors import ConfigError, InputError
-from dualslam.io.run_folder import CONFIG, SCHEDULE
-from dualslam.workers.schedule import Recorded
+from dualslam.workers.schedule import SCHEDULE, Recorded
 
 
 def config_of(args: argparse.Namespace) -> Config:

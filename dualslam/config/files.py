@@ -16,6 +16,9 @@ from dualslam.config.problems import kind, sentence
 from dualslam.config.settings import Config
 from dualslam.core.errors import ConfigError
 
+CONFIG = "config.yaml"
+"""In a run folder: the run's configuration."""
+
 Model = TypeVar("Model", bound=BaseModel)
 
 

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import yaml
 
+from dualslam.config.files import CONFIG as CONFIG
 from dualslam.core.errors import OutputError
 from dualslam.core.events import Event
 from dualslam.core.types import BoolArray
@@ -26,6 +27,7 @@ from dualslam.io.folder_lock import FolderLock
 from dualslam.io.map_files import METADATA, to_plain
 from dualslam.io.trajectory_files import Trajectory, write_kitti, write_tum
 from dualslam.map.frame_records import FrameRow as FrameRow  # a row of frames.csv
+from dualslam.workers.schedule import SCHEDULE
 
 log = logging.getLogger(__name__)
 
@@ -34,9 +36,7 @@ TRAJECTORY_KITTI = "trajectory_kitti.txt"
 TRAJECTORY_KITTI_FRAMES = "trajectory_kitti_frames.txt"
 FRAMES = "frames.csv"
 EVENTS = "events.jsonl"
-SCHEDULE = "schedule.jsonl"
 SUMMARY = "summary.json"
-CONFIG = "config.yaml"
 REPORT = "report.html"
 MAP_PAGE = "map.html"
 GROUND_TRUTH = "groundtruth.txt"

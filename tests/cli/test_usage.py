@@ -301,6 +301,7 @@ def test_an_export_to_where_no_folder_can_be(form: str, tmp_path: Path, capsys: 
         ("run nowhere.mp4 --out there", "nowhere.mp4 does not exist"),
         ("run synthetic:street --out there --set sed=3", "did you mean seed?"),
         ("run synthetic:street --out there --config none.yaml", "none.yaml"),
+        ("run synthetic:street --out there --replay nowhere", "nowhere/schedule.jsonl"),
         ("demo --set sed=3", "did you mean seed?"),
     ],
 )
