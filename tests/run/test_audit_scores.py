@@ -14,7 +14,8 @@ def samples(agreement: list[float], submap: int = 0) -> list[Sample]:
 
 
 def test_the_worst_stretch_counts_not_the_worst_sample() -> None:
-    assert worst_disagreement(samples([0.9, 0.0, 0.9, 0.5, 0.4, 0.3, 0.6, 0.9])) == pytest.approx(0.4)
+    made = samples([0.9, 0.0, 0.9, 0.5, 0.4, 0.3, 0.6, 0.9])
+    assert worst_disagreement(made) == pytest.approx(0.5), "of 0.5, 0.4, 0.3"
     assert worst_disagreement(samples([0.1, 0.1]) + samples([0.1, 0.1], submap=1)) == 0.0
 
 

@@ -113,5 +113,13 @@ def test_on_a_saved_map_an_unknown_camera_is_the_one_that_made_it(tmp_path: Path
     assert sequence is not None
     assert sequence.camera == made_by, "self-calibration's part comes with the map"
     assert len(list(sequence)) == 3
-    save_atlas(tmp_path / "other", Atlas(), {}, DivisionCamera(128, 96, 50.0, 50.0, 63.5, 47.5))
-    assert with_camera_of_map(tmp_path / "other", opened) is None
+
+
+def test_images_of_half_the_size_are_of_the_map_s_camera_and_those_of_another_shape_are_not(tmp_path: Path) -> None:
+    opened = open_without_calibration(str(write(tmp_path / "images", [np.zeros((48, 64), np.uint8)] * 3)))
+    save_atlas(tmp_path / "larger", Atlas(), {}, DivisionCamera(128, 96, 50.0, 50.0, 63.5, 47.5, k=-0.2))
+    sequence = with_camera_of_map(tmp_path / "larger", opened)
+    assert sequence is not None
+    assert sequence.camera == DivisionCamera(64, 48, 25.0, 25.0, 31.5, 23.5, k=-0.2)
+    save_atlas(tmp_path / "cropped", Atlas(), {}, DivisionCamera(128, 72, 50.0, 50.0, 63.5, 35.5))
+    assert with_camera_of_map(tmp_path / "cropped", opened) is None
