@@ -10,8 +10,9 @@ import pytest
 from dualslam.config.corruption import Corruption, CorruptionKind
 from dualslam.core.events import EventKind
 from dualslam.core.types import FrameStatus
-from dualslam.lab.audits.link_audit import LinkAudit, audit_links
+from dualslam.lab.audits.link_audit import LinkAudit, audit_link, audit_links
 from dualslam.lab.disturbances import FaultScript
+from dualslam.map.atlas import Link, LinkKind
 from dualslam.run.results import trajectories_of
 from dualslam.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
@@ -49,18 +50,33 @@ def corrupted(request: pytest.FixtureRequest) -> tuple[System, PointWorld]:
     return run(*request.param)
 
 
+def recovery_link(system: System) -> Link:
+    (link,) = (link for link in system.atlas.links if link.kind is LinkKind.RECOVERY)
+    return link
+
+
 def test_the_link_stands_on_what_was_healthy_and_is_true(corrupted: tuple[System, PointWorld]) -> None:
     system, world = corrupted
     (found,) = audit_links(system.atlas, system.poses.values(), dict(enumerate(world.T_world_cam)))
     assert isinstance(found, LinkAudit)
     assert not found.wrong, found
-    (link,) = system.atlas.links
-    assert max(link.keyframes) < FORCED.start
+    assert max(recovery_link(system).keyframes) < FORCED.start
+
+
+def test_a_place_that_confirms_the_link_is_healthy_and_true(corrupted: tuple[System, PointWorld]) -> None:
+    system, world = corrupted
+    (loop,) = (link for link in system.atlas.links if link.kind is not LinkKind.RECOVERY)
+    assert loop.kind is LinkKind.LOOP
+    assert loop.keyframe_a < FORCED.start
+    asked = replace(loop, keyframes=recovery_link(system).keyframes)
+    found = audit_link(system.atlas, asked, list(system.poses.values()), dict(enumerate(world.T_world_cam)))
+    assert isinstance(found, LinkAudit)
+    assert not found.wrong, found
 
 
 def test_what_is_not_to_be_relied_on_is_marked(corrupted: tuple[System, PointWorld]) -> None:
     system, _ = corrupted
-    (link,) = system.atlas.links
+    link = recovery_link(system)
     old, new = system.atlas.submaps[link.a], system.atlas.submaps[link.b]
     forced = {k for k in FORCED if k in old.keyframes}
     assert forced <= old.condemned
