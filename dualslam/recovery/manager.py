@@ -211,14 +211,15 @@ class Recoveries:
         self._take(self._desk.poll(JobKind.WALK), live, now)
 
     def finish(self, live: VisualOdometry | None, last: FrameStamp | None, interrupted: bool) -> None:
-        """Track in reverse once more, and merge what is under way after the last frame.
+        """Merge the walks that are under way after the last frame, and track in reverse once more.
 
         `interrupted`: no walk is begun any more.
         """
-        if live is not None and last is not None and not interrupted:
-            self.collect(live, last)
+        if last is None:
+            return
+        self._take(self._desk.drain(JobKind.WALK), live, last)
+        if live is not None and not interrupted:
             self.retry(live.submap, last, last_chance=True)
-        if last is not None:
             self._take(self._desk.drain(JobKind.WALK), live, last)
 
     def _take(self, answers: Iterable[Ended], live: VisualOdometry | None, now: FrameStamp) -> None:

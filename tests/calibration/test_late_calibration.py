@@ -35,7 +35,7 @@ def late_system(polls: int, recovery: bool = False, waits: bool = False) -> tupl
         "tracking": {"max_lost_s": 0.25},
     }
     system, world = build_system(Config.model_validate(settings), wrong_camera(WRONG)), CalibrationWorld()
-    system._calibrations._desk = LateDesk(system._state.parts.desk, polls)
+    system._calibrations._desk = LateDesk(system._state.parts.desk.executor, polls)
     system._state.pace.in_real_time = not waits
     return system, world
 

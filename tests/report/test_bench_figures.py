@@ -21,7 +21,8 @@ def test_every_figure_is_drawn(tmp_path: Path) -> None:
     files = draw_figures(SPEC, bench_tables(SPEC, records), records, tmp_path)
     names = {"table_2_failures", "figure_6_initialisation", "figure_7_a", "figure_7_b", "figure_9_end_point"}
     assert {file.stem for file in files} == names
-    for file in files:
+    assert {file.stem for file in files if file.suffix == ".pdf"} == names
+    for file in (file for file in files if file.suffix != ".pdf"):
         image = cv2.imread(str(file))
         assert image is not None
         assert min(image.shape[:2]) > 200

@@ -51,7 +51,7 @@ def test_a_trial_is_a_run_folder_and_a_line(spec: BenchSpec, trial: Trial, tmp_p
     assert record.end_point_error_m is not None
     assert judge(record, spec.thresholds) is None
     # 1.2 s are too short for a stretch to be judged; the rest of what makes a run right is there.
-    assert (record.level, record.judged, record.is_still) == ("none", 0, False)
+    assert (record.level, record.judged, record.is_still) == ("good", 0, False)
     assert record.n_clear == record.n_clear_posed > 25
     assert faults_of(record, RightRun()) == ()
     run = tmp_path / "trials" / "room" / "gap" / "base" / "00"

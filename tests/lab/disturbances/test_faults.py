@@ -152,7 +152,7 @@ def test_a_killed_worker_costs_its_recovery_and_nothing_else(workers: int) -> No
     system.finish()
     (failed,) = system.events.of_kind(EventKind.RECOVERY_FAILED)
     assert failed.data["reason"] == "worker"
-    assert failed.frame < 69
+    assert failed.frame <= 69  # by the schedule a walk's answer is used 60 frames after its request, or at the end
     (linked,) = system.events.of_kind(EventKind.LINKED)
     assert linked.frame == 69  # by the walk that is made once more when the run ends
     assert len(system.atlas.submaps) == 2
