@@ -28,6 +28,7 @@ from dualslam.places.revisits import Revisits
 from dualslam.places.sightings import Relocalised
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.manager import Recoveries
+from dualslam.recovery.motion_watch import Break
 from dualslam.recovery.relocaliser import Relocaliser
 from dualslam.recovery.walk_news import WalkNews
 from dualslam.steps.components import Components
@@ -343,17 +344,14 @@ class System:
         state.lost = []
         self.buffer.thaw()
         broken = state.motion_watch.judge(view, track.wide, state.record, live.submap)
+        if broken is None and (first := self.audit.broken_since(live.submap.id)) is not None:
+            detail = f"the images disagree with the map since frame {first}"
+            broken = Break(first, Failure(FailureReason.PHOTOMETRIC, detail))
         if broken is not None:
             self._endings.break_at(live, view, broken.first, broken.failure)
             self._begin_anew()
             state.lost = []
             return broken.failure
-        if (first := self.audit.broken_since(live.submap.id)) is not None:
-            failure = Failure(FailureReason.PHOTOMETRIC, f"the images disagree with the map since frame {first}")
-            self._endings.break_at(live, view, first, failure)
-            self._begin_anew()
-            state.lost = []
-            return failure
         if (found := self._places.seen_from(live, track)) is not None:
             return self._go_over(found, live, view)
         if live.reference_id == view.index:

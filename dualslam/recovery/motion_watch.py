@@ -18,7 +18,7 @@ HISTORY_S = 30.0
 
 @dataclass(frozen=True, slots=True)
 class Break:
-    """Where a map is broken: its first posed frame beyond the gap, and why the camera cannot have moved so."""
+    """Where a map is broken: the first frame that it poses wrongly, and why."""
 
     first: int
     failure: Failure
