@@ -100,11 +100,12 @@ def test_an_answer_for_a_map_that_was_lost_meanwhile_changes_nothing(in_time: Sy
     asked = in_time.events.of_kind(EventKind.CALIBRATED)[0].frame
     system = run(polls=40, n_frames=asked + 60, blind=range(asked + 5, asked + 30))
     assert system.events.of_kind(EventKind.FAILED)
-    assert not system.events.of_kind(EventKind.CALIBRATED)
+    lost, *_ = system.atlas.submaps.values()
     kept = system.events.of_kind(EventKind.CALIBRATION_KEPT)[0]
-    assert "live no more" in kept.data["reason"]
-    np.testing.assert_array_equal(system._state.parts.calibration.camera.K, wrong_camera(WRONG).K)
-    assert all((submap.K == wrong_camera(WRONG).K).all() for submap in system.atlas.submaps.values())
+    assert kept.submap == lost.id and "live no more" in kept.data["reason"]
+    np.testing.assert_array_equal(lost.K, wrong_camera(WRONG).K)
+    # A map that begins afterwards may ask its own question, whose answer the end of the run waits for.
+    assert all(found.submap != lost.id for found in system.events.of_kind(EventKind.CALIBRATED))
 
 
 @pytest.mark.parametrize("is_lost", [False, True])
