@@ -9,7 +9,7 @@ import numpy as np
 
 from dualslam.backend.observability import MIN_DEPTH_MU, compute_depth_sigmas, compute_residuals, numbered, take_mask
 from dualslam.backend.selection import Candidates, choose_factors
-from dualslam.config.settings import GraphConfig
+from dualslam.core.config.settings import GraphConfig
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.map.submap import Submap
 from dualslam.map.tables import Table

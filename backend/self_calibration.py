@@ -27,11 +27,11 @@ import numpy as np
 from dualslam.backend.calibration_bundle import CalibratedOptimum, optimise_with_camera
 from dualslam.backend.observability import compute_depth_sigmas, compute_residuals, take_mask
 from dualslam.backend.solver import GTSAM_ERRORS, SolverFailure
-from dualslam.config.calibration_config import CalibrationConfig
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import LensCorrection, correction_of, given_camera
 from dualslam.core.chi_square import CHI2_999
+from dualslam.core.config.calibration_config import CalibrationConfig
 from dualslam.core.estimates import CalibrationEstimate, PreferredCamera
 from dualslam.core.geometry import so3
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray

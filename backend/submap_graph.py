@@ -26,7 +26,7 @@ from dualslam.backend.points_beside import landmarks_beside, triangulated_covari
 from dualslam.backend.reading import READ_ALL, READ_WINDOW, choose_part
 from dualslam.backend.solver import N_LAST, IncrementalSolver, SolverFailure, optimise_batch
 from dualslam.backend.ties import TieChanges, Ties
-from dualslam.config.settings import GraphConfig
+from dualslam.core.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import GraphEstimate
 from dualslam.core.types import FloatArray, IntArray

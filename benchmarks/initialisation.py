@@ -24,8 +24,8 @@ import cv2
 import numpy as np
 
 from dualslam.backend.local_ba import bundle_adjust_arrays
-from dualslam.config.files import load_config
-from dualslam.config.settings import Config
+from dualslam.core.config.files import load_config
+from dualslam.core.config.settings import Config
 from dualslam.core.types import FloatArray, Start, View
 from dualslam.frontends.frame_reader import view_of
 from dualslam.frontends.registry import create_frontend

@@ -75,7 +75,7 @@ def revisits(world: Any) -> int:
 def run(world: Any, frames: list[Any], seed: int, loops: bool, settings: dict[str, Any]) -> tuple[Any, float]:
     """Return the system that has seen all frames, and its CPU time in seconds."""
     from dualslam.build import build_system
-    from dualslam.config.files import config_from_dict
+    from dualslam.core.config.files import config_from_dict
 
     values = {"seed": seed, "frontend": {"n_features": SIZE[2]}, "loops": {"enabled": loops}}
     system = build_system(config_from_dict(values | settings, "loops"), world.camera)

@@ -15,7 +15,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.core.memory import peak_rss_mb
 from dualslam.core.types import Features, Keyframe
 from dualslam.frontends.registry import create_frontend

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dualslam.config.corruption import Corruption
+from dualslam.core.config.corruption import Corruption
 from dualslam.core.interfaces import Sequence
 from dualslam.frontends.features.images import to_grey
 from dualslam.frontends.still_pixels import StillPixels

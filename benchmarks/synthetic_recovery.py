@@ -88,7 +88,7 @@ def run_once(job: tuple[str, str, int], settings: dict[str, Any]) -> dict[str, A
 def run(world: Any, values: dict[str, Any]) -> Any:
     """Return the system that has seen the whole of a world."""
     from dualslam.build import build_system
-    from dualslam.config.files import config_from_dict
+    from dualslam.core.config.files import config_from_dict
 
     system = build_system(config_from_dict(values, "synthetic_recovery"), world.camera)
     for frame in world:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import dualslam
-from dualslam.config.corruption import Corruption, CorruptionKind
+from dualslam.core.config.corruption import Corruption, CorruptionKind
 from dualslam.core.events import EventKind
 from dualslam.lab.audits.join_audit import JoinAudit, JoinOutcome, audit_join
 from dualslam.lab.audits.silent_breaks import find_silent_breaks

@@ -19,9 +19,9 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from dualslam.build import build_system, create_frontend, recovery_parts
-    from dualslam.config.files import config_from_dict, dump_config, load_config
-    from dualslam.config.settings import Config
     from dualslam.core.camera.base import Camera
+    from dualslam.core.config.files import config_from_dict, dump_config, load_config
+    from dualslam.core.config.settings import Config
     from dualslam.core.errors import ConfigError, DualSlamError, InputError, OutputError, SolverError
     from dualslam.core.memory import keep_freed_memory
     from dualslam.core.threads import limit_threads
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from dualslam.io.map_store import load_atlas, save_atlas
     from dualslam.lab.disturbances import corrupted
     from dualslam.lab.metrics.trajectory_metrics import evaluate_run
+    from dualslam.linking import propose_correspondences
     from dualslam.map.frame_records import FrameResult
-    from dualslam.recovery.linking import propose_correspondences
     from dualslam.recovery.reverse_tracking import track_in_reverse
     from dualslam.report import comparison_page, read_run, report_page
     from dualslam.run.judgement import judge_run
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
     from dualslam.run.session import run_to_folder
     from dualslam.run.slam import Slam
     from dualslam.run.sources import open_source
-    from dualslam.system import System
+    from dualslam.system.system import System
     from dualslam.viewer.progress import Progress
 
 _WHERE = {
     "Camera": "core.camera.base",
-    "Config": "config.settings",
+    "Config": "core.config.settings",
     "ConfigError": "core.errors",
     "DualSlamError": "core.errors",
     "Failure": "core.types",
@@ -55,22 +55,22 @@ _WHERE = {
     "Progress": "viewer.progress",
     "Slam": "run.slam",
     "SolverError": "core.errors",
-    "System": "system",
+    "System": "system.system",
     "build_system": "build",
     "comparison_page": "report",
-    "config_from_dict": "config.files",
+    "config_from_dict": "core.config.files",
     "corrupted": "lab.disturbances",
     "create_frontend": "build",
-    "dump_config": "config.files",
+    "dump_config": "core.config.files",
     "evaluate_run": "lab.metrics.trajectory_metrics",
     "frame_rows": "run.results",
     "keep_freed_memory": "core.memory",
     "judge_run": "run.judgement",
     "limit_threads": "core.threads",
     "load_atlas": "io.map_store",
-    "load_config": "config.files",
+    "load_config": "core.config.files",
     "open_source": "run.sources",
-    "propose_correspondences": "recovery.linking",
+    "propose_correspondences": "linking",
     "read_run": "report",
     "recovery_parts": "build",
     "report_page": "report",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from dualslam import exit_status
+from dualslam.core import exit_status
 
 
 def main() -> int:

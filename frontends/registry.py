@@ -10,8 +10,8 @@ from typing import Any, Protocol, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from dualslam.config.problems import nearest_of
-from dualslam.config.settings import FrontendConfig
+from dualslam.core.config.problems import nearest_of
+from dualslam.core.config.settings import FrontendConfig
 from dualslam.core.errors import ConfigError, written
 from dualslam.core.extras import how_to_install
 from dualslam.core.interfaces import Frontend

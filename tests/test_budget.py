@@ -24,8 +24,9 @@ def counts(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 def checkout(tmp_path: Path) -> Path:
     files = {
         "dualslam/__init__.py": '"""A package."""\n',
-        "dualslam/config/__init__.py": "",
-        "dualslam/config/settings.py": "class Part:\n    a: int = 3\n\nclass Config:\n    part: Part\n    b: int = 4\n",
+        "dualslam/core/config/__init__.py": "",
+        "dualslam/core/config/settings.py": "class Part:\n    a: int = 3\n\n"
+        "class Config:\n    part: Part\n    b: int = 4\n",
         "dualslam/map/__init__.py": "LIMIT = 7\n",
         "dualslam/lab/__init__.py": "from dualslam.map import LIMIT\n" * 50,
         "frontends/__init__.py": "from dualslam.map import LIMIT\n\nfactor = 0.5 * LIMIT\n",

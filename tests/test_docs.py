@@ -12,8 +12,8 @@ from types import ModuleType
 
 import pytest
 
-from dualslam.config.problems import all_paths
-from dualslam.config.settings import Config
+from dualslam.core.config.problems import all_paths
+from dualslam.core.config.settings import Config
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"]

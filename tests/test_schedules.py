@@ -11,7 +11,7 @@ import pytest
 
 from dualslam.core.types import FailureReason
 from dualslam.run.results import trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.lossy import Lossy
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
 from dualslam.workers.jobs import JobKind

@@ -17,7 +17,7 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 from pydantic import BaseModel
 
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 
 FIELDS = "<!-- every field of the configuration -->"
 # Code comes first: what looks like an equation in it is none.

@@ -15,7 +15,7 @@ import numpy as np
 
 import dualslam
 from dualslam.build import create_frontend
-from dualslam.config.settings import FrontendConfig
+from dualslam.core.config.settings import FrontendConfig
 from dualslam.places.cells import CELLS, N_CELLS
 
 SOURCES = (

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from traceback import walk_tb
 
-from dualslam.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.camera.base import Camera
+from dualslam.core.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.errors import ConfigError, FrontendError, InputError
 from dualslam.frontends.features.motion_statistics import nearest_search
 from dualslam.frontends.registry import check_frontend, package_of

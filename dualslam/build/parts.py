@@ -10,17 +10,17 @@ from dualslam.backend.local_ba import bundle_adjust, bundle_adjust_arrays
 from dualslam.backend.self_calibration import estimate_calibration
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.backend.window import NumpyWindowSolver
-from dualslam.calibration.lens import Calibration
-from dualslam.config.settings import Config
 from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import FocalSearch, ToldFocal
+from dualslam.core.config.settings import Config
 from dualslam.core.interfaces import Frontend, SelfCalibrator, WindowSolver
 from dualslam.core.types import Failure, FloatArray, Frame
 from dualslam.frontends.asking import features_of
 from dualslam.frontends.place_matcher import FrontendPlaceMatcher
 from dualslam.frontends.registry import create_frontend
 from dualslam.frontends.tracking.initialiser import Initialiser
+from dualslam.map.lens import Calibration
 from dualslam.map.submap import Submap
 from dualslam.places import FaissRecogniser, PlaceVerifier
 from dualslam.places.sightings import PlaceParts

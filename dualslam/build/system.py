@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
+from dualslam.atlas.tidying import tidy
 from dualslam.backend.final_refinement import refine_submap
 from dualslam.build.checks import check_config, check_given
 from dualslam.build.parts import (
@@ -26,13 +27,13 @@ from dualslam.build.workers import (
     map_handlers,
     worker_desk,
 )
-from dualslam.calibration.lens import Calibration
-from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.mapped import MappedCamera, camera_for_map
+from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Frontend, SubmapGraph
 from dualslam.core.types import View
+from dualslam.core.walk_news import WalkWatch
 from dualslam.frontends.direct.patch_audit import PatchAudit
 from dualslam.frontends.frame_reader import FrameReader
 from dualslam.frontends.gap.refinding import Refinder
@@ -45,12 +46,11 @@ from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.io.map_store import StoredMap
 from dualslam.lab.disturbances import FaultScript
 from dualslam.map.graph_beside import BesideGraphs
+from dualslam.map.lens import Calibration
 from dualslam.map.solving import open_graph
 from dualslam.map.submap import Submap
-from dualslam.map.tidying import tidy
-from dualslam.recovery.walk_news import WalkWatch
-from dualslam.steps.components import Components
-from dualslam.system import System
+from dualslam.system.components import Components
+from dualslam.system.system import System
 from dualslam.workers.desk import WorkerDesk
 from dualslam.workers.jobs import InlineDesk, JobKind
 from dualslam.workers.schedule import AT_ONCE, After, Policy, Recorded

@@ -11,8 +11,8 @@ import numpy as np
 from dualslam.backend.self_calibration import find_preferred_camera
 from dualslam.build.checks import auxiliary_config, naming_attempt
 from dualslam.build.parts import bundle_adjuster, graph_maker, window_solver
-from dualslam.config.settings import AttemptConfig, Config
 from dualslam.core.camera.base import Camera
+from dualslam.core.config.settings import AttemptConfig, Config
 from dualslam.core.estimates import PreferredCamera
 from dualslam.core.interfaces import Frontend, SubmapGraph
 from dualslam.core.support import judge_track
@@ -24,10 +24,10 @@ from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.gap.route import Route, find_lack
 from dualslam.frontends.registry import FOR_WALKS, create_frontend
 from dualslam.frontends.tracking.visual import VisualFrontEnd
+from dualslam.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
+from dualslam.linking.gates import DESCRIPTOR_RADIUS_PX
 from dualslam.map.submap import Submap
 from dualslam.recovery.job import RecoveryJob
-from dualslam.recovery.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
-from dualslam.recovery.linking.gates import DESCRIPTOR_RADIUS_PX
 from dualslam.recovery.reverse_tracking import Attempt, RecoveryParts
 
 FEATURE_THREADS = 2

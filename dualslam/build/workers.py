@@ -5,24 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
+from dualslam.atlas.beside import atlas_handlers
 from dualslam.build.parts import atlas_solver, graph_maker, new_calibration, new_initialiser, place_parts
 from dualslam.build.walks import FEATURE_THREADS, recovery_parts
-from dualslam.calibration.lens import CalibrationAnswer, CalibrationJob, answer
-from dualslam.config.settings import Config, FrontendConfig
 from dualslam.core.camera.base import Camera
+from dualslam.core.config.settings import Config, FrontendConfig
 from dualslam.core.interfaces import SubmapGraph
 from dualslam.core.threads import spare_cores
 from dualslam.core.types import Failure, Frame
+from dualslam.core.walk_news import WalkWatch
 from dualslam.frontends.registry import create_frontend
 from dualslam.frontends.tracking.map_readout import answer_readout
 from dualslam.lab.disturbances import FaultScript
-from dualslam.map.atlas_beside import atlas_handlers
 from dualslam.map.graph_beside import GraphServer
+from dualslam.map.lens import CalibrationAnswer, CalibrationJob, answer
 from dualslam.places import PlaceVerifier
 from dualslam.places.search import search_places
 from dualslam.recovery.reverse_tracking import RecoveryParts, recover_in_steps
 from dualslam.recovery.scale_watch import SCALE_HANDLERS
-from dualslam.recovery.walk_news import WalkWatch
 from dualslam.workers.desk import Lane, WorkerDesk
 from dualslam.workers.features_beside import FeaturesBeside
 from dualslam.workers.jobs import Handler, Handlers, JobKind

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
-from dualslam import exit_status
 from dualslam.cli import logs
 from dualslam.cli.parser import parse
 from dualslam.cli.streams import lenient, without_libraries
+from dualslam.core import exit_status
 from dualslam.core.errors import ConfigError, DualSlamError, FrontendError, InputError, OutputError
 from dualslam.core.memory import keep_freed_memory
 from dualslam.core.threads import limit_threads

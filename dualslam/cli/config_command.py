@@ -6,7 +6,7 @@ import argparse
 
 from dualslam.build import check_config
 from dualslam.cli.configuration import config_of, naming_source
-from dualslam.config.files import dump_config
+from dualslam.core.config.files import dump_config
 
 
 def execute(args: argparse.Namespace) -> int:

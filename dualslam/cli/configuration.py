@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from dualslam.config import strict_yaml
-from dualslam.config.files import CONFIG, Override, load_config
-from dualslam.config.settings import Config
+from dualslam.core.config import strict_yaml
+from dualslam.core.config.files import CONFIG, Override, load_config
+from dualslam.core.config.settings import Config
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.workers.schedule import SCHEDULE, Recorded
 

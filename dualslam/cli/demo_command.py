@@ -14,7 +14,7 @@ from dualslam.cli.configuration import config_of, naming_source
 from dualslam.cli.console import progress
 from dualslam.cli.outputs import check_free
 from dualslam.cli.run_command import conclude, naming_frontend
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.types import Frame
 from dualslam.io.run_folder import MAP_PAGE

@@ -14,12 +14,12 @@ from dualslam.cli.outputs import check_free
 from dualslam.cli.view_command import save_recording
 from dualslam.core.errors import DualSlamError, InputError, OutputError
 from dualslam.core.types import FloatArray, IntArray
-from dualslam.export.colours import keyframe_indices, landmark_colours
-from dualslam.export.exported_map import flatten, read_stored, with_frames
-from dualslam.export.formats import FORMATS
-from dualslam.export.images import mask_of, with_images
-from dualslam.export.metric import by_distance
 from dualslam.io.atomic import write_text
+from dualslam.io.export.colours import keyframe_indices, landmark_colours
+from dualslam.io.export.exported_map import flatten, read_stored, with_frames
+from dualslam.io.export.formats import FORMATS
+from dualslam.io.export.images import mask_of, with_images
+from dualslam.io.export.metric import by_distance
 from dualslam.io.map_store import StoredMap
 from dualslam.io.metric_scale import read_scale
 from dualslam.io.run_folder import TRAJECTORY, TRAJECTORY_KITTI

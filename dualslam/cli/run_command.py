@@ -9,13 +9,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from dualslam import exit_status
 from dualslam.build import check_config, fault_of_frontend
 from dualslam.cli import logs
 from dualslam.cli.configuration import config_of, naming_source
 from dualslam.cli.console import final_line, no_map_line, progress, stage_table, verdict_line, waiting
-from dualslam.config.settings import Config
+from dualslam.core import exit_status
 from dualslam.core.camera.focal import FocalSearch
+from dualslam.core.config.settings import Config
 from dualslam.core.errors import DualSlamError, InputError, NoCalibrationError
 from dualslam.io.atomic import atomic_file
 from dualslam.io.reduced import MAX_SIDE_PX

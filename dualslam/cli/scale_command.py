@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 
 from dualslam.core.errors import InputError
-from dualslam.export.exported_map import flatten, read_stored, with_frames
-from dualslam.export.metric import MetricScale, by_distance, by_height, by_marker
+from dualslam.io.export.exported_map import flatten, read_stored, with_frames
+from dualslam.io.export.metric import MetricScale, by_distance, by_height, by_marker
 from dualslam.io.metric_scale import read_scale, write_scale
 from dualslam.io.run_reading import read_numbers
 from dualslam.run.sources import open_images_of_run

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from dualslam.core.types import Failure, FailureReason, Track
 
 if TYPE_CHECKING:
-    from dualslam.config.settings import HealthConfig
+    from dualslam.core.config.settings import HealthConfig
 
 
 def find_lack_of_support(n_inliers: int, n_matches: int, chi2: float, config: HealthConfig) -> Failure | None:

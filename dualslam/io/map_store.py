@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.atlas.atlas import Atlas, Link, LinkKind, rollover_covariance
+from dualslam.atlas.trajectory import FramePose
+from dualslam.atlas.warp import Warp
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import camera_from_dict
 from dualslam.core.errors import InputError
@@ -27,10 +30,7 @@ from dualslam.io.map_files import (
     submap_to_arrays,
 )
 from dualslam.io.run_folder import MAP
-from dualslam.map.atlas import Atlas, Link, LinkKind, rollover_covariance
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose
-from dualslam.map.warp import Warp
 
 LINKS, FRAMES, SUBMAP, SOLUTION = "links", "frames", "submap_", "solution"
 _OTHER = (LINKS, FRAMES, SOLUTION)

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import yaml
 
-from dualslam.config.files import CONFIG as CONFIG
+from dualslam.core.config.files import CONFIG as CONFIG
 from dualslam.core.errors import OutputError
 from dualslam.core.events import Event
 from dualslam.core.types import BoolArray

@@ -10,10 +10,10 @@ from collections.abc import Set
 
 import numpy as np
 
+from dualslam.atlas.record import Record
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.interfaces import VisualOdometry
 from dualslam.core.types import Failure, FloatArray, Track, View
-from dualslam.map.record import Record
 from dualslam.places.sightings import SAME_WITHIN, Relocalised, Search, Sighting, Sightings, median_depth, same_pose
 
 

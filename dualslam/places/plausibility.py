@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from dualslam.atlas.atlas import Atlas
+from dualslam.atlas.record import Record
+from dualslam.atlas.trajectory import Path, compose
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure, FailureReason, FloatArray
-from dualslam.map.atlas import Atlas
-from dualslam.map.record import Record
-from dualslam.map.trajectory import Path, compose
+from dualslam.linking.motion import DRIFT, join_slack, refuse_seams
 from dualslam.places.sightings import SAME_WITHIN, same_pose, turn_between
 from dualslam.places.verification import PlaceMatch
-from dualslam.recovery.motion import DRIFT, join_slack, refuse_seams
 
 MAX_DRIFT, MAX_DRIFT_DEG, MAX_DRIFT_LOG_SCALE = 0.5, 60.0, float(np.log(3.0))
 """What a map that was never lost between two places can have drifted at most: a share of the way, a turn, a scale. Half

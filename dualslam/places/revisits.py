@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from dualslam.config.settings import Config
+from dualslam.atlas.atlas import Link, LinkKind
+from dualslam.atlas.connections import Connections
+from dualslam.atlas.record import FrameStamp, Record
+from dualslam.atlas.report import AtlasReport
 from dualslam.core.chi_square import MEDIAN_CHI2
+from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Seeker, SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, FloatArray
-from dualslam.map.atlas import Link, LinkKind
-from dualslam.map.atlas_report import AtlasReport
-from dualslam.map.connections import Connections
-from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
 from dualslam.places.plausibility import agree, contradict, plausible
 from dualslam.places.search import PlaceSearch, follow_maps, poses_of

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dualslam.atlas.propagation import follow_keyframes
 from dualslam.core.types import Failure, FloatArray
-from dualslam.map.propagation import follow_keyframes
 from dualslam.map.submap import Submap
 from dualslam.places.recogniser import PlaceCandidate
 from dualslam.places.verification import PlaceMatch, PlaceVerifier

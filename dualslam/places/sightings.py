@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dualslam.config.settings import Config
+from dualslam.atlas.record import FrameStamp, Record
+from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import Seeker, SubmapGraph
 from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, FloatArray, Track, View
-from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
 from dualslam.places.recogniser import PlaceCandidate, PlaceRecogniser
 from dualslam.places.verification import PlaceVerifier

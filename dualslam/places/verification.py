@@ -15,11 +15,20 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.random import Generator
 
-from dualslam.config.settings import LinkingConfig
+from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
 from dualslam.core.place_matcher import PlaceMatcher, Sighting
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray
+from dualslam.linking.evidence import Gate, first_refusal, sigma_gates
+from dualslam.linking.gates import (
+    MAX_HYPOTHESES,
+    MAX_SCALE,
+    MIN_IMAGE_SPREAD,
+    MIN_MAJORITY,
+    MIN_PAIRS_PER_KEYFRAME,
+    PAIR_CHI2,
+)
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 from dualslam.places.second_pose import SecondSimilarity, alike, find_second_pose
@@ -34,15 +43,6 @@ from dualslam.places.sides import (
     seen_as,
     side_of,
     sigmas_at_pairs,
-)
-from dualslam.recovery.linking.evidence import Gate, first_refusal, sigma_gates
-from dualslam.recovery.linking.gates import (
-    MAX_HYPOTHESES,
-    MAX_SCALE,
-    MIN_IMAGE_SPREAD,
-    MIN_MAJORITY,
-    MIN_PAIRS_PER_KEYFRAME,
-    PAIR_CHI2,
 )
 
 N_MATCHED = 3

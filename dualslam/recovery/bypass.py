@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dualslam.atlas.propagation import propagate_poses
+from dualslam.atlas.record import FrameStamp, Record
+from dualslam.atlas.trajectory import Path
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure, FloatArray, FrameStatus
+from dualslam.linking.motion import refuse_steps
 from dualslam.map.frame_observations import Change
-from dualslam.map.propagation import propagate_poses
-from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import Path
 from dualslam.recovery.job import RecoveredFrame, refusal_data
 from dualslam.recovery.merge import Merged
-from dualslam.recovery.motion import refuse_steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ def absorb(
     A map of a few frames hardly knows its own scale, so that no similarity to it is sure. None is needed: what it saw
     has its place in the larger map. The smaller one stays archived, without frames. A lost map that holds more than
     the new one stays: what a long map says is not given up for a short one that would not fit it. So does one whose
-    frames would move as the camera does not (`recovery/motion.py`).
+    frames would move as the camera does not (`linking/motion.py`).
 
     Parameters
     ----------

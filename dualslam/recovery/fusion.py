@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from dualslam.atlas.atlas import Link, LinkKind
+from dualslam.atlas.connections import Connections
+from dualslam.atlas.record import FrameStamp, Record
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus, IntArray
-from dualslam.map.atlas import Link, LinkKind
-from dualslam.map.connections import Connections
-from dualslam.map.record import FrameStamp, Record
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 from dualslam.recovery.bypass import bypass, condemn_tail, drop_corrupted

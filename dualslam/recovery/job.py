@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from dualslam.atlas.trajectory import FramePose, Path
 from dualslam.core.camera.base import Camera
 from dualslam.core.events import Event
 from dualslam.core.types import Failure, FloatArray, FrameMethod, View
+from dualslam.linking import LinkEstimate
+from dualslam.linking.link_tries import LinkTries
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose, Path
-from dualslam.recovery.link_tries import LinkTries
-from dualslam.recovery.linking import LinkEstimate
 
 
 @dataclass(frozen=True, slots=True, eq=False)

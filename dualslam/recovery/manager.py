@@ -11,28 +11,28 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.calibration.lens import Calibration, rectified_where_possible
-from dualslam.config.settings import RecoveryConfig
+from dualslam.atlas.connections import Connections
+from dualslam.atlas.record import FrameStamp, Record
+from dualslam.atlas.trajectory import Path
+from dualslam.core.config.settings import RecoveryConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, View
-from dualslam.map.connections import Connections
+from dualslam.linking.link_tries import LinkTries
+from dualslam.linking.motion import join_slack, refuse_gaps, refuse_seams
 from dualslam.map.frame_observations import Change
-from dualslam.map.record import FrameStamp, Record
+from dualslam.map.lens import Calibration, rectified_where_possible
 from dualslam.map.solving import solve
 from dualslam.map.split import sound_copy
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
-from dualslam.map.trajectory import Path
 from dualslam.recovery.bypass import absorb, n_frames, pose_frames
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.fusion import fuse, gauge_at_overlap, note_refused
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
-from dualslam.recovery.link_tries import LinkTries
 from dualslam.recovery.merge import merge_recovery
-from dualslam.recovery.motion import join_slack, refuse_gaps, refuse_seams
 from dualslam.recovery.schedule import RetrySchedule, as_far_as_it_leads, way_to_gaps
 from dualslam.workers.jobs import Desk, Ended, JobKind
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 from dualslam.core.events import Event
 from dualslam.core.types import Failure, FailureReason, Rival
+from dualslam.linking.rivals import Choice
 from dualslam.map.submap import Submap
 from dualslam.recovery.job import FoundLink, RecoveredFrame
-from dualslam.recovery.rivals import Choice
 
 
 @dataclass(slots=True, eq=False)

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from dualslam.core.types import Failure
+from dualslam.linking import LinkEstimate, LinkRefusal
+from dualslam.linking.gates import TIE_WINDOW
 from dualslam.map.submap import Submap
-from dualslam.recovery.linking import LinkEstimate, LinkRefusal
-from dualslam.recovery.linking.gates import TIE_WINDOW
 
 MIN_SHARED_KEYFRAMES = 4
 """Keyframes that both maps must hold before a link is tried."""

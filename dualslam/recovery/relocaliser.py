@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.core.interfaces import Seeker, SubmapGraph, VisualOdometry
 from dualslam.core.support import judge_track
 from dualslam.core.types import View

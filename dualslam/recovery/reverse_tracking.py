@@ -18,25 +18,25 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from dualslam.config.settings import RecoveryConfig
+from dualslam.atlas.trajectory import FramePose, Path
+from dualslam.core.config.settings import RecoveryConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.types import Failure, FailureReason, Rival, Track, View
+from dualslam.core.walk_news import WalkNews, WalkTrace
+from dualslam.linking import NO_BEND, Bend, LinkEstimate, LinkRefusal
+from dualslam.linking.link_tries import LinkTries
+from dualslam.linking.motion import WINDOW_FRAMES
+from dualslam.linking.rivals import choose_by_velocity
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose, Path
 from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult, refusal_data
-from dualslam.recovery.link_tries import LinkTries
-from dualslam.recovery.linking import NO_BEND, Bend, LinkEstimate, LinkRefusal
-from dualslam.recovery.motion import WINDOW_FRAMES
 from dualslam.recovery.progress import Progress
 from dualslam.recovery.relinker import Linker, LinkTry, Relinker
-from dualslam.recovery.rivals import choose_by_velocity
 from dualslam.recovery.schedule import way_to_gaps
-from dualslam.recovery.walk_news import WalkNews, WalkTrace
 from dualslam.workers.jobs import Limit, result_of
 
 log = logging.getLogger(__name__)

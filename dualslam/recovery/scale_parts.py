@@ -12,16 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.config.settings import LinkingConfig
+from dualslam.atlas.atlas import Atlas
+from dualslam.atlas.endings import part_off
+from dualslam.atlas.record import FrameStamp, Record
+from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.events import EventKind
 from dualslam.core.types import IntArray
-from dualslam.map.atlas import Atlas
-from dualslam.map.endings import part_off
-from dualslam.map.record import FrameStamp, Record
+from dualslam.linking.scale_observability import N_AROUND, answer_scale
 from dualslam.map.residual_noise import noise_excess
 from dualslam.map.split import submap_of
 from dualslam.map.submap import Submap
-from dualslam.recovery.linking.scale_observability import N_AROUND, answer_scale
 from dualslam.recovery.scale_watch import FIRM_TIES, GROUP, SCALE_INFLATION, count_ties, lost_from, question_about
 
 SPAN = 2

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtri
 
-from dualslam.config.settings import LinkingConfig
+from dualslam.atlas.atlas import Link
+from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.types import Failure, IntArray
-from dualslam.map.atlas import Link
+from dualslam.linking.gates import PIXEL_CHI2
+from dualslam.linking.scale_observability import N_AROUND, ScaleQuestion, answer_scale, ask_scale
 from dualslam.map.submap import Submap
-from dualslam.recovery.linking.gates import PIXEL_CHI2
-from dualslam.recovery.linking.scale_observability import N_AROUND, ScaleQuestion, answer_scale, ask_scale
 from dualslam.workers.jobs import Desk, Handlers, InlineDesk, JobKind
 
 GROUP = 5

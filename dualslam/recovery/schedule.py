@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import takewhile
 
+from dualslam.atlas.trajectory import FramePose
 from dualslam.core.camera.base import Camera
 from dualslam.core.types import View
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose
 
 LAST_GROWTH = 1.5
 """Times the live keyframes that the last walk knew, from which on one more at the end of the run is worth it: a sigma

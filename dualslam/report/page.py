@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.core.types import FrameStatus
 from dualslam.io.run_folder import EVENTS, MAP_PAGE, MASK
 from dualslam.report.atlas_table import atlas_section

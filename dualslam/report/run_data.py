@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.config import strict_yaml
+from dualslam.atlas.atlas import joined
+from dualslam.core.config import strict_yaml
 from dualslam.core.errors import InputError
 from dualslam.core.extras import how_to_install
 from dualslam.core.geometry import sim3
@@ -22,7 +23,6 @@ from dualslam.io.map_store import load_joints, submap_path
 from dualslam.io.run_folder import FrameRow, unlinked_submaps
 from dualslam.io.run_reading import read_events, read_frames, read_samples, read_summary
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate, read_text, read_tum
-from dualslam.map.atlas import joined
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

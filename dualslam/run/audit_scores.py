@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import groupby
 
-from dualslam.audit.photometric import MIN_SAMPLES, Sample
-from dualslam.audit.steps import measure_steps
-from dualslam.audit.verdict import ReasonCode
 from dualslam.run.results import trajectories_of
-from dualslam.system import System
+from dualslam.system.audit.photometric import MIN_SAMPLES, Sample
+from dualslam.system.audit.steps import measure_steps
+from dualslam.system.audit.verdict import ReasonCode
+from dualslam.system.system import System
 
 
 def audit_scores(system: System) -> dict[str, float]:
@@ -32,7 +32,7 @@ def audit_scores(system: System) -> dict[str, float]:
 def worst_disagreement(samples: Sequence[Sample]) -> float:
     """Return the largest share of patches that disagree in all of `MIN_SAMPLES` consecutive samples of one map.
 
-    With a threshold below it, `dualslam.audit.photometric.disagreeing_stretches` finds a stretch. 0 without samples.
+    With a threshold below it, `system.audit.photometric.disagreeing_stretches` finds a stretch. 0 without samples.
     """
     worst = 0.0
     for _, group in groupby(samples, key=lambda s: s.submap_id):

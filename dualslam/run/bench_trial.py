@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, cast
 
-from dualslam.config.files import config_from_dict
+from dualslam.core.config.files import config_from_dict
 from dualslam.core.errors import DualSlamError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.memory import keep_freed_memory

@@ -13,11 +13,11 @@ import numpy as np
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians
 from dualslam.core.types import FloatArray
+from dualslam.linking.gates import PIXEL_CHI2
+from dualslam.linking.scale_observability import scale_sigmas_between
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.residual_noise import noise_excess
 from dualslam.map.submap import Submap
-from dualslam.recovery.linking.gates import PIXEL_CHI2
-from dualslam.recovery.linking.scale_observability import scale_sigmas_between
 from dualslam.recovery.scale_watch import GROUP, SCALE_INFLATION
 
 TOGETHER = 2

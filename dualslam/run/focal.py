@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from dualslam.build import find_focal
-from dualslam.config.settings import Config
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.camera.mapped import own_camera
+from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.types import Failure
 from dualslam.io.map_store import load_camera

@@ -6,16 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dualslam.audit.photometric import Sample, disagreeing_stretches
-from dualslam.audit.steps import measure_steps
-from dualslam.audit.verdict import Level, Reason, ReasonCode, Verdict
 from dualslam.core.camera.corrected import correction_of
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FrameStatus
 from dualslam.map.frame_records import FrameRow
 from dualslam.run.results import Trajectories
-from dualslam.system import System
+from dualslam.system.audit.photometric import Sample, disagreeing_stretches
+from dualslam.system.audit.steps import measure_steps
+from dualslam.system.audit.verdict import Level, Reason, ReasonCode, Verdict
+from dualslam.system.system import System
 
 MAX_STEP_RATIO = 12.0
 """A step of so many times the median of those about it is a jump. Right runs have at most 7, false joins 34 to 199."""

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from dualslam.build import build_system
-from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import CorrectedCamera
 from dualslam.core.camera.mapped import MappedCamera, camera_for_map, own_camera
+from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.geometry.so3 import exp
 from dualslam.core.interfaces import Sequence

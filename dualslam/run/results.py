@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.audit.verdict import Verdict
-from dualslam.config.settings import Config
+from dualslam.atlas.atlas import LinkKind
+from dualslam.atlas.trajectory import compose
+from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
@@ -22,12 +23,11 @@ from dualslam.core.types import FloatArray, FrameStatus
 from dualslam.io.run_folder import FrameRow
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
 from dualslam.lab.metrics.trajectory_metrics import score_trajectory
-from dualslam.map.atlas import LinkKind
-from dualslam.map.trajectory import compose
 from dualslam.recovery.frame_buffer import MB
 from dualslam.run.claims import Claim, claims_of
 from dualslam.run.runner import RunReport
-from dualslam.system import System
+from dualslam.system.audit.verdict import Verdict
+from dualslam.system.system import System
 from dualslam.workers.desk import WorkerDesk
 
 log = logging.getLogger(__name__)

@@ -14,9 +14,9 @@ from dualslam.core.errors import InputError, OutputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult
-from dualslam.pace import Pace
 from dualslam.run.interrupts import Interrupts
 from dualslam.run.schedule import Schedule, as_recorded, prepared
+from dualslam.system.pace import Pace
 from dualslam.workers.schedule import Recorded
 
 PAUSE_S = 0.05

@@ -14,17 +14,17 @@ from typing import Any, Protocol
 
 from dualslam import __version__
 from dualslam.build import build_system
-from dualslam.config.files import dump_config
-from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import FocalSearch
+from dualslam.core.config.files import dump_config
+from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Sequence
 from dualslam.core.threads import spare_cores
 from dualslam.core.types import Frame
-from dualslam.export.colours import keyframe_indices, landmark_colours
 from dualslam.io.colours import Colours, save_colours, save_pictures
+from dualslam.io.export.colours import keyframe_indices, landmark_colours
 from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.masks import hidden_pixels, masked
 from dualslam.io.run_folder import TRAJECTORY, RunFolder, RunRecord, check_vacant
@@ -40,7 +40,7 @@ from dualslam.run.map_camera import camera_that_fits, in_size_of_map
 from dualslam.run.no_map import StartRefusals
 from dualslam.run.results import frame_rows, summarise, trajectories_of, truth_of_frames
 from dualslam.run.runner import RunReport, run_sequence
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.viewer.map_page import map_page
 from dualslam.workers.desk import WorkerDesk
 from dualslam.workers.schedule import SCHEDULE, Recorded, header_of

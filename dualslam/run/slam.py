@@ -9,16 +9,15 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.audit.verdict import Verdict
 from dualslam.build import build_system
-from dualslam.config.files import load_config
-from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
+from dualslam.core.config.files import load_config
+from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.memory import peak_rss_mb
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import Frame
-from dualslam.export.exported_map import ExportedMap, flatten
+from dualslam.io.export.exported_map import ExportedMap, flatten
 from dualslam.io.map_store import StoredMap, load_atlas
 from dualslam.map.frame_records import FrameResult
 from dualslam.report.run_data import RunData, read_run
@@ -26,7 +25,8 @@ from dualslam.run.judgement import judge_run
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.run.runner import RunReport
 from dualslam.run.session import save_system
-from dualslam.system import System
+from dualslam.system.audit.verdict import Verdict
+from dualslam.system.system import System
 
 
 class Slam:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.config import strict_yaml
 from dualslam.core.camera.base import Camera
+from dualslam.core.config import strict_yaml
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame

@@ -7,20 +7,20 @@ from typing import Any
 
 import numpy as np
 
+from dualslam.atlas.atlas import Atlas, Link, LinkKind
+from dualslam.atlas.beside import atlas_handlers
+from dualslam.atlas.connections import Connections
+from dualslam.atlas.record import Record
+from dualslam.atlas.trajectory import FramePose, compose
 from dualslam.backend.atlas_solver import GtsamAtlasSolver
 from dualslam.backend.point_refinement import refit_points
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.config.settings import GraphConfig
+from dualslam.core.config.settings import GraphConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import BoolArray, FloatArray, FrameStatus, Keyframe
-from dualslam.map.atlas import Atlas, Link, LinkKind
-from dualslam.map.atlas_beside import atlas_handlers
-from dualslam.map.connections import Connections
 from dualslam.map.frame_records import FrameRow
-from dualslam.map.record import Record
 from dualslam.map.split import next_submap
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose, compose
 from dualslam.testing.point_world import CAMERA, SIZE_PX, make_features
 from dualslam.testing.relative import relative_similarity
 from dualslam.workers.jobs import InlineDesk

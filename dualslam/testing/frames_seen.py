@@ -6,7 +6,7 @@ import numpy as np
 
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
-from dualslam.system import System
+from dualslam.system.system import System
 
 
 def residuals_px(system: System) -> dict[int, float]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from dualslam.atlas.atlas import Atlas
+from dualslam.atlas.node_views import NodeViews
+from dualslam.atlas.skeleton import Node, build_skeleton
 from dualslam.core.atlas_problem import AtlasSolver
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import sim3
 from dualslam.core.types import FloatArray
-from dualslam.map.atlas import Atlas
-from dualslam.map.node_views import NodeViews
-from dualslam.map.skeleton import Node, build_skeleton
 
 
 def relative_similarity(atlas: Atlas, solver: AtlasSolver, a: Node, b: Node) -> tuple[FloatArray, FloatArray]:

@@ -7,7 +7,7 @@ from typing import Any, Protocol, TypeVar
 
 from dualslam.core.types import Failure
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.workers.jobs import Desk, Ended, JobKind
 
 Outcome = tuple[RecoveryJob, RecoveryResult | Failure]

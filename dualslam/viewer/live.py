@@ -18,9 +18,9 @@ from dualslam.core.errors import InputError, OutputError
 from dualslam.core.extras import how_to_install
 from dualslam.core.processes import start_undisturbed
 from dualslam.core.types import Frame
+from dualslam.core.walk_news import WalkNews
 from dualslam.map.frame_records import FrameResult
-from dualslam.recovery.walk_news import WalkNews
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.viewer.messages import Message, Teller
 
 log = logging.getLogger(__name__)

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from dualslam.core.events import Event
 from dualslam.core.types import BoolArray, FloatArray, Frame, FrameStatus, IntArray, Track
+from dualslam.core.walk_news import WalkNews
 from dualslam.map.frame_records import FrameResult
 from dualslam.map.submap import Submap
-from dualslam.recovery.walk_news import WalkNews
 from dualslam.report.event_words import event_words
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.workers.jobs import JobKind
 
 WIDTH_PX = 480

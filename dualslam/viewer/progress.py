@@ -7,9 +7,9 @@ import time
 from typing import TextIO
 
 from dualslam.core.types import Frame
+from dualslam.core.walk_news import WalkNews
 from dualslam.map.frame_records import FrameResult
-from dualslam.recovery.walk_news import WalkNews
-from dualslam.system import System
+from dualslam.system.system import System
 
 FINISHING = "all frames are in: ending reverse tracking, writing the results"
 """Said once no frame is left to count: the last reverse tracking may take seconds."""

@@ -50,7 +50,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from pydantic import Field
 
-from dualslam.config.settings import StrictModel
+from dualslam.core.config.settings import StrictModel
 from dualslam.core.types import Features, FloatArray, IntArray, Matches
 from dualslam.frontends.features.corners import (
     detect_corners,

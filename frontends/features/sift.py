@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from dualslam.config.settings import StrictModel
+from dualslam.core.config.settings import StrictModel
 from dualslam.core.types import BoolArray, Features, FloatArray, IntArray, Matches
 from dualslam.frontends.features.corners import grades, select_spread, share_out
 from dualslam.frontends.features.groups import consistent_rotation, mutual_best

@@ -20,9 +20,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from dualslam.config.settings import Config
 from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.camera.base import Camera
+from dualslam.core.config.settings import Config
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import SubmapGraph

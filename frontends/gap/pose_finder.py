@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dualslam.config.settings import Config
 from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.camera.base import Camera
+from dualslam.core.config.settings import Config
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
 from dualslam.core.support import find_lack_of_support, judge_track

@@ -12,9 +12,9 @@ from itertools import combinations
 
 import numpy as np
 
-from dualslam.config.settings import InitialiserConfig
 from dualslam.core.bundle import BundleAdjuster, BundleProblem
 from dualslam.core.chi_square import CHI2_95, CHI2_99, MEDIAN_CHI2
+from dualslam.core.config.settings import InitialiserConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import refine_pose

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dualslam.config.settings import KeyframeConfig
+from dualslam.core.config.settings import KeyframeConfig
 from dualslam.core.geometry import se3
 from dualslam.core.quantiles import median
 from dualslam.core.types import FloatArray, IntArray, Track

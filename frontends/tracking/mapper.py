@@ -6,9 +6,9 @@ from collections.abc import Set
 
 import numpy as np
 
-from dualslam.config.settings import MappingConfig
 from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_95
+from dualslam.core.config.settings import MappingConfig
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.triangulation import triangulate_two_view
 from dualslam.core.geometry.two_view import fundamental_from_pose

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from dualslam.config.settings import CameraConfig
 from dualslam.core.camera.base import Camera
+from dualslam.core.config.settings import CameraConfig
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import Failure, Features, FloatArray, View
 from dualslam.frontends.tracking.map_readout import ReadoutQuestion, ask_readout

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dualslam.config.settings import TrackingConfig
 from dualslam.core.camera.base import Camera
 from dualslam.core.chi_square import CHI2_99
+from dualslam.core.config.settings import TrackingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.projection import PoseEstimate, project_points, refine_pose
 from dualslam.core.interfaces import Frontend

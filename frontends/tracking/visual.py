@@ -10,8 +10,8 @@ from collections.abc import Set
 
 import numpy as np
 
-from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
+from dualslam.core.config.settings import Config
 from dualslam.core.estimates import GraphEstimate, KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import N_WINDOW, Frontend, SubmapGraph, WindowSolver

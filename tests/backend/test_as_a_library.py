@@ -6,7 +6,7 @@ import pytest
 
 import dualslam
 from dualslam.backend import ISam2SubmapGraph
-from dualslam.config.settings import GraphConfig
+from dualslam.core.config.settings import GraphConfig
 from dualslam.testing.graph_scene import guessed_submap, make_scene, pose_errors
 
 

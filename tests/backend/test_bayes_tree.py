@@ -5,7 +5,7 @@ import pytest
 
 from dualslam.backend.bayes_tree import parse_bayes_tree
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.config.settings import GraphConfig
+from dualslam.core.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
 from tests.backend.test_submap_graph import grow, start
 

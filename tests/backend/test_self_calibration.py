@@ -15,10 +15,10 @@ from dualslam.backend.self_calibration import (
     make_problem,
 )
 from dualslam.build import adjust_submap
-from dualslam.config.calibration_config import CalibrationConfig
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.camera.corrected import LensCorrection, correct
 from dualslam.core.camera.models import PinholeCamera
+from dualslam.core.config.calibration_config import CalibrationConfig
 from dualslam.core.geometry import so3
 from dualslam.core.types import Failure, FailureReason, FloatArray, Keyframe
 from dualslam.lab.metrics.alignment import distances_when_aligned

@@ -9,7 +9,7 @@ from dualslam.backend import submap_graph
 from dualslam.backend.local_ba import bundle_adjust
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.backend.window import NumpyWindowSolver
-from dualslam.config.settings import GraphConfig
+from dualslam.core.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, so3
 from dualslam.map.anchors import RelativePose

@@ -10,7 +10,7 @@ import pytest
 from dualslam.backend import submap_graph as module
 from dualslam.backend.solver import IncrementalSolver, SolverFailure
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.config.settings import GraphConfig
+from dualslam.core.config.settings import GraphConfig
 from dualslam.core.errors import SolverError
 from dualslam.map.submap import Submap
 from dualslam.testing.graph_scene import K, pose_errors

@@ -6,7 +6,7 @@ import numpy as np
 
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.backend.window import NumpyWindowSolver, Window, _evaluate, _window, adjust_window
-from dualslam.config.settings import GraphConfig
+from dualslam.core.config.settings import GraphConfig
 from dualslam.core.geometry import se3
 from dualslam.core.types import Failure
 from dualslam.testing.graph_scene import pose_errors

@@ -6,19 +6,19 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dualslam.audit.photometric import PhotometricAudit
-from dualslam.config.settings import Config
+from dualslam.atlas.atlas import Atlas
+from dualslam.atlas.trajectory import FramePose
 from dualslam.core.camera.base import Camera
+from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.stage_timer import StageTimer
 from dualslam.core.types import Features, FloatArray, Frame, FrameStatus, Keyframe, View
-from dualslam.map.atlas import Atlas
 from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameResult, FrameRow
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose
-from dualslam.pace import Pace
 from dualslam.recovery.frame_buffer import FrameBuffer
+from dualslam.system.audit.photometric import PhotometricAudit
+from dualslam.system.pace import Pace
 from dualslam.workers.jobs import InlineDesk
 from dualslam.workers.scheduled_desk import ScheduledDesk
 

@@ -14,8 +14,8 @@ import pytest
 
 from dualslam.cli.console import final_line, no_map_line, progress, verdict_line, waiting
 from dualslam.core.types import Frame, FrameStatus
+from dualslam.core.walk_news import WalkNews
 from dualslam.map.frame_records import FrameResult
-from dualslam.recovery.walk_news import WalkNews
 from dualslam.run.sources import open_source
 from dualslam.viewer.progress import FINISHING, RunState
 

@@ -13,9 +13,9 @@ from dualslam.build import build_system
 from dualslam.cli import main
 from dualslam.cli.demo_command import drive
 from dualslam.cli.parser import parse
-from dualslam.config.files import load_config
-from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
+from dualslam.core.config.files import load_config
+from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, Frame
 from dualslam.run.sources import make_world

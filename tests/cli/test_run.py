@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from dualslam.cli import main
-from dualslam.config.files import load_config
+from dualslam.core.config.files import load_config
 from dualslam.core.errors import OutputError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.types import Frame

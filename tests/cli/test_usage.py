@@ -16,7 +16,7 @@ from dualslam.__main__ import main as command
 from dualslam.cli import main
 from dualslam.cli.configuration import config_of
 from dualslam.cli.parser import parse
-from dualslam.config.files import load_config
+from dualslam.core.config.files import load_config
 
 
 def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:

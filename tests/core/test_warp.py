@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from dualslam.atlas.warp import Warp
 from dualslam.core.geometry import sim3
-from dualslam.map.warp import Warp
 
 RNG = np.random.default_rng(0)
 S = sim3.exp(0.1 * RNG.normal(size=(3, 7)))

@@ -12,7 +12,7 @@ import pytest
 
 from dualslam.build import fault_of_frontend
 from dualslam.cli import main
-from dualslam.config.files import load_config
+from dualslam.core.config.files import load_config
 from dualslam.core.errors import FrontendError
 from dualslam.core.types import Features, Matches
 from dualslam.frontends.asking import features_of

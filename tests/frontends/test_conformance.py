@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dualslam.config.settings import FrontendConfig
+from dualslam.core.config.settings import FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.types import Features, Matches
 from dualslam.frontends import registry

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from dualslam.config.settings import FrontendConfig
+from dualslam.core.config.settings import FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.frontends import registry
 from dualslam.frontends.features.orb import OrbFrontend

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dualslam.config.corruption import Corruption
+from dualslam.core.config.corruption import Corruption
 from dualslam.core.types import BoolArray
 from dualslam.frontends.still_pixels import StillPixels, U8Image
 from dualslam.lab.disturbances import hidden_by

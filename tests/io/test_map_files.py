@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dualslam.atlas.atlas import Atlas, Link, LinkKind
+from dualslam.atlas.trajectory import FramePose
 from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.geometry import se3
@@ -20,9 +22,7 @@ from dualslam.io import load_map, load_submap, map_files, save_map, save_submap
 from dualslam.io.map_files import Arrays, load_arrays, save_arrays, submap_to_arrays
 from dualslam.io.map_store import load_atlas, save_atlas, submap_path
 from dualslam.map.anchors import RelativePose
-from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose
 
 
 def features(rng: np.random.Generator, n: int) -> Features:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.config.settings import GraphConfig
+from dualslam.core.config.settings import GraphConfig
 from dualslam.core.estimates import GraphEstimate
 from dualslam.core.types import Failure, FailureReason, IntArray
 from dualslam.map import dead_rows
@@ -14,7 +14,7 @@ from dualslam.map.dead_rows import drop_dead_rows
 from dualslam.map.graph_beside import BesideGraphs, GraphAnswer, GraphJob, GraphServer
 from dualslam.map.submap import Submap
 from dualslam.map.submap_delta import SubmapMirror
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.graph_scene import Feeder, make_scene
 from dualslam.testing.late_desk import LateDesk
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in

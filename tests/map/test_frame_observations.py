@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dualslam.atlas.endings import part_off
+from dualslam.atlas.record import MAX_OBSERVED, Record
+from dualslam.atlas.reposing import pose_frames_anew, rows_of_frames
+from dualslam.atlas.trajectory import FramePose
 from dualslam.core.geometry import se3
 from dualslam.core.types import Features, FrameStatus
-from dualslam.map.endings import part_off
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.frame_records import FrameRow
-from dualslam.map.record import MAX_OBSERVED, Record
-from dualslam.map.reposing import pose_frames_anew, rows_of_frames
 from dualslam.map.split import submap_of
 from dualslam.map.submap import NO_LANDMARK, Submap
-from dualslam.map.trajectory import FramePose
 from dualslam.testing.graph_scene import guessed_submap, make_features, make_scene
 
 N, FRAME = 8, 100

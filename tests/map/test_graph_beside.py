@@ -13,16 +13,16 @@ import pytest
 
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.build import build_system, graph_handlers, window_solver
-from dualslam.calibration.lens import change_camera
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.core.errors import SolverError
 from dualslam.core.types import Failure, FailureReason, FrameStatus
 from dualslam.map.graph_beside import BesideGraph, BesideGraphs, GraphAnswer, GraphJob, GraphServer
+from dualslam.map.lens import change_camera
 from dualslam.map.solving import open_graph
 from dualslam.map.submap import Submap
 from dualslam.map.submap_delta import SubmapMirror
 from dualslam.run.results import trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.graph_scene import guessed_submap, make_scene
 from dualslam.testing.graph_scene import pose_errors as scene_errors
 from dualslam.testing.late_desk import LateDesk

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dualslam.config.settings import HealthConfig
+from dualslam.atlas.atlas import Atlas, Link, LinkKind
+from dualslam.atlas.trajectory import FramePose, compose
+from dualslam.core.config.settings import HealthConfig
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Keyframe, Track, View
-from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose, compose
 from dualslam.testing.point_world import path, random_features
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dualslam.atlas.atlas import Atlas, Link, LinkKind
+from dualslam.atlas.trajectory import FramePose, compose
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.config.settings import GraphConfig
+from dualslam.core.config.settings import GraphConfig
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray, Keyframe
-from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.split import next_submap
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose, compose
 from dualslam.testing.point_world import CAMERA, SIZE_PX, make_features
 
 N_KEYFRAMES = 5000

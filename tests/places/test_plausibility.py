@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dualslam.atlas.atlas import Link, LinkKind
+from dualslam.atlas.record import Record
+from dualslam.atlas.trajectory import FramePose
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
-from dualslam.map.atlas import Link, LinkKind
 from dualslam.map.frame_records import FrameRow
-from dualslam.map.record import Record
-from dualslam.map.trajectory import FramePose
 from dualslam.places.plausibility import agree, contradict, plausible
 from dualslam.places.verification import PlaceMatch
 from dualslam.testing.graph_scene import guessed_submap, make_scene
-from tests.recovery.test_motion import way
+from tests.linking.test_motion import way
 
 N = 12
 STEP = 0.12

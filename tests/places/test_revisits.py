@@ -8,13 +8,13 @@ from operator import attrgetter
 import numpy as np
 import pytest
 
+from dualslam.atlas.atlas import LinkKind
 from dualslam.core.events import EventKind
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
-from dualslam.map.atlas import LinkKind
 from dualslam.places.plausibility import can_have_drifted
 from dualslam.places.search import PlaceSearch
 from dualslam.run.results import trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.late_desk import LateDesk
 from dualslam.testing.point_world import PointWorld, pose_errors, system_in
 from dualslam.workers.jobs import Ended, InlineDesk, JobKind

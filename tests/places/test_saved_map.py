@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dualslam.build import build_system
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.umeyama import umeyama
@@ -19,7 +19,7 @@ from dualslam.core.types import Failure, Frame, Track, View
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.io.map_store import StoredMap, load_atlas, save_atlas
 from dualslam.run.results import frame_rows, trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.point_world import CAMERA, PointWorld
 from tests.places.worlds import N_LAP, lap, ring, run, wall
 

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 
 from dualslam.build import create_frontend
-from dualslam.config.settings import FrontendConfig, LinkingConfig
+from dualslam.core.config.settings import FrontendConfig, LinkingConfig
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.types import FailureReason
 from dualslam.frontends.place_matcher import FrontendPlaceMatcher

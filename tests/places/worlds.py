@@ -8,7 +8,7 @@ import numpy as np
 
 from dualslam.core.geometry import se3
 from dualslam.core.types import FloatArray
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.point_world import PointWorld, system_in
 
 N_LAP, N = 110, 140

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dualslam.atlas.record import Record
+from dualslam.atlas.trajectory import FramePose
 from dualslam.core.events import EventKind
 from dualslam.core.types import FrameStatus
 from dualslam.map.frame_records import FrameRow
-from dualslam.map.record import Record
-from dualslam.map.trajectory import FramePose
 from dualslam.recovery.bypass import Absorption, absorb
 from dualslam.recovery.job import RecoveredFrame
 from dualslam.testing.graph_scene import guessed_submap, make_scene

@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dualslam.atlas.atlas import Link, LinkKind
+from dualslam.atlas.connections import Connections
+from dualslam.atlas.record import FrameStamp
+from dualslam.atlas.report import AtlasReport
 from dualslam.build import build_system, recovery_parts
-from dualslam.config.corruption import Corruption
-from dualslam.config.corruption import CorruptionKind as SpoilKind
-from dualslam.config.settings import AttemptConfig, Config, LinkingConfig, RecoveryConfig
 from dualslam.core.camera.models import PinholeCamera
+from dualslam.core.config.corruption import Corruption
+from dualslam.core.config.corruption import CorruptionKind as SpoilKind
+from dualslam.core.config.settings import AttemptConfig, Config, LinkingConfig, RecoveryConfig
 from dualslam.core.errors import ConfigError, SolverError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import se3, sim3
@@ -24,14 +28,10 @@ from dualslam.frontends.features.sift import SiftFrontend
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry
 from dualslam.lab.audits.link_audit import LinkAudit, audit_links
 from dualslam.lab.synthetic import make_sequence
-from dualslam.map.atlas import Link, LinkKind
-from dualslam.map.atlas_report import AtlasReport
-from dualslam.map.connections import Connections
-from dualslam.map.record import FrameStamp
 from dualslam.recovery.job import RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.run.results import trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, random_features, system_in
 from dualslam.testing.walks import KeptWalks, replace_walks
 from dualslam.workers.jobs import JobKind, Limit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from dualslam.build import build_system
-from dualslam.config.files import config_from_dict
+from dualslam.core.config.files import config_from_dict
 from dualslam.core.events import EventKind
 from dualslam.lab.synthetic import make_sequence
 

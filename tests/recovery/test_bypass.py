@@ -8,7 +8,7 @@ import pytest
 from dualslam.core.events import EventKind
 from dualslam.core.types import FrameStatus
 from dualslam.run.results import frame_rows, trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
 
 COVERED = frozenset(range(35, 50))

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dualslam.config.corruption import Corruption, CorruptionKind
+from dualslam.atlas.atlas import Link, LinkKind
+from dualslam.core.config.corruption import Corruption, CorruptionKind
 from dualslam.core.events import EventKind
 from dualslam.core.types import FrameStatus
 from dualslam.lab.audits.link_audit import LinkAudit, audit_link, audit_links
 from dualslam.lab.disturbances import FaultScript
-from dualslam.map.atlas import Link, LinkKind
 from dualslam.run.results import trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
 
 FORCED = range(34, 40)

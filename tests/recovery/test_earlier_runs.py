@@ -7,24 +7,24 @@ from types import SimpleNamespace as Fake
 import numpy as np
 import pytest
 
-from dualslam.config.settings import RecoveryConfig
+from dualslam.atlas.endings import archive
+from dualslam.atlas.record import Record
+from dualslam.atlas.trajectory import FramePose
+from dualslam.core.config.settings import RecoveryConfig
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus, View
-from dualslam.map.endings import archive
 from dualslam.map.frame_records import FrameRow
-from dualslam.map.record import Record
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose
 from dualslam.places.plausibility import reachable
 from dualslam.recovery.bypass import drop_corrupted
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.job import RecoveryJob
 from dualslam.recovery.manager import Recoveries
-from dualslam.recovery.motion_watch import MotionWatch
+from dualslam.system.motion_watch import MotionWatch
 from dualslam.testing.graph_scene import guessed_submap, make_scene
 from dualslam.testing.point_world import CAMERA, random_features
-from tests.recovery.test_motion import RATE_HZ, way
+from tests.linking.test_motion import RATE_HZ, way
 
 N_EARLIER, FIRST = 80, 1000
 

@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from dualslam.atlas.atlas import Link
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FloatArray
-from dualslam.map.atlas import Link
+from dualslam.linking.estimate import LinkEstimate
 from dualslam.recovery.fusion import fuse
 from dualslam.recovery.job import FoundLink
-from dualslam.recovery.linking.estimate import LinkEstimate
 from dualslam.testing.atlas_world import DriftingMap
 
 SHARED = range(5, 10)

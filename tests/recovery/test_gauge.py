@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.config.settings import GraphConfig, LinkingConfig
+from dualslam.core.config.settings import GraphConfig, LinkingConfig
+from dualslam.linking import DescriptorMatcher, LinkEstimate, estimate_link
 from dualslam.map.solving import solve
 from dualslam.recovery.fusion import gauge_at_overlap
-from dualslam.recovery.linking import DescriptorMatcher, LinkEstimate, estimate_link
 from dualslam.testing.link_worlds import hamming, make_case
 
 

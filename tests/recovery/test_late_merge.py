@@ -7,20 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dualslam.atlas.trajectory import compose
 from dualslam.build import build_system
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, View
-from dualslam.map.trajectory import compose
 from dualslam.recovery.job import RecoveryJob
 from dualslam.run.results import trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, random_features, system_in
 from dualslam.testing.walks import Outcome, Walks, replace_walks
 from tests.backend.test_self_calibration import wrong_camera
-from tests.calibration.test_lens import CalibrationWorld as CalibrationWorld
 from tests.map.test_submap import assert_consistent
+from tests.system.camera.test_lens import CalibrationWorld as CalibrationWorld
 
 COVERED = frozenset(range(35, 50))
 POSITION_M, ROTATION_RAD = 0.08, 0.01
@@ -271,7 +271,7 @@ def test_the_lost_map_has_been_found_again_meanwhile(world: PointWorld, again: b
 def test_a_link_that_leaps_must_hold_anew(world: PointWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     leap = Failure(FailureReason.LEAP, "a leap 9 times further off than velocities lead elsewhere")
     monkeypatch.setattr("dualslam.recovery.manager.refuse_gaps", lambda *_: leap)
-    monkeypatch.setattr("dualslam.recovery.link_tries.tightened", lambda *_: 0.0)  # sure as it may be, it holds twice
+    monkeypatch.setattr("dualslam.linking.link_tries.tightened", lambda *_: 0.0)  # sure as it may be, it holds twice
     system, frames = late_system(world, 12), iter(world.frames())
     tries = system._recoveries._tries
     tries.refused[0] = 1

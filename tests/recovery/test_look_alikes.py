@@ -7,14 +7,14 @@ from collections.abc import Container
 import pytest
 
 from dualslam.build import build_system
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.types import FailureReason, FloatArray, IntArray
 from dualslam.lab.metrics.alignment import distances_when_aligned
 from dualslam.lab.synthetic import make_sequence
 from dualslam.lab.synthetic.traps import BOARD_PERIOD_M, CAR_PERIOD_M
 from dualslam.run.results import trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 
 
 def past_a_gap(world: str, seed: int, missing: Container[int]) -> tuple[System, IntArray, FloatArray]:

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from dualslam.atlas.record import Record
+from dualslam.atlas.trajectory import FramePose
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Features, FrameStatus
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.frame_records import FrameRow
-from dualslam.map.record import Record
 from dualslam.map.split import submap_of
 from dualslam.map.submap import NO_LANDMARK, Submap
-from dualslam.map.trajectory import FramePose
 from dualslam.recovery.bypass import pose_frames
 from dualslam.recovery.job import RecoveredFrame
 from dualslam.recovery.merge import Merged, merge_recovery

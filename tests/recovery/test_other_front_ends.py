@@ -13,7 +13,7 @@ from dualslam.frontends.features.sift import SiftFrontend
 from dualslam.frontends.registry import BUILT_IN
 from dualslam.io.map_files import load_submap, save_submap
 from dualslam.run.results import trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
 from tests.frontends.example_package.patch_corners import PatchFrontend
 

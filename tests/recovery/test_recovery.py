@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dualslam.atlas.atlas import LinkKind
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, View
 from dualslam.lab.audits.link_audit import LinkAudit, audit_links
-from dualslam.map.atlas import LinkKind
-from dualslam.recovery.linking import LinkRefusal
+from dualslam.linking import LinkRefusal
 from dualslam.run.results import frame_rows, trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.frames_seen import residuals_px
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
 

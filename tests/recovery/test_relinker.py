@@ -8,9 +8,9 @@ from typing import Any, cast
 import numpy as np
 
 from dualslam.core.types import Failure, FailureReason
+from dualslam.linking import LinkRefusal
+from dualslam.linking.gates import TIE_WINDOW
 from dualslam.map.submap import Submap
-from dualslam.recovery.linking import LinkRefusal
-from dualslam.recovery.linking.gates import TIE_WINDOW
 from dualslam.recovery.relinker import Relinker
 
 ONSET = 190

@@ -7,19 +7,19 @@ from functools import cache
 import numpy as np
 import pytest
 
-from dualslam.config.settings import LinkingConfig
+from dualslam.atlas.atlas import Atlas, Link, LinkKind
+from dualslam.atlas.record import Record
+from dualslam.atlas.trajectory import FramePose
+from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.types import FrameStatus
 from dualslam.io.run_folder import FrameRow
-from dualslam.map.atlas import Atlas, Link, LinkKind
-from dualslam.map.record import Record
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose
 from dualslam.recovery.scale_parts import SPAN, part_what_lost_its_scale
 from dualslam.recovery.scale_watch import GROUP
 from dualslam.run.results import trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.link_worlds import FRAME_STEP, thinned
 from dualslam.testing.point_world import pose_errors
 from tests.places.worlds import N, lap, ring, run

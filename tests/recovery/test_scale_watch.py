@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dualslam.atlas.atlas import Link, LinkKind
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.config.settings import GraphConfig, LinkingConfig
+from dualslam.core.config.settings import GraphConfig, LinkingConfig
 from dualslam.core.events import EventKind
-from dualslam.map.atlas import Link, LinkKind
+from dualslam.linking.scale_observability import N_AROUND
 from dualslam.map.solving import solve
 from dualslam.map.split import submap_of
 from dualslam.map.submap import Submap
-from dualslam.recovery.linking.scale_observability import N_AROUND
 from dualslam.recovery.scale_watch import BEHIND, GROUP, SCALE_HANDLERS, ScaleLoss, ScaleWatch
 from dualslam.run.results import trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.link_worlds import FRAME_STEP, Recipe, build, make_world, thinned
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
 from dualslam.workers.jobs import Ended, InlineDesk, JobKind

@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dualslam.atlas.trajectory import FramePose
 from dualslam.build import recovery_parts
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray, FrameStatus, Keyframe, View
 from dualslam.frontends.tracking.local_map import covering_keyframes
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose
 from dualslam.recovery.job import RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.recovery.schedule import RetrySchedule, as_far_as_it_leads, way_to_gaps
 from dualslam.run.results import trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.point_world import (
     CAMERA,
     PointWorld,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.types import Frame
 from dualslam.lab.synthetic import SyntheticSequence, make_sequence

@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 import pytest
 
+from dualslam.atlas.atlas import Atlas, Link, LinkKind
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.types import Frame, FrameStatus, Keyframe
 from dualslam.io.map_store import save_atlas
 from dualslam.io.run_folder import MAP_PAGE, RunFolder
 from dualslam.lab.synthetic import SyntheticSequence
-from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.submap import Submap
 from dualslam.report import RunData, SampleKeeper, read_run, report_page
 from dualslam.report.canvas import Canvas, nice_step, ticks

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dualslam.audit.photometric import MIN_AGREEMENT, Sample, disagreeing_stretches
 from dualslam.run.audit_scores import worst_disagreement
+from dualslam.system.audit.photometric import MIN_AGREEMENT, Sample, disagreeing_stretches
 
 
 def samples(agreement: list[float], submap: int = 0) -> list[Sample]:

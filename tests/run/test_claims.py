@@ -10,7 +10,7 @@ import numpy as np
 from dualslam.map.submap import Submap
 from dualslam.run.claims import GROUP, claims_of
 from dualslam.run.results import frame_rows, trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
 
 N = 90

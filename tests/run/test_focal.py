@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from dualslam.config.settings import Config
+from dualslam.atlas.atlas import Atlas
 from dualslam.core.camera.corrected import LensCorrection, correct
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.camera.models import DivisionCamera, PinholeCamera
+from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.io.map_store import save_atlas
 from dualslam.lab.synthetic import make_sequence
-from dualslam.map.atlas import Atlas
 from dualslam.run.focal import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
 from dualslam.run.session import SEARCHED_SIGMA, refined_camera
-from dualslam.system import System
+from dualslam.system.system import System
 
 
 def write(folder: Path, images: list[np.ndarray], exif: Image.Exif | bytes = b"") -> Path:

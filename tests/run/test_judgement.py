@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dualslam.audit.photometric import MIN_SAMPLES, Sample
-from dualslam.audit.verdict import Level, ReasonCode, Verdict
 from dualslam.core.camera.corrected import LensCorrection, correct
 from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, Frame
 from dualslam.run.judgement import judge_run
 from dualslam.run.results import frame_rows, trajectories_of
+from dualslam.system.audit.photometric import MIN_SAMPLES, Sample
+from dualslam.system.audit.verdict import Level, ReasonCode, Verdict
 from tests.cli.fakes import FakeSystem
 
 N = 200

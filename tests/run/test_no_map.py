@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dualslam.build import build_system
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.core.types import Failure, FailureReason, Frame, FrameStatus
 from dualslam.lab.synthetic import make_sequence
 from dualslam.map.frame_records import FrameResult

@@ -11,9 +11,9 @@ import pytest
 from dualslam.core.errors import InputError
 from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult
-from dualslam.pace import Pace
 from dualslam.run.results import frame_rows
 from dualslam.run.runner import RunReport, run_sequence
+from dualslam.system.pace import Pace
 from tests.cli.fakes import FakeSystem
 
 EVERYWHERE = {i: np.eye(4) for i in range(100)}

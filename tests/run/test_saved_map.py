@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dualslam.cli import main
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.report.run_data import read_run
 from dualslam.run.map_camera import camera_that_fits, own_focal_px
 from dualslam.run.sources import open_source

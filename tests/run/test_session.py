@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dualslam.config.settings import Config
 from dualslam.core.camera.base import Camera
+from dualslam.core.config.settings import Config
 from dualslam.core.errors import OutputError
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import FloatArray, Frame

@@ -19,14 +19,14 @@ import numpy as np
 import pytest
 
 from dualslam.cli import main
+from dualslam.core import walk_news
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.extras import how_to_install
 from dualslam.core.geometry import sim3
 from dualslam.core.types import FloatArray, Frame, FrameStatus
+from dualslam.core.walk_news import WalkNews
 from dualslam.map.frame_records import FrameResult
-from dualslam.recovery import walk_news
-from dualslam.recovery.walk_news import WalkNews
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.point_world import PointWorld, system_in
 from dualslam.viewer import live
 from dualslam.viewer.colours import STATUS_COLOURS, rgb

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from dualslam.core.types import Frame, FrameStatus
+from dualslam.core.walk_news import WalkNews
 from dualslam.map.frame_records import FrameResult
-from dualslam.recovery.walk_news import WalkNews
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.viewer import progress
 from dualslam.viewer.progress import FINISHING, Progress
 

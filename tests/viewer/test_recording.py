@@ -17,6 +17,7 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
+from dualslam.atlas.atlas import Atlas, Link, LinkKind
 from dualslam.cli import main
 from dualslam.core.errors import OutputError
 from dualslam.core.extras import how_to_install
@@ -24,7 +25,6 @@ from dualslam.core.geometry import sim3, so3
 from dualslam.core.types import FrameStatus, Keyframe
 from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.trajectory_files import read_tum
-from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.submap import Submap
 from dualslam.report import RunData, read_run
 from dualslam.report.run_data import PosedRows

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.build import feature_handlers
-from dualslam.config.settings import FrontendConfig
+from dualslam.core.config.settings import FrontendConfig
 from dualslam.core.types import Failure, Frame
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.testing.desk_work import lane, working

@@ -12,7 +12,7 @@ from dualslam.build import create_frontend, new_initialiser
 from dualslam.core.events import EventKind
 from dualslam.core.types import Failure, FailureReason, FrameStatus, Start, View
 from dualslam.frontends.tracking.initialiser import Initialiser
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.late_desk import LateDesk
 from dualslam.testing.point_world import CAMERA, SIZE_PX, PointWorld, cloud, hand_held, pose_errors, system_in
 from dualslam.workers.jobs import InlineDesk, JobKind

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from dualslam.build import recovery_parts, walk_handlers
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.types import Failure, FailureReason
 from dualslam.recovery.job import RecoveryJob, RecoveryResult

@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
+from dualslam.atlas.atlas import Atlas, Link, LinkKind
+from dualslam.atlas.trajectory import FramePose
 from dualslam.core.geometry import sim3, so3
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
-from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose
 
 WRONG_SCALE, WRONG_ROTATION_DEG, WRONG_POSITION = 0.05, 3.0, 0.05
 """Beyond any of these a link is wrong: relative, degrees, relative to the path that it links."""

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.atlas.atlas import Atlas
+from dualslam.atlas.trajectory import FramePose
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import sim3, so3
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.lab.audits.link_audit import Side, align_cameras
-from dualslam.map.atlas import Atlas
-from dualslam.map.trajectory import FramePose
 
 WINDOW = 15
 """Frames on either side of a place that are laid upon the truth: enough for noise, few enough for drift."""

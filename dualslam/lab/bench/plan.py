@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.config.corruption import CAMERA_KINDS
-from dualslam.config.files import Override, load_config
-from dualslam.config.settings import Config
+from dualslam.core.config.corruption import CAMERA_KINDS
+from dualslam.core.config.files import Override, load_config
+from dualslam.core.config.settings import Config
 from dualslam.core.errors import ConfigError
 from dualslam.lab.bench.spec import BenchSpec, ConditionSpec, Half, SequenceSpec, VariantSpec
 

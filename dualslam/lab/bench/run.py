@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from dualslam.config.files import dump_config
+from dualslam.core.config.files import dump_config
 from dualslam.core.errors import OutputError
 from dualslam.io.atomic import write_text
 from dualslam.lab.bench.plan import Trial

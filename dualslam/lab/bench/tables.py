@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from dualslam.config.corruption import Cause
+from dualslam.core.config.corruption import Cause
 from dualslam.lab.bench.record import FailureKind, TrialRecord, judge
 from dualslam.lab.bench.recovery_tables import recovery_table, redundancy_table
 from dualslam.lab.bench.spec import BenchSpec

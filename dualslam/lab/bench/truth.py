@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.config.corruption import CAMERA_KINDS, CLOCK_KINDS, INTERNAL_KINDS, Corruption, CorruptionKind
+from dualslam.core.config.corruption import CAMERA_KINDS, CLOCK_KINDS, INTERNAL_KINDS, Corruption, CorruptionKind
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 from dualslam.io.run_folder import FrameRow
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate

@@ -7,7 +7,7 @@
 `CorruptedSequence` stands before its sequence and a `FaultScript` around the system's parts.
 """
 
-from dualslam.config.corruption import Cause, Corruption, CorruptionKind
+from dualslam.core.config.corruption import Cause, Corruption, CorruptionKind
 from dualslam.lab.disturbances.faults import FaultScript
 from dualslam.lab.disturbances.overlays import hidden_by
 from dualslam.lab.disturbances.sequence import CorruptedSequence, corrupted

@@ -14,7 +14,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from dualslam.config.corruption import INTERNAL_KINDS, Corruption, CorruptionKind
+from dualslam.core.config.corruption import INTERNAL_KINDS, Corruption, CorruptionKind
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import so3

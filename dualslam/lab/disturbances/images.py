@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.config.corruption import Corruption, CorruptionKind
+from dualslam.core.config.corruption import Corruption, CorruptionKind
 from dualslam.lab.disturbances.overlays import OVERLAYS, put_overlay
 
 U8Image = NDArray[np.uint8]

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from dualslam.config.corruption import Corruption, CorruptionKind
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import PinholeCamera
+from dualslam.core.config.corruption import Corruption, CorruptionKind
 from dualslam.core.types import FloatArray, IntArray
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.config.corruption import Corruption, CorruptionKind
+from dualslam.core.config.corruption import Corruption, CorruptionKind
 
 U8Image = NDArray[np.uint8]
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.config.corruption import CAMERA_KINDS, CLOCK_KINDS, RENDERED_KINDS, Corruption, CorruptionKind
+from dualslam.core.config.corruption import CAMERA_KINDS, CLOCK_KINDS, RENDERED_KINDS, Corruption, CorruptionKind
 from dualslam.core.errors import ConfigError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame, IntArray

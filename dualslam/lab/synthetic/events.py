@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dualslam.config.corruption import Corruption, CorruptionKind
-from dualslam.config.files import model_from_dict
+from dualslam.core.config.corruption import Corruption, CorruptionKind
+from dualslam.core.config.files import model_from_dict
 from dualslam.core.errors import ConfigError
 
 IN_A_WORLD = (

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.config.corruption import Corruption
+from dualslam.core.config.corruption import Corruption
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.types import FloatArray, Frame, IntArray
 from dualslam.lab.synthetic.circuit import make_circuit, make_eight, make_terrace

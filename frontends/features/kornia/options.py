@@ -12,7 +12,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from dualslam.config.settings import StrictModel
+from dualslam.core.config.settings import StrictModel
 
 NETWORKS = ("xfeat", "aliked", "disk")
 """One network each that detects and describes, at one scale and without an orientation, and that LightGlue knows."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dualslam.config.settings import Config, FrontendConfig, InitialiserConfig
+from dualslam.core.config.settings import Config, FrontendConfig, InitialiserConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.types import FloatArray
 from dualslam.frontends.features.gms import GmsFrontend, GmsOptions

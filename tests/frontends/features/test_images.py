@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from dualslam.build import build_system
-from dualslam.config.corruption import Corruption
-from dualslam.config.corruption import CorruptionKind as Spoil
-from dualslam.config.settings import Config
+from dualslam.core.config.corruption import Corruption
+from dualslam.core.config.corruption import CorruptionKind as Spoil
+from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.types import FrameStatus
 from dualslam.lab.synthetic import SyntheticSequence, make_sequence
 from dualslam.run.results import trajectories_of
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.point_world import pose_errors
 
 SIZE = {"width": 320, "height": 240}

@@ -12,7 +12,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from dualslam.config.settings import FrontendConfig
+from dualslam.core.config.settings import FrontendConfig
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.extras import how_to_install
 from dualslam.core.types import Features
@@ -277,7 +277,7 @@ def run(code: str) -> str:
 def test_the_core_never_imports_torch() -> None:
     code = (
         "import sys, dualslam, dualslam.build\n"
-        "from dualslam.config.settings import FrontendConfig\n"
+        "from dualslam.core.config.settings import FrontendConfig\n"
         "from dualslam.frontends.registry import create_frontend\n"
         "create_frontend(FrontendConfig())\n"
         "print([name for name in ('torch', 'kornia', 'dualslam.frontends.features.kornia') if name in sys.modules])"
@@ -289,7 +289,7 @@ def test_the_core_never_imports_torch() -> None:
 def test_without_the_extra_the_error_says_what_to_install(missing: str) -> None:
     code = (
         f"import sys; sys.modules['{missing}'] = None\n"
-        "from dualslam.config.settings import FrontendConfig\n"
+        "from dualslam.core.config.settings import FrontendConfig\n"
         "from dualslam.core.errors import ConfigError\n"
         "from dualslam.frontends.registry import create_frontend\n"
         "try: create_frontend(FrontendConfig(name='kornia'))\n"

@@ -17,7 +17,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from dualslam.config.settings import FrontendConfig
+from dualslam.core.config.settings import FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.interfaces import Frontend
 from dualslam.frontends.features.kornia.networks import Network

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dualslam.config.settings import FrontendConfig
+from dualslam.core.config.settings import FrontendConfig
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.frontends.features.sift import SiftFrontend, SiftOptions
 from dualslam.frontends.registry import create_frontend

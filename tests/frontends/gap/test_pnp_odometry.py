@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dualslam.backend.local_ba import bundle_adjust_arrays
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Track, View
 from dualslam.frontends.features.orb import OrbFrontend

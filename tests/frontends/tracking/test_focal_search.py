@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from dualslam.build import create_frontend
-from dualslam.config.settings import FrontendConfig
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.camera.models import DivisionCamera, PinholeCamera
+from dualslam.core.config.settings import FrontendConfig
 from dualslam.core.types import Failure, Features
 from dualslam.frontends.tracking.focal_search import search_focal
 from dualslam.testing.point_world import CAMERA, SIZE_PX, PointWorld, cloud, hand_held, path

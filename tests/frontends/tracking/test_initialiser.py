@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dualslam.backend.local_ba import bundle_adjust_arrays
-from dualslam.config.settings import HealthConfig, InitialiserConfig
+from dualslam.core.config.settings import HealthConfig, InitialiserConfig
 from dualslam.core.types import Failure, FailureReason, FloatArray, Start, View
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.tracking.initialiser import Initialiser

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dualslam.build import build_system
-from dualslam.config.settings import Config
+from dualslam.core.config.settings import Config
 from dualslam.core.geometry import so3
 from dualslam.lab.synthetic import make_sequence
 from dualslam.run.results import trajectories_of

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dualslam.config.settings import CameraConfig
+from dualslam.core.config.settings import CameraConfig
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray, Frame, View
@@ -16,7 +16,7 @@ from dualslam.frontends.tracking.pair_readout import READOUT_EVIDENCE, READOUTS_
 from dualslam.frontends.tracking.rolling_shutter import RollingShutter, TurnMeter
 from dualslam.frontends.tracking.row_shifts import correct_shutter
 from dualslam.frontends.tracking.turning import turn_between
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.point_world import (
     CAMERA,
     RATE_HZ,

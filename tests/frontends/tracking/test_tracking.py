@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from dualslam.backend.submap_graph import ISam2SubmapGraph
-from dualslam.config.settings import Config, KeyframeConfig
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import KannalaBrandtCamera, PinholeCamera, RadTanCamera
 from dualslam.core.chi_square import CHI2_95
+from dualslam.core.config.settings import Config, KeyframeConfig
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Keyframe, Track, View

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dualslam.atlas.atlas import Atlas, Link, LinkKind
+from dualslam.atlas.trajectory import FramePose
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.types import Failure, FloatArray, Keyframe
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.lab.audits.link_audit import LinkAudit, UnbrokenAudit, audit_links, audit_unbroken, truth_by_frame
-from dualslam.map.atlas import Atlas, Link, LinkKind
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose
 from dualslam.testing.point_world import path, random_features
 
 N = 60

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dualslam.atlas.atlas import Atlas
+from dualslam.atlas.trajectory import FramePose
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import sim3, so3
 from dualslam.core.types import FloatArray, Keyframe
 from dualslam.lab.audits.map_jumps import MapJump, find_map_jumps
-from dualslam.map.atlas import Atlas
 from dualslam.map.submap import Submap
-from dualslam.map.trajectory import FramePose
 from dualslam.testing.point_world import path, random_features
 
 N = 90

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dualslam.config.corruption import Cause
+from dualslam.core.config.corruption import Cause
 from dualslam.core.errors import InputError
 from dualslam.lab.bench.plan import SourceInfo, plan_trials
 from dualslam.lab.bench.record import FailureKind, TrialOutcome, judge

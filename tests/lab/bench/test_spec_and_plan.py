@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dualslam.config.corruption import Cause
+from dualslam.core.config.corruption import Cause
 from dualslam.core.errors import ConfigError
 from dualslam.lab.bench.plan import Trial, plan_trials
 from dualslam.lab.bench.spec import BenchSpec, Half, load_spec

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dualslam.config.corruption import Corruption
+from dualslam.core.config.corruption import Corruption
 from dualslam.core.geometry import so3
 from dualslam.io.trajectory_files import Trajectory, write_tum
 from dualslam.lab.bench.measure import trajectory_error

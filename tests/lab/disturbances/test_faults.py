@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dualslam.config.files import load_config
+from dualslam.core.config.files import load_config
 from dualslam.core.events import EventKind
 from dualslam.core.types import Failure, FailureReason, FrameStatus
 from dualslam.lab.disturbances import Corruption, FaultScript
 from dualslam.run.session import run_to_folder
 from dualslam.run.sources import open_source
-from dualslam.system import System
+from dualslam.system.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
 from dualslam.workers.desk import WorkerDesk
 from tests.cli.conftest import _own_environment  # noqa: F401 (used by every test)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dualslam.config.corruption import STRENGTHS, Corruption, CorruptionKind
+from dualslam.core.config.corruption import STRENGTHS, Corruption, CorruptionKind
 from dualslam.lab.disturbances import hidden_by
 from dualslam.lab.disturbances.images import corrupt_image
 from dualslam.lab.disturbances.overlays import OVERLAYS, overlay_mask

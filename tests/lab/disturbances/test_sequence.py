@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from dualslam.config.corruption import CAMERA_KINDS
-from dualslam.config.files import load_config
 from dualslam.core.camera.models import PinholeCamera, RadTanCamera
+from dualslam.core.config.corruption import CAMERA_KINDS
+from dualslam.core.config.files import load_config
 from dualslam.core.errors import ConfigError
 from dualslam.core.types import Frame
 from dualslam.lab.disturbances import Corruption, CorruptionKind, corrupted

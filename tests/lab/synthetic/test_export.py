@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dualslam.config.corruption import Corruption, CorruptionKind
+from dualslam.core.config.corruption import Corruption, CorruptionKind
 from dualslam.core.errors import ConfigError, OutputError
 from dualslam.lab.synthetic import make_sequence, render_to_folder
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dualslam.config.corruption import Corruption, CorruptionKind
+from dualslam.core.config.corruption import Corruption, CorruptionKind
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.lab.synthetic import SyntheticSequence, make_sequence, parse_events
 

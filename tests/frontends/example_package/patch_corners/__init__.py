@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from dualslam.config.settings import StrictModel
+from dualslam.core.config.settings import StrictModel
 from dualslam.core.errors import InputError
 from dualslam.core.types import Features, Matches
 from dualslam.frontends.registry import parse_options

@@ -1,0 +1,115 @@
+"""What follows a submap that has moved: its frames that are no keyframes, its culled keyframes, its links."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dualslam.atlas.atlas import Atlas, Link
+from dualslam.atlas.trajectory import FramePose
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.types import FloatArray, IntArray
+from dualslam.map.anchors import Anchor
+from dualslam.map.submap import Submap
+from dualslam.map.submap_change import change_of_frame
+
+
+def propagate_poses(poses: Iterable[FramePose], before: Submap, after: Submap) -> list[FramePose]:
+    """Move the frames of a submap with it: a solution or a change of calibration bends the whole map.
+
+    A pose relative to one keyframe would follow that keyframe rigidly, though lengths and turns have changed as well.
+    Each frame is therefore carried by the keyframes before and after it in time, in proportion to its distance from
+    them.
+
+    Parameters
+    ----------
+    poses : iterable of FramePose
+        Those of other submaps are passed over.
+    before, after : Submap
+        Two states of the submap, in about the same frame.
+
+    Returns
+    -------
+    list of FramePose
+        Posed against keyframes of `after`; those that are keyframes there are left out.
+    """
+    own = [pose for pose in poses if pose.submap_id == after.id and pose.index not in after.keyframes]
+    if not own:
+        return []
+    T_submap_cam = np.array([before.resolve_anchor(pose.keyframe_id, pose.T_kf_cam) for pose in own])
+    ids, T_kf_cam = _propagate([pose.index for pose in own], T_submap_cam, before, after)
+    return [replace(pose, keyframe_id=k, T_kf_cam=T) for pose, k, T in zip(own, ids.tolist(), T_kf_cam, strict=True)]
+
+
+def propagate_anchors(before: Submap, after: Submap) -> None:
+    """Move the culled keyframes of `after` in the same way."""
+    # The others came with the change.
+    known = [k for k in after.anchors if k in before.anchors or k in before.keyframes]
+    if not known:
+        return
+    ids, T_kf_cam = _propagate(known, np.array([before.resolve_anchor(k, np.eye(4)) for k in known]), before, after)
+    for k, reference, T in zip(known, ids.tolist(), T_kf_cam, strict=True):
+        after.anchors[k] = Anchor(reference, T)
+
+
+def _propagate(
+    index: Sequence[int], T_submap_cam: FloatArray, before: Submap, after: Submap
+) -> tuple[IntArray, FloatArray]:
+    """Return keyframes (N,) and the poses against them (N, 4, 4) of frames that were at `T_submap_cam`."""
+    keyframe_ids = np.array(sorted(before.keyframes.keys() & after.keyframes.keys()), np.int64)
+    was, now = (np.array([s.T_submap_kf[k] for k in keyframe_ids.tolist()]) for s in (before, after))
+    here = np.searchsorted(keyframe_ids, np.asarray(index, np.int64))
+    a, b = np.maximum(here - 1, 0), np.minimum(here, len(keyframe_ids) - 1)
+    T_a, T_b = (se3.inverse(was[at]) @ T_submap_cam for at in (a, b))
+    from_a, from_b = (np.linalg.norm(T[:, :3, 3], axis=1) for T in (T_a, T_b))
+    share = np.divide(from_a, from_a + from_b, out=np.zeros(len(a)), where=from_a + from_b > 0)
+    share[a == b] = 0.0
+    T_a_b = se3.inverse(now[a]) @ now[b]
+    gap = se3.log(se3.inverse(T_a) @ T_a_b @ T_b)
+    return keyframe_ids[a], T_a @ se3.exp(share[:, None] * gap)
+
+
+def follow_keyframes(
+    S_a_b: FloatArray,
+    covariance: FloatArray,
+    then: tuple[FloatArray, FloatArray],
+    now: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Return a similarity between two submaps, and its covariance, as a keyframe of each has moved.
+
+    What holds is how the two keyframes lie to each other.
+
+    Parameters
+    ----------
+    S_a_b : (4, 4)
+    covariance : (7, 7)
+        In the frame of b.
+    then, now : ((4, 4), (4, 4))
+        Poses of the keyframes, that of a first, in their submaps.
+    """
+    (a_then, b_then), (a_now, b_now) = then, now
+    S = a_now @ se3.inverse(a_then) @ S_a_b @ b_then @ se3.inverse(b_now)
+    Ad = sim3.adjoint(b_now @ se3.inverse(b_then))
+    return S, Ad @ covariance @ Ad.T
+
+
+def propagate_links(atlas: Atlas, before: Submap, after: Submap) -> None:
+    """Let the links of a submap follow a change of it, each as the keyframes moved that it stands on there."""
+    for i, link in enumerate(atlas.links):
+        S_a_b, covariance = link.S_a_b, link.covariance
+        if link.a == after.id:
+            S_a_b = _change_at(before, after, link, link.keyframe_a) @ S_a_b
+        if link.b == after.id:
+            S_after_before = _change_at(before, after, link, link.keyframe_b)
+            Ad = sim3.adjoint(S_after_before)
+            S_a_b = S_a_b @ sim3.inverse(S_after_before)
+            covariance = Ad @ covariance @ Ad.T
+        atlas.links[i] = replace(link, S_a_b=S_a_b, covariance=covariance)
+
+
+def _change_at(before: Submap, after: Submap, link: Link, attached: int) -> FloatArray:
+    """Return how a submap has changed about the keyframes that a link stands on there."""
+    stands_on = [k for k in (*link.keyframes, attached) if k in before.keyframes and k in after.keyframes]
+    return change_of_frame(before, after, stands_on or before.keyframes)

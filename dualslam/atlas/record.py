@@ -1,0 +1,99 @@
+"""What a run has found out so far: the one book that tracking and recovery both write in, between two frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from dualslam.atlas.atlas import Atlas
+from dualslam.atlas.trajectory import FramePose
+from dualslam.core.events import EventKind, EventLog
+from dualslam.core.stage_timer import StageTimer
+from dualslam.core.types import BoolArray, FrameMethod, FrameStatus
+from dualslam.map.frame_observations import Change, FrameObservations
+from dualslam.map.frame_records import FrameRow
+
+MAX_OBSERVED = 10_000
+"""Frames of which observations are kept, 24 bytes a landmark: some 60 MB. Those posed earlier are not posed anew."""
+
+
+class FrameStamp(Protocol):
+    """A frame, a view, or a row: what has its place in the sequence."""
+
+    @property
+    def index(self) -> int:
+        """In the source."""
+        ...
+
+    @property
+    def timestamp_s(self) -> float:
+        """Seconds."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Record:
+    """Maps, rows, poses, events and times of a run.
+
+    Attributes
+    ----------
+    atlas : Atlas
+    rows : dict of int to FrameRow
+        Every frame that was given to the system, by its index.
+    poses : dict of int to FramePose
+    observations : dict of int to FrameObservations
+        What they saw of their submaps, of the frames that were posed last.
+    events : EventLog
+    timer : StageTimer
+    """
+
+    atlas: Atlas = field(default_factory=Atlas)
+    rows: dict[int, FrameRow] = field(default_factory=dict)
+    poses: dict[int, FramePose] = field(default_factory=dict)
+    observations: dict[int, FrameObservations] = field(default_factory=dict)
+    events: EventLog = field(default_factory=EventLog)
+    timer: StageTimer = field(default_factory=StageTimer)
+
+    def pose(
+        self,
+        pose: FramePose,
+        n_matches: int | None = None,
+        n_inliers: int = 0,
+        observations: FrameObservations | None = None,
+        method: FrameMethod | None = None,
+    ) -> None:
+        """Enter where a frame is, and what it saw; without numbers or method, its row keeps those that it has."""
+        self.poses[pose.index] = pose
+        self.observations.pop(pose.index, None)
+        if observations is not None:
+            self.observations[pose.index] = observations
+            if len(self.observations) > MAX_OBSERVED:
+                del self.observations[next(iter(self.observations))]
+        row = self.rows[pose.index]
+        row.status, row.submap = FrameStatus.TRACKED, pose.submap_id
+        if n_matches is not None:
+            row.n_matches, row.n_inliers = n_matches, n_inliers
+        if method is not None:
+            row.method = method
+
+    def change_pixels(self, submap_id: int, change_of: Callable[[int], Change | None]) -> None:
+        """Let what a submap's frames have seen follow its pixels: `change_of` tells how those of a frame change."""
+        for i, seen in self.observations.items():
+            if seen.submap_id == submap_id and (change := change_of(i)) is not None:
+                self.observations[i] = seen.with_change(change)
+
+    def own_poses(self) -> Iterator[FramePose]:
+        """Yield the poses of this run's frames: those of earlier runs, in a saved map, go by another clock."""
+        return (pose for i, pose in self.poses.items() if i in self.rows)
+
+    def are_refound(self, indices: Iterable[int]) -> BoolArray:
+        """Return which frames (N,) were found by wide matching, beyond a gap: not by those before them."""
+        refound = {event.frame for event in self.events.of_kind(EventKind.GAP_RELOCALISED)}
+        return np.array([index in refound for index in indices], bool)
+
+    def event(self, kind: EventKind, at: FrameStamp, submap_id: int | None = None, **data: Any) -> None:
+        """Enter what happened at a frame."""
+        self.events.add(kind, at.index, at.timestamp_s, submap_id, **data)

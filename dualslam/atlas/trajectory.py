@@ -1,0 +1,126 @@
+"""Per-frame poses: measured relative to a keyframe, composed when asked for, never stored."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dualslam.atlas.atlas import Atlas
+from dualslam.core.geometry import sim3, so3
+from dualslam.core.trajectory import Trajectory
+from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.map.submap import Submap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FramePose:
+    """Where a frame was measured to be: relative to a keyframe of a submap."""
+
+    index: int
+    timestamp_s: float
+    submap_id: int
+    keyframe_id: int
+    T_kf_cam: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Path:
+    """The way of a camera in a submap, from frame to frame as they came.
+
+    Attributes
+    ----------
+    index : (N,) int64
+        Of the frames.
+    times_s : (N,) float64
+        Ascending: negative timestamps where a source is read from its end.
+    T_map_cam : (N, 4, 4) float64
+    refound : (N,) bool
+        Frames that were found again by wide matching, and not by those before them.
+    """
+
+    index: IntArray
+    times_s: FloatArray
+    T_map_cam: FloatArray
+    refound: BoolArray
+
+    @classmethod
+    def of(cls, poses: Iterable[FramePose], submap: Submap) -> Path:
+        """Return the path of frames that are posed in a submap, as if none had been found again."""
+        by_index = sorted(poses, key=lambda pose: pose.index)
+        times_s = np.array([pose.timestamp_s for pose in by_index], np.float64)
+        T = [submap.resolve_anchor(pose.keyframe_id, pose.T_kf_cam) for pose in by_index]
+        index = np.array([pose.index for pose in by_index], np.int64)
+        return cls.of_trajectory(Trajectory(times_s, np.array(T, np.float64).reshape(-1, 4, 4), index))
+
+    @classmethod
+    def of_trajectory(cls, trajectory: Trajectory) -> Path:
+        """Return the path of frames that are ordered by index, as if none had been found again."""
+        t = trajectory.timestamps_s
+        times_s = -t if len(t) > 1 and t[-1] < t[-2] else t
+        order = times_s.argsort(kind="stable")
+        return cls(trajectory.index[order], times_s[order], trajectory.T_world_cam[order], np.zeros(len(t), bool))
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+    @property
+    def centres(self) -> FloatArray:
+        """Where the camera was, (N, 3)."""
+        return self.T_map_cam[:, :3, 3]
+
+    def way_between(self, i: int, j: int) -> float:
+        """Return the length of the way between two frames, given by their indices."""
+        rows = (self.index >= min(i, j)) & (self.index <= max(i, j))
+        return float(np.linalg.norm(np.diff(self.centres[rows], axis=0), axis=1).sum())
+
+    def take(self, rows: BoolArray) -> Path:
+        """Return the path of some of the frames."""
+        return Path(self.index[rows], self.times_s[rows], self.T_map_cam[rows], self.refound[rows])
+
+    def moved(self, S: FloatArray) -> Path:
+        """Return the path in other coordinates, by a Sim(3) (4, 4)."""
+        return replace(self, T_map_cam=sim3.act_on_pose(S, self.T_map_cam))
+
+    def then(self, later: Path) -> Path:
+        """Return the path that goes on with those frames of another that are later than all of its own."""
+        rest = later if not len(self.times_s) else later.take(later.times_s > self.times_s[-1])
+        both = zip(*((path.index, path.times_s, path.T_map_cam, path.refound) for path in (self, rest)), strict=True)
+        return Path(*(np.concatenate(arrays) for arrays in both))
+
+    def similarity_to(self, other: Path, min_frames: int) -> FloatArray | None:
+        """Return the Sim(3) (4, 4) that takes this path to another by the frames in both; None where these are few.
+
+        The turn is that of the cameras: of a straight way the places leave it open.
+        """
+        _, mine, theirs = np.intersect1d(self.index, other.index, return_indices=True)
+        if len(mine) < min_frames:
+            return None
+        a, b = other.T_map_cam[theirs], self.T_map_cam[mine]
+        R = so3.orthonormalise((a[:, :3, :3] @ b[:, :3, :3].swapaxes(1, 2)).sum(axis=0))
+        mean_a, mean_b = a[:, :3, 3].mean(axis=0), b[:, :3, 3].mean(axis=0)
+        spread_a, spread_b = np.linalg.norm(a[:, :3, 3] - mean_a), np.linalg.norm(b[:, :3, 3] - mean_b)
+        if not spread_a * spread_b > 0:
+            return None
+        s = spread_a / spread_b
+        return sim3.from_parts(s, R, mean_a - s * R @ mean_b)
+
+
+def compose(poses: Iterable[FramePose], atlas: Atlas, S_world_submap: dict[int, FloatArray]) -> Trajectory:
+    """Compose the poses of the frames that stand in the given submaps, in their common frame.
+
+    Parameters
+    ----------
+    poses : iterable of FramePose
+    atlas : Atlas
+    S_world_submap : dict of int to (4, 4) float64
+        The submaps to take in; frames of others are left out.
+    """
+    kept = sorted((p for p in poses if p.submap_id in S_world_submap), key=lambda p: p.index)
+    T_world_cam = np.empty((len(kept), 4, 4))
+    for i, pose in enumerate(kept):
+        T_submap_cam = atlas.submaps[pose.submap_id].resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
+        T_world_cam[i] = sim3.act_on_pose(S_world_submap[pose.submap_id], T_submap_cam)
+    timestamps_s = np.array([p.timestamp_s for p in kept], float)
+    return Trajectory(timestamps_s, T_world_cam, np.array([p.index for p in kept], np.int64))

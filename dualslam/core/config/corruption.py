@@ -1,0 +1,137 @@
+"""What the failure lab does to a run on purpose: image corruptions and faults inside the system, as config values."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from dualslam.core.config.strict_model import StrictModel
+
+
+class CorruptionKind(StrEnum):
+    """What is done; in brackets the meaning of `Corruption.strength`."""
+
+    WIPE = "wipe"  # fog, or a blank wall before the lens: texture fades to flat shade (fraction)
+    OCCLUSION = "occlusion"  # something textured moves through the image (fraction of the image that it hides)
+    BLUR = "blur"  # out of focus (standard deviation in pixels of a 640 pixels wide image)
+    MOTION_BLUR = "motion_blur"  # the camera shakes while the shutter is open (pixels of a 640 pixels wide image)
+    BLACKOUT = "blackout"  # the lens is covered (fraction of the light that is lost)
+    EXPOSURE = "exposure"  # too bright or too dark (stops, positive is brighter)
+    NOISE = "noise"  # sensor noise (standard deviation, grey levels)
+    FREEZE = "freeze"  # the camera delivers the last image again and again (without meaning)
+    DROP = "drop"  # the frames do not arrive (without meaning)
+    STRIDE = "stride"  # one frame of so many arrives (their number)
+    FEW_FEATURES = "few_features"  # the detector finds little (fraction of the features that is lost)
+    WRONG_POSE = "wrong_pose"  # a wrong pose goes into the map as a keyframe (degrees; moved by as much of the depth)
+    KILL_WORKER = "kill_worker"  # the first recovery that starts in the frames loses its process (without meaning)
+    SOLVER_ERROR = "solver_error"  # the live graph fails once, at the first keyframe of the frames (without meaning)
+    SHUTTER = "shutter"  # rendered worlds: the shutter stays open (fraction of the time between frames)
+    ROTATION = "rotation"  # rendered worlds: the camera is swung aside and back (degrees, positive to the right)
+    FOCAL = "focal"  # the calibration's focal length is wrong (factor)
+    RESOLUTION = "resolution"  # the calibration is that of images of another size (factor)
+    NO_DISTORTION = "no_distortion"  # the calibration lacks the lens distortion (without meaning)
+    CLOCK_UNIT = "clock_unit"  # times are in another unit than seconds (units a second)
+    CLOCK_JITTER = "clock_jitter"  # times scatter evenly (fraction of the time between frames)
+    CLOCK_REPEAT = "clock_repeat"  # neighbouring frames share the time of their first (their number)
+    CAB = "cab"  # a driver's cab about the windscreen stands still in the image (share of the image)
+    BONNET = "bonnet"  # a car's bonnet stands still at the lower edge (share of the image)
+    BARS = "bars"  # black bars on the left and on the right, as about an upright film (share of the image)
+    LOGO = "logo"  # a logo in the upper right corner (share of the image)
+    CLOCK = "clock"  # a clock in the lower left corner, whose digits change (share of the image)
+
+
+class Cause(StrEnum):
+    """Where a disturbance comes from: results are told apart by it."""
+
+    NATURAL = "natural"
+    """Nothing was added: what the sequence itself does."""
+    IMAGE = "image"
+    INPUT = "input"
+    """What comes with the images is wrong: the calibration or the clock."""
+    INTERNAL = "internal"
+
+
+INTERNAL_KINDS = frozenset({CorruptionKind.WRONG_POSE, CorruptionKind.SOLVER_ERROR, CorruptionKind.KILL_WORKER})
+
+CAMERA_KINDS = frozenset({CorruptionKind.FOCAL, CorruptionKind.RESOLUTION, CorruptionKind.NO_DISTORTION})
+
+CLOCK_KINDS = frozenset({CorruptionKind.CLOCK_UNIT, CorruptionKind.CLOCK_JITTER, CorruptionKind.CLOCK_REPEAT})
+
+RENDERED_KINDS = frozenset({CorruptionKind.SHUTTER, CorruptionKind.ROTATION})
+
+# kind: (default, lowest, highest strength)
+STRENGTHS: dict[CorruptionKind, tuple[float, float, float]] = {
+    CorruptionKind.WIPE: (1.0, 0.0, 1.0),
+    CorruptionKind.OCCLUSION: (0.4, 0.0, 1.0),
+    CorruptionKind.BLUR: (5.0, 0.0, 100.0),
+    CorruptionKind.MOTION_BLUR: (30.0, 0.0, 400.0),
+    CorruptionKind.BLACKOUT: (1.0, 0.0, 1.0),
+    CorruptionKind.EXPOSURE: (2.5, -8.0, 8.0),
+    CorruptionKind.NOISE: (25.0, 0.0, 200.0),
+    CorruptionKind.FREEZE: (1.0, 0.0, 1.0),
+    CorruptionKind.DROP: (1.0, 0.0, 1.0),
+    CorruptionKind.STRIDE: (3.0, 2.0, 1000.0),
+    CorruptionKind.FEW_FEATURES: (0.8, 0.0, 1.0),
+    CorruptionKind.WRONG_POSE: (15.0, 0.0, 180.0),
+    CorruptionKind.SOLVER_ERROR: (1.0, 0.0, 1.0),
+    CorruptionKind.KILL_WORKER: (1.0, 0.0, 1.0),
+    CorruptionKind.SHUTTER: (1.0, 0.0, 4.0),
+    CorruptionKind.ROTATION: (60.0, -180.0, 180.0),
+    CorruptionKind.FOCAL: (0.8, 0.1, 10.0),
+    CorruptionKind.RESOLUTION: (0.5, 0.1, 10.0),
+    CorruptionKind.NO_DISTORTION: (1.0, 0.0, 1.0),
+    CorruptionKind.CLOCK_UNIT: (1000.0, 1e-9, 1e9),
+    CorruptionKind.CLOCK_JITTER: (0.5, 0.0, 0.99),
+    CorruptionKind.CLOCK_REPEAT: (2.0, 2.0, 1000.0),
+    CorruptionKind.CAB: (0.28, 0.01, 0.8),
+    CorruptionKind.BONNET: (0.15, 0.01, 0.4),
+    CorruptionKind.BARS: (0.6, 0.01, 0.9),
+    CorruptionKind.LOGO: (0.02, 0.001, 0.2),
+    CorruptionKind.CLOCK: (0.01, 0.001, 0.1),
+}
+
+
+class Corruption(StrictModel):
+    """One disturbance of the frames ``start <= index < start + length``, indices counted in the source."""
+
+    kind: CorruptionKind
+    """wipe, occlusion, blur, motion_blur, blackout, exposure, noise, freeze, drop, stride, few_features, wrong_pose,
+    solver_error, kill_worker, focal, resolution, no_distortion, clock_unit, clock_jitter, clock_repeat, cab, bonnet,
+    bars, logo or clock; in the script of a rendered world also shutter and rotation."""
+    start: int = Field(0, ge=0)
+    """First frame, counted in the source whatever the stride."""
+    length: int | None = Field(None, ge=1)
+    """Number of frames; null: to the end."""
+    strength: float | None = None
+    """How badly, in the unit of the kind; null: the kind's default."""
+    seed: int = Field(0, ge=0)
+    """Of what is random about it: noise, directions, which features are lost."""
+
+    @model_validator(mode="after")
+    def _check_strength(self) -> Self:
+        _, low, high = STRENGTHS[self.kind]
+        if not low <= self.level <= high:
+            raise ValueError(f"strength of {self.kind} is {self.level:g}; it must lie between {low:g} and {high:g}")
+        if self.kind is CorruptionKind.ROTATION and self.length is None:
+            raise ValueError("rotation needs a length: the camera is swung aside and back in it")
+        if self.kind in CAMERA_KINDS and (self.start, self.length) != (0, None):
+            raise ValueError(f"{self.kind} is of the whole run; leave out start and length")
+        return self
+
+    @property
+    def level(self) -> float:
+        """The strength, or the kind's default."""
+        return STRENGTHS[self.kind][0] if self.strength is None else self.strength
+
+    @property
+    def cause(self) -> Cause:
+        """Whether images, what comes with them, or the system's inside are disturbed."""
+        if self.kind in INTERNAL_KINDS:
+            return Cause.INTERNAL
+        return Cause.INPUT if self.kind in CAMERA_KINDS | CLOCK_KINDS else Cause.IMAGE
+
+    def covers(self, index: int) -> bool:
+        """Return whether frame `index` is disturbed."""
+        return self.start <= index and (self.length is None or index < self.start + self.length)

@@ -1,0 +1,344 @@
+"""Every setting of a run, with its meaning: strict pydantic models, read from and written to YAML."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from dualslam.core.config.calibration_config import CalibrationConfig
+from dualslam.core.config.corruption import Corruption
+from dualslam.core.config.strict_model import StrictModel as StrictModel  # part of this module, too
+
+
+class FrontendConfig(StrictModel):
+    """Features and their comparison."""
+
+    name: str = "orb"
+    """Which front end: `orb`, `sift`, `gms`, `kornia` (an extra), or one that another package offers as an entry point
+    of `dualslam.frontends`; or `module:Class`, of what can be imported."""
+    n_features: int = Field(1000, ge=50, le=20000)
+    """Keypoints per image."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """Settings of the chosen front end alone; it checks their names itself."""
+
+
+class CameraConfig(StrictModel):
+    """What is known of the camera beyond its calibration file."""
+
+    model_sigma_px: float = Field(0.8, ge=0, le=100)
+    """Error of the camera model itself at a pixel (one sigma), beside the noise of the features: chequerboard
+    calibrations and rectified data sets are off by half a pixel to a pixel towards the rim of the image."""
+    readout_s: float | None = Field(None, ge=-0.1, le=0.1)
+    """Time between reading the first and the last row of an image: 0 for a global shutter, about 0.03 for webcams and
+    the first Kinect, negative where images were turned upside down since, so that the last row was read first. None:
+    the frames in which there is no map are asked for it, and where one that rolls is likely, no map starts from a fast
+    turn until it is known."""
+    find_still_pixels: bool = True
+    """Find pixels that stand still in the image while the rest moves (a bonnet, black bars, a logo), and leave them
+    out. No map starts while the camera itself stands still."""
+    mask: str | None = None
+    """Image whose black pixels show no scene, of the frames' size; or a folder with one for each frame, named as the
+    frames, or in their order."""
+
+
+class InitialiserConfig(StrictModel):
+    """How a submap starts: two views, a first bundle adjustment, and a check after it."""
+
+    matching: Literal["ratio", "gms"] = "ratio"
+    """How the two views are matched: by the front end's own wide matching, or by grid-based motion statistics, which
+    any front end with binary descriptors supports (`orb` with `gms` is the paper's Dual-SLAM+)."""
+    min_points: int = Field(50, ge=15)
+    """Triangulated points that must survive the first bundle adjustment."""
+    min_parallax_deg: float = Field(1.0, gt=0)
+    """Angle under which the two cameras must see half as many points as `min_points`, after the rotation is taken out.
+    However many more are far away: on a road most are, and the near ones fix the motion."""
+    max_direction_sigma_deg: float = Field(1.5, gt=0)
+    """Largest standard deviation (from the bundle adjustment's Hessian) of the direction of translation: by the pixels'
+    sigmas, or less in proportion, down to two thirds, where residuals are smaller than 0.3 of these."""
+
+    @property
+    def min_matches(self) -> int:
+        """Matches between the two views below which no model is tried: a sixth of them may be wrong."""
+        return round(1.2 * self.min_points)
+
+
+class TrackingConfig(StrictModel):
+    """Pose of each frame against the submap."""
+
+    search_radius_px: float = Field(15.0, gt=0)
+    """Search radius about a landmark's predicted pixel, at the finest octave, when the motion model is trusted."""
+    min_inliers: int = Field(20, ge=6)
+    """Landmarks that must agree with a pose for it to be taken at all."""
+    max_lost_s: float = Field(0.75, ge=0)
+    """Seconds, by the frames' times, from the first frame that is not posed, after which the submap is given up. Until
+    then wide matching may find it again, unless the next one starts first: its start is looked for meanwhile."""
+
+
+class KeyframeConfig(StrictModel):
+    """When a frame becomes a keyframe."""
+
+    max_tracked_ratio: float = Field(0.6, gt=0, le=1)
+    """A keyframe is due when fewer than this share of the last keyframe's landmarks is still tracked; from 1.4
+    degrees of parallax on; with less a smaller one, half of it where the camera turns in place."""
+    max_parallax_deg: float = Field(4.0, gt=0)
+    """Parallax at which a keyframe is due whatever is tracked."""
+    max_frames: int = Field(30, ge=1)
+    """Frames after which a keyframe is due if the camera moved at all."""
+    weak_landmarks: int = Field(60, ge=10)
+    """Tracked landmarks below which tracking is weak and a keyframe is due at once. Where so few near ones hold the
+    camera's position, one is due as well when of their hold, one over the depth squared, less than half of what
+    `max_tracked_ratio` asks of their number is left."""
+
+
+class MappingConfig(StrictModel):
+    """New landmarks at a keyframe, and what is culled."""
+
+    min_parallax_deg: float = Field(1.0, gt=0)
+    """Smallest angle between the two rays of a new landmark."""
+    max_observations: int = Field(250, ge=50)
+    """Known landmarks that a keyframe holds on to, spread over its image: more make the solver slower, not better."""
+    redundant_ratio: float = Field(0.9, gt=0, le=1)
+    """A keyframe of whose landmarks this share is seen by three others at the same or a finer scale is culled."""
+
+
+class HealthConfig(StrictModel):
+    """When a tracked frame counts as explained by the map."""
+
+    min_inliers: int = Field(25, ge=6)
+    """Landmarks that must agree with the frame's pose."""
+    min_inlier_ratio: float = Field(0.35, ge=0, le=1)
+    """Share of the matched landmarks that must agree."""
+    max_chi2: float = Field(2.5, gt=0)
+    """Mean squared whitened residual per degree of freedom of the agreeing landmarks (1 is expected)."""
+    max_refused: float = Field(0.5, ge=0, le=1)
+    """Share of a new keyframe's matches that its graph may refuse: where the map contradicts the majority, the pose
+    is wrong, and the keyframe is taken out again before the map grows about it. 1 lets every pose in."""
+
+
+class AttemptConfig(StrictModel):
+    """One attempt at a recovery: where its poses come from. It may be written as one word, which is
+    `live`, `gap` (`{frontend: sift, tracking: live}`) or a front end's name.
+    """
+
+    frontend: str = "live"
+    """`live`: the live features, guided by the motion model in reverse. Or a front end by its name: features of its
+    own, found in the buffered images, pose the frames by PnP from one to the next, and skip those that cannot be used.
+    Landmarks, and what is compared when linking, are made of the live features in either case."""
+    tracking: Literal["own", "live"] = "own"
+    """Whether that front end poses every frame, so that the attempt does not depend on the live features, or only the
+    first frames beyond gaps and what follows until the live features can take over, which is several times as fast."""
+    n_features: int = Field(2000, ge=50, le=20000)
+    """Keypoints per image of that front end."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """Settings of that front end alone."""
+
+    @property
+    def is_live(self) -> bool:
+        """Whether it walks on the live features alone."""
+        return self.frontend == "live"
+
+    @property
+    def name(self) -> str:
+        """What events call it."""
+        return self.frontend if self.tracking == "own" else f"gap ({self.frontend})"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_word(cls, value: Any) -> Any:
+        if value == "gap":
+            return {"frontend": "sift", "tracking": "live"}
+        return {"frontend": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _settings_have_an_owner(self) -> AttemptConfig:
+        if self.is_live and self != AttemptConfig.model_construct():
+            raise ValueError("`live` has no settings of its own: it is the front end that the section `frontend` sets")
+        return self
+
+
+class RecoveryConfig(StrictModel):
+    """Reverse tracking that joins a new submap to the one that was lost."""
+
+    enabled: bool = True
+    """Off: a lost track ends the submap, and the next one stays apart from it."""
+    max_gap_frames: int = Field(30, ge=0)
+    """Frames in a row that reverse tracking may skip, because none of its keyframes can be matched in them. A walk that
+    links no map, but poses the frames before a start, goes on to the end of the buffer."""
+    attempts: tuple[AttemptConfig, ...] = Field(
+        (AttemptConfig(frontend="sift", tracking="live"), AttemptConfig(frontend="sift")), min_length=1
+    )
+    """In this order, each from the same snapshot of the new map, until one leads to a link. A list of words will do,
+    such as `[gap, live, sift]`; an attempt with settings is written `{frontend: sift, n_features: 3000}`."""
+    relocalise_after: int | None = Field(15, ge=0)
+    """Frames that show something without a start, after which a lost map is looked for, and continued where it is seen
+    again; null: never. A map that starts sooner is better linked, by all that reverse tracking finds: most start within
+    2 to 5 frames, unless the camera turns in place, and then it may come back to what the lost map shows before any can
+    start."""
+    retry_keyframes: tuple[Annotated[int, Field(ge=1)], ...] = (5, 15)
+    """Keyframes of the new map, from its start on, at which reverse tracking that has found no link, or left buffered
+    frames without a pose, is made again: the map knows depths better then, and more of the scene. It is too when the
+    camera has been calibrated since, and, if any number stands here, when the run ends and the map has grown by half.
+    One for poses alone that finds none is the last."""
+    covering_keyframes: int = Field(20, ge=0)
+    """Keyframes that a walk which only poses frames, or a search for a lost map, matches widely at most, beyond those
+    nearest in time: the ones that together show the most of the map, since in a gap the
+    camera may have looked anywhere. Each costs about 2 ms of CPU for a frame that is not found."""
+    workers: int = Field(0, ge=0, le=16)
+    """Processes for long work beside the tracking, which never waits for it (`--workers`): reverse tracking and
+    self-calibration. With any there is one more, which solves the live map's graph. 0: inline, in the tracking process,
+    which waits."""
+    time_limit_s: float = Field(120.0, gt=0)
+    """Time after which a worker counts as hung, and its recovery as failed. A walk over a full buffer of 10 s takes
+    about a tenth of it on a free core."""
+    finish_wait_s: float = Field(30.0, ge=0)
+    """How long the end of the run waits for walks that are still under way."""
+
+
+class BufferConfig(StrictModel):
+    """The frames that reverse tracking can still read."""
+
+    duration_s: float = Field(10.0, gt=0)
+    """Seconds of video that are kept (the paper's k) while there is a map to track; before it and after it, all is."""
+    max_mb: float = Field(256.0, gt=0)
+    """Hard bound on the memory of the kept features and images, mebibytes. Ten seconds of KITTI are 56, of 640 x 480 at
+    30 Hz 120. A long loss reaches it; then images are packed, and the stretch between the frames before the loss and
+    the newest ones thins out: first its images, then its frames. A bound too small for the rest costs the oldest."""
+
+
+class GraphConfig(StrictModel):
+    """The factor graph of a submap and its solver."""
+
+    robust_k: float = Field(0.8, gt=0)
+    """Huber threshold in sigmas: 1.345 keeps 95 % efficiency under Gaussian noise, 0.8 does where residuals are at
+    0.6 of their sigmas, and 88 % where the sigmas are right."""
+    max_keyframes: int = Field(150, ge=20, le=1000)
+    """Keyframes at which a submap rolls over into the next: an update's cost grows with the map (on a road 65 ms on
+    average with this cap, 140 ms without), and the solver's Cholesky rejects chains of more than about 1,000."""
+    rollover_keyframes: int = Field(12, ge=3, le=19)
+    """Keyframes that a submap shares with the one that it rolls over into."""
+    factors_per_keyframe: int = Field(60, ge=20)
+    """Observations of a keyframe that become factors of the graph, about, chosen from those that it could bear: spread
+    over the image, long tracks first. Points of the others follow the poses. An update's cost grows with it; where few
+    other keyframes see the same points (on a road), it is up to 2.5 times as many."""
+    factors_per_landmark: int = Field(6, ge=3)
+    """Views of a landmark that become factors, spread over its track; more where a keyframe would be short of them."""
+    update_every: int = Field(1, ge=1, le=10)
+    """Keyframes at which the graph is solved, once a map is past its first: a window of neighbours poses those between,
+    and these, too, before anything is mapped from them. At every second one a run on a road costs 8 % less, but a young
+    map on a road drifts more in scale."""
+
+
+class LinkingConfig(StrictModel):
+    """When two submaps that saw the same frames are linked by a similarity.
+
+    A wrong link is off by more than one of the first three limits. All bounds on sigmas follow from them: a third, so
+    that three sigmas are the limit; half of it, two sigmas, for what is judged again later.
+    """
+
+    wrong_scale: float = Field(0.05, gt=0)
+    """Relative error of the scale at which a link is wrong."""
+    wrong_rotation_deg: float = Field(3.0, gt=0)
+    """Error of the rotation at which it is."""
+    wrong_position: float = Field(0.05, gt=0)
+    """Error of the matched landmarks' centre, relative to their median depth, at which it is."""
+
+    deformation_sigma: float = Field(0.01, gt=0, le=0.1)
+    """Relative deformation (standard deviation: drift in scale, bending in radians) that two healthy maps may have
+    against each other over the length of their overlap, beyond their pixels' noise. It is the noise model of all gates
+    that compare parts of the maps with each other."""
+    min_inliers: int = Field(20, ge=6)
+    """Matched landmarks that must agree."""
+    min_keyframes: int = Field(4, ge=2)
+    """Shared keyframes older than the suspected onset of corruption that must agree one by one. A rigid corrupted tail
+    passes every other gate: two keyframes fix it, so evidence starts with the third."""
+
+    @property
+    def max_scale_sigma(self) -> float:
+        """Largest standard deviation of the scale (relative)."""
+        return self.wrong_scale / 3
+
+    @property
+    def max_rotation_sigma_deg(self) -> float:
+        """Largest standard deviation of the rotation about any axis."""
+        return self.wrong_rotation_deg / 3
+
+    @property
+    def max_position_sigma(self) -> float:
+        """Largest standard deviation of the position of the matched landmarks' centre, relative to their depth."""
+        return self.wrong_position / 3
+
+    @property
+    def max_live_scale_sigma(self) -> float:
+        """Largest standard deviation of the scale at the new map's live end, with what reverse tracking has lost of it
+        on the way from there to the overlap; and beyond a gap over which wide matching has skipped while tracking.
+        """
+        return self.wrong_scale / 2
+
+    @property
+    def max_live_rotation_deg(self) -> float:
+        """Rotation by which the new map may bend, from the overlap to its live end, under the camera that its pixels
+        ask for.
+        """
+        return self.wrong_rotation_deg / 2
+
+    @property
+    def max_gap_scale_sigma(self) -> float:
+        """Largest standard deviation of the scale beyond a gap of reverse tracking, by the Hessian of its wide matches:
+        the landmarks that are found again beyond the gap halve it, if the gap relocalisation is right.
+        """
+        return self.wrong_scale
+
+
+class AuditConfig(StrictModel):
+    """Whether a map is checked while it grows and when the run ends."""
+
+    enabled: bool = True
+    """Whether a map is split at keyframes across which its scale is lost."""
+
+
+class AtlasConfig(StrictModel):
+    """The graph over all submaps."""
+
+    robust: bool = True
+    """Whether a connection that the others contradict is rejected; else all of them are obeyed."""
+
+
+class PlacesConfig(StrictModel):
+    """Places that are seen again."""
+
+    enabled: bool = True
+    """Whether places are recognised at all: loops, merges by revisit, frames without a map that are found in one."""
+
+
+class LoopsConfig(StrictModel):
+    """Loops and merges of maps by what is seen again."""
+
+    enabled: bool = True
+    """Whether the live map is linked where it shows what any map, itself among them, has shown before. Without
+    recovery (`recovery.enabled`) a lost map of the same run stays apart all the same."""
+
+
+class Config(StrictModel):
+    """The root of the configuration."""
+
+    seed: int = Field(0, ge=0, le=2**64 - 1)
+    """Seed of every random choice of the run; the solvers take 64 bits."""
+    frontend: FrontendConfig = FrontendConfig()
+    camera: CameraConfig = CameraConfig()
+    initialiser: InitialiserConfig = InitialiserConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    keyframes: KeyframeConfig = KeyframeConfig()
+    mapping: MappingConfig = MappingConfig()
+    health: HealthConfig = HealthConfig()
+    buffer: BufferConfig = BufferConfig()
+    recovery: RecoveryConfig = RecoveryConfig()
+    graph: GraphConfig = GraphConfig()
+    linking: LinkingConfig = LinkingConfig()
+    audit: AuditConfig = AuditConfig()
+    atlas: AtlasConfig = AtlasConfig()
+    places: PlacesConfig = PlacesConfig()
+    loops: LoopsConfig = LoopsConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
+    corruptions: tuple[Corruption, ...] = ()
+    """What the failure lab does to the run on purpose, for example [{kind: blackout, start: 100, length: 10}]."""

@@ -1,0 +1,149 @@
+"""Whether a wrong camera bends the new map between the overlap, where a link is measured, and its live end.
+
+A wrong camera bends a map wherever it turns: it may agree with another map of that camera on all that both have seen,
+and say nothing of the scale beyond. How sure the pixels contradict the camera does not decide. Matches that err alike
+look like a wrong camera, beyond what their noise explains, where what they ask for changes little in the map's shape;
+and a short map may hardly know its camera, and be bent. So what counts is by how much the map would be another one
+under the camera that its pixels ask for, both by the same observations: what else holds a map together would count as
+the camera's doing.
+
+Of that, chance has its share: pixels of an exact camera ask for another one, too. A correction at a squared distance of
+d2 makes, in whatever direction, a change of at most sqrt(d2) of that change's standard deviations (Cauchy-Schwarz), so
+that of the change's square at least the part 1 / d2 is what chance makes on average. The rest counts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.core.config.calibration_config import CalibrationConfig
+from dualslam.core.config.settings import LinkingConfig
+from dualslam.core.estimates import PreferredCamera
+from dualslam.core.geometry import so3
+from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
+from dualslam.linking.estimate import LinkEstimate
+from dualslam.map.submap import Submap
+
+MIN_PLACE = 5
+"""Keyframes whose positions tell the scale of a place."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bend:
+    """How one end of a map would lie to the other under another camera.
+
+    Attributes
+    ----------
+    log_scale : float
+        Logarithm of its scale there, over that of now.
+    rotation_rad : float
+    """
+
+    log_scale: float = 0.0
+    rotation_rad: float = 0.0
+
+    def beyond_chance(self, distance2: float) -> Bend:
+        """Return what counts of it, if the pixels ask for the other camera by this squared distance."""
+        share = math.sqrt(max(0.0, 1.0 - 1.0 / distance2)) if distance2 > 0 else 0.0
+        return Bend(share * self.log_scale, share * self.rotation_rad)
+
+
+NO_BEND = Bend()
+
+
+def measure_bend(T_now: FloatArray, T_other: FloatArray, here: IntArray, there: IntArray) -> Bend:
+    """Return by what a place of a map turns and grows relative to another, between two states of its poses.
+
+    Parameters
+    ----------
+    T_now, T_other : (K, 4, 4)
+        Each in a frame and unit of its own.
+    here, there : (A,), (B,) int64
+        Rows of the two places, two at least in each.
+    """
+    log_scale = _log_spread(T_other, there) - _log_spread(T_now, there)
+    log_scale -= _log_spread(T_other, here) - _log_spread(T_now, here)
+    R_there, R_here = (_mean_turn(T_now[rows], T_other[rows]) for rows in (there, here))
+    return Bend(log_scale, float(np.linalg.norm(so3.log(R_here.T @ R_there))))
+
+
+def check_camera(
+    submap: Submap,
+    link: LinkEstimate,
+    live_since: int,
+    find: Callable[[Submap, IntArray], PreferredCamera | None],
+    config: LinkingConfig,
+    calibration: CalibrationConfig,
+) -> Bend | Failure:
+    """Return the bend that the camera may have made in a new map, none where its pixels say nothing of it.
+
+    Parameters
+    ----------
+    submap : Submap
+        As the walk has left it.
+    link : LinkEstimate
+        Carried to the live end.
+    live_since : int
+        The keyframe that the walk set out from.
+    find : callable
+        Asks keyframes of the submap about the camera.
+    config : LinkingConfig
+    calibration : CalibrationConfig
+        Keyframes of a map that has more than its window holds are asked at even spaces.
+
+    Returns
+    -------
+    Bend or Failure
+        A failure where the link would not be known well enough with it: of the camera where that is contradicted beyond
+        chance, else of the scale, which more keyframes may tell.
+    """
+    ids = np.array(sorted(submap.keyframes), np.int64)
+    here, there = _places(ids, link.agreeing_keyframes, live_since)
+    ids = ids[(ids >= min(here[0], there[0])) & (ids <= max(here[-1], there[-1]))]
+    if len(ids) > calibration.max_keyframes:
+        ids = ids[np.linspace(0, len(ids) - 1, calibration.max_keyframes).astype(np.int64)]
+    found = find(submap, ids)
+    if found is None:
+        return NO_BEND
+    rows = [np.flatnonzero(np.isin(ids, place)) for place in (here, there)]
+    bend = Bend(math.inf, math.inf)
+    if min(len(each) for each in rows) >= 2:
+        bend = measure_bend(found.T_now, found.T_preferred, *rows).beyond_chance(found.distance2)
+    turn_deg = math.degrees(bend.rotation_rad)
+    sigma = math.hypot(link.sigma_scale, bend.log_scale)
+    if sigma <= config.max_live_scale_sigma and turn_deg <= config.max_live_rotation_deg:
+        return bend
+    numbers = {
+        "log_focal": found.log_focal,
+        "distance2": found.distance2,
+        "bend_scale": bend.log_scale,
+        "bend_deg": turn_deg,
+    }
+    by = f"focal length {found.log_focal:+.1%}, known to {found.log_focal_sigma:.1%}"
+    by += f", would bend it by {abs(bend.log_scale):.1%} and {turn_deg:.1f} deg"
+    if found.beyond_chance:
+        return Failure(FailureReason.CAMERA, f"the new map contradicts its camera: {by}", numbers)
+    return Failure(FailureReason.SCALE, f"the new map hardly knows its camera: {by}", numbers)
+
+
+def _places(ids: IntArray, agreeing: IntArray, live_since: int) -> tuple[IntArray, IntArray]:
+    """Return, of a map's keyframes, those of the overlap, and those of the live end or next to it; ascending."""
+    live = ids[ids >= live_since]
+    return ids[np.isin(ids, agreeing)], live if len(live) >= MIN_PLACE else ids[-MIN_PLACE:]
+
+
+def _log_spread(T: FloatArray, rows: IntArray) -> float:
+    centres = T[rows, :3, 3]
+    return 0.5 * math.log(max(float(((centres - centres.mean(axis=0)) ** 2).sum()), 1e-300))
+
+
+def _mean_turn(T_now: FloatArray, T_other: FloatArray) -> FloatArray:
+    """Return the rotation that takes the keyframes of now to where they would be, on average."""
+    turns = T_other[:, :3, :3] @ T_now[:, :3, :3].swapaxes(1, 2)
+    middle = turns[len(turns) // 2]
+    mean = np.mean([so3.log(middle.T @ turn) for turn in turns], axis=0)
+    return np.asarray(middle @ so3.exp(mean), np.float64)

@@ -1,0 +1,304 @@
+"""Motion test: whether a camera can have moved across a gap, or across the seam between two maps. It uses no pixels.
+
+On either side the maps give a velocity. The mean of the two, times the time between them, predicts the displacement.
+How far such predictions are off is measured in the run itself: the same question is asked over the same time wherever
+the camera was tracked without interruption. So no unit is needed, and a hand is judged as a hand, a car as a car.
+
+A gap may be longer than the history that could be asked. The error then grows as that of a velocity that changes at
+random, and in the end the test allows everything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.atlas.trajectory import Path
+from dualslam.core.geometry import sim3
+from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
+
+WINDOW_S = 0.3
+"""Seconds over which a velocity is measured on either side, or `WINDOW_FRAMES`, if these take longer."""
+WINDOW_FRAMES = 4
+MISSING = 2.5
+"""Times the usual interval; frames further apart have others missing between them."""
+USUAL = 0.95
+"""Quantile of the prediction's errors that counts as usual."""
+ALLOWED = 3.0
+"""Times the usual error: a run of seconds has not shown all that its camera does."""
+MIN_ASKED = 12
+"""Places at which the same question could be asked."""
+INDEPENDENT = 3.0
+"""Times the gap that a history must be long to be asked about it: in less, all places are the same stretch."""
+GROWTH = 1.5
+"""Power of time by which the error grows beyond what could be asked: that of a velocity that walks at random. On real
+sequences (hand, drone, car) the error grows with powers of 1.0 to 1.7 between 0.3 and 12 s."""
+DRIFT = 0.1
+"""Share of the way by which a map can have drifted between the place where two maps were matched and their seam. Right
+loops lost 3 % at most."""
+TAIL = 5
+"""Frames at the end of a map that was lost: they may be wrong already."""
+
+JOIN_SIGMAS = 3.0
+"""Standard deviations by which the similarity that joins two maps may be off."""
+
+Slack = Callable[[int, int], float]
+"""What a join leaves open at the seam between two frames, in the unit of the map."""
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """The displacement across a gap or a seam, against its prediction. Lengths are in the unit of the map.
+
+    Attributes
+    ----------
+    off_mu : float
+        Distance between the displacement and its prediction.
+    usual_mu : float
+        The usual error of such predictions over the same time.
+    change_mu : float
+        Error that the change of velocity across the gap explains, if it came all at its beginning or at its end.
+    slack_mu : float
+        What the join of two maps leaves open there.
+    n_asked : int
+        Places at which the usual error was measured.
+    n_sides : int
+        Sides on which a velocity is known.
+    """
+
+    off_mu: float
+    usual_mu: float
+    n_asked: int
+    n_sides: int = 2
+    change_mu: float = 0.0
+    slack_mu: float = 0.0
+
+    @property
+    def allowed_mu(self) -> float:
+        """Return how far off the prediction may be."""
+        return max(ALLOWED * self.usual_mu, self.change_mu) + self.slack_mu
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the camera cannot have moved so, as far as the run can tell."""
+        return self.n_asked >= MIN_ASKED and self.off_mu > self.allowed_mu
+
+    @property
+    def refusal(self) -> Failure:
+        """Return why the motion is not believed."""
+        times = self.off_mu / max(self.usual_mu, 1e-12)
+        detail = f"the camera is {times:.0f} times further from where its velocities lead than elsewhere"
+        numbers = {"leap_off": self.off_mu, "leap_usual": self.usual_mu, "leap_asked": float(self.n_asked)}
+        return Failure(FailureReason.LEAP, detail, numbers)
+
+
+def measure_motion(path: Path, last_before: int, known: Path, slack_mu: float = 0.0) -> Motion | None:
+    """Compare the displacement behind a frame of a path with what its velocities predict.
+
+    Parameters
+    ----------
+    path : Path
+    last_before : int
+        Row of the last frame before the gap, or before the seam.
+    known : Path
+        The camera's path where the usual error is measured, in the unit of `path`.
+    slack_mu : float, optional
+        What the join of two maps leaves open.
+
+    Returns
+    -------
+    Motion or None
+        None where neither side has a velocity.
+    """
+    return _measure(_Fits.of(path), last_before, _Fits.of(known), slack_mu)
+
+
+def refuse_gaps(path: Path, known: Path) -> Failure | None:
+    """Return why a path cannot be the camera's, by its motion across its gaps (`measure_motion`)."""
+    return refuse_steps(path, gaps_of(path.times_s), known)
+
+
+def refuse_steps(path: Path, rows: IntArray, known: Path) -> Failure | None:
+    """Return why a path cannot be the camera's, by its motion behind some of its frames (`measure_motion`)."""
+    fits, fits_known = _Fits.of(path), _Fits.of(known)
+    for i in rows.tolist():
+        motion = _measure(fits, i, fits_known)
+        if motion is not None and motion.is_refused:
+            return motion.refusal
+    return None
+
+
+def refuse_seams(old: Path, new: Path, slack: Slack = lambda i, j: 0.0) -> Failure | None:
+    """Return why two maps cannot be joined, by the camera's motion wherever one of them follows on the other.
+
+    The usual error is the old map's, or the new one's where the old one is too short. The end of the old map may be
+    corrupted: a seam is only refused if it is as well without the old map's last frames.
+
+    Parameters
+    ----------
+    old, new : Path
+        Of different frames, in the same coordinates.
+    slack : callable, optional
+        What the join leaves open between a frame of one map and one of the other, given by their indices.
+    """
+    known = next((fits for fits in map(_Fits.of, (old, new)) if fits.can_be_asked), None)
+    if known is None:
+        return None
+    for before, after in _seams(old, new):
+        slack_mu = slack(int(before.index[-1]), int(after.index[0]))
+        motion = _measure_seam(before, after, known, slack_mu)
+        if motion is None or not motion.is_refused:
+            continue
+        is_old = before.index[-1] in old.index
+        sound = before.take(np.arange(len(before)) < len(before) - TAIL) if is_old else before
+        without = _measure_seam(sound, after, known, slack_mu) if len(sound) else motion
+        if without is None or without.is_refused:
+            return motion.refusal
+    return None
+
+
+def join_slack(S_old_new: FloatArray, covariance: FloatArray, place: FloatArray) -> float:
+    """Return how far the similarity that joins two maps may displace a place, in the unit of the old map.
+
+    Parameters
+    ----------
+    S_old_new : (4, 4)
+    covariance : (7, 7)
+        Of xi in ``S_old_new @ exp(xi)``.
+    place : (3,)
+        In the old map.
+    """
+    J = S_old_new[:3, :3] @ sim3.displacement(sim3.act(sim3.inverse(S_old_new), place[None])[0])
+    return JOIN_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(J @ covariance @ J.T)[-1]))
+
+
+def gaps_of(times_s: FloatArray) -> IntArray:
+    """Return the rows behind which frames are missing."""
+    apart_s = np.diff(times_s)
+    return np.flatnonzero(apart_s > MISSING * np.median(apart_s)) if len(apart_s) else np.zeros(0, np.int64)
+
+
+def usual_error(known: Path, apart_s: float) -> tuple[float, int]:
+    """Return the usual error of the prediction over a time, and at how many places it was measured.
+
+    Frames that were found again by wide matching may have jumped: no stretch with one in it counts.
+    """
+    return _usual_error(_Fits.of(known), apart_s, 0.5, 0.5)
+
+
+def _seams(old: Path, new: Path) -> Iterator[tuple[Path, Path]]:
+    """Yield the paths before and after each seam, one of each map."""
+    times = np.concatenate([old.times_s, new.times_s])
+    of_new = np.arange(len(times)) >= len(old)
+    order = times.argsort(kind="stable")
+    times, of_new = times[order], of_new[order]
+    for n in np.flatnonzero(np.diff(of_new.astype(int))).tolist():
+        before, after = (new, old) if of_new[n] else (old, new)
+        yield before.take(before.times_s <= times[n]), after.take(after.times_s >= times[n + 1])
+
+
+def _measure_seam(before: Path, after: Path, known: _Fits, slack_mu: float) -> Motion | None:
+    return _measure(_Fits.of(before.then(after)), len(before) - 1, known, slack_mu)
+
+
+def _measure(fits: _Fits, last_before: int, known: _Fits, slack_mu: float = 0.0) -> Motion | None:
+    i, j = last_before, last_before + 1
+    has = bool(fits.before.known[i]), bool(fits.after.known[j])
+    if not any(has):
+        return None
+    weights = has[0] / sum(has), has[1] / sum(has)
+    apart_s = float(fits.times_s[j] - fits.times_s[i])
+    off = float(fits.errors(np.array([i]), np.array([j]), *weights)[0])
+    change = (
+        0.5 * float(np.linalg.norm(fits.before.velocity[i] - fits.after.velocity[j])) * apart_s if all(has) else 0.0
+    )
+    return Motion(off, *_usual_error(known, apart_s, *weights), sum(has), change, slack_mu)
+
+
+def _usual_error(known: _Fits, apart_s: float, of_before: float, of_after: float) -> tuple[float, int]:
+    """Return `usual_error` of predictions by the velocities before and after, with these weights."""
+    if len(known.times_s) < 2:
+        return 0.0, 0
+    span_s = float(known.times_s[-1] - known.times_s[0])
+    asked_s, n_asked = min(apart_s, span_s / INDEPENDENT), 0
+    while asked_s > 0.5 * known.usual_s:
+        i, j = known.stretches(asked_s, of_before > 0, of_after > 0)
+        n_asked = max(n_asked, len(i))
+        if len(i) >= MIN_ASKED:
+            usual = float(np.quantile(known.errors(i, j, of_before, of_after), USUAL))
+            return usual * (apart_s / asked_s) ** GROWTH, len(i)
+        asked_s *= 0.5
+    return 0.0, n_asked
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lines:
+    """Straight lines through the frames on one side of each of N frames, itself included.
+
+    `place`: where they put the camera at the frame's time, (N, 3); where no line is known, the frame's own place.
+    """
+
+    velocity: FloatArray
+    place: FloatArray
+    known: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fits:
+    """The lines before and after each frame of a path. `jumped`: frames that were found by wide matching."""
+
+    times_s: FloatArray
+    usual_s: float
+    reach_s: float
+    jumped: BoolArray
+    before: _Lines
+    after: _Lines
+
+    @classmethod
+    def of(cls, path: Path) -> _Fits:
+        t = path.times_s - path.times_s[0] if len(path) else path.times_s
+        usual_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+        reach_s = max(WINDOW_S, WINDOW_FRAMES * usual_s) + 0.5 * usual_s
+        rows = np.arange(len(t))
+        first, end = np.searchsorted(t, t - reach_s, "right"), np.searchsorted(t, t + reach_s, "left")
+        before, after = (_fit(t, path.centres, a, b, usual_s) for a, b in ((first, rows + 1), (rows, end)))
+        return cls(t, usual_s, reach_s, path.refound, before, after)
+
+    @property
+    def can_be_asked(self) -> bool:
+        """Whether the usual error can be measured over any time at all."""
+        return len(self.stretches(self.usual_s, True, True)[0]) >= MIN_ASKED
+
+    def errors(self, i: IntArray, j: IntArray, of_before: float, of_after: float) -> FloatArray:
+        """Return how far the displacements from frames i to j are from their predictions."""
+        velocity = of_before * self.before.velocity[i] + of_after * self.after.velocity[j]
+        moved = self.after.place[j] - self.before.place[i]
+        return np.asarray(np.linalg.norm(moved - velocity * (self.times_s[j] - self.times_s[i])[:, None], axis=1))
+
+    def stretches(self, apart_s: float, needs_before: bool, needs_after: bool) -> tuple[IntArray, IntArray]:
+        """Return the pairs of frames so far apart in time over which the camera was tracked without a jump."""
+        t = self.times_s
+        j = np.searchsorted(t, t + apart_s - 0.5 * self.usual_s)
+        i = np.flatnonzero(j < len(t))
+        j = j[i]
+        jumps = np.concatenate([[0], np.cumsum(self.jumped)])
+        first, end = np.searchsorted(t, t[i] - self.reach_s, "right"), np.searchsorted(t, t[j] + self.reach_s)
+        good = jumps[first] == jumps[end]
+        good &= self.before.known[i] if needs_before else True
+        good &= self.after.known[j] if needs_after else True
+        return i[good], j[good]
+
+
+def _fit(t: FloatArray, centres: FloatArray, first: IntArray, end: IntArray, usual_s: float) -> _Lines:
+    """Fit a line to the rows `first` to `end` for each frame: known where there are enough, and none is missing."""
+    terms = np.column_stack([np.ones(len(t)), t, t**2, centres, t[:, None] * centres])
+    sums = np.vstack([np.zeros(terms.shape[1]), np.cumsum(terms, axis=0)])
+    n, s_t, s_tt, s_p, s_tp = np.split(sums[end] - sums[first], [1, 2, 3, 6], axis=1)
+    missing = np.concatenate([[0, 0], np.cumsum(np.diff(t) > MISSING * usual_s)])[: len(t) + 1]
+    known = (n[:, 0] >= WINDOW_FRAMES) & (missing[end] == missing[np.minimum(first + 1, len(t))])
+    spread = np.where(known[:, None], n * s_tt - s_t**2, 1.0)
+    velocity = np.where(known[:, None], (n * s_tp - s_t * s_p) / spread, 0.0)
+    place = np.where(known[:, None], (s_p + velocity * (n * t[:, None] - s_t)) / np.maximum(n, 1), centres)
+    return _Lines(velocity, place, known)

@@ -1,0 +1,139 @@
+"""What the shared keyframes say about a similarity one by one, in order of time.
+
+The newest part of the old map may be corrupted: rigid in itself, so that it fits the new map by a clean similarity that
+is wrong. What gives it away lies along time: the place where the old map is torn, or where the similarity changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dualslam.core.config.settings import LinkingConfig
+from dualslam.core.geometry import se3, sim3, so3
+from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.linking.gates import (
+    GATE_SIGMAS,
+    MIN_MAJORITY,
+    MIN_PAIRS_PER_KEYFRAME,
+    MIN_TIES,
+    PAIR_CHI2,
+    PIXEL_CHI2,
+    TIE_WINDOW,
+)
+from dualslam.linking.pairs import PairModel, pixel_chi2
+from dualslam.map.submap import Submap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeVotes:
+    """How each of the K shared keyframes stands to a similarity.
+
+    Attributes
+    ----------
+    rotation_rad : (K,)
+        Angle between the camera's orientations in the two maps.
+    centre : (K,)
+        Distance between its centres, relative to the distance of the landmarks it sees (or of the centre of the
+        overlap, if that is more).
+    agrees, can_vote : (K,) bool
+    """
+
+    rotation_rad: FloatArray
+    centre: FloatArray
+    agrees: BoolArray
+    can_vote: BoolArray
+
+
+def ask_keyframes(model: PairModel, S_old_new: FloatArray, config: LinkingConfig) -> KeyframeVotes:
+    """Ask each shared keyframe whether its matches and its two poses agree with a similarity."""
+    c = model.pairs
+    every = np.ones(len(c.view_pair), bool)
+    n = c.count_by_keyframe(every)
+    per = np.maximum(n, 1)
+    near = model.mahalanobis2(S_old_new) < PAIR_CHI2
+    share = c.count_by_keyframe(near[c.view_pair]) / per
+    T_moved = sim3.act_on_pose(S_old_new, model.T_new_kf)
+    turn = so3.log(T_moved[:, :3, :3].swapaxes(1, 2) @ model.T_old_kf[:, :3, :3])
+    rotation = np.sqrt((turn**2).sum(1))
+    centres = model.T_old_kf[:, :3, 3]
+    apart = np.linalg.norm(T_moved[:, :3, 3] - centres, axis=1)
+    distance = np.linalg.norm(c.xyz_old[c.view_pair] - centres[c.view_keyframe], axis=1)
+    depth = np.array([np.median(distance[c.view_keyframe == k]) for k in range(len(c.keyframes))])
+    reach = np.maximum(depth, np.linalg.norm(centres - model.centre_old, axis=1))
+    bound = GATE_SIGMAS * config.deformation_sigma
+    agrees = (share > MIN_MAJORITY) & (rotation < bound) & (apart < bound * reach)
+    return KeyframeVotes(rotation, apart / reach, agrees, n >= MIN_PAIRS_PER_KEYFRAME)
+
+
+def leading_run(agrees: BoolArray, max_misfits: int) -> int:
+    """Return the length of the run of agreement that begins at the first element: single misfits do not end it.
+
+    More than `max_misfits` in a row do, and so does a misfit at the very end, or at the beginning (then it is 0).
+    """
+    if len(agrees) == 0 or not agrees[0]:
+        return 0
+    end, misfits = 0, 0
+    for i, agree in enumerate(agrees.tolist()):
+        misfits = 0 if agree else misfits + 1
+        if misfits > max_misfits:
+            break
+        if agree:
+            end = i + 1
+    return end
+
+
+def find_discontinuities(submap: Submap, oldest: int, newest: int) -> IntArray:
+    """Return the ids of the keyframes before which a map is torn, ascending: its parts there are not held together.
+
+    A wrong pose either ends the tracks, or leaves their observations wrong on one side of it. So a place between two
+    keyframes is torn if too few landmarks are seen on both sides in agreement with their pixels, or if most
+    observations of those that are followed across it (twice on either side: a single camera cannot tell a change of
+    scale about itself) disagree.
+
+    Parameters
+    ----------
+    submap : Submap
+    oldest, newest : int
+        Keyframe ids; the places after `oldest` up to before `newest` are searched.
+    """
+    w = TIE_WINDOW
+    ids = np.array(sorted(submap.keyframes))
+    first, last = int(np.searchsorted(ids, oldest, "right")), int(np.searchsorted(ids, newest, "right"))
+    start = max(first - w, 0)
+    ids = ids[start : last + w]
+    seen, good = _own_agreement(submap, ids, PIXEL_CHI2)
+    places = range(max(first - start, 1), last - start)
+    torn, contrast = np.zeros((2, len(ids)), bool), np.zeros(len(ids))
+    for i in places:
+        before, after = slice(max(i - w, 0), i), slice(i, i + w)
+        ties = good[:, before].any(1) & good[:, after].any(1)
+        torn[0, i] = np.count_nonzero(ties) < MIN_TIES
+        followed = (seen[:, before].sum(1) >= 2) & (seen[:, after].sum(1) >= 2)
+        if np.count_nonzero(followed) >= MIN_TIES:
+            share = [good[followed, side].sum() / seen[followed, side].sum() for side in (before, after)]
+            torn[1, i] = min(share) <= MIN_MAJORITY
+            contrast[i] = abs(share[0] - share[1])
+    # Windows that reach over a discontinuity disagree already beside it: of such neighbours the clearest is the place.
+    for run in np.split(np.arange(len(ids)), np.flatnonzero(np.diff(torn[1].astype(int))) + 1):
+        if len(run) and torn[1, run[0]]:
+            torn[1, run] = False
+            torn[1, run[np.argmax(contrast[run])]] = True
+    return ids[torn.any(0)]
+
+
+def _own_agreement(submap: Submap, ids: IntArray, gate: float) -> tuple[BoolArray, BoolArray]:
+    """Return which landmarks are seen in which of the keyframes, and where their pixels agree; both (L, len(ids))."""
+    obs = submap.observations
+    rows = np.flatnonzero(obs["alive"] & np.isin(obs["kf"], ids))
+    column = np.searchsorted(ids, obs["kf"][rows])
+    landmarks, row = np.unique(obs["landmark"][rows], return_inverse=True)
+    uv, sigma = submap.observed_pixels(rows)
+    T_kf_submap = se3.inverse(submap.keyframe_poses(ids))
+    none = np.zeros((3, 3))
+    chi2 = pixel_chi2(submap.K, T_kf_submap[column], submap.landmarks["xyz_mu"][obs["landmark"][rows]], none, uv, sigma)
+    seen, good = np.zeros((2, len(landmarks), len(ids)), bool)
+    seen[row, column] = True
+    good[row[chi2 < gate], column[chi2 < gate]] = True
+    return seen, good

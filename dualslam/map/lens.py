@@ -1,0 +1,312 @@
+"""The camera as it is known now: when a submap estimates it, what a new estimate changes, and what must wait.
+
+Asking takes up to seconds, so it is a job on a snapshot (`CalibrationJob`), which `answer` does, wherever that is; the
+submap that was asked has gone on when the answer comes (`dualslam/system/camera/background.py`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dualslam.core.camera.base import Camera
+from dualslam.core.camera.corrected import correct
+from dualslam.core.config.calibration_config import CalibrationConfig
+from dualslam.core.errors import InputError, SolverError
+from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph
+from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Keyframe, View
+from dualslam.map.submap import Submap
+
+GROWTH = 1.5
+"""Each next time comes when it has so many times the keyframes."""
+UPDATE_SIGMA_RATIO = 0.7
+"""A camera that was changed on an answer that was not even sure by `max_sigma_ratio` is changed again, however little,
+where the new sigma of the focal length is below this share of that answer's: twice the information. One that was
+sure stays, until another is significantly different."""
+AT_LOSS = 1.05
+"""A map that may be at its end is asked once more, where it has so many times the keyframes of when it was asked: the
+next one begins with what it says. Lower, single frames without a pose would each cost a question."""
+SURE_SIGMA = 0.01
+"""Of the log focal length: an answer that is no surer than this is not the last, however little was known before."""
+
+log = logging.getLogger(__name__)
+
+RETRY_KEYFRAMES, RETRY_SHARE = 10, 0.25
+"""Where the motion said nothing yet, a submap is asked again after so many more keyframes, or this share more."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationJob:
+    """A question about the camera, with all that the answer is made from. It can be pickled.
+
+    Attributes
+    ----------
+    submap : Submap
+        The one that is asked, a copy.
+    lost : dict of int to Submap
+        Copies of those that are to change with it.
+    camera : Camera
+        The present one, which rectified their features.
+    covariance : (5, 5) or None
+        Of the correction that it has, if it was estimated.
+    """
+
+    submap: Submap
+    lost: dict[int, Submap]
+    camera: Camera
+    covariance: FloatArray | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationAnswer:
+    """What a submap has said of its camera, and what becomes of the maps.
+
+    Attributes
+    ----------
+    camera : Camera
+    covariance : (5, 5)
+    submap : Submap
+        The job's, changed to that camera and adjusted.
+    lost : dict of int to Submap
+        Those of the job's that could be changed, solved.
+    numbers : dict
+        For the event log.
+    """
+
+    camera: Camera
+    covariance: FloatArray
+    submap: Submap
+    lost: dict[int, Submap]
+    numbers: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refinement:
+    """A submap's change to a better calibration.
+
+    Attributes
+    ----------
+    graph : SubmapGraph or None
+        Made from the changed submap, where one was given.
+    before : Submap
+        A copy of the submap as it was.
+    numbers : dict
+        For the event log.
+    """
+
+    graph: SubmapGraph | None
+    before: Submap
+    numbers: dict[str, float]
+
+
+class Calibration:
+    """The camera that features are rectified by, from the one that was given to the best one known.
+
+    Parameters
+    ----------
+    camera : Camera
+        As it was given.
+    config : CalibrationConfig
+    estimate : SelfCalibrator
+    adjust : SubmapAdjuster
+    covariance : (5, 5), optional
+        Of the correction that the camera has, if it was estimated.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: CalibrationConfig,
+        estimate: SelfCalibrator,
+        adjust: SubmapAdjuster,
+        covariance: FloatArray | None = None,
+    ) -> None:
+        self._camera = camera
+        self._config = config
+        self._estimate = estimate
+        self._adjust = adjust
+        self._due_at: dict[int, int] = {}
+        self._asked_with: dict[int, int] = {}
+        self._refined_in: int | None = None
+        self._covariance = covariance
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that the frames to come are rectified by."""
+        return self._camera
+
+    @property
+    def covariance(self) -> FloatArray | None:
+        """(5, 5) of the correction that it has; none where it is as it was given."""
+        return self._covariance
+
+    @property
+    def log_focal_sigma(self) -> float | None:
+        """Standard deviation of the logarithm of its focal length; None where it is as it was given."""
+        return None if self._covariance is None else float(np.sqrt(self._covariance[0, 0]))
+
+    def is_due(self, submap: Submap) -> bool:
+        """Whether it is time to ask this submap."""
+        if self._refined_in not in (None, submap.id):
+            return False  # what a longer submap said of the lens is not put at risk by a shorter one
+        due_at = self._due_at.get(submap.id, self._config.first_keyframes)
+        return self._config.refine and len(submap.keyframes) >= due_at
+
+    def is_due_at_loss(self, submap: Submap) -> bool:
+        """Whether it is time to ask a submap that may be at its end: as long as none has told what the camera is."""
+        n, config = len(submap.keyframes), self._config
+        has_grown = n >= AT_LOSS * self._asked_with.get(submap.id, 0)
+        return config.refine and self._refined_in is None and n >= config.first_keyframes and has_grown
+
+    def ask(self, submap: Submap, lost: dict[int, Submap]) -> CalibrationJob:
+        """Return the question to a submap, on copies of it and of those that are to change with it.
+
+        It is not due again before the submap has grown.
+        """
+        self._asked(submap.id, len(submap.keyframes))
+        copies = {m: each.copy() for m, each in lost.items()}
+        return CalibrationJob(submap.copy(), copies, self._camera, self._covariance)
+
+    def note(self, job: CalibrationJob, failure: Failure) -> None:
+        """Note that a question had no clear answer: where the motion said nothing yet, the next comes sooner."""
+        if failure.reason is FailureReason.DEGENERATE:
+            self._said_nothing(job.submap.id, len(job.submap.keyframes))
+
+    def take(self, answer: CalibrationAnswer) -> None:
+        """Let the frames to come be rectified by the camera that was found."""
+        self._camera, self._refined_in, self._covariance = answer.camera, answer.submap.id, answer.covariance
+
+    def _asked(self, submap_id: int, n: int) -> None:
+        self._due_at[submap_id], self._asked_with[submap_id] = int(np.ceil(GROWTH * n)), n
+
+    def _said_nothing(self, submap_id: int, n: int) -> None:
+        self._due_at[submap_id] = n + max(RETRY_KEYFRAMES, int(RETRY_SHARE * n))
+
+    def refine(self, submap: Submap, graph: SubmapGraph | None = None) -> Refinement | Failure:
+        """Ask a submap about its camera and, where the answer is clear, change the submap to it.
+
+        Parameters
+        ----------
+        submap : Submap
+            Keeps its ids. Only where the whole change succeeds, it gets other intrinsics, pixels, poses and points.
+        graph : SubmapGraph, optional
+            Makes a new graph for the changed submap; without it, the caller solves.
+        """
+        n = len(submap.keyframes)
+        self._asked(submap.id, n)
+        estimate = self._estimate(submap, self._camera, self._covariance)
+        if isinstance(estimate, Failure):
+            if estimate.reason is FailureReason.DEGENERATE:
+                self._said_nothing(submap.id, n)
+            return estimate
+        numbers = estimate.numbers
+        if not estimate.accepted and not self._is_much_surer(estimate.covariance):
+            return Failure(FailureReason.CHI_SQUARE, "no significant change", numbers)
+        try:
+            camera = correct(self._camera, estimate.correction)
+            before = self._change(submap, camera, graph)
+        except (InputError, SolverError) as error:
+            return Failure(FailureReason.SOLVER, str(error), numbers)
+        self._camera, self._refined_in, self._covariance = camera, submap.id, estimate.covariance
+        return Refinement(graph, before, numbers)
+
+    def update(self, submap: Submap, graph: SubmapGraph) -> Submap | Failure:
+        """Change a submap that an earlier camera made to the present one; return a copy of it as it was.
+
+        It was the same lens: what a longer map says of it is true of this one too. Two maps of different cameras have
+        different shapes, and would not be linked.
+        """
+        try:
+            return self._change(submap, self._camera, graph)
+        except (InputError, SolverError) as error:
+            return Failure(FailureReason.SOLVER, str(error))
+
+    def _change(self, submap: Submap, camera: Camera, graph: SubmapGraph | None) -> Submap:
+        changed = submap.copy()
+        change_camera(changed, camera)
+        self._adjust(changed)
+        if graph is not None:
+            solved = graph.rebuild(changed)
+            changed.apply_estimate(*solved.values)
+        before = submap.copy()
+        submap.take_over(changed)
+        return before
+
+    def _is_much_surer(self, covariance: FloatArray) -> bool:
+        """Whether an answer is worth a change that is not significant: only where the present one was hardly sure."""
+        config, present, found = self._config, self.log_focal_sigma, float(np.sqrt(covariance[0, 0]))
+        if present is None:
+            return False
+        hardly_sure = present > min(config.max_sigma_ratio * config.log_focal_sigma, SURE_SIGMA)
+        return hardly_sure and found < UPDATE_SIGMA_RATIO * present
+
+    def rectified(self, view: View) -> View:
+        """Return a view with the pixels of the present camera; features without a place there keep their old one."""
+        return replace(view, features=rectified_where_possible(view.features, self._camera))
+
+
+def answer(
+    job: CalibrationJob, calibration: Calibration, new_graph: Callable[[], SubmapGraph]
+) -> CalibrationAnswer | Failure:
+    """Do a job: ask its submap, and change it and the lost ones where the answer is clear.
+
+    Parameters
+    ----------
+    job : CalibrationJob
+        Its submaps are not changed.
+    calibration : Calibration
+        One of its own, with the camera and the covariance of the job.
+    new_graph : callable
+    """
+    submap, changed = job.submap.copy(), {}
+    refined = calibration.refine(submap)
+    if isinstance(refined, Failure):
+        return refined
+    for m, each in job.lost.items():
+        lost = each.copy()
+        before = calibration.update(lost, new_graph())
+        if isinstance(before, Failure):
+            log.warning("submap %d keeps its camera: %s", m, before.detail)
+        else:
+            changed[m] = lost
+    assert calibration.covariance is not None
+    return CalibrationAnswer(calibration.camera, calibration.covariance, submap, changed, refined.numbers)
+
+
+def rectified_again(features: Features, camera: Camera) -> Features:
+    """Return features with their pixels under another camera. None is dropped (observations name them by their row),
+    and sigmas stay: a correction changes them by a few per cent.
+    """
+    uv_rect_px, _ = camera.rectify(features.uv_px)
+    lost = ~np.isfinite(uv_rect_px).all(axis=1)
+    if lost.any():
+        raise InputError(f"camera: {int(lost.sum())} features have no place in the corrected image")
+    return replace(features, uv_rect_px=uv_rect_px)
+
+
+def rectified_where_possible(features: Features, camera: Camera) -> Features:
+    """Return features with their pixels under another camera; those without a place there keep their old one."""
+    uv_rect_px, _ = camera.rectify(features.uv_px)
+    lost = ~np.isfinite(uv_rect_px).all(axis=1)
+    uv_rect_px[lost] = features.uv_rect_px[lost]
+    return replace(features, uv_rect_px=uv_rect_px)
+
+
+def change_camera(
+    submap: Submap, camera: Camera, done: Mapping[int, Keyframe] | None = None, of: Mapping[int, Keyframe] | None = None
+) -> None:
+    """Give a submap the pixels and the intrinsics of another camera; poses and points stay.
+
+    `done`: keyframes whose pixels were changed already, when they were as they are in `of`.
+    """
+    submap.K = camera.K
+    submap.relative_poses = {}  # they were measured with the camera of before
+    done, of = done or {}, of or {}
+    for k, keyframe in submap.keyframes.items():
+        if k in done and k in of and keyframe.features is of[k].features:
+            submap.keyframes[k] = replace(keyframe, features=done[k].features)
+        else:
+            submap.keyframes[k] = replace(keyframe, features=rectified_again(keyframe.features, camera))

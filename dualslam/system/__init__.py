@@ -1,0 +1,1 @@
+"""The algorithm, in the numbered steps of a frame; `system.py` comes first."""

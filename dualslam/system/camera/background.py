@@ -1,0 +1,218 @@
+"""Questions about the camera, asked beside the tracking, and what becomes of a map that has gone on when the answer is.
+
+The snapshot that was asked comes back changed to another camera: other pixels, poses and points. All keyframes of the
+live submap take the new camera, those of the snapshot their new poses too, and what has come since follows them
+(`dualslam/map/late_estimate.py`); then the graph is made anew. Inline nothing has come since, and the live submap
+becomes what the snapshot was changed to.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+
+from dualslam.atlas.connections import Connections
+from dualslam.atlas.record import FrameStamp, Record
+from dualslam.core.errors import InputError, SolverError
+from dualslam.core.events import EventKind
+from dualslam.core.geometry import se3, sim3
+from dualslam.core.interfaces import SubmapGraph, VisualOdometry
+from dualslam.core.types import Failure, FailureReason, View
+from dualslam.map.late_estimate import apply_late
+from dualslam.map.lens import (
+    Calibration,
+    CalibrationAnswer,
+    CalibrationJob,
+    change_camera,
+    rectified_where_possible,
+)
+from dualslam.map.submap import Submap
+from dualslam.map.submap_change import change_of_frame
+from dualslam.workers.jobs import Desk, JobKind
+
+log = logging.getLogger(__name__)
+
+SAME_GAUGE = 1e-6
+"""Relative. A snapshot whose gauge the submap still has needs no change of frame; a solution moves it by rounding."""
+
+
+class Views(Protocol):
+    """Buffered views, which change to another camera with the maps."""
+
+    def map_later(self, change: Callable[[View], View], subject: str) -> None:
+        """Change each view, at the latest when somebody looks at it."""
+        ...
+
+
+class Calibrations:
+    """Asks live submaps about their camera, and takes the answers in between two frames.
+
+    Parameters
+    ----------
+    record : Record
+    buffer : Views
+    calibration : Calibration
+    desk : Desk
+        Where the questions are answered.
+    new_graph : callable
+    connections : Connections
+    """
+
+    def __init__(
+        self,
+        record: Record,
+        buffer: Views,
+        calibration: Calibration,
+        desk: Desk,
+        new_graph: Callable[[], SubmapGraph],
+        connections: Connections,
+    ) -> None:
+        self._record = record
+        self._buffer = buffer
+        self._calibration = calibration
+        self._desk = desk
+        self._new_graph = new_graph
+        self._connections = connections
+
+    def ask_if_due(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int]) -> None:
+        """Ask the live submap about its camera where it is time to.
+
+        `lost`: the submaps that are to be linked with it, and must have the same camera.
+        """
+        if self._calibration.is_due(live.submap):
+            self._ask(live, now, lost)
+
+    def ask_at_loss(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int]) -> None:
+        """Ask the live submap as its track is lost, so that the next map has its camera from the first frame on."""
+        if self._calibration.is_due_at_loss(live.submap):
+            self._ask(live, now, lost)
+
+    def _ask(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int]) -> None:
+        if self._desk.n_open(JobKind.CALIBRATION, live.submap.id):
+            return
+        with self._record.timer.measure("calibration"):
+            job = self._calibration.ask(live.submap, {m: self._record.atlas.submaps[m] for m in lost})
+            self._desk.submit(JobKind.CALIBRATION, job, of=live.submap.id)
+        self.collect(live, now, lost)
+
+    def collect(self, live: VisualOdometry | None, now: FrameStamp, lost: Collection[int], wait: bool = False) -> bool:
+        """Take in what was answered meanwhile; `live` goes on in its submap as it is after that.
+
+        It may be the front end that looks for a submap which was lost since it was asked. Returns whether the frames to
+        come have another camera. `wait`: for a limited time, for what is open.
+        """
+        before, desk = self._calibration.camera, self._desk
+        for ended in desk.drain(JobKind.CALIBRATION) if wait else desk.poll(JobKind.CALIBRATION):
+            with self._record.timer.measure("calibration"):
+                self._take(ended.work, ended.result, live, now, lost)
+        return self._calibration.camera is not before
+
+    def _take(
+        self,
+        job: CalibrationJob,
+        result: CalibrationAnswer | Failure,
+        live: VisualOdometry | None,
+        now: FrameStamp,
+        lost: Collection[int],
+    ) -> None:
+        """Let submap, graph, buffer and lost submaps change to the camera that was found, all of them or none."""
+        failure = result if isinstance(result, Failure) else self._take_answer(job, result, live, now, lost)
+        if isinstance(failure, Failure):
+            self._calibration.note(job, failure)
+            kept = EventKind.CALIBRATION_KEPT
+            self._record.event(kept, now, job.submap.id, reason=failure.detail, **failure.numbers)
+            return
+        assert isinstance(result, CalibrationAnswer)
+        self._record.event(EventKind.CALIBRATED, now, job.submap.id, lost=failure, **result.numbers)
+
+    def _take_answer(
+        self,
+        job: CalibrationJob,
+        answer: CalibrationAnswer,
+        live: VisualOdometry | None,
+        now: FrameStamp,
+        lost: Collection[int],
+    ) -> list[int] | Failure:
+        """Return the lost submaps that have changed, too."""
+        if live is None or live.submap.id != job.submap.id:
+            # What lives now was made with the camera of before, and would be left apart from all that changes.
+            return Failure(FailureReason.DISABLED, "the submap that was asked is live no more", answer.numbers)
+        graph = self._new_graph()
+        try:
+            merged = merge_calibrated(live.submap, job.submap, answer)
+            merged.apply_estimate(*graph.rebuild(merged, near_optimum=True).values)
+        except (InputError, SolverError) as error:
+            return Failure(FailureReason.SOLVER, str(error), answer.numbers)
+        self._calibration.take(answer)
+        before = live.submap.copy()
+        live.submap.take_over(merged)
+        live.adopt(graph, before)
+        self._buffer.map_later(self._calibration.rectified, "camera")
+        self._connections.follow(before, live.submap, now)
+        changed = [m for m in sorted(lost) if self._change_lost(m, job, answer, now)]
+        rectified = partial(rectified_where_possible, camera=answer.camera)
+        for m in (live.submap.id, *changed):
+            self._record.change_pixels(m, lambda _: rectified)
+        return changed
+
+    def _change_lost(self, submap_id: int, job: CalibrationJob, answer: CalibrationAnswer, now: FrameStamp) -> bool:
+        """Change a lost submap with the live one, if it could be."""
+        if submap_id not in answer.lost:
+            return False
+        submap = self._record.atlas.submaps[submap_id]
+        of_lost = CalibrationAnswer(answer.camera, answer.covariance, answer.lost[submap_id], {}, answer.numbers)
+        try:
+            merged = merge_calibrated(submap, job.lost[submap_id], of_lost)
+        except InputError as error:
+            log.warning("submap %d keeps its camera: %s", submap_id, error)
+            return False
+        before = submap.copy()
+        submap.take_over(merged)
+        self._connections.follow(before, submap, now)
+        return True
+
+
+def merge_calibrated(live: Submap, base: Submap, answer: CalibrationAnswer) -> Submap:
+    """Return a copy of a submap changed to another camera as its snapshot was; what has come since follows.
+
+    Parameters
+    ----------
+    live : Submap
+        As it is now: grown, solved again, merged with what a walk found.
+    base : Submap
+        The snapshot.
+    answer : CalibrationAnswer
+        Its `submap` is the snapshot, changed.
+
+    Raises
+    ------
+    InputError
+        If features have no place in the corrected image.
+    """
+    changed, merged = answer.submap, live.copy()
+    if not _same_gauge(live, base):
+        changed = changed.copy()
+        S = change_of_frame(base, live, base.keyframes, len(base.landmarks))
+        T = se3.from_parts(sim3.rotation(S), sim3.translation(S))
+        changed.transform(float(sim3.scale(S)), T)
+    change_camera(merged, answer.camera, changed.keyframes, base.keyframes)
+    shared = np.array([k for k in changed.keyframes if k in merged.keyframes], np.int64)
+    n = len(base.landmarks)
+    alive = np.flatnonzero(merged.landmarks["alive"][:n] & changed.landmarks["alive"])
+    if len(shared):
+        apply_late(merged, shared, changed.keyframe_poses(shared), alive, changed.landmarks["xyz_mu"][alive])
+    return merged
+
+
+def _same_gauge(live: Submap, base: Submap) -> bool:
+    first, second = base.gauge
+    if live.gauge != base.gauge or not {first, second} <= live.keyframes.keys():
+        return False
+    baselines = [m.T_submap_kf[second][:3, 3] - m.T_submap_kf[first][:3, 3] for m in (live, base)]
+    lengths = [float(np.linalg.norm(each)) for each in baselines]
+    stays = np.allclose(live.T_submap_kf[first], base.T_submap_kf[first], rtol=0, atol=SAME_GAUGE)
+    return bool(stays) and abs(lengths[0] - lengths[1]) <= SAME_GAUGE * lengths[1]

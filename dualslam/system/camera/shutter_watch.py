@@ -1,0 +1,195 @@
+"""The shutter of a live map: how long its images were read is asked of the map itself, and taken out of all it is in.
+
+Before a map starts, pairs of frames tell a readout time to five or ten milliseconds, and where the camera does not turn
+fast just then they tell nothing. A map tells it to a fraction of one (`frontends/tracking/map_readout.py`). It matters:
+where a camera turns fast, few landmarks are seen from both sides of the turn, and each millisecond of readout on a fast
+walk moves the scale behind such a turn by 4 %, which nothing else shows.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import replace
+from functools import partial
+from typing import Protocol
+
+from dualslam.atlas.connections import Connections
+from dualslam.atlas.record import FrameStamp, Record
+from dualslam.core.camera.base import Camera
+from dualslam.core.errors import SolverError
+from dualslam.core.estimates import ReadoutEstimate
+from dualslam.core.events import EventKind
+from dualslam.core.interfaces import Shutter, SubmapGraph, VisualOdometry
+from dualslam.core.types import Failure, FloatArray, View
+from dualslam.map.frame_observations import Change
+from dualslam.map.lens import Calibration
+from dualslam.map.submap import Submap
+from dualslam.system.camera.background import Views
+from dualslam.system.camera.turns import turn_rates
+from dualslam.workers.jobs import Desk, JobKind
+
+log = logging.getLogger(__name__)
+
+FIRST_KEYFRAMES, GROWTH, SOON = 15, 2.0, 1.4
+"""Keyframes at which a map is asked first, and how many times as many it has at each next time; and where it was
+changed: what it had refused as outliers was by the shutter of before, and the first answer errs towards that."""
+INFLATION = 4.0
+"""How much larger errors are than the residuals say, as neighbouring pixels err alike: as self-calibration has it."""
+MIN_SIGMAS = 3.0
+"""Of these inflated errors, that a readout time must be off for the map to be changed. Global shutters come out at up
+to 1.2 (KITTI, EuRoC), rolling ones at 5 and more."""
+
+MAX_SIGMA_S = 0.004
+"""Inflated: where the camera turns too slowly to tell a readout time to that, other errors of the pixels pass for one
+(a rendered street, which hardly turns: -0.020 s with 0.008 claimed). There it does not matter either."""
+
+
+class ReadViews(Views, Protocol):
+    """Buffered views, which change to another shutter with the maps."""
+
+    @property
+    def indices(self) -> list[int]:
+        """Return whose they are, the oldest first."""
+        ...
+
+    def newest(self, n: int) -> list[View]:
+        """Return so many of the newest views, from the oldest to the newest."""
+        ...
+
+    def change_all(self, change: Callable[[Iterable[View]], Iterable[View]]) -> None:
+        """Put what `change` makes of the views, oldest first, into their places."""
+        ...
+
+
+class ShutterWatch:
+    """Asks live submaps how long their images were read, and takes the answer in between two frames.
+
+    Parameters
+    ----------
+    record : Record
+    buffer : ReadViews
+    calibration : Calibration
+    shutter : Shutter
+    desk : Desk
+        Where the questions are answered.
+    new_graph : callable
+    connections : Connections
+    """
+
+    def __init__(
+        self,
+        record: Record,
+        buffer: ReadViews,
+        calibration: Calibration,
+        shutter: Shutter,
+        desk: Desk,
+        new_graph: Callable[[], SubmapGraph],
+        connections: Connections,
+    ) -> None:
+        self._record = record
+        self._buffer = buffer
+        self._calibration = calibration
+        self._shutter = shutter
+        self._desk = desk
+        self._new_graph = new_graph
+        self._connections = connections
+        self._due_at: dict[int, float] = {}  # by submap, keyframes
+        self._asked: dict[int, tuple[object, float, Camera]] = {}  # by submap: what, and of which pixels
+
+    def ask_if_due(self, live: VisualOdometry) -> None:
+        """Ask the live submap where it is time to."""
+        submap = live.submap
+        n = len(submap.keyframes)
+        if self._shutter.is_stated or self._desk.n_open(JobKind.READOUT, submap.id):
+            return
+        with self._record.timer.measure("shutter"):
+            if n >= self._due_at.get(submap.id, FIRST_KEYFRAMES):
+                self._due_at[submap.id] = GROWTH * n
+                question = self._shutter.ask(
+                    submap, turn_rates(submap, self._record.poses.values()), self._calibration.camera
+                )
+                if not isinstance(question, Failure):
+                    self._asked[submap.id] = question, self._shutter.readout_s, self._calibration.camera
+                    self._desk.submit(JobKind.READOUT, question, of=submap.id)
+
+    def collect(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int], wait: bool = False) -> None:
+        """Take in what the live submap has answered.
+
+        `lost`: the submaps that are to be linked with it, and must have the same pixels. `wait`: for a limited time,
+        for what is open.
+        """
+        for ended in self._desk.drain(JobKind.READOUT) if wait else self._desk.poll(JobKind.READOUT):
+            asked = self._asked.get(live.submap.id)
+            # An answer of another map, or of other pixels, is no answer.
+            if asked == (ended.work, self._shutter.readout_s, self._calibration.camera):
+                with self._record.timer.measure("shutter"):
+                    self._take_answer(ended.result, live, now, lost)
+
+    def _take_answer(
+        self, answer: ReadoutEstimate | Failure, live: VisualOdometry, now: FrameStamp, lost: Collection[int]
+    ) -> None:
+        submap = live.submap
+        if isinstance(answer, Failure) or not _is_sure(answer):
+            return
+        readout_s = self._shutter.readout_s + answer.more_s
+        if not self._change(submap, answer.more_s, now, live):
+            return
+        self._due_at[submap.id] = SOON * len(submap.keyframes)
+        submaps = self._record.atlas.submaps
+        changed = [m for m in sorted(lost) if self._change(submaps[m], answer.more_s, now)]
+        self._take(readout_s)
+        sigma_s = INFLATION * answer.sigma_s
+        self._record.event(EventKind.SHUTTER_FOUND, now, submap.id, readout_s=readout_s, sigma_s=sigma_s, lost=changed)
+
+    def _change(self, submap: Submap, more_s: float, now: FrameStamp, live: VisualOdometry | None = None) -> bool:
+        """Change a submap, in which `live` goes on if it is given; return whether it could be solved."""
+        changed, graph = submap.copy(), self._new_graph()
+        changed.relative_poses = {}  # they were measured with the pixels of before
+        changes = self._changes(submap, more_s)
+        for k in changes.keys() & changed.keyframes.keys():
+            keyframe = changed.keyframes[k]
+            changed.keyframes[k] = replace(keyframe, features=changes[k](keyframe.features))
+        try:
+            changed.apply_estimate(*graph.rebuild(changed).values)
+        except SolverError as error:
+            log.warning("submap %d keeps its shutter: %s", submap.id, error)
+            return False
+        before = submap.copy()
+        submap.take_over(changed)
+        self._record.change_pixels(submap.id, changes.get)
+        if live is not None:
+            live.adopt(graph, before)
+        self._connections.follow(before, submap, now)
+        return True
+
+    def _changes(self, submap: Submap, more_s: float) -> dict[int, Change]:
+        """Return what takes so much more of the readout out of a submap's frames, where it is known how they turned."""
+        move, camera = self._shutter.moved, self._calibration.camera
+        rates = turn_rates(submap, self._record.poses.values())
+        return {i: partial(move, camera=camera, turn_rad=more_s * rate) for i, rate in rates.items()}
+
+    def _take(self, readout_s: float) -> None:
+        """Let the buffered frames and those to come be read in the time that was found."""
+        rates: dict[int, FloatArray] = {}
+        for submap in self._record.atlas.submaps.values():
+            rates.update(turn_rates(submap, self._record.poses.values()))
+        camera = self._calibration.camera
+        known = {i: rates[i] for i in self._buffer.indices if i in rates}
+        self._shutter.take(readout_s, known, self._buffer.newest(2), camera.K)
+        correct_views(self._buffer, self._shutter, camera)
+
+
+def correct_views(buffer: ReadViews, shutter: Shutter, camera: Camera) -> None:
+    """Let the buffered views be read in the time that the shutter has now."""
+    correction = shutter.correction(buffer.indices, camera)
+    if correction is None:
+        buffer.change_all(lambda views: shutter.all_corrected(views, camera))
+    else:
+        buffer.map_later(correction, "shutter")
+
+
+def _is_sure(answer: ReadoutEstimate) -> bool:
+    """Whether a map is to be changed by what it says."""
+    sigma_s = INFLATION * answer.sigma_s
+    return sigma_s < MAX_SIGMA_S and abs(answer.more_s) > MIN_SIGMAS * sigma_s

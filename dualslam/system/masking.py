@@ -1,0 +1,71 @@
+"""What stands still in the image: the frames, and the map, from before it was found are rid of it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dualslam.atlas.record import Record
+from dualslam.core.events import EventKind
+from dualslam.core.types import BoolArray, View
+from dualslam.map.submap import Submap
+from dualslam.system.starting import Starting
+from dualslam.system.state import State
+
+
+class Masking:
+    """Follows what is known to stand still.
+
+    Parameters
+    ----------
+    state : State
+    starting : Starting
+    """
+
+    def __init__(self, state: State, starting: Starting) -> None:
+        self._state = state
+        self._starting = starting
+        self._hidden: BoolArray | None = None
+        self._camera_stands = False
+
+    def follow(self, view: View) -> None:
+        """Take in what has become known by a frame, which is not buffered yet."""
+        state, scene = self._state, self._state.parts.scene
+        if scene.camera_stands is not self._camera_stands:
+            self._camera_stands = scene.camera_stands
+            kind = EventKind.CAMERA_STANDS if scene.camera_stands else EventKind.CAMERA_MOVES
+            state.record.event(kind, view, None)
+        if scene.hidden is self._hidden:
+            return
+        self._hidden = scene.hidden
+        share = 0.0 if scene.hidden is None else float(scene.hidden.mean())
+        n_removed = 0
+        if scene.hidden is not None and state.live is None:
+            self._mask_buffer()
+        elif state.live is not None:
+            n_removed = self._clean(state.live.submap)
+        submap_id = None if state.live is None else state.live.submap.id
+        state.record.event(EventKind.MASKED, view, submap_id, share=share, observations_removed=n_removed)
+
+    def _mask_buffer(self) -> None:
+        """Mask the buffered frames that no map knows by their features, and look for a start anew."""
+        scene, known = self._state.parts.scene, _keyframes(self._state.record)
+        self._state.buffer.change_all(
+            lambda views: [view if view.index in known else scene.masked(view) for view in views]
+        )
+        self._starting.begin_again()
+
+    def _clean(self, submap: Submap) -> int:
+        """Remove the observations of what stands still from a map; return their number."""
+        scene, observations = self._state.parts.scene, submap.observations
+        rows = np.flatnonzero(observations["alive"])
+        keyframe, feature = observations["kf"][rows], observations["feature"][rows]
+        still = np.zeros(len(rows), np.bool_)
+        for k in np.unique(keyframe).tolist():
+            of_k = keyframe == k
+            still[of_k] = ~scene.shows(submap.keyframes[k].features)[feature[of_k]]
+        submap.remove_outliers(rows[still])
+        return int(still.sum())
+
+
+def _keyframes(record: Record) -> set[int]:
+    return {k for submap in record.atlas.submaps.values() for k in submap.keyframes}

@@ -1,0 +1,248 @@
+"""Without a live map: a lost one, or any other, is found again, or the next one starts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from dualslam.atlas.trajectory import FramePose
+from dualslam.core.errors import SolverError
+from dualslam.core.events import EventKind
+from dualslam.core.geometry import se3
+from dualslam.core.interfaces import START_REACH, SubmapGraph
+from dualslam.core.types import Failure, FailureReason, FrameMethod, Start, Track, View
+from dualslam.map.frame_observations import FrameObservations
+from dualslam.map.submap import Submap
+from dualslam.places.sightings import Sightings
+from dualslam.recovery.manager import Recoveries
+from dualslam.system.camera.shutter_watch import correct_views
+from dualslam.system.state import State
+from dualslam.system.tracking import Tracking
+from dualslam.workers.jobs import JobKind
+
+EARLY_FRAMES = 8
+"""Lost frames up to which no pair of them lies eight apart, as the pairs do that a start is mostly made of."""
+FIRM_SIGMA_DEG = 0.25
+"""Of the direction of translation of a start, up to which reverse tracking from it crosses a gap as well as from a
+later one: over 1 to 1.5 s without frames (`kitti_03`, three places) the link's scale was known to 0.6 to 1.0 % from
+starts of 0.20 to 0.27 degrees, to 1.1 to 1.6 % up to 0.38; of 0.45 and more to 1.7 % at best, after tries in vain."""
+
+FORESEEN = 3
+"""Frames before a loss that reverse tracking over it asks for: two that cross the gap, and one to go on from there."""
+
+
+class Starting:
+    """Finds a map again, or starts one.
+
+    Parameters
+    ----------
+    state : State
+    tracking : Tracking
+    recoveries : Recoveries
+    sightings : Sightings
+        Tells whether any submap shows a frame.
+    """
+
+    def __init__(self, state: State, tracking: Tracking, recoveries: Recoveries, sightings: Sightings) -> None:
+        self._state = state
+        self._tracking = tracking
+        self._recoveries = recoveries
+        self._sightings = sightings
+        self._starter = state.parts.new_starter()
+        self._n_without_map = 0  # frames
+        self._since_s: float | None = None  # stamp of the first of them for which a start was looked for
+        self._foresee: Callable[[View], None] | None = None  # for the first frame after a loss that shows something
+
+    def begin_anew(self, lost: list[View]) -> None:
+        """Look for the next map's start from these frames on."""
+        self._since_s = None
+        self._collect(lost)
+
+    def begin_again(self) -> None:
+        """Look for the next map's start anew, as the pixels of the frames that are buffered have changed."""
+        self._begin_from(self._state.buffer.newest(START_REACH))
+
+    def _begin_from(self, waiting: Iterable[View]) -> None:
+        rows = self._state.record.rows
+        self._collect([view for view in waiting if rows[view.index].submap is None])
+
+    def _collect(self, views: list[View]) -> None:
+        self._starter = self._state.parts.new_starter()
+        for view in views:
+            self._starter.collect(view)
+
+    # --- a map that is there
+
+    def find_again(self, view: View) -> Track | None:
+        """Continue in the map that was lost last, or in any other, if the frames of now show it."""
+        if self._state.relocaliser.note(view) and (track := self._find_lost(view)):
+            return track
+        return self._find_any(view)
+
+    def _find_lost(self, view: View) -> Track | None:
+        """Continue in the map that was lost last, once two frames in a row show it."""
+        state = self._state
+        with state.record.timer.measure("relocalisation"):
+            relocaliser = state.relocaliser.sighted(view)
+        if relocaliser is None:
+            return None
+        track = self._tracking.track(relocaliser, view)
+        if isinstance(track, Failure):
+            if track.reason is FailureReason.SOLVER:
+                state.relocaliser.end()
+            return None
+        state.live = relocaliser
+        state.relocaliser.end()
+        self._n_without_map = 0
+        state.record.event(EventKind.RELOCALISED, view, relocaliser.submap.id, n_inliers=track.n_inliers)
+        self._go_on(relocaliser.submap, view)
+        return track
+
+    def _find_any(self, view: View) -> Track | None:
+        """Continue in any submap that a few frames in a row show: at once in a saved map, else where no map starts."""
+        state, record = self._state, self._state.record
+        self._n_without_map += len(view.features) >= state.config.tracking.min_inliers
+        recovery = state.config.recovery
+        after = 0 if state.saved is not None else recovery.relocalise_after if recovery.enabled else None
+        if not record.atlas.submaps or after is None or self._n_without_map <= after:
+            return None
+        with record.timer.measure("places"):
+            found = self._sightings.sighted(view, state.parts.K)
+        if found is None:
+            return None
+        state.live, submap = found.odometry, found.odometry.submap
+        state.relocaliser.end()
+        self._n_without_map = 0
+        state.begin_health()
+        for track, T_kf_cam in (*found.earlier, (found.track, state.live.relative_pose(found.track))):
+            at = track.view
+            pose = FramePose(at.index, at.timestamp_s, submap.id, found.reference, T_kf_cam)
+            record.pose(pose, track.n_matches, track.n_inliers, method=FrameMethod.WIDE)
+        first = found.earlier[0][0]
+        record.event(
+            EventKind.RELOCALISED,
+            view,
+            submap.id,
+            n_inliers=first.n_inliers,
+            other_frame=found.reference,
+            frames=len(found.earlier) + 1,
+        )
+        if not state.localises:
+            self._go_on(submap, first.view)
+        return found.track
+
+    def _go_on(self, submap: Submap, since: View) -> None:
+        """Go on in a submap that was found again, and doubt it until the camera's velocity has agreed."""
+        self._state.motion_watch.begin(since)
+        self._recoveries.found_again(submap)
+        self._state.buffer.thaw()
+
+    # --- a new map
+
+    def find_start(self, view: View) -> Start | Failure:
+        """Look for the start of a map that ends at this frame, or at one before it if it was looked for meanwhile."""
+        self._foresee_from(view)
+        state, shutter = self._state, self._state.parts.shutter
+        if (refused := state.parts.scene.refuse_start()) is not None:
+            self._starter.collect(view)
+            return refused
+        if self._since_s is None:
+            self._since_s = view.timestamp_s
+        with state.record.timer.measure("shutter"):
+            readout_s = shutter.readout_s
+            may_start = shutter.may_start(view, state.parts.calibration.camera)
+            if shutter.readout_s != readout_s:
+                view = self._correct_shutter(view)
+        if not may_start:
+            return Failure(FailureReason.DOUBTFUL_INITIALISATION, "a fast turn before the shutter is known")
+        with state.record.timer.measure("initialisation"):
+            start = self._starter.add(view, view.timestamp_s - self._since_s, briefly=state.pace.in_real_time)
+        if isinstance(start, Failure) and start.reason is FailureReason.DOUBTFUL_INITIALISATION:
+            state.record.event(EventKind.INITIALISATION_REFUSED, view, None, reason=start.detail, **start.numbers)
+        return start
+
+    def foresee(self) -> None:
+        """Let what the next walk may ask for on either side of a loss be found while no map has started to walk from.
+
+        On this side it is the first frame that shows something.
+        """
+        self._foresee = foresee = self._state.parts.foresee
+        if foresee is None:
+            return
+        *before, _ = self._state.buffer.newest(FORESEEN + 1)
+        for view in reversed(before):
+            foresee(view)
+
+    def _foresee_from(self, view: View) -> None:
+        if self._foresee is not None and len(view.features) >= self._state.config.tracking.min_inliers:
+            self._foresee(view)
+            self._foresee = None
+
+    def find_start_instead(self, view: View) -> Start | Failure:
+        """Look for the start of the next map while the present one is lost and may still be seen again.
+
+        One that comes early rests on frames close together, and must be firm: it is to be tracked back from.
+        """
+        self._foresee_from(view)
+        present = None if self._state.live is None else self._state.live.submap.id
+        if self._state.parts.desk.n_open(JobKind.CALIBRATION, present):  # what it says of its camera is for both
+            self._starter.collect(view)
+            return Failure(FailureReason.BUSY, "the camera is being asked for")
+        start, is_early = self.find_start(view), len(self._state.lost) <= EARLY_FRAMES
+        if is_early and start and start.numbers.get("direction_sigma_deg", 0.0) > FIRM_SIGMA_DEG:
+            return Failure(FailureReason.DOUBTFUL_INITIALISATION, "frames farther apart would know their motion better")
+        return start
+
+    def _correct_shutter(self, view: View) -> View:
+        """Take the shutter that was found out of the frames so far; the starter begins anew. Returns the view's own."""
+        state, shutter = self._state, self._state.parts.shutter
+        state.record.event(EventKind.SHUTTER_FOUND, view, None, readout_s=shutter.readout_s)
+        correct_views(state.buffer, shutter, state.parts.calibration.camera)
+        state.relocaliser.end()  # it is of the pixels of before
+        *waiting, newest = state.buffer.newest(START_REACH + 1)
+        self._begin_from(waiting)
+        return newest
+
+    def begin(self, start: Start) -> Track | Failure:
+        """Make a submap of a start, and pose the frames before and between by reverse tracking over the buffer."""
+        state, record, view = self._state, self._state.record, start.views[-1]
+        submap = Submap.from_start(start, len(record.atlas.submaps), state.parts.K)
+        graph = state.parts.new_graph()
+        try:
+            with record.timer.measure("graph"):
+                estimate = graph.update(submap)
+        except SolverError as error:
+            return Failure(FailureReason.SOLVER, str(error), start.numbers)
+        submap.apply_estimate(*estimate.values)
+        self._record_start(submap, start)
+        self._track_in(submap, graph, view)
+        ids = submap.landmark_of[view.index]
+        n = int((ids >= 0).sum())
+        T_cam_submap = se3.inverse(submap.T_submap_kf[view.index])
+        return Track(view, T_cam_submap, T_cam_submap, ids, np.zeros(0, np.int64), n, n, 1.0, False, np.zeros((6, 6)))
+
+    def _record_start(self, submap: Submap, start: Start) -> None:
+        record = self._state.record
+        kind = EventKind.INITIALISED if not record.atlas.submaps else EventKind.REINITIALISED
+        record.atlas.add(submap)
+        for k, keyframe in submap.keyframes.items():
+            seen = FrameObservations.of(keyframe.features, submap.landmark_of[k], submap.id)
+            n = len(seen.landmark_ids)
+            pose = FramePose(k, keyframe.timestamp_s, submap.id, k, np.eye(4))
+            record.pose(pose, n, n, seen, FrameMethod.WIDE)
+        with record.timer.measure("audit of images"):
+            self._state.audit.begin(submap, start.views)
+        record.event(kind, start.views[-1], submap.id, first_view=start.views[0].index, **start.numbers)
+
+    def _track_in(self, submap: Submap, graph: SubmapGraph, view: View) -> None:
+        """Let a new submap be the live one, and reverse tracking start from it."""
+        state = self._state
+        state.live = state.parts.new_odometry(submap, graph)
+        state.relocaliser.end()
+        state.live.start_at(view.index)
+        self._n_without_map = 0
+        state.begin_health()
+        self._recoveries.start(submap, view)
+        self._recoveries.collect(state.live, view)
+        state.buffer.thaw()

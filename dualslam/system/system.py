@@ -1,0 +1,462 @@
+"""The state machine of Dual-SLAM: one frame at a time, in the order in which the paper tells it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from dualslam.atlas.connections import Connections
+from dualslam.atlas.record import FrameStamp, Record
+from dualslam.atlas.worlds import Worlds
+from dualslam.core.camera.base import Camera
+from dualslam.core.config.settings import Config
+from dualslam.core.events import EventKind
+from dualslam.core.interfaces import SubmapGraph, VisualOdometry
+from dualslam.core.types import BoolArray, Failure, FailureReason, Frame, FrameStatus, Start, Track, View
+from dualslam.core.walk_news import WalkNews
+from dualslam.io.map_store import StoredMap
+from dualslam.map.frame_numbers import FrameNumbers
+from dualslam.map.frame_records import FrameResult, FrameRow
+from dualslam.map.submap import Submap
+from dualslam.places.handover import Handover
+from dualslam.places.revisits import Revisits
+from dualslam.places.sightings import Relocalised
+from dualslam.recovery.frame_buffer import FrameBuffer
+from dualslam.recovery.manager import Recoveries
+from dualslam.recovery.relocaliser import Relocaliser
+from dualslam.system.audit.photometric import PhotometricAudit
+from dualslam.system.audit.verdict import ReasonCode
+from dualslam.system.camera.background import Calibrations
+from dualslam.system.camera.shutter_watch import ShutterWatch
+from dualslam.system.components import Components
+from dualslam.system.endings import Endings
+from dualslam.system.graphs import GraphKeeping
+from dualslam.system.health import HealthMonitor
+from dualslam.system.masking import Masking
+from dualslam.system.motion_watch import Break
+from dualslam.system.places import PlaceKeeping
+from dualslam.system.starting import Starting
+from dualslam.system.state import State
+from dualslam.system.tracking import Tracking
+from dualslam.workers.jobs import JobKind
+from dualslam.workers.scheduled_desk import ScheduledDesk
+
+SETTLED_A_FRAME = 10
+"""Buffered views that follow a change of the camera at each frame: 3 to 4 ms, where all of 10 s would take 100."""
+
+
+class System:
+    """Monocular SLAM that keeps a lost map and starts the next.
+
+    Attributes
+    ----------
+    atlas : Atlas
+    rows : dict of int to FrameRow
+        Every frame that was given to `step`, by its index.
+    poses : dict of int to FramePose
+    events : EventLog
+    timer : StageTimer
+    buffer : FrameBuffer
+    pace : Pace
+        Whoever feeds the system in real time reports here how late its frames are; otherwise without effect.
+    blank : set of int
+        Frames that show too few features to be posed.
+    audit : PhotometricAudit
+        How well the images agree with the map.
+    numbers : FrameNumbers
+        The frames' own count, by which all here goes but the frames that `step` is given and its results.
+    saved : StoredMap or None
+        The map that this run continues.
+    """
+
+    def __init__(
+        self, components: Components, config: Config, saved: StoredMap | None = None, localise: bool = False
+    ) -> None:
+        """`saved`: a map to continue, which becomes this system's own; `localise`: only find poses in it."""
+        record = Record() if saved is None else Record(saved.atlas, poses=dict(saved.poses))
+        self.saved, self.numbers = saved, FrameNumbers(0 if saved is None else saved.next_id)
+        self.blank: set[int] = set()
+        self._world = saved.main[0] if saved is not None and saved.main else None
+        self._worlds = Worlds(record.atlas, self._world)
+        earlier = frozenset(record.atlas.submaps)
+        self.atlas, self.rows, self.poses = record.atlas, record.rows, record.poses
+        self.events, self.timer = record.events, record.timer
+        self.buffer = FrameBuffer(config.buffer.duration_s, config.buffer.max_mb)
+        self.buffer.freeze()  # no map yet, as after a loss: the first start is tracked back from to the first frame
+        relocaliser, health = Relocaliser(components.new_relocaliser, config), HealthMonitor(config.health)
+        self.audit = PhotometricAudit(components.patches)
+        self._state = State(components, config, record, self.buffer, saved, localise, relocaliser, health, self.audit)
+        self.pace = self._state.pace
+        # What is found beside the tracking and comes into the map between two frames.
+        self._connections = Connections(
+            record,
+            components.atlas_solver,
+            components.new_graph,
+            components.desk,
+            self._state.front_ends,
+            None if components.graphs is None else components.graphs.forget,
+        )
+        self._revisits = Revisits(
+            record,
+            components.places,
+            self._connections,
+            components.desk,
+            components.new_graph,
+            components.new_relocaliser,
+            config,
+            merges=config.recovery.enabled or saved is not None,
+        )
+        self._recoveries = Recoveries(
+            record,
+            self.buffer,
+            components.desk,
+            components.new_graph,
+            components.calibration,
+            self._connections,
+            config.recovery,
+            self._state.front_ends,
+        )
+        self._calibrations = Calibrations(
+            record, self.buffer, components.calibration, components.desk, components.new_graph, self._connections
+        )
+        self._shutter_watch = ShutterWatch(
+            record,
+            self.buffer,
+            components.calibration,
+            components.shutter,
+            components.desk,
+            components.new_graph,
+            self._connections,
+        )
+        # The steps of a frame.
+        sightings = self._revisits.sightings
+        extends = saved is not None and not localise and config.places.enabled and config.loops.enabled
+        handover = Handover(record, sightings, earlier) if extends else None
+        self._graphs = GraphKeeping(self._state)
+        self._places = PlaceKeeping(self._state, self._revisits, self._recoveries, handover)
+        self._tracking = Tracking(self._state, self._places)
+        self._starting = Starting(self._state, self._tracking, self._recoveries, sightings)
+        self._masking = Masking(self._state, self._starting)
+        self._endings = Endings(self._state, self._recoveries, self._connections, sightings, earlier)
+
+    @property
+    def desk(self) -> ScheduledDesk:
+        """Where work beside the tracking is done."""
+        return self._state.parts.desk
+
+    @property
+    def camera(self) -> Camera:
+        """By which features are rectified now."""
+        return self._state.parts.calibration.camera
+
+    @property
+    def log_focal_sigma(self) -> float | None:
+        """Standard deviation of the logarithm of that camera's focal length; None where it is as it was given."""
+        return self._state.parts.calibration.log_focal_sigma
+
+    @property
+    def hidden(self) -> BoolArray | None:
+        """Pixels (H, W) that were found to stand still in the image, and are left out; None while there are none."""
+        return self._state.parts.scene.hidden
+
+    @property
+    def world(self) -> int | None:
+        """The submap in whose frame the saved map's world is; None without one."""
+        return self._world
+
+    @property
+    def live(self) -> VisualOdometry | None:
+        """The front end of the live submap; None while there is no map."""
+        return self._state.live
+
+    @property
+    def on_pose(self) -> Callable[[Track], None] | None:
+        """Called with each frame's track as soon as it is posed.
+
+        That is before the map grows from it, so that a controller need not wait for a keyframe.
+        """
+        return self._tracking.on_pose
+
+    @on_pose.setter
+    def on_pose(self, on_pose: Callable[[Track], None] | None) -> None:
+        self._tracking.on_pose = on_pose
+
+    def graph_of(self, submap: Submap) -> SubmapGraph:
+        """Return a factor graph of a submap as it is, live or archived, which tells its covariances.
+
+        It is made anew, in batch, for the caller: the system does not use it.
+
+        Raises
+        ------
+        SolverError
+            If the submap cannot be solved.
+        """
+        return self._state.parts.open_graph(submap)
+
+    def features_beside(self) -> Callable[[Frame], Frame] | None:
+        """Start a process that finds the features of the frame to come while another is tracked.
+
+        Returns
+        -------
+        callable or None
+            Waits for a frame's features, on a thread of the caller's, and returns the frame with them, to be given to
+            `step`. None where all is done in one process.
+        """
+        return None if self._state.parts.open_features is None else self._state.parts.open_features()
+
+    def is_tracking_in_reverse(self, submap_id: int) -> bool:
+        """Whether reverse tracking from a submap is under way."""
+        return self._recoveries.is_under_way(self.atlas.submaps[submap_id])
+
+    def watch_walks(self, on_walk: Callable[[WalkNews], None]) -> None:
+        """Have a function called with how far reverse tracking has come, while it is under way; some news may be lost.
+
+        It may look at the system, and change nothing. Frames are told by their index in the source.
+        """
+        numbers = self.numbers
+        self._state.parts.walk_watch.add(lambda news: on_walk(replace(news, frame=numbers.index_of(news.frame))))
+
+    def step(self, frame: Frame) -> FrameResult:
+        """Take one frame through the system.
+
+        Parameters
+        ----------
+        frame : Frame
+            Frames come in any steady order of time.
+
+        Returns
+        -------
+        FrameResult
+
+        Raises
+        ------
+        InputError
+            If it cannot be the next frame: one that came already, or after the end.
+        """
+        state, started, self._tracking.posed_at = self._state, time.perf_counter(), None
+        source, frame = frame, self.numbers.numbered(frame)
+        self.rows[frame.index] = FrameRow(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
+        # 1. What was found beside the tracking meanwhile comes into the map between two frames.
+        if (recorded := self.desk.recorded_lateness(source.index)) is not None:
+            state.pace.note(recorded.late_s)
+        self.desk.begin_frame(source.index, state.pace.in_real_time)
+        self._graphs.collect(frame)
+        self._places.collect(frame)
+        in_map = state.relocaliser.relocaliser if state.live is None else state.live
+        if self._calibrations.collect(in_map, frame, self._recoveries.waiting):
+            if state.live is None:
+                self._starting.begin_again()
+            elif state.lost:
+                self._begin_anew()
+        self._recoveries.collect(state.live, frame)
+        if state.pace.in_real_time:
+            held_s = time.perf_counter() - started
+            state.pace.hold_up(self.desk.lateness(source.index, state.pace.late_s, held_s).held_s)
+        if not state.pace.behind:
+            self.buffer.settle(SETTLED_A_FRAME)
+        # 2. Features, into the buffer that reverse tracking will read.
+        with self.timer.measure("features"):
+            view = state.parts.view_of(source)
+        if isinstance(view, Failure):
+            outcome: Track | Failure = self._unusable(frame, view)
+            self.blank.add(frame.index)
+        else:
+            view = replace(view, index=frame.index)
+            self._masking.follow(view)
+            self.buffer.append(view)
+            # 3. Without a live submap, look for the lost one, or try to start one; with one, track.
+            outcome = self._without_map(view) if state.live is None else self._with_map(state.live, view)
+            if len(view.features) < state.config.tracking.min_inliers:
+                self.blank.add(frame.index)
+        return self._result(frame, outcome, started)
+
+    def finish(self, interrupted: bool = False) -> None:
+        """End the run: wait, for a limited time, for reverse tracking that is under way; archive the live submap.
+
+        Parameters
+        ----------
+        interrupted : bool
+            Someone is waiting: leave out the last walk, which the growth of the live map would earn, and refinement.
+        """
+        self.numbers.end()
+        self.desk.begin_end(interrupted)
+        state, last = self._state, next(reversed(self.rows.values()), None)
+        self._graphs.finish(last)
+        if state.live is not None and last is not None:
+            self._calibrations.collect(state.live, last, self._recoveries.waiting, wait=True)
+        self._recoveries.finish(state.live, last, interrupted or state.localises)
+        if state.live is not None and last is not None:
+            self._take_shutter(state.live, last, wait=True)
+        if last is not None:
+            self._places.finish(last)
+        self._graphs.finish(last)
+        if state.live is not None and not state.localises:
+            self._endings.archive(state.live, "end of sequence")
+        shapes = {} if interrupted or state.localises else self._endings.refine()
+        if last is not None:
+            self._connections.settle(last)
+            self._endings.pose_frames_anew(shapes)
+            self._endings.part_what_lost_its_scale(last)
+        state.parts.desk.close()
+
+    def _unusable(self, frame: Frame, failure: Failure) -> Failure:
+        """Record a frame without an image of the right size; tracking continues with the next frame."""
+        self.rows[frame.index].status = FrameStatus.UNREADABLE
+        self.events.add(EventKind.UNREADABLE, frame.index, frame.timestamp_s, None, detail=failure.detail)
+        return failure
+
+    # --- without a map
+
+    def _without_map(self, view: View) -> Track | Failure:
+        """Find a map again that this frame shows, or start the next one."""
+        if track := self._starting.find_again(view):
+            return track
+        if self._state.localises:
+            return Failure(FailureReason.TOO_FEW_MATCHES, "the saved map does not show this place")
+        start = self._starting.find_start(view)
+        return start if isinstance(start, Failure) else self._begin(start, view)
+
+    def _begin(self, start: Start, view: View) -> Track | Failure:
+        """Go on in a new map."""
+        outcome = self._starting.begin(start)
+        # A search beside the tracking finds a start that ends some frames back: go on from there.
+        for later in [v for v in self.buffer if start.views[-1].index < v.index <= view.index]:
+            if self._state.live is None:
+                break
+            outcome = self._with_map(self._state.live, later)
+        return outcome
+
+    # --- with a map
+
+    def _with_map(self, live: VisualOdometry, view: View) -> Track | Failure:
+        """Pose a frame in the live map; then do what the frame, or the keyframe that it has become, gives rise to."""
+        state = self._state
+        track = self._tracking.track(live, view)
+        if isinstance(track, Failure):
+            if (found := self._places.seen_instead(live, view)) is None:
+                return self._lose(live, view, track)
+            state.lost = []
+            self.buffer.thaw()
+            return self._go_over(found, live, view)
+        if state.localises:
+            return track
+        state.lost = []
+        self.buffer.thaw()
+        broken = state.motion_watch.judge(view, track.wide, state.record, live.submap)
+        if broken is None and (first := self.audit.broken_since(live.submap.id)) is not None:
+            detail = f"the images disagree with the map since frame {first}"
+            broken = Break(first, Failure(FailureReason.PHOTOMETRIC, detail))
+        if broken is not None:
+            self._endings.break_at(live, view, broken.first, broken.failure)
+            self._begin_anew()
+            state.lost = []
+            return broken.failure
+        if (found := self._places.seen_from(live, track)) is not None:
+            return self._go_over(found, live, view)
+        if live.reference_id == view.index:
+            self._grow(live, view)
+        else:
+            self._places.catch_up(live, view)
+        return track
+
+    def _go_over(self, found: Relocalised, live: VisualOdometry, view: View) -> Track:
+        self._endings.archive(live, "an earlier map goes on")
+        return self._places.go_over(found, live.submap.id, view)
+
+    def _grow(self, live: VisualOdometry, view: View) -> None:
+        """After a keyframe: ask the live map what it knows now, and what it can be linked with; a full one ends."""
+        if self._endings.part_where_scale_is_lost(live, view):
+            return
+        self._ask_shutter(live, view)
+        self._calibrations.ask_if_due(live, view, self._recoveries.waiting)
+        if self._endings.is_full(live.submap):
+            self._take_open(live, view)
+            self._endings.roll_over(live, view)
+        else:
+            self._recoveries.retry(live.submap, view)
+            self._places.note_keyframe(live, view)
+
+    def _ask_shutter(self, live: VisualOdometry, view: View) -> None:
+        """Ask the live map how long its images were read; not where what comes back meanwhile has the pixels of now."""
+        if self.saved is None:
+            self._shutter_watch.ask_if_due(live)
+            self._take_shutter(live, view)
+
+    def _take_shutter(self, live: VisualOdometry, now: FrameStamp, wait: bool = False) -> None:
+        """Take in how long its images were read; not while what is open for the map has the pixels of now."""
+        open_ = self._recoveries.is_under_way(live.submap) or self.desk.n_open(JobKind.CALIBRATION, live.submap.id)
+        if not open_:
+            self._shutter_watch.collect(live, now, self._recoveries.waiting, wait)
+
+    def _lose(self, live: VisualOdometry, view: View, failure: Failure) -> Track | Failure:
+        """Take a frame that was not posed: the map may be seen again until the next one starts, or it is given up."""
+        state = self._state
+        self.rows[view.index].status = FrameStatus.LOST
+        if state.localises:
+            state.live = None
+            return failure
+        state.lost.append(view)
+        if len(state.lost) == 1:
+            view = self._begin_to_lose(live, view)
+        readout_s = state.parts.shutter.readout_s
+        start = self._starting.find_start_instead(view)
+        # A graph that has failed, and a map of the pixels of before, are not found again.
+        may_return = failure.reason is not FailureReason.SOLVER and state.parts.shutter.readout_s == readout_s
+        waited_s = abs(view.timestamp_s - state.lost[0].timestamp_s)
+        if start or not may_return or waited_s >= state.config.tracking.max_lost_s:
+            self._endings.give_up(live, view, failure, may_return)
+            state.lost = []
+        return failure if isinstance(start, Failure) else self._begin(start, view)
+
+    def _begin_to_lose(self, live: VisualOdometry, view: View) -> View:
+        """Keep what is buffered, and ask the map about its camera; return the view under the camera of now."""
+        self.buffer.freeze()
+        # A map whose end is suspected is no witness.
+        if all(frame.failed for frame in self._state.health.suspected()):
+            self._calibrations.ask_at_loss(live, view, self._recoveries.waiting)
+        self._take_open(live, view)
+        self._starting.begin_anew([])
+        self._starting.foresee()
+        return self.buffer.newest(1)[0]
+
+    def _take_open(self, live: VisualOdometry, now: FrameStamp) -> None:
+        """Wait, where no clock goes on, for what a map that may end is still to hear of its camera."""
+        if not self.pace.in_real_time:
+            self._calibrations.collect(live, now, self._recoveries.waiting, wait=True)
+            self._take_shutter(live, now, wait=True)
+
+    def _begin_anew(self) -> None:
+        """Look for the next map's start from the frames since the loss on, rectified by the camera of now."""
+        lost = {view.index for view in self._state.lost}
+        self._starting.begin_anew([view for view in self.buffer if view.index in lost])
+
+    # --- records
+
+    def _result(self, frame: Frame, outcome: Track | Failure, started: float) -> FrameResult:
+        row = self.rows[frame.index]
+        row.latency_ms = 1e3 * (time.perf_counter() - started)
+        posed_at = self._tracking.posed_at
+        pose_ms = None if posed_at is None else 1e3 * (posed_at - started)
+        pose = self.poses.get(frame.index)
+        T_submap_cam = None
+        if pose is not None:
+            T_submap_cam = self.atlas.submaps[pose.submap_id].resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
+        failure = outcome if isinstance(outcome, Failure) else None
+        S_world_submap, world_id = (None, None) if pose is None else self._worlds.of(pose.submap_id)
+        is_doubtful = pose is not None and self.audit.doubts(pose.submap_id)
+        return FrameResult(
+            self.numbers.index_of(frame.index),
+            row.status,
+            row.submap,
+            T_submap_cam,
+            row.n_matches,
+            row.n_inliers,
+            row.latency_ms,
+            failure,
+            pose_ms,
+            S_world_submap,
+            world_id,
+            row.method,
+            str(ReasonCode.PHOTOMETRIC) if is_doubtful else "",
+        )

@@ -1,0 +1,45 @@
+"""A step that does not fit the speed about it is found; a camera that starts, stops or speeds up is not."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dualslam.core.types import FloatArray
+from dualslam.system.audit.steps import measure_steps
+
+TIMES = np.arange(200) / 30
+SUSPECT = 6.0
+
+
+def along_x(x: FloatArray) -> FloatArray:
+    return np.column_stack([x, np.zeros((len(x), 2))])
+
+
+def test_a_jump_stands_out_by_its_length() -> None:
+    x = 0.5 * TIMES
+    x[120:] += 0.8  # 48 steps
+    steps = measure_steps(TIMES, along_x(x))
+    assert np.flatnonzero(steps.ratio > SUSPECT).tolist() == [119]
+    np.testing.assert_allclose(steps.ratio[119], 49.0)
+    np.testing.assert_allclose(steps.excess[119], 0.8)
+
+
+def test_a_frame_that_is_off_by_itself_is_found_on_both_sides() -> None:
+    x = 0.5 * TIMES
+    x[120] += 0.8
+    assert np.flatnonzero(measure_steps(TIMES, along_x(x)).ratio > SUSPECT).tolist() == [119, 120]
+
+
+def test_a_camera_may_rest_start_and_speed_up() -> None:
+    speed = np.concatenate([np.zeros(60), np.linspace(0, 1.0, 20), np.full(60, 1.0), np.full(60, 3.0)])
+    steps = measure_steps(TIMES, along_x(np.cumsum(speed) / 30))
+    assert steps.ratio.max() < SUSPECT
+
+
+def test_missing_frames_are_no_jump() -> None:
+    kept = np.r_[0:80, 110:200]
+    assert measure_steps(TIMES[kept], along_x(0.5 * TIMES[kept])).ratio.max() < 1.01
+
+
+def test_a_few_frames_tell_nothing() -> None:
+    assert measure_steps(TIMES[:8], along_x(np.r_[np.zeros(4), np.ones(4)])).ratio.tolist() == [0.0] * 7
