@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import dualslam
+from dualslam.core.jobs import JobKind
 from dualslam.run.session import run_to_folder
 from dualslam.testing.lossy import Lossy
-from dualslam.workers.jobs import JobKind
 from dualslam.workers.schedule import AT_ONCE, DELAYS, After
 
 ANSWERED = tuple(DELAYS)

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dualslam.core.jobs import JobKind
 from dualslam.core.types import FailureReason
 from dualslam.run.results import trajectories_of
 from dualslam.system.system import System
 from dualslam.testing.lossy import Lossy
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
-from dualslam.workers.jobs import JobKind
 from dualslam.workers.schedule import DELAYS, After, Policy, Recorded, header_of, never
 
 COVERED = frozenset(range(35, 44))

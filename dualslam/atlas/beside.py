@@ -22,9 +22,9 @@ from dualslam.atlas.skeleton import Skeleton
 from dualslam.core.atlas_problem import AtlasProblem, AtlasSolution, AtlasSolver
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
+from dualslam.core.jobs import Handlers, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.submap import Submap
-from dualslam.workers.jobs import Handlers, JobKind
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,9 +22,9 @@ from dualslam.atlas.skeleton import Skeleton
 from dualslam.core.atlas_problem import AtlasSolution, AtlasSolver
 from dualslam.core.errors import SolverError
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
+from dualslam.core.jobs import Desk, JobKind
 from dualslam.core.types import Failure, FailureReason
 from dualslam.map.submap import Submap
-from dualslam.workers.jobs import Desk, JobKind
 
 log = logging.getLogger(__name__)
 

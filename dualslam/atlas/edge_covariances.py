@@ -11,9 +11,9 @@ import numpy as np
 from dualslam.atlas.warp import Warp
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, sim3
+from dualslam.core.jobs import Desk, JobKind
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
-from dualslam.workers.jobs import Desk, JobKind
 
 log = logging.getLogger(__name__)
 

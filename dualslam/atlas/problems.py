@@ -11,7 +11,7 @@ from dualslam.atlas.node_views import NodeViews
 from dualslam.atlas.record import Record
 from dualslam.atlas.skeleton import Skeleton, build_skeleton, foresee_skeleton, skeleton_knots
 from dualslam.core.atlas_problem import AtlasSolver
-from dualslam.workers.jobs import Desk
+from dualslam.core.jobs import Desk
 
 
 class AtlasProblems:

@@ -32,6 +32,7 @@ from dualslam.core.camera.mapped import MappedCamera, camera_for_map
 from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Frontend, SubmapGraph
+from dualslam.core.jobs import InlineDesk, JobKind
 from dualslam.core.types import View
 from dualslam.core.walk_news import WalkWatch
 from dualslam.frontends.direct.patch_audit import PatchAudit
@@ -52,7 +53,6 @@ from dualslam.map.submap import Submap
 from dualslam.system.components import Components
 from dualslam.system.system import System
 from dualslam.workers.desk import WorkerDesk
-from dualslam.workers.jobs import InlineDesk, JobKind
 from dualslam.workers.schedule import AT_ONCE, After, Policy, Recorded
 from dualslam.workers.scheduled_desk import ScheduledDesk
 from dualslam.workers.start_beside import StartBeside

@@ -11,6 +11,7 @@ from dualslam.build.walks import FEATURE_THREADS, recovery_parts
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import Config, FrontendConfig
 from dualslam.core.interfaces import SubmapGraph
+from dualslam.core.jobs import Handler, Handlers, JobKind
 from dualslam.core.threads import spare_cores
 from dualslam.core.types import Failure, Frame
 from dualslam.core.walk_news import WalkWatch
@@ -25,7 +26,6 @@ from dualslam.recovery.reverse_tracking import RecoveryParts, recover_in_steps
 from dualslam.recovery.scale_watch import SCALE_HANDLERS
 from dualslam.workers.desk import Lane, WorkerDesk
 from dualslam.workers.features_beside import FeaturesBeside
-from dualslam.workers.jobs import Handler, Handlers, JobKind
 from dualslam.workers.start_beside import StartServer
 
 WORKER_BUDGET = 0.75

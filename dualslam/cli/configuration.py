@@ -12,7 +12,7 @@ from dualslam.core.config import strict_yaml
 from dualslam.core.config.files import CONFIG, Override, load_config
 from dualslam.core.config.settings import Config
 from dualslam.core.errors import ConfigError, InputError
-from dualslam.workers.schedule import SCHEDULE, Recorded
+from dualslam.run.schedule import recorded_selection
 
 
 def config_of(args: argparse.Namespace) -> Config:
@@ -46,7 +46,7 @@ def take_selection(args: argparse.Namespace) -> None:
         return
     if args.realtime or args.inline or args.workers is not None:
         raise InputError("--replay repeats a run in one process: leave out --realtime, --inline and --workers.")
-    selection = Recorded.read(args.replay / SCHEDULE).header.get("selection")
+    selection = recorded_selection(args.replay)
     if selection and (args.start, args.stride, args.max_frames, args.reverse) == (0, 1, None, False):
         for name in ("start", "stride", "max_frames", "reverse"):
             setattr(args, name, selection[name])

@@ -27,7 +27,6 @@ from dualslam.io.folder_lock import FolderLock
 from dualslam.io.map_files import METADATA, to_plain
 from dualslam.io.trajectory_files import Trajectory, write_kitti, write_tum
 from dualslam.map.frame_records import FrameRow as FrameRow  # a row of frames.csv
-from dualslam.workers.schedule import SCHEDULE
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +38,7 @@ EVENTS = "events.jsonl"
 SUMMARY = "summary.json"
 REPORT = "report.html"
 MAP_PAGE = "map.html"
+SCHEDULE = "schedule.jsonl"
 GROUND_TRUTH = "groundtruth.txt"
 MASK = "mask.png"
 SUBMAPS = "submaps"

@@ -23,12 +23,12 @@ import numpy as np
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import GraphEstimate
 from dualslam.core.interfaces import N_WINDOW, SubmapGraph, WindowSolver
+from dualslam.core.jobs import Desk, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.dead_rows import drop_dead_rows
 from dualslam.map.late_estimate import apply_late
 from dualslam.map.submap import Submap
 from dualslam.map.submap_delta import SubmapDelta, SubmapMirror
-from dualslam.workers.jobs import Desk, JobKind
 
 log = logging.getLogger(__name__)
 

@@ -17,13 +17,13 @@ from dualslam.core.chi_square import MEDIAN_CHI2
 from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Seeker, SubmapGraph, VisualOdometry
+from dualslam.core.jobs import Desk, Ended, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.submap import Submap
 from dualslam.places.plausibility import agree, contradict, plausible
 from dualslam.places.search import PlaceSearch, follow_maps, poses_of
 from dualslam.places.sightings import N_SECONDS, PlaceParts, Sightings, record_refusal
 from dualslam.places.verification import PlaceMatch
-from dualslam.workers.jobs import Desk, Ended, JobKind
 
 ASK_EVERY = 2
 """Keyframes between two searches, where nothing is provisional: neighbours show the same."""

@@ -19,6 +19,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
+from dualslam.core.jobs import Desk, Ended, JobKind
 from dualslam.core.types import Failure, FailureReason, View
 from dualslam.linking.link_tries import LinkTries
 from dualslam.linking.motion import join_slack, refuse_gaps, refuse_seams
@@ -34,7 +35,6 @@ from dualslam.recovery.fusion import fuse, gauge_at_overlap, note_refused
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.merge import merge_recovery
 from dualslam.recovery.schedule import RetrySchedule, as_far_as_it_leads, way_to_gaps
-from dualslam.workers.jobs import Desk, Ended, JobKind
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,6 +25,7 @@ from dualslam.core.estimates import KeyframeReport
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
+from dualslam.core.jobs import Limit, result_of
 from dualslam.core.types import Failure, FailureReason, Rival, Track, View
 from dualslam.core.walk_news import WalkNews, WalkTrace
 from dualslam.linking import NO_BEND, Bend, LinkEstimate, LinkRefusal
@@ -37,7 +38,6 @@ from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, Recove
 from dualslam.recovery.progress import Progress
 from dualslam.recovery.relinker import Linker, LinkTry, Relinker
 from dualslam.recovery.schedule import way_to_gaps
-from dualslam.workers.jobs import Limit, result_of
 
 log = logging.getLogger(__name__)
 

@@ -17,11 +17,11 @@ from scipy.special import ndtri
 
 from dualslam.atlas.atlas import Link
 from dualslam.core.config.settings import LinkingConfig
+from dualslam.core.jobs import Desk, Handlers, InlineDesk, JobKind
 from dualslam.core.types import Failure, IntArray
 from dualslam.linking.gates import PIXEL_CHI2
 from dualslam.linking.scale_observability import N_AROUND, ScaleQuestion, answer_scale, ask_scale
 from dualslam.map.submap import Submap
-from dualslam.workers.jobs import Desk, Handlers, InlineDesk, JobKind
 
 GROUP = 5
 """Keyframes over which the scale is handed on from those before to those after: about as long as a landmark lives on a

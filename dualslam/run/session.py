@@ -27,7 +27,7 @@ from dualslam.io.colours import Colours, save_colours, save_pictures
 from dualslam.io.export.colours import keyframe_indices, landmark_colours
 from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.masks import hidden_pixels, masked
-from dualslam.io.run_folder import TRAJECTORY, RunFolder, RunRecord, check_vacant
+from dualslam.io.run_folder import SCHEDULE, TRAJECTORY, RunFolder, RunRecord, check_vacant
 from dualslam.io.sequence import RecordedSequence, Selection
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.io.video import WebcamSequence
@@ -43,7 +43,7 @@ from dualslam.run.runner import RunReport, run_sequence
 from dualslam.system.system import System
 from dualslam.viewer.map_page import map_page
 from dualslam.workers.desk import WorkerDesk
-from dualslam.workers.schedule import SCHEDULE, Recorded, header_of
+from dualslam.workers.schedule import Recorded, header_of
 
 log = logging.getLogger(__name__)
 

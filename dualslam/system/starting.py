@@ -11,6 +11,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import START_REACH, SubmapGraph
+from dualslam.core.jobs import JobKind
 from dualslam.core.types import Failure, FailureReason, FrameMethod, Start, Track, View
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
@@ -19,7 +20,6 @@ from dualslam.recovery.manager import Recoveries
 from dualslam.system.camera.shutter_watch import correct_views
 from dualslam.system.state import State
 from dualslam.system.tracking import Tracking
-from dualslam.workers.jobs import JobKind
 
 EARLY_FRAMES = 8
 """Lost frames up to which no pair of them lies eight apart, as the pairs do that a start is mostly made of."""

@@ -13,6 +13,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
+from dualslam.core.jobs import JobKind
 from dualslam.core.types import BoolArray, Failure, FailureReason, Frame, FrameStatus, Start, Track, View
 from dualslam.core.walk_news import WalkNews
 from dualslam.io.map_store import StoredMap
@@ -39,7 +40,6 @@ from dualslam.system.places import PlaceKeeping
 from dualslam.system.starting import Starting
 from dualslam.system.state import State
 from dualslam.system.tracking import Tracking
-from dualslam.workers.jobs import JobKind
 from dualslam.workers.scheduled_desk import ScheduledDesk
 
 SETTLED_A_FRAME = 10

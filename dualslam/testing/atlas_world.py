@@ -17,13 +17,13 @@ from dualslam.backend.point_refinement import refit_points
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.config.settings import GraphConfig
 from dualslam.core.geometry import se3, sim3
+from dualslam.core.jobs import InlineDesk
 from dualslam.core.types import BoolArray, FloatArray, FrameStatus, Keyframe
 from dualslam.map.frame_records import FrameRow
 from dualslam.map.split import next_submap
 from dualslam.map.submap import Submap
 from dualslam.testing.point_world import CAMERA, SIZE_PX, make_features
 from dualslam.testing.relative import relative_similarity
-from dualslam.workers.jobs import InlineDesk
 
 N_SHARED = 8
 LINK_SIGMAS = np.array([2e-3] * 3 + [5e-3] * 3 + [5e-3])

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from dualslam.core.jobs import Handlers, JobKind
 from dualslam.core.types import Features
 from dualslam.workers.desk import Lane, WorkerDesk
-from dualslam.workers.jobs import Handlers, JobKind
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from dualslam.workers.jobs import Desk, Ended, JobKind
+from dualslam.core.jobs import Desk, Ended, JobKind
 
 
 class LateDesk:

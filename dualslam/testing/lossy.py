@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Collection
 from typing import Any
 
+from dualslam.core.jobs import Ended, Executor, JobKind, Limit
 from dualslam.core.types import Failure, FailureReason
-from dualslam.workers.jobs import Ended, Executor, JobKind, Limit
 
 
 class Lossy:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
+from dualslam.core.jobs import Desk, Ended, JobKind
 from dualslam.core.types import Failure
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.system.system import System
-from dualslam.workers.jobs import Desk, Ended, JobKind
 
 Outcome = tuple[RecoveryJob, RecoveryResult | Failure]
 

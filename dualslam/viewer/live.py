@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from typing import TYPE_CHECKING
 
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.extras import how_to_install
@@ -20,8 +21,10 @@ from dualslam.core.processes import start_undisturbed
 from dualslam.core.types import Frame
 from dualslam.core.walk_news import WalkNews
 from dualslam.map.frame_records import FrameResult
-from dualslam.system.system import System
 from dualslam.viewer.messages import Message, Teller
+
+if TYPE_CHECKING:
+    from dualslam.system.system import System
 
 log = logging.getLogger(__name__)
 

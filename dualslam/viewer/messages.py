@@ -7,19 +7,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.events import Event
+from dualslam.core.jobs import JobKind
 from dualslam.core.types import BoolArray, FloatArray, Frame, FrameStatus, IntArray, Track
 from dualslam.core.walk_news import WalkNews
 from dualslam.map.frame_records import FrameResult
 from dualslam.map.submap import Submap
 from dualslam.report.event_words import event_words
-from dualslam.system.system import System
-from dualslam.workers.jobs import JobKind
+
+if TYPE_CHECKING:
+    from dualslam.system.system import System
 
 WIDTH_PX = 480
 """Of the picture: what a side panel shows."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from dualslam.core.types import Frame
 from dualslam.core.walk_news import WalkNews
 from dualslam.map.frame_records import FrameResult
-from dualslam.system.system import System
+
+if TYPE_CHECKING:
+    from dualslam.system.system import System
 
 FINISHING = "all frames are in: ending reverse tracking, writing the results"
 """Said once no frame is left to count: the last reverse tracking may take seconds."""

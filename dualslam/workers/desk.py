@@ -22,8 +22,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dualslam.core.errors import ConfigError
+from dualslam.core.jobs import Ended, JobKind, Limit
 from dualslam.core.types import Failure, FailureReason
-from dualslam.workers.jobs import Ended, JobKind, Limit
 from dualslam.workers.worker import STOP_S, Answer, MakeHandlers, Worker
 
 log = logging.getLogger(__name__)

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from dualslam.core.errors import ConfigError
+from dualslam.core.jobs import JobKind
 from dualslam.core.types import Failure, Frame
 from dualslam.workers.desk import WorkerDesk
-from dualslam.workers.jobs import JobKind
 
 log = logging.getLogger(__name__)
 

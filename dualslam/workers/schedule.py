@@ -15,11 +15,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from dualslam.core.errors import InputError
+from dualslam.core.jobs import JobKind, Limit
 from dualslam.core.types import Failure, FailureReason
-from dualslam.workers.jobs import JobKind, Limit
 
-SCHEDULE = "schedule.jsonl"
-"""In a run folder."""
 VERSION = 1
 """Of the file: another one is not read."""
 AT_END = "end"

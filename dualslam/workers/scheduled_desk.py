@@ -13,8 +13,8 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from dualslam.core.jobs import PAUSE_S, Ended, Executor, JobKind, Limit
 from dualslam.core.types import Failure, FailureReason
-from dualslam.workers.jobs import PAUSE_S, Ended, Executor, JobKind, Limit
 from dualslam.workers.schedule import (
     AT_END,
     AT_ONCE,
@@ -36,7 +36,7 @@ UNANSWERED = frozenset({JobKind.FORESIGHT})
 
 
 class ScheduledDesk:
-    """The `dualslam.workers.jobs.Desk` whose answers come by a schedule.
+    """The `dualslam.core.jobs.Desk` whose answers come by a schedule.
 
     Parameters
     ----------

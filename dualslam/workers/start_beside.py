@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from itertools import count
 
 from dualslam.core.interfaces import MapStarter
+from dualslam.core.jobs import Desk, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray, Start, View
-from dualslam.workers.jobs import Desk, JobKind
 
 MAX_VIEWS = 128
 """Frames that can be sent once more, to a process that takes the place of another: a start looks no farther back."""

@@ -13,10 +13,10 @@ from queue import Empty, SimpleQueue
 from threading import Event, Thread
 from typing import Any
 
+from dualslam.core.jobs import Handlers, JobKind, Limit, result_of
 from dualslam.core.memory import keep_freed_memory, peak_rss_mb
 from dualslam.core.processes import start_undisturbed
 from dualslam.core.types import Failure, FailureReason
-from dualslam.workers.jobs import Handlers, JobKind, Limit, result_of
 from dualslam.workers.transport import Channel
 
 MakeHandlers = Callable[[], Handlers]

@@ -11,11 +11,11 @@ import pytest
 from dualslam.atlas.atlas import Link, LinkKind
 from dualslam.atlas.report import AtlasReport
 from dualslam.core.geometry import se3, sim3
+from dualslam.core.jobs import Ended, InlineDesk, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.submap import Submap
 from dualslam.testing.atlas_world import LINK_SIGMAS, DriftingMap, lap_in_submaps
 from dualslam.testing.late_desk import LateDesk
-from dualslam.workers.jobs import Ended, InlineDesk, JobKind
 from tests.atlas.test_atlas_graph import CLOSED, FrontEnd, rms, state
 
 POLLS = 3

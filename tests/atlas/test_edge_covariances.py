@@ -12,11 +12,11 @@ from dualslam.atlas.warp import Warp
 from dualslam.backend.edge_covariance import edge_covariances
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3, sim3
+from dualslam.core.jobs import InlineDesk, JobKind
 from dualslam.core.types import FloatArray
 from dualslam.map.submap import Submap
 from dualslam.testing.atlas_world import DriftingMap
 from dualslam.testing.late_desk import LateDesk
-from dualslam.workers.jobs import InlineDesk, JobKind
 
 PAIRS = list(pairwise([0, 8, 16, 24]))
 

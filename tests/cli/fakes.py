@@ -11,6 +11,7 @@ from dualslam.atlas.trajectory import FramePose
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind, EventLog
+from dualslam.core.jobs import InlineDesk
 from dualslam.core.stage_timer import StageTimer
 from dualslam.core.types import Features, FloatArray, Frame, FrameStatus, Keyframe, View
 from dualslam.map.frame_numbers import FrameNumbers
@@ -19,7 +20,6 @@ from dualslam.map.submap import Submap
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.system.audit.photometric import PhotometricAudit
 from dualslam.system.pace import Pace
-from dualslam.workers.jobs import InlineDesk
 from dualslam.workers.scheduled_desk import ScheduledDesk
 
 NO_FEATURES = Features(

@@ -21,6 +21,7 @@ from dualslam.cli import main
 from dualslam.core.config.files import load_config
 from dualslam.core.errors import OutputError
 from dualslam.core.events import Event, EventKind
+from dualslam.core.jobs import InlineDesk
 from dualslam.core.types import Frame
 from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.run_folder import RunFolder
@@ -29,7 +30,6 @@ from dualslam.lab.synthetic import SyntheticSequence
 from dualslam.run.results import versions
 from dualslam.run.session import run_to_folder
 from dualslam.run.sources import open_source
-from dualslam.workers.jobs import InlineDesk
 from tests.cli.conftest import N_FRAMES
 from tests.cli.fakes import FakeSystem
 

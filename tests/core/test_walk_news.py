@@ -11,13 +11,13 @@ import pytest
 from dualslam.build import recovery_parts
 from dualslam.core import walk_news
 from dualslam.core.config.settings import Config
+from dualslam.core.jobs import JobKind
 from dualslam.core.types import Failure, FailureReason
 from dualslam.core.walk_news import MAX_POINTS, WalkNews, WalkTrace
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, pose_errors, system_in
 from dualslam.workers.desk import WorkerDesk
-from dualslam.workers.jobs import JobKind
 from dualslam.workers.transport import Channel
 from tests.workers.test_worker import COVERED, assert_same, wait_for
 from tests.workers.test_worker import desk as desk

@@ -12,13 +12,13 @@ from dualslam.atlas.trajectory import FramePose
 from dualslam.core.config.settings import RecoveryConfig
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import sim3
+from dualslam.core.jobs import Ended
 from dualslam.core.types import FailureReason, FloatArray, FrameStatus
 from dualslam.map.frame_records import FrameRow
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult
 from dualslam.recovery.manager import Recoveries, _UnderWay
 from dualslam.testing.point_world import CAMERA
-from dualslam.workers.jobs import Ended
 from tests.linking.test_motion import way, without
 from tests.recovery.test_earlier_runs import book, enter, pose_frames
 

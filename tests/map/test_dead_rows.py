@@ -8,6 +8,7 @@ import pytest
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.config.settings import GraphConfig
 from dualslam.core.estimates import GraphEstimate
+from dualslam.core.jobs import InlineDesk, JobKind
 from dualslam.core.types import Failure, FailureReason, IntArray
 from dualslam.map import dead_rows
 from dualslam.map.dead_rows import drop_dead_rows
@@ -18,7 +19,6 @@ from dualslam.system.system import System
 from dualslam.testing.graph_scene import Feeder, make_scene
 from dualslam.testing.late_desk import LateDesk
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
-from dualslam.workers.jobs import InlineDesk, JobKind
 
 N = 30
 Observation = tuple[int, int, int]

@@ -15,6 +15,7 @@ from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.build import build_system, graph_handlers, window_solver
 from dualslam.core.config.settings import Config
 from dualslam.core.errors import SolverError
+from dualslam.core.jobs import InlineDesk, JobKind
 from dualslam.core.types import Failure, FailureReason, FrameStatus
 from dualslam.map.graph_beside import BesideGraph, BesideGraphs, GraphAnswer, GraphJob, GraphServer
 from dualslam.map.lens import change_camera
@@ -28,7 +29,6 @@ from dualslam.testing.graph_scene import pose_errors as scene_errors
 from dualslam.testing.late_desk import LateDesk
 from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, pose_errors, system_in
 from dualslam.workers.desk import WorkerDesk
-from dualslam.workers.jobs import InlineDesk, JobKind
 from tests.backend.test_self_calibration import wrong_camera
 from tests.map.test_submap import assert_consistent
 

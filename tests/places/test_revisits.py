@@ -10,6 +10,7 @@ import pytest
 
 from dualslam.atlas.atlas import LinkKind
 from dualslam.core.events import EventKind
+from dualslam.core.jobs import Ended, InlineDesk, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
 from dualslam.places.plausibility import can_have_drifted
 from dualslam.places.search import PlaceSearch
@@ -17,7 +18,6 @@ from dualslam.run.results import trajectories_of
 from dualslam.system.system import System
 from dualslam.testing.late_desk import LateDesk
 from dualslam.testing.point_world import PointWorld, pose_errors, system_in
-from dualslam.workers.jobs import Ended, InlineDesk, JobKind
 from tests.places.worlds import N_LAP, N, driven_lap, lap, ring, run, wall
 
 ROLLING = {"graph": {"max_keyframes": 25, "rollover_keyframes": 6}}

@@ -23,6 +23,7 @@ from dualslam.core.errors import ConfigError, SolverError
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.grey_image import GreyImage
+from dualslam.core.jobs import JobKind, Limit
 from dualslam.core.types import Failure, FailureReason, Features, View
 from dualslam.frontends.features.sift import SiftFrontend
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry
@@ -34,7 +35,6 @@ from dualslam.run.results import trajectories_of
 from dualslam.system.system import System
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, random_features, system_in
 from dualslam.testing.walks import KeptWalks, replace_walks
-from dualslam.workers.jobs import JobKind, Limit
 from tests.workers.test_worker import assert_same
 
 COVERED = frozenset(range(35, 50))

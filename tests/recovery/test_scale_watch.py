@@ -9,6 +9,7 @@ from dualslam.atlas.atlas import Link, LinkKind
 from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.config.settings import GraphConfig, LinkingConfig
 from dualslam.core.events import EventKind
+from dualslam.core.jobs import Ended, InlineDesk, JobKind
 from dualslam.linking.scale_observability import N_AROUND
 from dualslam.map.solving import solve
 from dualslam.map.split import submap_of
@@ -18,7 +19,6 @@ from dualslam.run.results import trajectories_of
 from dualslam.system.system import System
 from dualslam.testing.link_worlds import FRAME_STEP, Recipe, build, make_world, thinned
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
-from dualslam.workers.jobs import Ended, InlineDesk, JobKind
 
 N = 24
 PLACE = 11 * FRAME_STEP

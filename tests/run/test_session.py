@@ -12,6 +12,7 @@ import pytest
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import Config
 from dualslam.core.errors import OutputError
+from dualslam.core.jobs import InlineDesk
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import FloatArray, Frame
 from dualslam.io.map_store import load_atlas
@@ -20,7 +21,6 @@ from dualslam.io.trajectory_files import read_tum
 from dualslam.map.frame_records import FrameResult
 from dualslam.run.session import run_to_folder
 from dualslam.testing.point_world import CAMERA
-from dualslam.workers.jobs import InlineDesk
 from dualslam.workers.scheduled_desk import ScheduledDesk
 from tests.cli.fakes import FakeSystem
 

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 from dualslam.core.grey_image import GreyImage
+from dualslam.core.jobs import Ended, InlineDesk, JobKind
 from dualslam.core.types import Failure, FailureReason
 from dualslam.testing.desk_work import handlers, lane, working
 from dualslam.testing.point_world import PointWorld, cloud, hand_held
 from dualslam.testing.waiting import wait_until
 from dualslam.workers.desk import WorkerDesk
-from dualslam.workers.jobs import Ended, InlineDesk, JobKind
 from dualslam.workers.transport import Channel
 
 GRAPH, CALIBRATION, WALK = JobKind.GRAPH, JobKind.CALIBRATION, JobKind.WALK

@@ -6,12 +6,12 @@ import numpy as np
 
 from dualslam.build import feature_handlers
 from dualslam.core.config.settings import FrontendConfig
+from dualslam.core.jobs import JobKind
 from dualslam.core.types import Failure, Frame
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.testing.desk_work import lane, working
 from dualslam.workers.desk import MAX_STILLBORN, Lane
 from dualslam.workers.features_beside import FeaturesBeside
-from dualslam.workers.jobs import JobKind
 from tests.workers.test_stillborn import end_at_once
 
 

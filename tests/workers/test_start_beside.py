@@ -10,12 +10,12 @@ import pytest
 
 from dualslam.build import create_frontend, new_initialiser
 from dualslam.core.events import EventKind
+from dualslam.core.jobs import InlineDesk, JobKind
 from dualslam.core.types import Failure, FailureReason, FrameStatus, Start, View
 from dualslam.frontends.tracking.initialiser import Initialiser
 from dualslam.system.system import System
 from dualslam.testing.late_desk import LateDesk
 from dualslam.testing.point_world import CAMERA, SIZE_PX, PointWorld, cloud, hand_held, pose_errors, system_in
-from dualslam.workers.jobs import InlineDesk, JobKind
 from dualslam.workers.start_beside import StartBeside, StartServer
 
 N = 40

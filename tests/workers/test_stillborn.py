@@ -7,9 +7,9 @@ import time
 import pytest
 
 from dualslam.core.errors import ConfigError
+from dualslam.core.jobs import Ended, Handlers, JobKind
 from dualslam.core.types import Failure
 from dualslam.workers.desk import MAX_STILLBORN, Lane, WorkerDesk
-from dualslam.workers.jobs import Ended, Handlers, JobKind
 
 
 def end_at_once() -> Handlers:

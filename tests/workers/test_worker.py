@@ -15,6 +15,7 @@ import pytest
 from dualslam.build import recovery_parts, walk_handlers
 from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
+from dualslam.core.jobs import JobKind, Limit
 from dualslam.core.types import Failure, FailureReason
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
@@ -22,7 +23,6 @@ from dualslam.run.results import trajectories_of
 from dualslam.testing.point_world import CAMERA, PointWorld, cloud, hand_held, pose_errors, system_in
 from dualslam.testing.walks import KeptWalks, replace_walks
 from dualslam.workers.desk import Lane, WorkerDesk
-from dualslam.workers.jobs import JobKind, Limit
 
 COVERED = frozenset(range(35, 50))
 MAKE_PARTS = partial(recovery_parts, Config(), CAMERA)

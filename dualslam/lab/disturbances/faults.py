@@ -10,7 +10,7 @@ import os
 import signal
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -19,10 +19,12 @@ from dualslam.core.errors import SolverError
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import so3
 from dualslam.core.interfaces import Seeker, SubmapGraph, VisualOdometry
+from dualslam.core.jobs import JobKind
 from dualslam.core.types import Failure, FloatArray, Frame, Track, View
 from dualslam.map.submap import Submap
-from dualslam.recovery.job import RecoveryJob
-from dualslam.workers.jobs import JobKind
+
+if TYPE_CHECKING:
+    from dualslam.recovery.job import RecoveryJob
 
 _KINDS = INTERNAL_KINDS | {CorruptionKind.FEW_FEATURES}
 

@@ -21,6 +21,7 @@ from dualslam.core.errors import InputError, SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
+from dualslam.core.jobs import Desk, JobKind
 from dualslam.core.types import Failure, FailureReason, View
 from dualslam.map.late_estimate import apply_late
 from dualslam.map.lens import (
@@ -32,7 +33,6 @@ from dualslam.map.lens import (
 )
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
-from dualslam.workers.jobs import Desk, JobKind
 
 log = logging.getLogger(__name__)
 

@@ -21,13 +21,13 @@ from dualslam.core.errors import SolverError
 from dualslam.core.estimates import ReadoutEstimate
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Shutter, SubmapGraph, VisualOdometry
+from dualslam.core.jobs import Desk, JobKind
 from dualslam.core.types import Failure, FloatArray, View
 from dualslam.map.frame_observations import Change
 from dualslam.map.lens import Calibration
 from dualslam.map.submap import Submap
 from dualslam.system.camera.background import Views
 from dualslam.system.camera.turns import turn_rates
-from dualslam.workers.jobs import Desk, JobKind
 
 log = logging.getLogger(__name__)
 

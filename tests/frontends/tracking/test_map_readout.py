@@ -13,6 +13,7 @@ from dualslam.core.estimates import KeyframeReport, ReadoutEstimate
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, so3
 from dualslam.core.interfaces import VisualOdometry
+from dualslam.core.jobs import Ended
 from dualslam.core.types import Failure, Features, FloatArray, Frame, IntArray, Keyframe, Track, View
 from dualslam.frontends.tracking.map_readout import MIN_KEYFRAMES, ReadoutQuestion, answer_readout, ask_readout
 from dualslam.frontends.tracking.rolling_shutter import TurnMeter
@@ -23,7 +24,6 @@ from dualslam.system.camera.shutter_watch import INFLATION, MIN_SIGMAS
 from dualslam.system.system import System
 from dualslam.system.system.camera import shutter_watch
 from dualslam.testing.point_world import CAMERA, RATE_HZ, PointWorld, cloud, pose_errors, system_in
-from dualslam.workers.jobs import Ended
 from tests.frontends.tracking.test_rolling_shutter import read_row_by_row, turn_rate
 
 READOUT_S = 0.025

@@ -11,6 +11,7 @@ from dualslam.build import build_system
 from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
+from dualslam.core.jobs import JobKind
 from dualslam.core.types import FloatArray, Frame, View
 from dualslam.map.lens import CalibrationAnswer, change_camera
 from dualslam.run.results import trajectories_of
@@ -18,7 +19,6 @@ from dualslam.system.camera.background import merge_calibrated
 from dualslam.system.system import System
 from dualslam.testing.late_desk import LateDesk
 from dualslam.testing.point_world import pose_errors
-from dualslam.workers.jobs import JobKind
 from tests.backend.test_self_calibration import TRUE, make_submap, wrong_camera
 from tests.system.camera.test_lens import WRONG, CalibrationWorld
 
