@@ -14,7 +14,7 @@ from dualslam.core.geometry.projection import project_points
 from dualslam.core.types import BoolArray, FloatArray, IntArray, View
 from dualslam.frontends.direct.warp import build_pyramid, correlate, sample, warp_points
 from dualslam.frontends.tracking.row_shifts import find_as_read
-from dualslam.map.submap import Submap
+from dualslam.map.submap import NO_LANDMARK, Submap
 
 HALF = 4
 """Half the side of a patch, in its own pixels: 9 x 9 of them."""
@@ -109,7 +109,11 @@ class PatchAudit:
         recent = [k for k in known if abs(view.timestamp_s - self._kept[k].timestamp_s) <= MAX_AGE_S]
         for k in [*recent, *(k for k in reversed(known) if k not in recent)]:
             patches = self._kept[k]
-            ids = submap.landmark_of[k][patches.feature]
+            # Another map of the same frame has its features, without those that the first one found again by patches.
+            landmark_of = submap.landmark_of[k]
+            ids = np.full(len(patches.feature), NO_LANDMARK, np.int64)
+            known = patches.feature < len(landmark_of)
+            ids[known] = landmark_of[patches.feature[known]]
             rows = np.flatnonzero(ids >= 0)
             uv, depth = project_points(K, T_cam_submap, submap.landmarks["xyz_mu"][ids[rows]])
             zoom = submap.depths(ids[rows], se3.inverse(submap.T_submap_kf[k])) / np.maximum(depth, 1e-9)

@@ -105,6 +105,21 @@ def test_a_frame_agrees_with_an_older_keyframe_at_its_own_pose_alone() -> None:
     assert audit.measure(submap, other, away) is None, "it shows another place"
 
 
+def test_a_map_whose_keyframe_has_fewer_features_is_compared_by_those_that_it_has() -> None:
+    keyframe, other, submap = views()
+    audit = PatchAudit(lambda: CAMERA)
+    audit.remember(submap, keyframe)
+    n = 100  # of 140: another map of the same frame lacks the last ones
+    features = keyframe.features.take(np.arange(n))
+    second = Submap(1, CAMERA.K, features.descriptors[0])
+    second.add_keyframe(Keyframe(0, 0.0, features), np.eye(4))
+    ids = second.add_landmarks(lift(grid()[:n]), features.descriptors, np.ones(n), 0)
+    second.add_observations(0, np.arange(n), ids)
+    right = audit.measure(second, other, T_CAM_KF)
+    assert right is not None
+    assert right > 0.9
+
+
 def test_what_something_hides_does_not_agree() -> None:
     keyframe, other, submap = views()
     assert other.image is not None
