@@ -1,25 +1,16 @@
-"""Batch bundle adjustment of a few keyframes and their points: initialisation, overlaps, windows.
-
-GTSAM's Levenberg-Marquardt with the points eliminated first. A vectorised numpy solver with a Schur complement was
-written beside it and thrown away: at 20 free and 5 fixed keyframes with 6,200 observations it took 14.4 ms an iteration
-against 13.5 (and 3 ms to build the graph), at 8 and 2 with 2,500 observations 4.5 against 5.2. Both found the same
-optimum.
-"""
+"""Batch bundle adjustment of a submap, or a part of it: initialisation, calibration, the last refinement."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
-import gtsam
 import numpy as np
 
-from dualslam.backend import convert
-from dualslam.backend.factors import insert_projections, pose_prior
-from dualslam.backend.noise import PixelNoise
 from dualslam.backend.observability import compute_depth_sigmas, compute_residuals
-from dualslam.backend.solver import SolverFailure, optimise_batch
+from dualslam.backend.point_refinement import huber
+from dualslam.backend.schur import geman_mcclure, optimise
 from dualslam.core.bundle import BundleProblem, BundleResult, FrameRows
-from dualslam.core.errors import SolverError
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 
@@ -76,12 +67,12 @@ def bundle_adjust_arrays(
     tolerance : float
         Relative decrease of the cost below which to stop.
     forgets : bool
-        See `PixelNoise`.
+        Whether the loss is Geman and McClure's with the shape `robust_k`, under which outliers no longer count.
 
     Raises
     ------
     SolverError
-        If the solver fails.
+        If the system has no optimum.
     """
     p = problem
     before = compute_residuals(p.K, p.T_submap_kf, p.kf, p.xyz_mu[p.point], p.uv_px, p.sigma_px)
@@ -91,35 +82,17 @@ def bundle_adjust_arrays(
     )
     adjusted = sigmas < MAX_DEPTH_SIGMA
     row = front[adjusted[p.point[front]]]
-    poses, points = np.unique(p.kf[row]), np.flatnonzero(adjusted)
-    T, xyz = p.T_submap_kf.copy(), p.xyz_mu.copy()
-    cost = (0.0, 0.0)
+    points = np.flatnonzero(adjusted)
+    number = np.cumsum(adjusted) - 1
+    T, xyz, cost = p.T_submap_kf.copy(), p.xyz_mu.copy(), (0.0, 0.0)
     if len(row):
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        # Tight priors: equality constraints make an iteration ten times as long.
-        for k in poses[p.fixed[poses]].tolist():
-            graph.push_back(pose_prior(k, p.T_submap_kf[k]))
-        insert_projections(
-            graph,
-            p.kf[row],
-            p.point[row],
-            p.uv_px[row],
-            p.sigma_px[row],
-            convert.to_cal3_s2(p.K),
-            PixelNoise(robust_k, forgets),
+        used = BundleProblem(
+            p.K, T, p.fixed, xyz[points], p.kf[row], number[p.point[row]], p.uv_px[row], p.sigma_px[row]
         )
-        convert.insert_poses(values, poses, p.T_submap_kf[poses])
-        convert.insert_points(values, points, p.xyz_mu[points])
-        try:
-            batch = optimise_batch(graph, values, poses, points, max_iterations, tolerance)
-        except SolverFailure as failure:
-            raise SolverError(
-                f"bundle adjustment of {len(poses)} keyframes and {len(points)} points: {failure}"
-            ) from failure
-        free = ~p.fixed[poses]
-        T[poses[free]] = batch.T_submap_kf[free]
-        xyz[points] = batch.xyz_mu
-        cost = (batch.cost_before, batch.cost_after)
+        loss = partial(geman_mcclure, shape=robust_k) if forgets else partial(huber, k=robust_k)
+        optimum = optimise(used, loss, max_iterations, tolerance)
+        T, xyz[points] = optimum.T_submap_kf, optimum.xyz_mu
+        cost = optimum.cost_before, optimum.cost_after
     after = compute_residuals(p.K, T, p.kf, xyz[p.point], p.uv_px, p.sigma_px)
     return BundleResult(T, xyz, adjusted, after.chi2, *cost)
 

@@ -59,13 +59,10 @@ class PixelNoise:
     ----------
     robust_k : float
         Huber threshold in sigmas.
-    forgets : bool
-        Whether the loss is Geman and McClure's, `robust_k` its shape: what does not fit loses its say.
     """
 
-    def __init__(self, robust_k: float, forgets: bool = False) -> None:
-        estimators = gtsam.noiseModel.mEstimator
-        self._loss = (estimators.GemanMcClure if forgets else estimators.Huber).Create(robust_k)
+    def __init__(self, robust_k: float) -> None:
+        self._loss = gtsam.noiseModel.mEstimator.Huber.Create(robust_k)
         self._models: dict[float, gtsam.noiseModel.Robust] = {}
 
     def __call__(self, sigma_px: float) -> gtsam.noiseModel.Robust:

@@ -12,6 +12,8 @@ Only real time has a pace. Without it nothing here ever changes what a run does.
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 BEHIND_S = 1 / 30
@@ -54,10 +56,13 @@ class Pace:
     in_real_time : bool
         Whether frames come by a clock.
     statistics : PaceStatistics
+    clock : callable
+        Seconds; measures by how much background results hold a frame up.
     """
 
     def __init__(self) -> None:
         self.statistics = PaceStatistics()
+        self.clock: Callable[[], float] = time.perf_counter
         self.in_real_time = False
         self._late_s = 0.0
         self._lag = 0

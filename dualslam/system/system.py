@@ -235,7 +235,7 @@ class System:
             If it cannot be the next frame: one that came already, or after the end.
         """
         state, started, self._tracking.posed_at = self._state, time.perf_counter(), None
-        source, frame = frame, self.numbers.numbered(frame)
+        source, frame, began_s = frame, self.numbers.numbered(frame), state.pace.clock()
         self.rows[frame.index] = FrameRow(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
         # 1. What was found beside the tracking meanwhile comes into the map between two frames.
         if (recorded := self.desk.recorded_lateness(source.index)) is not None:
@@ -251,7 +251,7 @@ class System:
                 self._begin_anew()
         self._recoveries.collect(state.live, frame)
         if state.pace.in_real_time:
-            held_s = time.perf_counter() - started
+            held_s = state.pace.clock() - began_s
             state.pace.hold_up(self.desk.lateness(source.index, state.pace.late_s, held_s).held_s)
         if not state.pace.behind:
             self.buffer.settle(SETTLED_A_FRAME)

@@ -117,6 +117,7 @@ def system_in(world: PointWorld, schedule: Policy | None = None, **settings: obj
     """Build the real system, with the world's features instead of those of an image; no other ones are to be had.
 
     `schedule`: when answers of background work are used; all of it is done in this process then.
+    The pace's clock stands still: how busy the machine is does not count.
     """
     recovery: Any = settings.get("recovery", {"enabled": False})
     fixed = {"camera": {"model_sigma_px": 0.0}, "calibration": {"refine": False}}
@@ -130,6 +131,7 @@ def system_in(world: PointWorld, schedule: Policy | None = None, **settings: obj
         return world.view(frame.index)
 
     system._state.parts = replace(system._state.parts, view_of=view_of)
+    system.pace.clock = lambda: 0.0
     return system
 
 

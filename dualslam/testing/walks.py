@@ -25,7 +25,7 @@ class Walks(Protocol):
         ...
 
     def finish(self) -> list[Outcome]:
-        """Return the outcomes of all that are left."""
+        """Return the outcomes of all that are left, each once."""
         ...
 
 
@@ -94,7 +94,6 @@ class _WalkDesk:
 
     def __init__(self, walks: Walks) -> None:
         self._walks = walks
-        self._drained: set[int] = set()
 
     def submit(self, kind: JobKind, work: Any, of: int | None = None) -> None:
         self._walks.submit(work)
@@ -103,10 +102,7 @@ class _WalkDesk:
         return [Ended(*outcome) for outcome in self._walks.poll()] if kind is JobKind.WALK else []
 
     def drain(self, kind: JobKind) -> list[Ended]:
-        ended = [Ended(*outcome) for outcome in self._walks.finish()] if kind is JobKind.WALK else []
-        new = [each for each in ended if id(each.work) not in self._drained]
-        self._drained |= {id(each.work) for each in new}
-        return new
+        return [Ended(*outcome) for outcome in self._walks.finish()] if kind is JobKind.WALK else []
 
 
 def replace_walks(system: System, wrap: Callable[[Walks], AnyWalks]) -> AnyWalks:

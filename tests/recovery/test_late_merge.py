@@ -45,7 +45,8 @@ class LateExecutor:
         return due
 
     def finish(self) -> list[Outcome]:
-        return [outcome for _, outcome in self.waiting]
+        left, self.waiting = self.waiting, []
+        return [outcome for _, outcome in left]
 
 
 class FailingExecutor(LateExecutor):

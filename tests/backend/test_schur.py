@@ -1,0 +1,121 @@
+"""Bundle adjustment by the Schur complement, against GTSAM's: the same optimum under both losses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from dualslam.backend import convert, schur
+from dualslam.backend.factors import insert_projections, pose_prior
+from dualslam.backend.point_refinement import huber
+from dualslam.backend.schur import Loss, geman_mcclure, optimise
+from dualslam.backend.solver import optimise_batch
+from dualslam.core.bundle import BundleProblem
+from dualslam.core.errors import SolverError
+from dualslam.testing.graph_scene import Feeder, make_scene, pose_errors
+
+SHAPE, ITERATIONS, TOLERANCE = 2.0, 20, 1e-9
+
+
+def problem_of(n: int, seed: int = 0) -> BundleProblem:
+    """A corridor with outliers, one pose fixed."""
+    scene = make_scene(n, 100, 0.5, seed)
+    feeder = Feeder(scene, seed, point_noise=0.02)
+    for k in range(n):
+        feeder.add(k, exact=True)
+    submap, rng = feeder.submap, np.random.default_rng(seed)
+    obs = submap.observations
+    uv, sigma = submap.observed_pixels(np.arange(len(obs)))
+    uv[rng.random(len(uv)) < 0.05] += [6.0, -4.0]
+    T = scene.T_true.copy()
+    T[1:, :3, 3] += 0.005 * rng.normal(size=(n - 1, 3))
+    views = np.bincount(obs["landmark"])
+    kept = views[obs["landmark"]] >= 3
+    number = np.cumsum(views >= 3) - 1
+    xyz = submap.landmarks["xyz_mu"][: len(views)][views >= 3]
+    return BundleProblem(
+        submap.K, T, np.arange(n) == 0, xyz, obs["kf"][kept], number[obs["landmark"][kept]], uv[kept], sigma[kept]
+    )
+
+
+def by_gtsam(p: BundleProblem, loss: Any) -> float:
+    """The cost at GTSAM's optimum."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+
+    def noise(sigma: float) -> gtsam.noiseModel.Robust:
+        return gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Isotropic.Sigma(2, sigma))
+
+    poses, points = np.arange(len(p.T_submap_kf)), np.arange(len(p.xyz_mu))
+    graph.push_back(pose_prior(0, p.T_submap_kf[0]))
+    insert_projections(graph, p.kf, p.point, p.uv_px, p.sigma_px, convert.to_cal3_s2(p.K), noise)  # type: ignore[arg-type]
+    convert.insert_poses(values, poses, p.T_submap_kf)
+    convert.insert_points(values, points, p.xyz_mu)
+    return optimise_batch(graph, values, poses, points, ITERATIONS, TOLERANCE).cost_after
+
+
+ESTIMATORS = gtsam.noiseModel.mEstimator
+
+
+@pytest.mark.parametrize(
+    ("loss", "theirs"),
+    [
+        (partial(huber, k=SHAPE), ESTIMATORS.Huber.Create(SHAPE)),
+        (partial(geman_mcclure, shape=SHAPE), ESTIMATORS.GemanMcClure.Create(SHAPE)),
+    ],
+)
+def test_the_optimum_is_gtsam_s(loss: Loss, theirs: Any) -> None:
+    problem = problem_of(12)
+    found = optimise(problem, loss, ITERATIONS, TOLERANCE)
+    assert found.cost_after < 0.5 * found.cost_before
+    assert found.cost_after == pytest.approx(by_gtsam(problem, theirs), rel=1e-4)
+    np.testing.assert_array_equal(found.T_submap_kf[0], problem.T_submap_kf[0])
+
+
+@pytest.fixture
+def in_small_chunks(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    return lambda: monkeypatch.setattr(schur, "CHUNK", 100)
+
+
+def test_neither_chunks_nor_the_order_of_poses_count(in_small_chunks: Callable[[], None]) -> None:
+    problem, loss = problem_of(10), partial(huber, k=SHAPE)
+    problem = replace(problem, fixed=np.arange(10) < 2)  # the scale, too
+    whole = optimise(problem, loss, 3, TOLERANCE)
+    in_small_chunks()
+    order = np.random.default_rng(1).permutation(10)
+    place = np.argsort(order)
+    shuffled = replace(
+        problem, T_submap_kf=problem.T_submap_kf[order], fixed=problem.fixed[order], kf=place[problem.kf]
+    )
+    again = optimise(shuffled, loss, 3, TOLERANCE)
+    np.testing.assert_allclose(again.T_submap_kf[place], whole.T_submap_kf, atol=1e-7)
+    np.testing.assert_allclose(again.xyz_mu, whole.xyz_mu, atol=1e-5)
+
+
+def test_a_point_behind_a_camera_moves_no_pose() -> None:
+    problem, loss = problem_of(10), partial(geman_mcclure, shape=SHAPE)
+    alone = optimise(problem, loss, 5, TOLERANCE)
+    T = problem.T_submap_kf[:3]
+    behind = T[0, :3, 3] - T[0, :3, 2]
+    more = replace(
+        problem,
+        xyz_mu=np.vstack([problem.xyz_mu, behind]),
+        kf=np.append(problem.kf, [0, 1, 2]),
+        point=np.append(problem.point, [len(problem.xyz_mu)] * 3),
+        uv_px=np.vstack([problem.uv_px, [[300.0, 200.0]] * 3]),
+        sigma_px=np.append(problem.sigma_px, [1.0] * 3),
+    )
+    t, r = pose_errors(optimise(more, loss, 5, TOLERANCE).T_submap_kf, alone.T_submap_kf)
+    assert t.max() < 1e-6
+    assert r.max() < 1e-6
+
+
+def test_what_is_no_number_is_a_failure() -> None:
+    problem = problem_of(6)
+    with pytest.raises(SolverError, match="no optimum"):
+        optimise(replace(problem, uv_px=problem.uv_px * np.nan), partial(huber, k=SHAPE), 3, TOLERANCE)
