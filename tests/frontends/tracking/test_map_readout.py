@@ -20,9 +20,9 @@ from dualslam.frontends.tracking.rolling_shutter import TurnMeter
 from dualslam.frontends.tracking.row_shifts import correct_shutter, find_as_read, straighten
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.map.submap import Submap
+from dualslam.system.camera import shutter_watch
 from dualslam.system.camera.shutter_watch import INFLATION, MIN_SIGMAS
 from dualslam.system.system import System
-from dualslam.system.system.camera import shutter_watch
 from dualslam.testing.point_world import CAMERA, RATE_HZ, PointWorld, cloud, pose_errors, system_in
 from tests.frontends.tracking.test_rolling_shutter import read_row_by_row, turn_rate
 
