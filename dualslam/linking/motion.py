@@ -5,7 +5,8 @@ How far such predictions are off is measured in the run itself: the same questio
 the camera was tracked without interruption. So no unit is needed, and a hand is judged as a hand, a car as a car.
 
 A gap may be longer than the history that could be asked. The error then grows as that of a velocity that changes at
-random, and in the end the test allows everything.
+random, and the camera may have stood still for the time that could not be asked: a robot that has never been seen to
+stop can stop all the same. In the end the test allows everything.
 """
 
 from __future__ import annotations
@@ -55,11 +56,12 @@ class Motion:
     Attributes
     ----------
     off_mu : float
-        Distance between the displacement and its prediction.
+        Distance between the displacement and its prediction; the nearest one, where the camera may have stood still.
     usual_mu : float
         The usual error of such predictions over the same time.
     change_mu : float
-        Error that the change of velocity across the gap explains, if it came all at its beginning or at its end.
+        Error that the change of velocity across the gap explains, whenever it came between the middles of the two
+        windows in which the velocities were measured.
     slack_mu : float
         What the join of two maps leaves open there.
     n_asked : int
@@ -180,14 +182,6 @@ def gaps_of(times_s: FloatArray) -> IntArray:
     return np.flatnonzero(apart_s > MISSING * np.median(apart_s)) if len(apart_s) else np.zeros(0, np.int64)
 
 
-def usual_error(known: Path, apart_s: float) -> tuple[float, int]:
-    """Return the usual error of the prediction over a time, and at how many places it was measured.
-
-    Frames that were found again by wide matching may have jumped: no stretch with one in it counts.
-    """
-    return _usual_error(_Fits.of(known), apart_s, 0.5, 0.5)
-
-
 def _seams(old: Path, new: Path) -> Iterator[tuple[Path, Path]]:
     """Yield the paths before and after each seam, one of each map."""
     times = np.concatenate([old.times_s, new.times_s])
@@ -210,17 +204,23 @@ def _measure(fits: _Fits, last_before: int, known: _Fits, slack_mu: float = 0.0)
         return None
     weights = has[0] / sum(has), has[1] / sum(has)
     apart_s = float(fits.times_s[j] - fits.times_s[i])
-    off = float(fits.errors(np.array([i]), np.array([j]), *weights)[0])
-    change = (
-        0.5 * float(np.linalg.norm(fits.before.velocity[i] - fits.after.velocity[j])) * apart_s if all(has) else 0.0
-    )
-    return Motion(off, *_usual_error(known, apart_s, *weights), sum(has), change, slack_mu)
+    change = 0.0
+    if all(has):
+        difference = float(np.linalg.norm(fits.before.velocity[i] - fits.after.velocity[j]))
+        change = 0.5 * difference * (apart_s + fits.reach_s)
+    usual, n_asked, asked_s = _usual_error(known, apart_s, *weights)
+    off = fits.error_of_a_halt(i, j, *weights, apart_s - asked_s)
+    return Motion(off, usual, n_asked, sum(has), change, slack_mu)
 
 
-def _usual_error(known: _Fits, apart_s: float, of_before: float, of_after: float) -> tuple[float, int]:
-    """Return `usual_error` of predictions by the velocities before and after, with these weights."""
+def _usual_error(known: _Fits, apart_s: float, of_before: float, of_after: float) -> tuple[float, int, float]:
+    """Return the usual error of predictions over a time, at how many places it was measured, and over which time.
+
+    The predictions are by the velocities before and after, with these weights. Frames that were found again by wide
+    matching may have jumped: no stretch with one in it counts.
+    """
     if len(known.times_s) < 2:
-        return 0.0, 0
+        return 0.0, 0, 0.0
     span_s = float(known.times_s[-1] - known.times_s[0])
     asked_s, n_asked = min(apart_s, span_s / INDEPENDENT), 0
     while asked_s > 0.5 * known.usual_s:
@@ -228,9 +228,9 @@ def _usual_error(known: _Fits, apart_s: float, of_before: float, of_after: float
         n_asked = max(n_asked, len(i))
         if len(i) >= MIN_ASKED:
             usual = float(np.quantile(known.errors(i, j, of_before, of_after), USUAL))
-            return usual * (apart_s / asked_s) ** GROWTH, len(i)
+            return usual * (apart_s / asked_s) ** GROWTH, len(i), asked_s
         asked_s *= 0.5
-    return 0.0, n_asked
+    return 0.0, n_asked, 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -276,6 +276,14 @@ class _Fits:
         velocity = of_before * self.before.velocity[i] + of_after * self.after.velocity[j]
         moved = self.after.place[j] - self.before.place[i]
         return np.asarray(np.linalg.norm(moved - velocity * (self.times_s[j] - self.times_s[i])[:, None], axis=1))
+
+    def error_of_a_halt(self, i: int, j: int, of_before: float, of_after: float, halt_s: float) -> float:
+        """Return `errors` of one pair of frames, where the camera may have stood still for up to `halt_s` between."""
+        apart_s = float(self.times_s[j] - self.times_s[i])
+        velocity = of_before * self.before.velocity[i] + of_after * self.after.velocity[j]
+        moved = self.after.place[j] - self.before.place[i]
+        moving_s = float(moved @ velocity) / max(float(velocity @ velocity), 1e-300)
+        return float(np.linalg.norm(moved - velocity * np.clip(moving_s, apart_s - halt_s, apart_s)))
 
     def stretches(self, apart_s: float, needs_before: bool, needs_after: bool) -> tuple[IntArray, IntArray]:
         """Return the pairs of frames so far apart in time over which the camera was tracked without a jump."""

@@ -67,10 +67,13 @@ def test_a_right_motion_is_believed_in_any_unit(seed: int, length: int) -> None:
 @pytest.mark.parametrize("off_m", [-1.5, 1.5])
 @pytest.mark.parametrize(("length", "sway_m"), [(10, 0.05), (38, 0.005), (42, 0.005), (80, 0.002)])
 def test_one_that_is_a_period_off_is_not(seed: int, off_m: float, length: int, sway_m: float) -> None:
-    """Nothing changes at two seconds, nor where the history is too short to be asked over so long a time."""
+    """Nothing changes at two seconds, nor where the history is too short to be asked over so long a time.
+
+    A period too little may be a halt, where the history is less than twice as long as the gap.
+    """
     t, p = without(*way(160 + length, seed, sway_m), 100, length)
     p[100:, 0] += off_m
-    for first in (0, 60):
+    for first in (0, 60) if off_m > 0 or length <= 10 else (0,) if length <= 50 else ():
         motion = motion_behind(path_of(t[first:], p[first:]), 99 - first)
         assert motion.n_asked >= MIN_ASKED
         assert motion.is_refused
@@ -114,6 +117,27 @@ def test_a_change_of_velocity_explains_what_it_can() -> None:
     assert not motion_behind(path_of(t, p), 99).is_refused
     p[100:, 0] += 1.0
     assert motion_behind(path_of(t, p), 99).is_refused
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_camera_may_halt_for_as_long_as_it_was_not_watched(seed: int) -> None:
+    """A robot at constant speed stops dead while nothing is seen, and goes on as before."""
+    for gap_s, halt_s, refused in ((4.0, 2.5, False), (4.0, -2.5, True), (1.0, 0.8, True)):
+        t, p = way(180, seed, sway_m=0.002)
+        length = round(RATE_HZ * gap_s)
+        t, p = without(np.arange(180 + length) / RATE_HZ, np.concatenate([p, np.zeros((length, 3))]), 100, length)
+        p[100:] = p[99] + np.outer(t[100:] - t[99] - halt_s, [0.8, 0.0, 0.3])
+        assert motion_behind(path_of(t[20:], p[20:]), 79).is_refused is refused
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_camera_that_brakes_right_behind_a_gap_is_believed(seed: int) -> None:
+    """Its velocity is measured over a window: it has changed until the middle of that."""
+    t = np.arange(80) / RATE_HZ
+    speed = np.interp(t, [0, 2.5, 3.0], [1.0, 1.0, 0.0])
+    p = np.outer(np.cumsum(speed) / RATE_HZ, [1.0, 0.0, 0.0]) + np.random.default_rng(seed).normal(0, 1e-3, (80, 3))
+    t, p = without(t, p, 40, 10)
+    assert not motion_behind(path_of(t, p), 39).is_refused
 
 
 def test_where_the_run_can_tell_nothing_nothing_is_refused() -> None:

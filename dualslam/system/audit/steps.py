@@ -12,6 +12,8 @@ NEIGHBOURS = 5
 """Steps on either side whose median speed is expected. Five outvote a frame that is off by itself."""
 MIN_SPEED_SHARE = 0.5
 """Of the median speed of the whole trajectory, the least that is expected: a camera at rest starts to move."""
+MIN_INTERVAL_SHARE = 0.5
+"""Of the median interval, the least that a step is taken to have lasted: timestamps repeat, or come late in turns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,11 +38,13 @@ def measure_steps(times_s: FloatArray, centres: FloatArray) -> Steps:
     Parameters
     ----------
     times_s : (N,)
-        Ascending.
+        Ascending; some may repeat.
     centres : (N, 3)
         Of the camera.
     """
-    interval_s = np.maximum(np.diff(times_s), 1e-9)
+    interval_s = np.diff(times_s)
+    least_s = MIN_INTERVAL_SHARE * float(np.median(interval_s[interval_s > 0])) if (interval_s > 0).any() else 1e-9
+    interval_s = np.maximum(interval_s, least_s)
     length = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     speed = length / interval_s
     if len(speed) <= 2 * NEIGHBOURS:

@@ -36,6 +36,14 @@ def test_a_camera_may_rest_start_and_speed_up() -> None:
     assert steps.ratio.max() < SUSPECT
 
 
+def test_timestamps_that_repeat_are_no_jump() -> None:
+    in_pairs = np.repeat(TIMES[::2], 2)
+    assert measure_steps(in_pairs, along_x(0.5 * TIMES)).ratio.max() < SUSPECT
+    x = 0.5 * TIMES
+    x[120:] += 0.8
+    assert measure_steps(in_pairs, along_x(x)).ratio[119] > 4 * SUSPECT
+
+
 def test_missing_frames_are_no_jump() -> None:
     kept = np.r_[0:80, 110:200]
     assert measure_steps(TIMES[kept], along_x(0.5 * TIMES[kept])).ratio.max() < 1.01
