@@ -371,7 +371,14 @@ class VisualOdometry(Protocol):
 
 
 class Seeker(VisualOdometry, Protocol):
-    """A front end that finds its submap again wherever it is seen, and goes on from there."""
+    """The live front end: it grows a submap from its start, and finds it again wherever it is seen."""
+
+    def grow_weak_start(self, noise2: float) -> None:
+        """Triangulate what else the views of a start match, where its last view holds few landmarks.
+
+        Call it after `start_at`. `noise2`: variance of the start's whitened residuals.
+        """
+        ...
 
     def relocalise(self, view: View, keyframe_id: int) -> Track | Failure:
         """Pose a frame by what a keyframe of the submap and those about it show; go on from there, at rest."""

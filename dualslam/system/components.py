@@ -14,7 +14,6 @@ from dualslam.core.interfaces import (
     Seeker,
     Shutter,
     SubmapGraph,
-    VisualOdometry,
 )
 from dualslam.core.types import Failure, FloatArray, Frame, View
 from dualslam.core.walk_news import WalkWatch
@@ -42,7 +41,7 @@ class Components:
     view_of: Callable[[Frame], View | Failure]
     new_starter: Callable[[], MapStarter]
     new_graph: Callable[[], SubmapGraph]
-    new_odometry: Callable[[Submap, SubmapGraph], VisualOdometry]
+    new_odometry: Callable[[Submap, SubmapGraph], Seeker]
     new_relocaliser: Callable[[Submap, SubmapGraph], Seeker]
     calibration: Calibration
     shutter: Shutter

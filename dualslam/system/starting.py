@@ -10,7 +10,7 @@ from dualslam.atlas.trajectory import FramePose
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
-from dualslam.core.interfaces import START_REACH, SubmapGraph
+from dualslam.core.interfaces import START_REACH, VisualOdometry
 from dualslam.core.jobs import JobKind
 from dualslam.core.types import Failure, FailureReason, FrameMethod, Start, Track, View
 from dualslam.map.frame_observations import FrameObservations
@@ -209,14 +209,18 @@ class Starting:
         state, record, view = self._state, self._state.record, start.views[-1]
         submap = Submap.from_start(start, len(record.atlas.submaps), state.parts.K)
         graph = state.parts.new_graph()
+        odometry = state.parts.new_odometry(submap, graph)
         try:
             with record.timer.measure("graph"):
                 estimate = graph.update(submap)
+                submap.apply_estimate(*estimate.values)
+                odometry.start_at(view.index)
+            with record.timer.measure("mapping"):
+                odometry.grow_weak_start(estimate.noise2)
         except SolverError as error:
             return Failure(FailureReason.SOLVER, str(error), start.numbers)
-        submap.apply_estimate(*estimate.values)
         self._record_start(submap, start)
-        self._track_in(submap, graph, view)
+        self._track_in(odometry, view)
         ids = submap.landmark_of[view.index]
         n = int((ids >= 0).sum())
         T_cam_submap = se3.inverse(submap.T_submap_kf[view.index])
@@ -235,14 +239,13 @@ class Starting:
             self._state.audit.begin(submap, start.views)
         record.event(kind, start.views[-1], submap.id, first_view=start.views[0].index, **start.numbers)
 
-    def _track_in(self, submap: Submap, graph: SubmapGraph, view: View) -> None:
+    def _track_in(self, odometry: VisualOdometry, view: View) -> None:
         """Let a new submap be the live one, and reverse tracking start from it."""
         state = self._state
-        state.live = state.parts.new_odometry(submap, graph)
+        state.live = odometry
         state.relocaliser.end()
-        state.live.start_at(view.index)
         self._n_without_map = 0
         state.begin_health()
-        self._recoveries.start(submap, view)
-        self._recoveries.collect(state.live, view)
+        self._recoveries.start(odometry.submap, view)
+        self._recoveries.collect(odometry, view)
         state.buffer.thaw()

@@ -104,6 +104,20 @@ class VisualFrontEnd:
         self._reference_id = keyframe_id
         self._path = [keyframe_id]
 
+    def grow_weak_start(self, noise2: float) -> None:
+        """Triangulate what else the views of a start match, where its last view holds few landmarks.
+
+        A start holds only points that three views prove: often too few to find again over a wide step. Points of two
+        views help tracking at once. As at any keyframe, the mapper culls those that later keyframes do not see.
+        """
+        start = self._tracker.last
+        assert start is not None, "start_at() comes first"
+        if start.n_inliers >= self._config.keyframes.weak_landmarks:
+            return
+        self._mapper.grow(start, noise2=noise2)
+        self._solve()
+        self._tracker.refresh()
+
     def keep(self, keyframe_ids: Set[int]) -> None:
         """Never cull these keyframes, however redundant they become."""
         self._kept = frozenset(keyframe_ids)

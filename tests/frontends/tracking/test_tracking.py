@@ -250,6 +250,25 @@ class TestMapping:
         seen = np.bitwise_count(submap.landmarks["descriptor"][new, None] ^ world.descriptors[None]).sum(-1).argmin(1)
         assert len(np.unique(seen)) > 0.97 * len(seen)
 
+    def test_a_weak_start_grows_by_what_its_views_see_before_any_further_frame(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8], start_at=8, every=16)
+        submap, n_before = live.submap, len(live.submap.landmarks)
+        assert not live.track(world.view(9)), "the points of the start are too few to find a frame by"
+        live.grow_weak_start(noise2=1.0)
+        new = np.flatnonzero(submap.landmarks["alive"][n_before:]) + n_before
+        assert len(new) > 4 * n_before
+        nearest = np.linalg.norm(submap.landmarks["xyz_mu"][new, None] - world.xyz[None], axis=2).min(axis=1)
+        assert np.median(nearest / submap.landmarks["distance_mu"][new]) < 0.02
+        track = tracked(live, world.view(9))
+        error = se3.log(track.T_cam_submap @ world.T_world_cam[9])
+        assert np.linalg.norm(error[3:]) < POSITION_M
+
+    def test_a_start_with_landmarks_enough_stays_as_it_is(self, world: PointWorld) -> None:
+        live = front_end(world, [0, 4, 8], start_at=8, every=2)
+        n_before = len(live.submap.landmarks)
+        live.grow_weak_start(noise2=1.0)
+        assert len(live.submap.landmarks) == n_before
+
     def test_a_keyframe_is_posed_by_the_map_before_it_places_anything(self, world: PointWorld) -> None:
         """Tracked a degree off, it maps as much as one that was tracked right, and as truly."""
         found = []
