@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dualslam.cli.outputs import check_free
 from dualslam.cli.view_command import save_recording
 from dualslam.core.errors import DualSlamError, InputError, OutputError
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.io.atomic import write_text
+from dualslam.io.colours import load_pictures
 from dualslam.io.export.colours import keyframe_indices, landmark_colours
-from dualslam.io.export.exported_map import flatten, read_stored, with_frames
+from dualslam.io.export.exported_map import ExportedMap, flatten, read_stored, with_frames
 from dualslam.io.export.formats import FORMATS
-from dualslam.io.export.images import mask_of, with_images
+from dualslam.io.export.images import mask_of, undistorted, with_images
+from dualslam.io.export.mcap import write_mcap
 from dualslam.io.export.metric import by_distance
 from dualslam.io.map_store import StoredMap
 from dualslam.io.metric_scale import read_scale
-from dualslam.io.run_folder import TRAJECTORY, TRAJECTORY_KITTI
+from dualslam.io.run_folder import MAP, TRAJECTORY, TRAJECTORY_KITTI
 from dualslam.io.run_reading import read_numbers, read_summary
 from dualslam.io.sequence import RecordedSequence
 from dualslam.io.trajectory_files import read_kitti, read_text, read_tum, write_tum
@@ -32,6 +35,8 @@ TRAJECTORIES = {"tum": TRAJECTORY, "kitti": TRAJECTORY_KITTI}
 """Formats of which a run folder has the file already."""
 RECORDING = "rerun"
 """Of the run, not of its map alone: what `dualslam view` shows."""
+MESSAGES = "mcap"
+"""The poses of all frames, the map, and the views' images, in one file."""
 
 
 def execute(args: argparse.Namespace) -> int:
@@ -41,16 +46,16 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _execute(args: argparse.Namespace) -> int:
-    if args.every is not None and not (args.to in FORMATS and FORMATS[args.to].has_images):
-        raise InputError(f"--every goes with --to colmap and nerfstudio: {args.to} has no images.")
+    if args.every is not None and not (args.to == MESSAGES or (args.to in FORMATS and FORMATS[args.to].has_images)):
+        raise InputError(f"--every goes with --to colmap, nerfstudio and mcap: {args.to} has no images.")
     if args.to == RECORDING:
         return _write_recording(args)
     if args.to in TRAJECTORIES:
         return _copy_trajectory(args)
-    chosen = FORMATS[args.to]
     stored = read_stored(args.run)
     numbers = read_numbers(args.run)
-    source = _source(args, stored) if chosen.has_colours else None
+    has_colours = args.to == MESSAGES or FORMATS[args.to].has_colours
+    source = _source(args, stored) if has_colours else None
     if source is not None and not stored.colours:
         frames = source.in_colour(keyframe_indices(stored.atlas, numbers))
         stored = replace(stored, colours=landmark_colours(stored.atlas, frames, numbers, {}))
@@ -63,6 +68,10 @@ def _execute(args: argparse.Namespace) -> int:
         exported = with_frames(exported, stored, list(numbers.values())[:: args.every])
     if metres is not None:
         exported = exported.scaled(metres)
+    if args.to == MESSAGES:
+        posed = with_frames(flatten(stored), stored, numbers.values()).scaled(metres or 1.0)
+        return _write_messages(args, exported, posed, stored, source, numbers, metres)
+    chosen = FORMATS[args.to]
     all_views = exported.frame
     if source is not None and chosen.has_images:
         assert stored.camera is not None
@@ -82,6 +91,35 @@ def _execute(args: argparse.Namespace) -> int:
     return 0
 
 
+def _write_messages(
+    args: argparse.Namespace,
+    exported: ExportedMap,
+    posed: ExportedMap,
+    stored: StoredMap,
+    source: RecordedSequence | WorldSequence | None,
+    numbers: Mapping[int, int],
+    metres: float | None,
+) -> int:
+    """Write the poses of all frames, and the images of the exported views."""
+    rows, wanted = posed.rows_by_index(numbers), exported.rows_by_index(numbers)
+    by_time = sorted(rows.values(), key=lambda v: float(posed.timestamp_s[v]))
+    n_images = 0
+
+    def images() -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        nonlocal n_images
+        assert stored.camera is not None
+        frames = () if source is None else source.in_colour(wanted)
+        for v, image, _ in undistorted(posed, stored.camera, frames, numbers):
+            n_images += 1
+            yield v, image
+
+    write_mcap(posed, np.array(by_time, np.int64), images(), args.out)
+    if not args.quiet:
+        found = f"{len(by_time)} poses, {len(posed.xyz)} points, {n_images} images"
+        print(f"{found}, in {_unit(metres)}; {args.to} in {args.out}", flush=True)
+    return 0
+
+
 def _source(args: argparse.Namespace, stored: StoredMap) -> RecordedSequence | WorldSequence | None:
     """Open what the run was made of, for images and colours; None, and a sentence, where it is not there any more."""
     remembered = read_summary(args.run).get("source")
@@ -89,10 +127,13 @@ def _source(args: argparse.Namespace, stored: StoredMap) -> RecordedSequence | W
     if args.images is None and not (
         remembered and (str(remembered).startswith(SYNTHETIC) or Path(remembered).exists())
     ):
-        if FORMATS[args.to].has_images and not args.quiet:
+        if (args.to == MESSAGES or FORMATS[args.to].has_images) and not args.quiet:
             print(f"no images: {_where_it_was(remembered)}; name it with --images", flush=True)
         return None
-    return open_images_of_run(str(args.images or remembered), stored.camera.size_px)
+    pictures = load_pictures(args.run / MAP)
+    return open_images_of_run(
+        str(args.images or remembered), stored.camera.size_px, read_summary(args.run).get("topic"), pictures
+    )
 
 
 def _where_it_was(remembered: str | None) -> str:

@@ -17,7 +17,7 @@ WORLDS = (
     *("street", "room", "circuit", "eight", "terrace", "corridors", "posters"),
     *("board", "parked", "takeoff", "standstill", "hover"),
 )
-EXPORTS = ("bal", "colmap", "g2o", "kitti", "nerfstudio", "ply", "rerun", "tum")
+EXPORTS = ("bal", "colmap", "g2o", "kitti", "mcap", "nerfstudio", "ply", "rerun", "tum")
 DICTIONARIES = (
     *("apriltag_36h11", "apriltag_25h9", "apriltag_16h5"),
     *("aruco_4x4", "aruco_5x5", "aruco_6x6", "aruco_original"),

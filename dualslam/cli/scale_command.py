@@ -6,10 +6,12 @@ import argparse
 from pathlib import Path
 
 from dualslam.core.errors import InputError
+from dualslam.io.colours import load_pictures
 from dualslam.io.export.exported_map import flatten, read_stored, with_frames
 from dualslam.io.export.metric import MetricScale, by_distance, by_height, by_marker
 from dualslam.io.metric_scale import read_scale, write_scale
-from dualslam.io.run_reading import read_numbers
+from dualslam.io.run_folder import MAP
+from dualslam.io.run_reading import read_numbers, read_summary
 from dualslam.run.sources import open_images_of_run
 
 NOTABLE = 0.05
@@ -32,7 +34,8 @@ def execute(args: argparse.Namespace) -> int:
         if args.images is None:
             raise InputError("--marker looks for markers in the run's images: name what it was made of with --images.")
         assert stored.camera is not None
-        source = open_images_of_run(args.images, exported.size_px)
+        topic, pictures = read_summary(args.run).get("topic"), load_pictures(args.run / MAP)
+        source = open_images_of_run(args.images, exported.size_px, topic, pictures)
         scale = by_marker(exported, stored.camera, source, numbers, args.marker, args.dictionary)
     before = _scale_before(args.run)
     write_scale(args.run, scale.metres_per_unit, scale.sigma_rel, scale.words)

@@ -51,6 +51,11 @@ def is_bag_file(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES or is_bag(path)
 
 
+def has_topics(path: Path) -> bool:
+    """Tell whether a source is a bag, so that a topic can be chosen."""
+    return recognises(path) if path.is_dir() else path.is_file() and is_bag_file(path)
+
+
 def open_recording(path: Path, given: Given) -> Recording:
     """Open a bag: a file, or the folder of one of ROS 2."""
     paths = _files(path) if path.is_dir() else [path]
@@ -151,6 +156,7 @@ class BagImages:
 
     def __init__(self, bag: Bag, topic: Topic, places: list[Place]) -> None:
         self._bag, self._topic, self._places = bag, topic, places
+        self.topic_name = topic.name
 
     def __len__(self) -> int:
         return len(self._places)
@@ -172,7 +178,7 @@ class BagImages:
             stamps_ns.append(seconds * 10**9 + rest)
         reader.close()
         stamps = np.array(stamps_ns)
-        if not (stamps > 0).all() or not (np.diff(stamps) > 0).all():
+        if not (np.diff(stamps) > 0).all():
             log.warning("%s: its headers have no usable times, so the recorder's are taken", self._topic.name)
             stamps = recorded_ns
         return np.asarray(stamps // 10**9 + stamps % 10**9 * 1e-9, np.float64)

@@ -109,7 +109,7 @@ def open_sequence(
         device = int(name) if name.isdigit() else name
         of_file = None if camera_file is None else read_camera_file(camera_file)
         return video.open_webcam(device, of_file, fov_degrees, selection, given, grey)
-    if topic is not None and not bags.is_bag_file(Path(str(source))) and not bags.recognises(Path(str(source))):
+    if topic is not None and not bags.has_topics(Path(str(source))):
         raise InputError(f"{source} is no bag, and has no topics; leave out the topic.")
     recording = _with_clock(_open_recording(Path(str(source)), given), rate_hz, time_unit)
     camera, calibration = recording.camera, recording.calibration

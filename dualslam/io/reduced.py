@@ -56,6 +56,7 @@ class ReducedImages:
     def __init__(self, images: ImageStore, factor: int) -> None:
         self._images, self._factor = images, factor
         self.names: tuple[str, ...] | None = getattr(images, "names", None)
+        self.topic_name: str | None = getattr(images, "topic_name", None)
 
     def __len__(self) -> int:
         return len(self._images)

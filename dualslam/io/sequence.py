@@ -176,6 +176,12 @@ class RecordedSequence:
         names: tuple[str, ...] | list[str] | None = getattr(self._recording.images, "names", None)
         return None if names is None else tuple(Path(name).stem for name in names)
 
+    @property
+    def topic(self) -> str | None:
+        """Return the topic of a bag that is read; None of any other source."""
+        name: str | None = getattr(self._recording.images, "topic_name", None)
+        return name
+
     def __len__(self) -> int:
         return len(self.source_indices)
 

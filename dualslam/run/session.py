@@ -382,6 +382,7 @@ def _given(sequence: Sequence, realtime: bool) -> dict[str, Any]:
     return {
         "sequence": sequence.name,
         "source": getattr(sequence, "source", "") or None,
+        "topic": getattr(sequence, "topic", None),
         "calibration": getattr(sequence, "calibration", "") or None,
         "selection": None if selection is None else asdict(selection),
         "realtime": realtime,

@@ -13,6 +13,8 @@ from dualslam.core.config import strict_yaml
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame
+from dualslam.io.bags import has_topics
+from dualslam.io.colours import likeness
 from dualslam.io.open_sequence import open_sequence
 from dualslam.io.read_ahead import read_ahead
 from dualslam.io.reduced import MAX_SIDE_PX
@@ -24,6 +26,9 @@ SYNTHETIC = "synthetic:"
 WORLD_NUMBERS = {"frames": 300, "seed": 0, "width": 640, "height": 480, "visit": 0, "backwards": 0}
 """What a synthetic source states in numbers, and what it takes where it does not."""
 RENDER_AHEAD_FRAMES = 4
+N_COMPARED = 9
+SAME_IMAGE = 0.97
+"""Correlation with a small picture: of the image itself above 0.98, of the next frame below (see `likeness`)."""
 ANY_FOV_DEG = 60.0
 """To read images by of whose camera nothing is known yet, or nothing is asked."""
 
@@ -84,7 +89,12 @@ def open_source(
     )
 
 
-def open_images_of_run(source: str | Path, size_px: tuple[int, int]) -> RecordedSequence | WorldSequence:
+def open_images_of_run(
+    source: str | Path,
+    size_px: tuple[int, int],
+    topic: str | None = None,
+    pictures: Mapping[int, bytes] | None = None,
+) -> RecordedSequence | WorldSequence:
     """Open what a run was made of, in the size in which the run has read it.
 
     Its camera is not the run's: that is in the map.
@@ -95,20 +105,38 @@ def open_images_of_run(source: str | Path, size_px: tuple[int, int]) -> Recorded
         As in `open_source`.
     size_px : (width, height)
         Of the run's images.
+    topic : str, optional
+        That the run has read, of a bag.
+    pictures : mapping of int to bytes, optional
+        Small JPEGs of the run's frames, by their index in the source.
 
     Raises
     ------
     InputError
-        If it cannot be read, is live, or has images of another size.
+        If it cannot be read, is live, or has images of another size, or others than `pictures`.
     """
     has_camera = str(source).startswith(SYNTHETIC)  # recordings may have one, and that comes before a field of view
     fov_degrees, unit = (None, None) if has_camera else (ANY_FOV_DEG, "s")  # times do not matter
-    opened = open_source(source, fov_degrees=fov_degrees, time_unit=unit, max_side_px=max(size_px))
+    of_bag = topic if has_topics(Path(str(source))) else None
+    opened = open_source(source, fov_degrees=fov_degrees, time_unit=unit, topic=of_bag, max_side_px=max(size_px))
     if not isinstance(opened, RecordedSequence | WorldSequence):
         raise InputError(f"{source} is live: its frames cannot be read again.")
     if opened.camera.size_px != size_px:
         raise InputError(f"{source} has images of another size than the run's.")
+    _refuse_others(opened, source, pictures or {})
     return opened
+
+
+def _refuse_others(opened: RecordedSequence | WorldSequence, source: str | Path, pictures: Mapping[int, bytes]) -> None:
+    """Refuse a source whose frames are not those of the pictures."""
+    chosen = dict(list(pictures.items())[:: max(1, len(pictures) // N_COMPARED)])
+    alike = [
+        likeness(chosen[frame.index], frame.image)
+        for frame in opened.in_colour(chosen)
+        if frame.index in chosen and frame.image is not None
+    ]
+    if chosen and (not alike or np.median(alike) < SAME_IMAGE):
+        raise InputError(f"{source} shows other images than the run's; name the source that the run was made of.")
 
 
 class WorldSequence:

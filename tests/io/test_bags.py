@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from dualslam.core.camera.models import KannalaBrandtCamera, PinholeCamera, RadTanCamera
 from dualslam.core.errors import InputError
 from dualslam.io import open_sequence
+from dualslam.run.sources import open_images_of_run
 
 N = 12
 WIDTH, HEIGHT = 64, 48
@@ -207,8 +208,18 @@ def test_several_topics_are_listed(tmp_path: Path) -> None:
         open_sequence(path, fov_degrees=60)
     with pytest.raises(InputError, match=rf"no images of topic '/rear'; it has {named}\."):
         open_sequence(path, fov_degrees=60, topic="/rear")
-    frame = next(iter(open_sequence(path, fov_degrees=60, topic="right/image_raw")))
-    np.testing.assert_array_equal(frame.image, grey_of(1))
+    sequence = open_sequence(path, fov_degrees=60, topic="right/image_raw")
+    np.testing.assert_array_equal(next(iter(sequence)).image, grey_of(1))
+    assert sequence.topic == "/right/image_raw"  # a run remembers it, and an export reads the same images
+    again = open_images_of_run(path, (WIDTH, HEIGHT), sequence.topic)
+    np.testing.assert_array_equal(next(iter(again)).image, grey_of(1))
+
+
+def test_headers_may_count_from_zero(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(f"{__name__}.BEGIN_NS", 0)  # as of a simulator
+    path = write_bag(tmp_path / "drive", "mcap", raw)
+    times_s = open_sequence(path).source_timestamps
+    np.testing.assert_allclose(times_s, [1e-9 * time_of(i) for i in range(len(times_s))], atol=1e-9)
 
 
 def test_what_is_no_bag_of_images_says_so(tmp_path: Path) -> None:

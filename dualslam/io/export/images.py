@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import cv2
@@ -51,10 +51,32 @@ def with_images(
     InputError
         If there is no image.
     """
+    has_image = np.zeros(len(exported.frame), bool)
+    for v, image, valid in undistorted(exported, camera, frames, numbers, mask):
+        name = image_name(int(exported.frame[v]))
+        _write(out / FOLDER / name, image)
+        if not valid.all():
+            _write(out / mask_path(name), valid)
+        has_image[v] = True
+    if not has_image.any():
+        raise InputError("--images has the image of no keyframe: name the source that the run was made of.")
+    return exported.of_views(has_image)
+
+
+def undistorted(
+    exported: ExportedMap,
+    camera: Camera,
+    frames: Iterable[Frame],
+    numbers: Mapping[int, int],
+    mask: NDArray[np.uint8] | None = None,
+) -> Iterator[tuple[int, NDArray[np.uint8], NDArray[np.uint8]]]:
+    """Yield the row of each view that has an image, the image without the lens, and its mask (0 is ignored).
+
+    Parameters as of `with_images`.
+    """
     row_of = exported.rows_by_index(numbers)
     maps: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
     valid: dict[int, NDArray[np.uint8]] = {}
-    has_image = np.zeros(len(exported.frame), bool)
     whole = np.full(exported.size_px[::-1], 255, np.uint8) if mask is None else mask
     for frame in frames:
         v = row_of.get(frame.index)
@@ -63,15 +85,8 @@ def with_images(
         c = int(exported.camera[v])
         if c not in maps:
             maps[c] = undistortion(camera, exported.K[c], exported.size_px)
-            valid[c] = cv2.remap(whole, *maps[c], cv2.INTER_NEAREST)
-        name = image_name(int(exported.frame[v]))
-        _write(out / FOLDER / name, cv2.remap(frame.image, *maps[c], cv2.INTER_LINEAR))
-        if not valid[c].all():
-            _write(out / mask_path(name), valid[c])
-        has_image[v] = True
-    if not has_image.any():
-        raise InputError("--images has the image of no keyframe: name the source that the run was made of.")
-    return exported.of_views(has_image)
+            valid[c] = np.asarray(cv2.remap(whole, *maps[c], cv2.INTER_NEAREST), np.uint8)
+        yield v, np.asarray(cv2.remap(frame.image, *maps[c], cv2.INTER_LINEAR), np.uint8), valid[c]
 
 
 def mask_of(run: Path) -> NDArray[np.uint8] | None:
