@@ -10,6 +10,7 @@ import numpy as np
 
 from dualslam.atlas.atlas import Atlas
 from dualslam.atlas.trajectory import FramePose
+from dualslam.core.decisions import Gate
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.stage_timer import StageTimer
 from dualslam.core.types import BoolArray, FrameMethod, FrameStatus
@@ -94,6 +95,14 @@ class Record:
         refound = {event.frame for event in self.events.of_kind(EventKind.GAP_RELOCALISED)}
         return np.array([index in refound for index in indices], bool)
 
-    def event(self, kind: EventKind, at: FrameStamp, submap_id: int | None = None, **data: Any) -> None:
-        """Enter what happened at a frame."""
-        self.events.add(kind, at.index, at.timestamp_s, submap_id, **data)
+    def event(
+        self,
+        kind: EventKind,
+        at: FrameStamp,
+        submap_id: int | None = None,
+        gates: tuple[Gate, ...] = (),
+        /,
+        **data: Any,
+    ) -> None:
+        """Enter what happened at a frame; `gates`: the comparisons behind it."""
+        self.events.add(kind, at.index, at.timestamp_s, submap_id, gates, **data)

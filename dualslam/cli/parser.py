@@ -93,6 +93,7 @@ def _build_parser() -> _Parser:
     _add_run(commands)
     _add_eval(commands)
     _add_compare(commands)
+    _add_explain(commands)
     _add_view(commands)
     _add_export(commands)
     _add_scale(commands)
@@ -134,6 +135,7 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument("source", metavar="SOURCE", type=_source, help=SOURCE_HELP)
     parser.add_argument("--topic", metavar="NAME", help="topic of the images, where SOURCE is a bag of several")
     _add_output(parser)
+    parser.add_argument("--decisions", action="store_true", help="write decisions.jsonl, which dualslam explain prints")
     talk.add_argument("--profile", action="store_true", help="print where the time went, stage by stage")
     _add_configuration(parser)
     _add_selection(parser)
@@ -216,6 +218,12 @@ def _add_compare(commands: argparse._SubParsersAction[_Parser]) -> None:
         "--out", metavar="FILE", type=_path, default=Path("compare.html"), help="page to write (default: compare.html)"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace the page that is there")
+
+
+def _add_explain(commands: argparse._SubParsersAction[_Parser]) -> None:
+    parser, _ = _command(commands, "explain", "Print the decisions about a frame, with their numbers and thresholds.")
+    parser.add_argument("run", metavar="RUN", type=_path, help="a run folder; all decisions: of run --decisions")
+    parser.add_argument("--frame", metavar="N", type=_count, required=True, help="index of the frame in the source")
 
 
 def _add_view(commands: argparse._SubParsersAction[_Parser]) -> None:

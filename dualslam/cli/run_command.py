@@ -87,6 +87,7 @@ def _run(args: argparse.Namespace, config: Config) -> int:
                 localise=args.localise,
                 focal=focal,
                 replay=args.replay,
+                decisions=args.decisions,
                 watcher=Watchers([each for each in (live, shown) if each is not None]),
             )
         status = conclude(outcome, args)

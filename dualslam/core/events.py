@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
+from dualslam.core.decisions import Decision, DecisionKind, DecisionSink, Gate
+
 
 class EventKind(StrEnum):
     """The `event` field of a line of ``events.jsonl``."""
@@ -58,6 +60,8 @@ class Event:
     submap : int or None
     data : dict
         What belongs to this kind of event: plain numbers, strings and lists.
+    gates : tuple of Gate
+        Comparisons behind it. They go into ``decisions.jsonl``, not into ``events.jsonl``.
     """
 
     event: EventKind
@@ -65,6 +69,7 @@ class Event:
     timestamp_s: float
     submap: int | None
     data: dict[str, Any] = field(default_factory=dict)
+    gates: tuple[Gate, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Return the flat object that ``events.jsonl`` holds."""
@@ -77,17 +82,58 @@ class Event:
         }
 
 
+_DECIDED = {
+    EventKind.INITIALISED: (DecisionKind.START, True),
+    EventKind.REINITIALISED: (DecisionKind.START, True),
+    EventKind.LINKED: (DecisionKind.LINK, True),
+    EventKind.LINK_REFUSED: (DecisionKind.LINK, False),
+    EventKind.LOOP_CLOSED: (DecisionKind.PLACE, True),
+    EventKind.MERGED: (DecisionKind.PLACE, True),
+    EventKind.LOOP_REFUSED: (DecisionKind.PLACE, False),
+}
+"""Events that tell of a decision, and whether it was a yes. `recovery_attempt` says so itself."""
+
+
 class EventLog:
-    """Append-only list of events."""
+    """Append-only list of events.
+
+    Attributes
+    ----------
+    decisions : DecisionSink
+        Receives the decisions of a run, those that events tell of included.
+    """
 
     def __init__(self) -> None:
         self._events: list[Event] = []
+        self.decisions = DecisionSink()
 
-    def add(self, kind: EventKind, frame: int, timestamp_s: float, submap: int | None, **data: Any) -> Event:
+    def add(
+        self,
+        kind: EventKind,
+        frame: int,
+        timestamp_s: float,
+        submap: int | None,
+        gates: tuple[Gate, ...] = (),
+        /,
+        **data: Any,
+    ) -> Event:
         """Append an event and return it."""
-        event = Event(kind, frame, timestamp_s, submap, data)
+        event = Event(kind, frame, timestamp_s, submap, data, gates)
         self._events.append(event)
+        if self.decisions.is_open:
+            self._note_decision(event)
         return event
+
+    def _note_decision(self, event: Event) -> None:
+        data = dict(event.data)
+        if event.event is EventKind.RECOVERY_ATTEMPT:
+            what, accepted = DecisionKind.WALK, data["verdict"] == "linked"
+        elif event.event in _DECIDED:
+            what, accepted = _DECIDED[event.event]
+        else:
+            return
+        reason, detail = data.pop("reason", ""), data.pop("detail", "") or data.pop("verdict", "")
+        self.decisions.note(Decision(event.frame, what, accepted, event.submap, event.gates, reason, detail, data))
 
     def __iter__(self) -> Iterator[Event]:
         return iter(self._events)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.bundle import FrameRows
+from dualslam.core.decisions import Ruling
 from dualslam.core.estimates import (
     CalibrationEstimate,
     GraphEstimate,
@@ -357,7 +358,7 @@ class VisualOdometry(Protocol):
         """Return the earlier frame, given without a pose, that the last one has confirmed the pose of."""
         ...
 
-    def keyframe_due(self, track: Track) -> bool:
+    def keyframe_due(self, track: Track) -> Ruling:
         """Whether the frame should become a keyframe; asking changes nothing."""
         ...
 

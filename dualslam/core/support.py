@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from dualslam.core.decisions import Gate
 from dualslam.core.types import Failure, FailureReason, Track
 
 if TYPE_CHECKING:
@@ -22,14 +23,26 @@ def find_lack_of_support(n_inliers: int, n_matches: int, chi2: float, config: He
     config : HealthConfig
     """
     numbers = {"n_matches": float(n_matches), "n_inliers": float(n_inliers), "chi2": chi2}
-    if n_inliers < config.min_inliers:
-        return Failure(FailureReason.TOO_FEW_INLIERS, f"{n_inliers} landmarks agree with the pose", numbers)
-    ratio = n_inliers / max(n_matches, 1)
-    if ratio < config.min_inlier_ratio:
-        return Failure(FailureReason.LOW_INLIER_RATIO, f"{ratio:.0%} of the matches agree with the pose", numbers)
-    if chi2 > config.max_chi2:
-        return Failure(FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {chi2:.1f}", numbers)
-    return None
+    gates = support_gates(n_inliers, n_matches, chi2, config)
+    few, low, misfit = gates
+    if not few.passed:
+        reason, detail = FailureReason.TOO_FEW_INLIERS, f"{n_inliers} landmarks agree with the pose"
+    elif not low.passed:
+        reason, detail = FailureReason.LOW_INLIER_RATIO, f"{low.value:.0%} of the matches agree with the pose"
+    elif misfit.value > misfit.threshold:
+        reason, detail = FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {chi2:.1f}"
+    else:
+        return None
+    return Failure(reason, detail, numbers, gates=gates)
+
+
+def support_gates(n_inliers: int, n_matches: int, chi2: float, config: HealthConfig) -> tuple[Gate, Gate, Gate]:
+    """Return the comparisons of `find_lack_of_support`, in their order."""
+    return (
+        Gate("inliers", n_inliers, ">=", config.min_inliers),
+        Gate("share of inliers", n_inliers / max(n_matches, 1), ">=", config.min_inlier_ratio),
+        Gate("chi-square per degree of freedom", chi2, "<=", config.max_chi2),
+    )
 
 
 def judge_track(track: Track | Failure, config: HealthConfig) -> Track | Failure:

@@ -14,6 +14,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from dualslam.core.decisions import Gate
 from dualslam.core.errors import InputError
 from dualslam.core.grey_image import GreyImage
 
@@ -362,6 +363,8 @@ class Failure:
     reason: FailureReason
     detail: str = ""
     numbers: dict[str, float] = field(default_factory=dict)
+    gates: tuple[Gate, ...] = field(default=(), kw_only=True)
+    """The comparisons that led to it, where they are known."""
 
     def __bool__(self) -> bool:
         return False

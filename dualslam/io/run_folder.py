@@ -35,6 +35,7 @@ TRAJECTORY_KITTI = "trajectory_kitti.txt"
 TRAJECTORY_KITTI_FRAMES = "trajectory_kitti_frames.txt"
 FRAMES = "frames.csv"
 EVENTS = "events.jsonl"
+DECISIONS = "decisions.jsonl"
 SUMMARY = "summary.json"
 REPORT = "report.html"
 MAP_PAGE = "map.html"
@@ -55,6 +56,7 @@ _FILES = (
     TRAJECTORY_KITTI_FRAMES,
     FRAMES,
     EVENTS,
+    DECISIONS,
     SCHEDULE,
     SUMMARY,
     CONFIG,
@@ -66,6 +68,7 @@ _FILES = (
 _RESULTS = (
     CONFIG,
     EVENTS,
+    DECISIONS,
     SCHEDULE,
     FRAMES,
     TRAJECTORY,
@@ -78,7 +81,7 @@ _RESULTS = (
     REPORT,
 )
 """In the order in which a person is told of them."""
-_NOT_OF_EVERY_RUN = frozenset({f"{SUBMAPS}/", GROUND_TRUTH, MASK, MAP_PAGE})
+_NOT_OF_EVERY_RUN = frozenset({f"{SUBMAPS}/", GROUND_TRUTH, MASK, MAP_PAGE, DECISIONS})
 _SUBMAP_NAME = re.compile(r"\d+\.txt")
 SAMPLE_NAME = re.compile(r"\d+\.jpg")
 _MAP_NAME = re.compile(r"[\w.-]+\.(npz|json)")
@@ -131,7 +134,7 @@ class RunFolder:
     def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
         self.path = Path(path)
         self._events: IO[str] | None = None
-        self._schedule: IO[str] | None = None
+        self._lines: dict[str, IO[str]] = {}
         self._config: str | None = None
         self.n_events = 0
         check_vacant(self.path, overwrite=overwrite)
@@ -193,14 +196,21 @@ class RunFolder:
 
     def append_schedule(self, row: Mapping[str, Any]) -> None:
         """Append a line to ``schedule.jsonl``; nothing once the folder is closed."""
+        self._append(SCHEDULE, row)
+
+    def append_decision(self, row: Mapping[str, Any]) -> None:
+        """Append a line to ``decisions.jsonl``; nothing once the folder is closed."""
+        self._append(DECISIONS, row)
+
+    def _append(self, name: str, row: Mapping[str, Any]) -> None:
         if self._events is None:
             return
         try:
-            if self._schedule is None:
-                self._schedule = (self.path / SCHEDULE).open("w", encoding="utf-8", newline="\n")
-            self._schedule.write(json.dumps(to_plain(row), allow_nan=False) + "\n")
+            if name not in self._lines:
+                self._lines[name] = (self.path / name).open("w", encoding="utf-8", newline="\n")
+            self._lines[name].write(json.dumps(to_plain(row), allow_nan=False) + "\n")
         except OSError as e:
-            raise OutputError(f"{self.path / SCHEDULE} cannot be written: {e.strerror or e}.") from e
+            raise OutputError(f"{self.path / name} cannot be written: {e.strerror or e}.") from e
 
     def write_truth(self, truth: Trajectory) -> None:
         """Write the true poses that belong to the run's frames, so that the folder can be judged by itself."""
@@ -276,8 +286,8 @@ class RunFolder:
 
     def close(self) -> None:
         """Close the files and let another run in; more than once does no harm."""
-        files = [file for file in (self._events, self._schedule) if file is not None]
-        self._events = self._schedule = None
+        files = [file for file in (self._events, *self._lines.values()) if file is not None]
+        self._events, self._lines = None, {}
         try:
             for file in files:
                 file.close()

@@ -60,6 +60,16 @@ _EVENT_KINDS: _Kinds = {
     "factors": ((dict,), "a mapping"),
 }
 """Of what pages are made of; what else belongs to an event is shown as it is."""
+_DECISION_KINDS: _Kinds = {
+    "what": ((str,), "a word"),
+    "frame": ((int,), "a whole number"),
+    "accepted": ((bool,), "true or false"),
+    "submap": ((int, type(None)), "a whole number"),
+    "reason": ((str,), "a word"),
+    "detail": ((str,), "a sentence"),
+    "gates": ((list,), "a list"),
+    "data": ((dict,), "a mapping"),
+}
 
 
 def read_frames(path: str | Path) -> list[FrameRow]:
@@ -152,22 +162,39 @@ def _misfit(values: Mapping[str, Any], kinds: _Kinds) -> str | None:
 
 def read_events(path: str | Path) -> list[dict[str, Any]]:
     """Read an ``events.jsonl``; a last line that a crash cut off is left out."""
+    return _read_lines(path, "event", _EVENT_KINDS)
+
+
+def read_decisions(path: str | Path) -> list[dict[str, Any]]:
+    """Read a ``decisions.jsonl``; a last line that a crash cut off is left out."""
+    decisions = _read_lines(path, "decision", _DECISION_KINDS)
+    for number, decision in enumerate(decisions, 1):
+        if not decision.keys() >= _DECISION_KINDS.keys():
+            raise InputError(f"{path}, line {number} is not a decision.")
+        for gate in decision["gates"]:
+            if not isinstance(gate, dict) or not gate.keys() >= {"name", "value", "sign", "threshold", "passed"}:
+                raise InputError(f"{path}, line {number}: gates is not a list of comparisons.")
+    return decisions
+
+
+def _read_lines(path: str | Path, noun: str, kinds: _Kinds) -> list[dict[str, Any]]:
+    """Read the objects of a file, one a line, each with the first field of `kinds`."""
     lines = [line for line in read_text(path).splitlines() if line.strip()]
-    events = []
+    values = []
     for number, line in enumerate(lines, 1):
         try:
-            event = json.loads(line)
+            value = json.loads(line)
         except json.JSONDecodeError:
             if number < len(lines):
                 raise InputError(f"{path}, line {number} is not valid JSON.") from None
             log.warning("%s: the last line is cut off and was left out", path)
             break
-        if not isinstance(event, dict) or "event" not in event:
-            raise InputError(f"{path}, line {number} is not an event.")
-        if (misfit := _misfit(event, _EVENT_KINDS)) is not None:
+        if not isinstance(value, dict) or next(iter(kinds)) not in value:
+            raise InputError(f"{path}, line {number} is not {'an' if noun == 'event' else 'a'} {noun}.")
+        if (misfit := _misfit(value, kinds)) is not None:
             raise InputError(f"{path}, line {number}: {misfit}.")
-        events.append(event)
-    return events
+        values.append(value)
+    return values
 
 
 def read_samples(run: str | Path) -> dict[int, bytes]:

@@ -22,7 +22,7 @@ from dualslam.core.types import Failure, FailureReason, FloatArray
 from dualslam.map.submap import Submap
 from dualslam.places.plausibility import agree, contradict, plausible
 from dualslam.places.search import PlaceSearch, follow_maps, poses_of
-from dualslam.places.sightings import N_SECONDS, PlaceParts, Sightings, record_refusal
+from dualslam.places.sightings import N_CONFIRMING, PlaceParts, Sightings, record_refusal
 from dualslam.places.verification import PlaceMatch
 
 ASK_EVERY = 2
@@ -30,7 +30,7 @@ ASK_EVERY = 2
 RECENT = 20
 """Keyframes before and after that are no revisit: what is seen there is tracked, or was a moment ago."""
 MAX_MISSES = 3
-"""Keyframes that may not second before the provisional pair is dropped."""
+"""Keyframes that may fail to confirm before the provisional pair is dropped."""
 REST, MAX_REST = 10, 40
 """Keyframes after a loop before the map that it lies in is searched again. Each loop that finds no more drift than the
 map claims doubles them: beside one that was closed a moment ago it tells next to nothing, and costs more the larger the
@@ -44,7 +44,7 @@ class _Provisional:
     """A verified pair that waits for others to say the same."""
 
     match: PlaceMatch
-    seconds: int = 0
+    confirmations: int = 0
     misses: int = 0
 
 
@@ -56,7 +56,7 @@ class _Believed:
     """
 
     match: PlaceMatch
-    seconds: int
+    confirmations: int
     then: tuple[FloatArray, FloatArray]
 
 
@@ -65,7 +65,7 @@ class _Closing:
     """A place whose connection the atlas is being solved with."""
 
     match: PlaceMatch
-    seconds: int
+    confirmations: int
     kind: LinkKind
 
 
@@ -244,7 +244,9 @@ class Revisits:
             if waiting is not None:
                 waiting.misses += 1
                 if waiting.misses > MAX_MISSES:
-                    why = Failure(FailureReason.UNCONFIRMED, f"seconded {waiting.seconds} times, {N_SECONDS} needed")
+                    why = Failure(
+                        FailureReason.UNCONFIRMED, f"confirmed {waiting.confirmations} times, {N_CONFIRMING} needed"
+                    )
                     record_refusal(self._record, now, submap.id, *waiting.match.place, why)
                     self._provisional = None
             return
@@ -252,17 +254,17 @@ class Revisits:
             self._provisional = _Provisional(match)
             return
         waiting.match = match
-        waiting.seconds += 1
-        if waiting.seconds < N_SECONDS:
+        waiting.confirmations += 1
+        if waiting.confirmations < N_CONFIRMING:
             return
         self._provisional = None
-        self._believe(match, waiting.seconds)
+        self._believe(match, waiting.confirmations)
 
-    def _believe(self, match: PlaceMatch, seconds: int) -> None:
+    def _believe(self, match: PlaceMatch, n_agreeing: int) -> None:
         """Ask for what the atlas needs to be solved with a place."""
         then = poses_of(match, self._record.atlas.submaps)
         assert then is not None, "it was followed to the submaps as they are"
-        self._believed = _Believed(match, seconds, then)
+        self._believed = _Believed(match, n_agreeing, then)
         self._connections.foresee(self._link_of(match))
 
     def _link_believed(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
@@ -271,7 +273,7 @@ class Revisits:
         if believed is None or live is None or live.submap.id != believed.match.query[0]:
             return None
         match = follow_maps(believed.match, believed.then, self._record.atlas.submaps)
-        return None if match is None else self._link(match, believed.seconds, live, now)
+        return None if match is None else self._link(match, believed.confirmations, live, now)
 
     def _link_of(self, match: PlaceMatch) -> Link:
         (a, keyframe_a), (b, keyframe_b) = match.place, match.query
@@ -279,10 +281,10 @@ class Revisits:
         kind = LinkKind.LOOP if together else LinkKind.MERGE
         return Link(a, b, match.S_place_query, match.covariance, kind, (), keyframe_a, keyframe_b, doubtful=False)
 
-    def _link(self, match: PlaceMatch, seconds: int, live: VisualOdometry, now: FrameStamp) -> AtlasReport | None:
+    def _link(self, match: PlaceMatch, n_agreeing: int, live: VisualOdometry, now: FrameStamp) -> AtlasReport | None:
         """Give a link to the atlas; None where that has to be solved with it first, or did not take it."""
         link = self._link_of(match)
-        closing = _Closing(match, seconds, link.kind)
+        closing = _Closing(match, n_agreeing, link.kind)
         report = self._connections.connect_later(link, now)
         if report is None:
             self._closing = closing
@@ -311,7 +313,7 @@ class Revisits:
             other_submap=a,
             other_frame=keyframe_a,
             keyframe=keyframe_b,
-            seconds=closing.seconds,
+            confirmations=closing.confirmations,
             matches=match.n_matches,
             inliers=match.n_inliers,
             chi2_drift=report.newest_chi2,

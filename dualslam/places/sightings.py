@@ -18,7 +18,7 @@ from dualslam.map.submap import Submap
 from dualslam.places.recogniser import PlaceCandidate, PlaceRecogniser
 from dualslam.places.verification import PlaceVerifier
 
-N_SECONDS = 2
+N_CONFIRMING = 2
 """Keyframes (or frames) that must say the same as the first: three with it, where evidence begins for a link too."""
 YOUNG = 5
 """Newest keyframes of the live submap whose own landmarks are not remembered yet: half of them will be culled."""
@@ -150,7 +150,7 @@ class Sightings:
             return track
         if track.wide:
             return Failure(FailureReason.UNCONFIRMED, "the frame does not follow from the one before")
-        if len(sighting.tracks) < N_SECONDS:
+        if len(sighting.tracks) < N_CONFIRMING:
             sighting.tracks.append((track, sighting.odometry.relative_pose(track)))
             return None
         return Relocalised(sighting.odometry, sighting.tracks, track, sighting.odometry.reference_id)
@@ -212,6 +212,7 @@ def record_refusal(
         EventKind.LOOP_REFUSED,
         now,
         submap_id,
+        why.gates,
         other_submap=other_submap,
         other_frame=other_frame,
         reason=str(why.reason),

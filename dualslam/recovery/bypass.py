@@ -159,7 +159,8 @@ def absorb(
             continue
         refused = _refuse_motion(record, found, frames, new_id)
         if refused is not None:
-            record.event(EventKind.LINK_REFUSED, now, new_id, **refusal_data("absorb", max(component), refused))
+            data = refusal_data("absorb", max(component), refused)
+            record.event(EventKind.LINK_REFUSED, now, new_id, refused.gates, **data)
             continue
         for i in frames:
             record.pose(found[i].pose, observations=found[i].observations, method=found[i].method)

@@ -109,7 +109,8 @@ def _hand_over(
 
 def note_refused(record: Record, found: FoundLink, new_id: int, why: Failure, now: FrameStamp) -> None:
     """Say why a link that a walk had found is not made."""
-    record.event(EventKind.LINK_REFUSED, now, new_id, **refusal_data(found.attempt, found.old_id, why))
+    data = refusal_data(found.attempt, found.old_id, why)
+    record.event(EventKind.LINK_REFUSED, now, new_id, why.gates, **data)
 
 
 def _was_lost(record: Record, index: int, old_id: int) -> bool:

@@ -290,7 +290,8 @@ class Recoveries:
         told = self._circumstances.get(result.submap.id, {})
         for event in result.events:
             data = event.data | (told if event.event is EventKind.RECOVERY_ATTEMPT else {})
-            self._record.events.add(event.event, event.frame, event.timestamp_s, event.submap, **data)
+            at = event.frame, event.timestamp_s, event.submap
+            self._record.events.add(event.event, *at, event.gates, **data)
 
     def _poses_any(self, result: RecoveryResult | Failure) -> bool:
         """Whether a walk has found a pose for a frame that has none."""

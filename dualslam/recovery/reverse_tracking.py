@@ -20,6 +20,7 @@ import numpy as np
 
 from dualslam.atlas.trajectory import FramePose, Path
 from dualslam.core.config.settings import RecoveryConfig
+from dualslam.core.decisions import Gate
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.events import Event, EventKind
@@ -233,7 +234,9 @@ def _make_attempt(
             break
     progress.needs_old_map |= bool(job.lost) and relinker.is_hopeless
     if job.lost:
-        progress.events.append(_event_of(job, progress, attempt.name, time.perf_counter() - started))
+        event = _event_of(job, progress, attempt.name, time.perf_counter() - started)
+        gap = Gate("frames in a row without a pose", progress.n_unusable, "<=", max_gap_frames)
+        progress.events.append(replace(event, gates=(gap,)))
     return progress
 
 
@@ -325,7 +328,7 @@ def _recovered_frame(reverse_tracker: VisualOdometry, view: View, track: Track) 
 
 def _refusal(tried: LinkTry, failure: Failure, attempt: str, view: View, submap_id: int) -> Event:
     data = refusal_data(attempt, tried.old_id, failure, shared_keyframes=tried.n_shared)
-    return Event(EventKind.LINK_REFUSED, view.index, view.timestamp_s, submap_id, data)
+    return Event(EventKind.LINK_REFUSED, view.index, view.timestamp_s, submap_id, data, failure.gates)
 
 
 def _event_of(job: RecoveryJob, progress: Progress, attempt: str, seconds: float) -> Event:

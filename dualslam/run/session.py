@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from hashlib import sha256
 from itertools import islice
 from pathlib import Path
@@ -18,6 +19,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.config.files import dump_config
 from dualslam.core.config.settings import Config
+from dualslam.core.decisions import Decision
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Sequence
@@ -32,6 +34,7 @@ from dualslam.io.sequence import RecordedSequence, Selection
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.io.video import WebcamSequence
 from dualslam.lab.disturbances import corrupted
+from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameResult
 from dualslam.report import PlaceAlbum, SampleKeeper, read_run, report_page
 from dualslam.run.interrupts import Interrupts
@@ -148,6 +151,7 @@ def run_to_folder(
     focal: FocalSearch | None = None,
     watcher: Watcher | None = None,
     replay: str | Path | None = None,
+    decisions: bool = False,
 ) -> Outcome:
     """Run on a sequence and write a run folder. What an interrupted run, or one that crashed, has found is kept.
 
@@ -172,6 +176,8 @@ def run_to_folder(
     watcher : Watcher, optional
     replay : path, optional
         Run folder whose schedule is repeated, in one process: when answers were used, and which frames were dropped.
+    decisions : bool
+        Write ``decisions.jsonl``: every decision with its numbers and thresholds.
 
     Raises
     ------
@@ -214,6 +220,8 @@ def run_to_folder(
         folder.append_schedule(header_of(system.desk.policy, realtime, **origin))
         if recorded is not None:
             warn_of_differences(recorded, origin)
+        if decisions:
+            system.events.decisions.write = partial(_write_decision, system.numbers, folder)
 
         refusals = StartRefusals()
 
@@ -482,6 +490,11 @@ class _Watched:
                 frames = [event.data.get("keyframe", event.frame), event.data.get("other_frame")]
                 self._album.show([numbers.index_of(i) for i in frames if i is not None])
         self._n_events = len(self._system.events)
+
+
+def _write_decision(numbers: FrameNumbers, folder: RunFolder, decision: Decision) -> None:
+    told = replace(decision, frame=numbers.index_of(decision.frame), data=numbers.in_source(decision.data))
+    folder.append_decision(told.as_dict())
 
 
 def _write_new_events(system: System, folder: RunFolder) -> None:

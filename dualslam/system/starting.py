@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from dualslam.atlas.trajectory import FramePose
+from dualslam.core.decisions import Decision, DecisionKind, Gate
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
@@ -160,7 +161,14 @@ class Starting:
             start = self._starter.add(view, view.timestamp_s - self._since_s, briefly=state.pace.in_real_time)
         if isinstance(start, Failure) and start.reason is FailureReason.DOUBTFUL_INITIALISATION:
             state.record.event(EventKind.INITIALISATION_REFUSED, view, None, reason=start.detail, **start.numbers)
+        if isinstance(start, Failure):
+            self._note_refused(view, start)
         return start
+
+    def _note_refused(self, view: View, why: Failure) -> None:
+        decisions = self._state.record.events.decisions
+        if decisions.is_open:
+            decisions.note(Decision.refused(view.index, DecisionKind.START, None, why))
 
     def foresee(self) -> None:
         """Let what the next walk may ask for on either side of a loss be found while no map has started to walk from.
@@ -191,7 +199,13 @@ class Starting:
             return Failure(FailureReason.BUSY, "the camera is being asked for")
         start, is_early = self.find_start(view), len(self._state.lost) <= EARLY_FRAMES
         if is_early and start and start.numbers.get("direction_sigma_deg", 0.0) > FIRM_SIGMA_DEG:
-            return Failure(FailureReason.DOUBTFUL_INITIALISATION, "frames farther apart would know their motion better")
+            detail = "frames farther apart would know their motion better"
+            numbers = start.numbers
+            sigma = Gate(
+                "sigma of the direction of translation in degrees", numbers["direction_sigma_deg"], "<=", FIRM_SIGMA_DEG
+            )
+            start = Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, gates=(sigma,))
+            self._note_refused(view, start)
         return start
 
     def _correct_shutter(self, view: View) -> View:

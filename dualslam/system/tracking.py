@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import cast
 
 from dualslam.atlas.trajectory import FramePose
+from dualslam.core.decisions import Decision, DecisionKind
 from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Seeker, VisualOdometry
+from dualslam.core.support import support_gates
 from dualslam.core.types import Failure, FailureReason, Track, View
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.system.camera.turns import with_turn_of_poses
@@ -34,12 +37,15 @@ class Tracking:
         self._state = state
         self._places = places
         self._last_pose: FramePose | None = None
+        self._decisions = state.record.events.decisions
 
     def track(self, odometry: VisualOdometry, view: View) -> Track | Failure:
         """Pose a frame, judge it, record it, and make it a keyframe where one is due."""
         state, submap = self._state, odometry.submap
         with state.record.timer.measure("tracking"):
             track = state.health.judge(odometry.track(view), view.index)
+        if self._decisions.is_open:
+            self._decisions.note(self._frame_decision(view, submap.id, track))
         if isinstance(track, Failure):
             return track
         self.posed_at = time.perf_counter()
@@ -66,13 +72,31 @@ class Tracking:
 
     def _keyframe_due(self, odometry: VisualOdometry, track: Track) -> bool:
         """Whether a frame is to become a keyframe, now and in this submap."""
-        state = self._state
-        if not odometry.keyframe_due(track):
+        state, ruling = self._state, odometry.keyframe_due(track)
+        is_made, detail = False, ruling.detail
+        if not ruling:
             odometry.go_by_known(track)
-            return False
-        if state.pace.puts_off(track.n_inliers, state.config.keyframes.weak_landmarks):
-            return False
-        return not self._places.keyframe_waits(odometry, track)
+        elif state.pace.puts_off(track.n_inliers, state.config.keyframes.weak_landmarks):
+            detail = "put off to a later frame: frames or the graph are late"
+        elif self._places.keyframe_waits(odometry, track):
+            detail = "a map of an earlier run may have the place"
+        else:
+            is_made = True
+        if self._decisions.is_open:
+            at = track.view.index, DecisionKind.KEYFRAME, is_made, odometry.submap.id
+            self._decisions.note(Decision(*at, ruling.gates, detail=detail))
+        return is_made
+
+    def _frame_decision(self, view: View, submap_id: int, track: Track | Failure) -> Decision:
+        """Return the decision whether the map explains a frame; the early signs of trouble are among its data."""
+        health = self._state.health.newest
+        signs = {"signs": [] if health is None else [str(sign) for sign in health.signs]}
+        if isinstance(track, Failure):
+            refused = Decision.refused(view.index, DecisionKind.FRAME, submap_id, track)
+            return replace(refused, data=refused.data | signs)
+        gates = support_gates(track.n_inliers, track.n_matches, track.chi2, self._state.config.health)
+        data = {"method": str(track.method), "in_view": len(track.visible_ids), "matches": track.n_matches} | signs
+        return Decision(view.index, DecisionKind.FRAME, True, submap_id, gates, data=data)
 
     def _insert_keyframe(self, odometry: VisualOdometry, track: Track) -> Failure | None:
         state, record = self._state, self._state.record
@@ -83,6 +107,7 @@ class Tracking:
             return Failure(FailureReason.SOLVER, str(error))
         state.health.note_keyframe(report)
         if isinstance(report, Failure):
+            self._decisions.note(Decision.refused(track.view.index, DecisionKind.KEYFRAME, odometry.submap.id, report))
             return report
         record.timer.add("graph (in mapping)", report.graph_seconds)
         if report.rebuilt:

@@ -23,6 +23,7 @@ import numpy as np
 from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import Config
+from dualslam.core.decisions import Ruling
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import SubmapGraph
@@ -124,11 +125,13 @@ class PnpOdometry:
         """Return ``T_kf_cam``: the track's pose relative to the reference keyframe."""
         return self._live.relative_pose(track)
 
-    def keyframe_due(self, track: Track) -> bool:
+    def keyframe_due(self, track: Track) -> Ruling:
         """Whether the frame should become a keyframe: in any case after a gap relocalisation, which only its landmarks
         tie down.
         """
-        return track.wide or self._live.keyframe_due(track)
+        if track.wide:
+            return Ruling(True, detail="it lies beyond a gap")
+        return self._live.keyframe_due(track)
 
     def go_by_known(self, track: Track) -> None:
         """Go by the keyframe of an earlier run that is there for a frame which would have become one."""

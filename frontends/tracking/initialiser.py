@@ -15,6 +15,7 @@ import numpy as np
 from dualslam.core.bundle import BundleAdjuster, BundleProblem
 from dualslam.core.chi_square import CHI2_95, CHI2_99, MEDIAN_CHI2
 from dualslam.core.config.settings import InitialiserConfig
+from dualslam.core.decisions import Gate
 from dualslam.core.errors import SolverError
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import refine_pose
@@ -128,7 +129,8 @@ class Initialiser:
         lenience = float(np.clip(waited_s / PATIENCE_S, 1.0, MAX_LENIENCE))
         best = Failure(FailureReason.TOO_FEW_MATCHES, "one view")
         if len(view.features) < self._config.min_matches:
-            return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image")
+            gate = Gate("features", len(view.features), ">=", self._config.min_matches)
+            return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image", gates=(gate,))
         farthest = sum(lag < len(self._views) for lag in LAGS) - 1
         for _ in range(1 if briefly else MAX_PAIRS):
             if farthest < 0:
@@ -158,13 +160,16 @@ class Initialiser:
         a, b = self._views[first], self._views[last]
         matches = self._match(a.features, b.features)
         if len(matches) < self._config.min_matches:
-            return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(matches)} matches, {self._config.min_matches} needed")
+            gate = Gate("matches", len(matches), ">=", self._config.min_matches)
+            detail = f"{len(matches)} matches, {self._config.min_matches} needed"
+            return Failure(FailureReason.TOO_FEW_MATCHES, detail, gates=(gate,))
         pair = self._best_pose(a, b, matches)
         start = self._verify(pair, [a, *self._witnesses(first, last), b]) if isinstance(pair, _Pair) else pair
         if isinstance(start, Start):
             direction = start.numbers["direction_sigma_deg"]
-            if not direction < lenience * self._config.max_direction_sigma_deg:
-                start = _direction_unknown(direction, start.numbers)
+            most_deg = lenience * self._config.max_direction_sigma_deg
+            if not direction < most_deg:
+                start = _direction_unknown(direction, most_deg, start.numbers)
         if isinstance(start, Failure) and start.reason is FailureReason.LOW_PARALLAX:
             return replace(start, numbers={**start.numbers, "shift_px": _shift_px(a, b, matches)})
         return start
@@ -184,7 +189,8 @@ class Initialiser:
         poses = RelativePoses(uv_a, uv_b, sigma, self._K, self._size_px, self._seed)
         if poses.n_moved < int(NEAR * self._config.min_points):
             detail = f"a turn explains all but {poses.n_moved} of {len(matches)} matches"
-            return Failure(FailureReason.LOW_PARALLAX, detail)
+            gate = Gate("matches that no turn explains", poses.n_moved, ">=", int(NEAR * self._config.min_points))
+            return Failure(FailureReason.LOW_PARALLAX, detail, gates=(gate,))
         pairs = [self._evaluate(a, b, matches, T_b_a) for T_b_a in poses.of_turns()]
         if (hopeless := self._hopeless(pairs, len(matches))) is not None:
             return hopeless
@@ -197,15 +203,18 @@ class Initialiser:
         best = max(contenders, key=lambda p: int(p.good.sum()))
         n_good = int(best.good.sum())
         numbers = {"n_matches": float(len(matches)), "n_points": float(n_good), "parallax_deg": best.parallax_deg}
-        if n_good < self._config.min_points:
-            return Failure(FailureReason.TOO_FEW_INLIERS, f"{n_good} points of {len(matches)} matches", numbers)
-        if best.n_near < NEAR * self._config.min_points:
+        enough = Gate("points", n_good, ">=", self._config.min_points)
+        near = Gate("near points", best.n_near, ">=", NEAR * self._config.min_points)
+        if not enough.passed:
+            detail = f"{n_good} points of {len(matches)} matches"
+            return Failure(FailureReason.TOO_FEW_INLIERS, detail, numbers, gates=(enough,))
+        if not near.passed:
             detail = f"median parallax {best.parallax_deg:.2f} deg, {best.n_near} near points"
-            return Failure(FailureReason.LOW_PARALLAX, detail, numbers)
+            return Failure(FailureReason.LOW_PARALLAX, detail, numbers, gates=(enough, near))
         if any(direction_angle_deg(best.T_b_a, other.T_b_a) > SAME_DEG for other in contenders):
             return Failure(FailureReason.AMBIGUOUS_MODEL, "two poses explain the views alike", numbers)
         if (direction := self._direction_sigma_deg(best)) > self._loose_direction_sigma_deg:
-            return _direction_unknown(direction, numbers)
+            return _direction_unknown(direction, self._loose_direction_sigma_deg, numbers)
         return best
 
     def _hopeless(self, pairs: list[_Pair], n_matches: int) -> Failure | None:
@@ -220,9 +229,9 @@ class Initialiser:
         if any(direction_angle_deg(p.T_b_a, q.T_b_a) > 2 * SAME_DEG for p, q in combinations(sure, 2)):
             return Failure(FailureReason.AMBIGUOUS_MODEL, "two poses explain the views alike")
         for pair in sure:
-            enough = pair.good.sum() >= self._config.min_points
-            if enough and (direction := self._direction_sigma_deg(pair)) > self._loose_direction_sigma_deg:
-                return _direction_unknown(direction, {})
+            has_points = pair.good.sum() >= self._config.min_points
+            if has_points and (direction := self._direction_sigma_deg(pair)) > self._loose_direction_sigma_deg:
+                return _direction_unknown(direction, self._loose_direction_sigma_deg, {})
         return None
 
     def _direction_sigma_deg(self, pair: _Pair) -> float:
@@ -280,7 +289,8 @@ class Initialiser:
         }
         if not support or min(support) < MIN_SUPPORT:
             detail = f"the frames between confirm {numbers['support']:.0%} of the points"
-            return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers)
+            gate = Gate("share of points that the frames between confirm", numbers["support"], ">=", MIN_SUPPORT)
+            return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers, gates=(gate,))
         views = [views[v] for v in np.flatnonzero(keep_views)]
         return self._adjust(views, T_first_cam[keep_views], xyz, feature[keep_views], numbers)
 
@@ -332,10 +342,11 @@ class Initialiser:
         in_front = np.all(se3.act(se3.inverse(result.T_submap_kf), result.xyz_mu)[..., 2] > 0, axis=0)
         keep = _agreeing(problem, inlier) & in_front & result.adjusted
         numbers["n_points"] = float(keep.sum())
-        if keep.sum() < self._config.min_points or keep.mean() < MIN_SUPPORT:
-            return Failure(
-                FailureReason.DOUBTFUL_INITIALISATION, f"{keep.sum()} of {len(xyz)} points survive adjustment", numbers
-            )
+        survivors = Gate("points after adjustment", int(keep.sum()), ">=", self._config.min_points)
+        share = Gate("share of points after adjustment", float(keep.mean()), ">=", MIN_SUPPORT)
+        if not (survivors.passed and share.passed):
+            detail = f"{keep.sum()} of {len(xyz)} points survive adjustment"
+            return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers, gates=(survivors, share))
         # What repeats itself along the epipolar line fits two views always, and a third, by chance, where pixels are
         # less noisy than supposed: as a point right before the camera, which pins it. So a point is taken on the word
         # of three views, by a gate in the residuals' own variance.
@@ -346,11 +357,15 @@ class Initialiser:
         # weigh most, a point is taken on the word of all of them, unless others that all have seen are as near.
         proven &= ~nearer_than_proven(result.xyz_mu[:, 2], proven & (n_views == len(views)))
         numbers["n_proven"] = float(proven.sum())
-        if proven.sum() < max(PROVEN * keep.sum(), CARRYING * self._config.min_points):
+        least = float(max(PROVEN * keep.sum(), CARRYING * self._config.min_points))
+        enough = Gate("points that three views prove", int(proven.sum()), ">=", least)
+        fits = Gate("chi-square per degree of freedom", chi2, "<", MAX_CHI2)
+        if not enough.passed:
             detail = f"three views prove {proven.sum()} of {keep.sum()} points"
-            return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers)
-        if not numbers["chi2"] < MAX_CHI2:
-            return Failure(FailureReason.CHI_SQUARE, f"chi-square per degree of freedom {numbers['chi2']:.1f}", numbers)
+            return Failure(FailureReason.DOUBTFUL_INITIALISATION, detail, numbers, gates=(survivors, share, enough))
+        if not fits.passed:
+            detail = f"chi-square per degree of freedom {chi2:.1f}"
+            return Failure(FailureReason.CHI_SQUARE, detail, numbers, gates=(survivors, share, enough, fits))
         feature = feature.copy()
         feature[view_of[~inlier], point_of[~inlier]] = -1
         depth = float(np.median(result.xyz_mu[proven, 2]))
@@ -383,9 +398,10 @@ def _calmer(noise2: float) -> float:
     return float(np.sqrt(np.clip(noise2, MIN_NOISE2, USUAL_NOISE2) / USUAL_NOISE2))
 
 
-def _direction_unknown(direction_sigma_deg: float, numbers: dict[str, float]) -> Failure:
+def _direction_unknown(direction_sigma_deg: float, most_deg: float, numbers: dict[str, float]) -> Failure:
     detail = f"direction of translation known to {direction_sigma_deg:.1f} deg only"
-    return Failure(FailureReason.LOW_PARALLAX, detail, numbers)
+    gate = Gate("sigma of the direction of translation in degrees", direction_sigma_deg, "<", most_deg)
+    return Failure(FailureReason.LOW_PARALLAX, detail, numbers, gates=(gate,))
 
 
 def _contenders(pairs: list[_Pair], n_matches: int, most: int) -> list[_Pair]:

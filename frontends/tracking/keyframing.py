@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.core.config.settings import KeyframeConfig
+from dualslam.core.decisions import Gate, Ruling
 from dualslam.core.geometry import se3
 from dualslam.core.quantiles import median
 from dualslam.core.types import FloatArray, IntArray, Track
@@ -27,7 +28,7 @@ more than half keyframes come a tenth more often there."""
 NEAREST = 1e-6  # of a submap's unit, its first median depth
 
 
-def keyframe_due(track: Track, submap: Submap, reference_id: int, config: KeyframeConfig, first_id: int = 0) -> bool:
+def keyframe_due(track: Track, submap: Submap, reference_id: int, config: KeyframeConfig, first_id: int = 0) -> Ruling:
     """Decide by what is still tracked of the last keyframe and by how far the camera has moved since.
 
     Parameters
@@ -41,9 +42,10 @@ def keyframe_due(track: Track, submap: Submap, reference_id: int, config: Keyfra
         Number of this run's first frame: how long ago another run was says nothing.
     """
     if track.view.index in submap.keyframes:
-        return False
-    if track.n_inliers < config.weak_landmarks:
-        return True
+        return Ruling(False, detail="it is one already")
+    weak = Gate("inliers", track.n_inliers, "<", config.weak_landmarks)
+    if weak.passed:
+        return Ruling(True, (weak,))
     n_frames = abs(track.view.index - reference_id) if reference_id >= first_id else 0
     share = _share_in(track.landmark_ids, submap, reference_id)
     parallax = parallax_deg(track, submap, reference_id)
@@ -51,7 +53,8 @@ def keyframe_due(track: Track, submap: Submap, reference_id: int, config: Keyfra
         # A few near ones hold the position, like a bench that a camera takes off from: while they leave, the many far
         # ones are still in view, and a keyframe that came when these change would find the scale already lost.
         share = min(share, _share_in(track.landmark_ids, submap, reference_id, by_hold=True) / LEAST_HOLD)
-    return _shows_other(share, parallax, n_frames, config)
+    gates = _shows_other(share, parallax, n_frames, config)
+    return Ruling(any(gate.passed for gate in gates), (weak, *gates))
 
 
 def keyframe_like(track: Track, submap: Submap, first_id: int, config: KeyframeConfig) -> int | None:
@@ -73,23 +76,24 @@ def keyframe_like(track: Track, submap: Submap, first_id: int, config: KeyframeC
     in_view = np.union1d(track.visible_ids, track.landmark_ids)
     covisible, _ = submap.covisible(track.landmark_ids[track.landmark_ids >= 0])
     for k in covisible[covisible < first_id][:N_LIKE].tolist():
-        if not _shows_other(_share_in(in_view, submap, k), parallax_deg(track, submap, k), 0, config):
+        gates = _shows_other(_share_in(in_view, submap, k), parallax_deg(track, submap, k), 0, config)
+        if not any(gate.passed for gate in gates):
             return int(k)
     return None
 
 
-def _shows_other(share: float, parallax: float, n_frames: int, config: KeyframeConfig) -> bool:
-    """Whether a frame shows other things than a keyframe, or from elsewhere.
+def _shows_other(share: float, parallax: float, n_frames: int, config: KeyframeConfig) -> list[Gate]:
+    """Return the comparisons of which one says that a frame shows other things than a keyframe, or from elsewhere.
 
     `share`: of the keyframe's landmarks, that the frame shows. `n_frames`: that lie between the two.
     """
-    if parallax > config.max_parallax_deg:
-        return True
-    if parallax < MIN_PARALLAX_DEG:
-        # A turn in place reveals nothing that could be triangulated, until half of what was known is out of view.
-        return share < 0.5 * config.max_tracked_ratio
-    worth = min(max(parallax / FULL_PARALLAX_DEG, LEAST), 1.0)
-    return share < worth * config.max_tracked_ratio or n_frames >= config.max_frames
+    moved = Gate("parallax to the last keyframe in degrees", parallax, ">", config.max_parallax_deg)
+    # A turn in place reveals nothing that could be triangulated, until half of what was known is out of view.
+    turns = parallax < MIN_PARALLAX_DEG
+    worth = 0.5 if turns else min(max(parallax / FULL_PARALLAX_DEG, LEAST), 1.0)
+    left = Gate("share of the last keyframe's landmarks", share, "<", worth * config.max_tracked_ratio)
+    late = Gate("frames since the last keyframe", n_frames, ">=", config.max_frames)
+    return [moved, left] if turns else [moved, left, late]
 
 
 def _share_in(landmark_ids: IntArray, submap: Submap, keyframe_id: int, by_hold: bool = False) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import Config
+from dualslam.core.decisions import Ruling
 from dualslam.core.estimates import GraphEstimate, KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import N_WINDOW, Frontend, SubmapGraph, WindowSolver
@@ -216,9 +217,12 @@ class VisualFrontEnd:
             return np.eye(4)
         return se3.inverse(self.submap.T_submap_kf[self._reference_id]) @ se3.inverse(track.T_cam_submap)
 
-    def keyframe_due(self, track: Track) -> bool:
+    def keyframe_due(self, track: Track) -> Ruling:
         """Whether the frame should become a keyframe: not where an earlier run has left one that shows the same."""
-        return self._shows_other(track) and self._known(track) is None
+        ruling = self._shows_other(track)
+        if ruling and self._known(track) is not None:
+            return Ruling(False, ruling.gates, "a keyframe of an earlier run shows the same")
+        return ruling
 
     def go_by_known(self, track: Track) -> None:
         """Go by the keyframe of an earlier run that is there for a frame which would have become one.
@@ -234,15 +238,16 @@ class VisualFrontEnd:
             self._meet(known)
             self._tracker.refresh()
 
-    def _shows_other(self, track: Track) -> bool:
+    def _shows_other(self, track: Track) -> Ruling:
         """Whether a frame shows other things than its reference keyframe, or from elsewhere."""
         config, last = self._config, self._reference_id
-        if keyframe_due(track, self.submap, last, config.keyframes, self._first_id):
-            return True
-        if track.view.index in self.submap.keyframes:
-            return False
+        ruling = keyframe_due(track, self.submap, last, config.keyframes, self._first_id)
+        if ruling or track.view.index in self.submap.keyframes:
+            return ruling
         parallax_deg, n = config.keyframes.max_parallax_deg, config.tracking.min_inliers
-        return passes_unmapped(track, self.submap, last, self._frontend, parallax_deg, n)
+        if passes_unmapped(track, self.submap, last, self._frontend, parallax_deg, n):
+            return Ruling(True, ruling.gates, "the camera passes something that is not mapped")
+        return ruling
 
     def _known(self, track: Track) -> int | None:
         """Return the keyframe of an earlier run that shows the same."""

@@ -43,14 +43,14 @@ def errors(system: System) -> FloatArray:
     return pose_errors(main.T_world_cam, ring(N)[main.index])[0]
 
 
-def test_a_loop_within_a_submap_is_closed_once_others_have_seconded_it() -> None:
+def test_a_loop_within_a_submap_is_closed_once_others_have_confirmed_it() -> None:
     system = closed_lap()
     loops = system.events.of_kind(EventKind.LOOP_CLOSED)
     assert loops
     assert {link.kind for link in system.atlas.believed} == {LinkKind.LOOP}
     for loop in loops:
         assert loop.submap == loop.data["other_submap"] == 0
-        assert loop.data["seconds"] == 2
+        assert loop.data["confirmations"] == 2
         assert abs(loop.frame - N_LAP - loop.data["other_frame"]) < 25, "what is seen now was seen a lap ago"
     assert not trajectories_of(system).unlinked
     assert system.rows[N - 1].status is FrameStatus.TRACKED

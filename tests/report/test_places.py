@@ -16,7 +16,7 @@ from dualslam.report.samples import thumbnail as jpeg_of
 
 LOOP = {
     "event": "loop_closed", "frame": 30, "timestamp_s": 3.0, "submap": 2, "other_submap": 0, "other_frame": 4,
-    "keyframe": 29, "seconds": 2, "matches": 183, "inliers": 120, "found": 0.26, "own_found": 0.56, "drift": 0.03,
+    "keyframe": 29, "confirmations": 2, "matches": 183, "inliers": 120, "found": 0.26, "own_found": 0.56, "drift": 0.03,
     "drift_rot_deg": 1.2, "drift_log_scale": -0.0953, "moved": 0.27,
 }  # fmt: skip
 REFUSED = {

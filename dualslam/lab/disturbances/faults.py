@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from dualslam.core.config.corruption import INTERNAL_KINDS, Corruption, CorruptionKind
+from dualslam.core.decisions import Ruling
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import KeyframeReport
 from dualslam.core.geometry import so3
@@ -123,11 +124,13 @@ class _FaultyOdometry:
             return track
         return replace(track, T_cam_submap=wrong_pose(track, self._inner.submap, fault))
 
-    def keyframe_due(self, track: Track) -> bool:
+    def keyframe_due(self, track: Track) -> Ruling:
         # A wrong pose that is no keyframe would not reach the map.
         forced = self._script.active(CorruptionKind.WRONG_POSE, track.view.timestamp_s) is not None
         known = track.view.index in self._inner.submap.keyframes
-        return (forced and not known) or self._inner.keyframe_due(track)
+        if forced and not known:
+            return Ruling(True, detail="the failure lab wants it")
+        return self._inner.keyframe_due(track)
 
     def insert_keyframe(self, track: Track) -> KeyframeReport | Failure:
         if self._script.solver_fails(track.view.timestamp_s):

@@ -399,7 +399,7 @@ class TestKeyframing:
                 shown = replace(track, landmark_ids=ids)
                 parallax = parallax_deg(shown, live.submap, 8)
                 if 0.5 < parallax < 1.0 or 1.5 < parallax < config.max_parallax_deg:
-                    due[parallax < 1.0].add(keyframe_due(shown, live.submap, 8, config))
+                    due[parallax < 1.0].add(bool(keyframe_due(shown, live.submap, 8, config)))
             assert due == {True: {with_little}, False: {with_much}}, share
 
     def test_a_few_near_landmarks_that_leave_make_one_before_the_scale_is_lost(self, world: PointWorld) -> None:
@@ -418,7 +418,8 @@ class TestKeyframing:
         def due(held: IntArray) -> bool:
             ids = np.full(max(len(track.landmark_ids), len(held)), NO_LANDMARK)
             ids[: len(held)] = held
-            return keyframe_due(replace(track, landmark_ids=ids), live.submap, 8, KeyframeConfig(max_frames=1000))
+            shown = replace(track, landmark_ids=ids)
+            return bool(keyframe_due(shown, live.submap, 8, KeyframeConfig(max_frames=1000)))
 
         assert not due(seen)
         assert not due(np.concatenate([near, far[: 3 * len(far) // 4]])), "the far ones hold little"
