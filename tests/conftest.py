@@ -4,10 +4,20 @@ import logging
 import signal
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from dualslam.core.threads import limit_threads
 
 limit_threads()
+
+# The same examples each time, however busy the machine is.
+settings.register_profile(
+    "dualslam",
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+)
+settings.load_profile("dualslam")
 
 # A shell hands Ctrl-C to what it starts in the background (`&`, nohup) as ignored; tests that interrupt a run need it.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -37,7 +37,7 @@ SEEDS = st.integers(0, 10_000)
 
 
 @pytest.mark.parametrize(("group", "dimension"), GROUPS, ids=IDS)
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60)
 @given(seed=SEEDS, angle=ANGLES)
 def test_exp_is_the_matrix_exponential_and_log_inverts_it(
     group: ModuleType, dimension: int, seed: int, angle: float
@@ -52,7 +52,7 @@ def test_exp_is_the_matrix_exponential_and_log_inverts_it(
 
 
 @pytest.mark.parametrize(("group", "dimension"), GROUPS, ids=IDS)
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=30)
 @given(seed=SEEDS, angle=ANGLES)
 def test_group_laws(group: ModuleType, dimension: int, seed: int, angle: float) -> None:
     """Inverse, action as a homomorphism, adjoint."""
@@ -113,7 +113,7 @@ def test_rotation_log_near_pi(gap: float) -> None:
     assert abs(so3.rotation_angle(R) - (np.pi - gap)) < EXACT
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=50)
 @given(seed=SEEDS, angle=ANGLES)
 def test_quaternions_agree_with_scipy(seed: int, angle: float) -> None:
     """Both directions, w >= 0."""
