@@ -91,7 +91,7 @@ def bundle_adjust_arrays(
         )
         loss = partial(geman_mcclure, shape=robust_k) if forgets else partial(huber, k=robust_k)
         optimum = optimise(used, loss, max_iterations, tolerance)
-        T, xyz[points] = optimum.T_submap_kf, optimum.xyz_mu
+        T, xyz[points] = optimum.state.T_submap_kf, optimum.state.xyz_mu
         cost = optimum.cost_before, optimum.cost_after
     after = compute_residuals(p.K, T, p.kf, xyz[p.point], p.uv_px, p.sigma_px)
     return BundleResult(T, xyz, adjusted, after.chi2, *cost)

@@ -1,13 +1,15 @@
 """Batch bundle adjustment of a whole submap in numpy, by the Schur complement of its points.
 
 The reduced system of the poses is a band matrix in a reordering of them: narrow for a map that moves on, full for one
-that stays in a room. Observations are linearised in chunks, so that memory grows with the band alone.
+that stays in a room. Observations are linearised in chunks, so that memory grows with the band alone. A lens that all
+poses share may be a variable, too: its few columns border the band.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
@@ -24,12 +26,36 @@ from dualslam.core.types import FloatArray, IntArray
 
 Loss = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 """Weights and losses of squared whitened residuals."""
-CHUNK = 8192
-"""Observations that are linearised at once, about 1 kB each."""
-FIRST_DAMPING, DAMPING_FACTOR, MOST_DAMPING = 1e-5, 10.0, 1e5
-"""Levenberg-Marquardt, added to the diagonal: as GTSAM's."""
+CHUNK, KEPT_CHUNKS = 8192, 4
+"""Observations that are linearised at once, about 1 kB each. Up to so many chunks are kept through a step, 0.3 kB an
+observation; more are linearised twice."""
+FIRST_DAMPING, DAMPING_FACTOR, LEAST_DAMPING, MOST_DAMPING = 1e-5, 10.0, 1e-8, 1e10
+"""Levenberg-Marquardt, added to the diagonal."""
 BEHIND_CHI2 = 1e6
-"""What a view of a point behind its camera counts as: the loss is large, and the weight none."""
+"""What a view of a point behind its camera counts as, by default: the loss is large, and the weight none."""
+
+
+class Lens(Protocol):
+    """A lens of M parameters, with a prior at zero."""
+
+    information: FloatArray  # (M, M), of the prior
+
+    def project(self, xy: FloatArray, parameters: FloatArray) -> FloatArray:
+        """Return the pixels (R, 2) of rays (x, y, 1), (R, 2)."""
+        ...
+
+    def derivatives(self, xy: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return how pixels change with the rays (R, 2, 2) and with the parameters (R, 2, M)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Values of the variables: poses (F, 4, 4), points (P, 3), parameters of the lens (M,)."""
+
+    T_submap_kf: FloatArray
+    xyz_mu: FloatArray
+    lens: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,14 +64,12 @@ class Optimum:
 
     Attributes
     ----------
-    T_submap_kf : (F, 4, 4)
-    xyz_mu : (P, 3)
+    state : State
     cost_before, cost_after : float
         Sum of the losses.
     """
 
-    T_submap_kf: FloatArray
-    xyz_mu: FloatArray
+    state: State
     cost_before: float
     cost_after: float
 
@@ -61,7 +85,7 @@ class _Linear:
     residuals : (R, 2)
         Whitened.
     weight : (R,)
-    J_pose : (R, 2, 6), J_point : (R, 2, 3)
+    J_pose : (R, 2, 6), J_point : (R, 2, 3), J_lens : (R, 2, M)
     """
 
     pose: IntArray
@@ -70,6 +94,28 @@ class _Linear:
     weight: FloatArray
     J_pose: FloatArray
     J_point: FloatArray
+    J_lens: FloatArray
+
+
+@dataclass(slots=True, eq=False)
+class _Reduced:
+    """Normal equations without the points, in sums over the chunks.
+
+    Attributes
+    ----------
+    blocks : (N, B + 1, 6, 6)
+        At [j, d]: rows of pose j + d, columns of pose j.
+    border : (N, 6, M), corner : (M, M)
+        Rows and columns of the lens.
+    g_pose : (N, 6), g_lens : (M,)
+        The gradient.
+    """
+
+    blocks: FloatArray
+    border: FloatArray
+    corner: FloatArray
+    g_pose: FloatArray
+    g_lens: FloatArray
 
 
 def geman_mcclure(chi2: FloatArray, shape: float) -> tuple[FloatArray, FloatArray]:
@@ -78,7 +124,15 @@ def geman_mcclure(chi2: FloatArray, shape: float) -> tuple[FloatArray, FloatArra
     return share**2, 0.5 * chi2 * share
 
 
-def optimise(problem: BundleProblem, loss: Loss, max_iterations: int, tolerance: float) -> Optimum:
+def optimise(
+    problem: BundleProblem,
+    loss: Loss,
+    max_iterations: int,
+    tolerance: float,
+    lens: Lens | None = None,
+    parameters: FloatArray | None = None,
+    behind_chi2: float = BEHIND_CHI2,
+) -> Optimum:
     """Run Levenberg-Marquardt on the poses that are not fixed, and on all points.
 
     Parameters
@@ -89,38 +143,47 @@ def optimise(problem: BundleProblem, loss: Loss, max_iterations: int, tolerance:
     max_iterations : int
     tolerance : float
         Relative decrease of the cost below which to stop.
+    lens : Lens, optional
+        One more variable, instead of ``problem.K``.
+    parameters : (M,), optional
+        Of the lens, to begin with.
+    behind_chi2 : float
+        What a view of a point behind its camera counts as; with 0 a step may put a point there.
 
     Raises
     ------
     SolverError
         If no damping makes the system definite, or a residual is not finite.
     """
-    system = _System(problem, loss)
-    T, xyz = problem.T_submap_kf, problem.xyz_mu
-    before = cost = system.cost(T, xyz)
+    system = System(problem, loss, lens, behind_chi2)
+    state = State(problem.T_submap_kf, problem.xyz_mu, np.zeros(0) if parameters is None else parameters)
+    before = cost = system.cost(state)
     damping, n_definite = FIRST_DAMPING, 0
     for _ in range(max_iterations):
         gain = 0.0
         while not gain > 0 and damping <= MOST_DAMPING:
-            moved = system.step(T, xyz, damping)
-            if moved is not None and (new := system.cost(*moved)) < cost:
-                (T, xyz), gain, cost = moved, cost - new, new
-                damping /= DAMPING_FACTOR
+            moved = system.step(state, damping)
+            if moved is not None and (new := system.cost(moved)) < cost:
+                state, gain, cost = moved, cost - new, new
+                damping = max(damping / DAMPING_FACTOR, LEAST_DAMPING)
             else:
                 damping *= DAMPING_FACTOR
             n_definite += moved is not None
         if not gain > tolerance * cost:
             break
     if not n_definite or not np.isfinite(before):
-        raise SolverError(f"bundle adjustment of {len(T)} poses and {len(xyz)} points has no optimum")
-    return Optimum(T, xyz, before, cost)
+        n, m = len(problem.T_submap_kf), len(problem.xyz_mu)
+        raise SolverError(f"bundle adjustment of {n} poses and {m} points has no optimum")
+    return Optimum(state, before, cost)
 
 
-class _System:
+class System:
     """The normal equations of a problem."""
 
-    def __init__(self, problem: BundleProblem, loss: Loss) -> None:
-        self._problem, self._loss = problem, loss
+    def __init__(
+        self, problem: BundleProblem, loss: Loss, lens: Lens | None = None, behind_chi2: float = BEHIND_CHI2
+    ) -> None:
+        self._problem, self._loss, self._lens, self._behind_chi2 = problem, loss, lens, behind_chi2
         self._rows = np.argsort(problem.point, kind="stable")
         n_views = np.bincount(problem.point, minlength=len(problem.xyz_mu))
         self._begin = np.concatenate([[0], np.cumsum(n_views)])  # of each point, among the rows
@@ -149,85 +212,156 @@ class _System:
             yield first, min(max(last, first + 1), n)
             first = last
 
-    def cost(self, T: FloatArray, xyz: FloatArray) -> float:
-        """Return the sum of the losses."""
-        return sum(float(self._fit(chunk, T, xyz)[3].sum()) for chunk in self._chunks)
+    def cost(self, state: State) -> float:
+        """Return the sum of the losses, and the prior's."""
+        prior = 0.0 if self._lens is None else 0.5 * float(state.lens @ self._lens.information @ state.lens)
+        return prior + sum(float(self._fit(chunk, state)[3].sum()) for chunk in self._chunks)
 
-    def _fit(
-        self, chunk: tuple[int, int], T: FloatArray, xyz: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def _fit(self, chunk: tuple[int, int], state: State) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return points in their cameras (R, 3), whitened residuals (R, 2), weights and losses (R,)."""
         p, rows = self._problem, self._rows_of(chunk)
-        xyz_cam, front, uv_px = reproject(p.K, T, p.kf[rows], xyz.take(p.point[rows], axis=0))
+        xyz_cam, front, uv_px = reproject(p.K, state.T_submap_kf, p.kf[rows], state.xyz_mu.take(p.point[rows], axis=0))
+        xyz_cam = np.where(front[:, None], xyz_cam, [0.0, 0.0, 1.0])
+        if self._lens is not None:
+            uv_px = self._lens.project(xyz_cam[:, :2] / xyz_cam[:, 2:], state.lens)
         residuals = (uv_px - p.uv_px[rows]) / p.sigma_px[rows, None]
-        chi2 = np.where(front, np.einsum("ri,ri->r", residuals, residuals), BEHIND_CHI2)
+        chi2 = np.where(front, np.einsum("ri,ri->r", residuals, residuals), self._behind_chi2)
         weight, losses = self._loss(chi2)
-        return np.where(front[:, None], xyz_cam, [0.0, 0.0, 1.0]), residuals, np.where(front, weight, 0.0), losses
+        return xyz_cam, residuals, np.where(front, weight, 0.0), losses
 
     def _rows_of(self, chunk: tuple[int, int]) -> IntArray:
         return self._rows[self._begin[chunk[0]] : self._begin[chunk[1]]]
 
-    def _linearise(self, chunk: tuple[int, int], T: FloatArray, xyz: FloatArray) -> _Linear:
+    def _linearise(self, chunk: tuple[int, int], state: State) -> _Linear:
         p, rows = self._problem, self._rows_of(chunk)
-        xyz_cam, residuals, weight, _ = self._fit(chunk, T, xyz)
-        R = T.take(p.kf[rows], axis=0)[:, :3, :3]
-        J_point = projection_jacobian(p.K, R, xyz_cam, p.sigma_px[rows]).transpose(2, 0, 1)
-        J_cam = J_point @ R  # by the pose: in the camera, a point moves by [p]x omega - v
+        xyz_cam, residuals, weight, _ = self._fit(chunk, state)
+        R, sigma_px = state.T_submap_kf.take(p.kf[rows], axis=0)[:, :3, :3], p.sigma_px[rows]
+        if self._lens is None:
+            J_point = projection_jacobian(p.K, R, xyz_cam, sigma_px).transpose(2, 0, 1)
+            J_cam = J_point @ R
+            J_lens = np.zeros((len(rows), 2, 0))
+        else:
+            xy, z = xyz_cam[:, :2] / xyz_cam[:, 2:], xyz_cam[:, 2]
+            by_ray, by_lens = self._lens.derivatives(xy, state.lens)
+            by_ray = by_ray / (z * sigma_px)[:, None, None]
+            J_cam = np.concatenate((by_ray, -(by_ray @ xy[:, :, None])), axis=2)
+            J_point, J_lens = J_cam @ R.transpose(0, 2, 1), by_lens / sigma_px[:, None, None]
+        # By the pose: in the camera, a point moves by [p]x omega - v.
         J_pose = np.concatenate((J_cam @ so3.hat(xyz_cam), -J_cam), axis=2)
-        return _Linear(self._place[p.kf[rows]], p.point[rows] - chunk[0], residuals, weight, J_pose, J_point)
+        return _Linear(self._place[p.kf[rows]], p.point[rows] - chunk[0], residuals, weight, J_pose, J_point, J_lens)
 
-    def step(self, T: FloatArray, xyz: FloatArray, damping: float) -> tuple[FloatArray, FloatArray] | None:
-        """Return poses and points moved by one damped step; None where the system is not definite."""
-        n = len(self._free)
-        blocks = np.zeros((n, self._band + 1, 6, 6))  # [j, d]: rows of pose j + d, columns of pose j
-        gradient, points = np.zeros((n, 6)), []
+    def step(self, state: State, damping: float) -> State | None:
+        """Return the variables moved by one damped step (poses by ``T exp(xi)``); None where nothing is definite."""
+        kept = self._linear(state)
+        linear = list(kept) if len(self._chunks) <= KEPT_CHUNKS else None
+        reduced, points = self._without_points(state, damping, kept if linear is None else linear)
+        solved = None if reduced is None else self._solve(reduced, damping)
+        if reduced is None or solved is None:
+            return None
+        xi, by_lens, corner, g_lens = solved
+        d_lens = -np.linalg.solve(corner, g_lens)
+        xi = xi - by_lens @ d_lens
+        xyz_mu = state.xyz_mu.copy()
+        again = self._linear(state) if linear is None else linear
+        for (first, last), chunk, (V_inverse, g) in zip(self._chunks, again, points, strict=True):
+            shift, seen = chunk.J_lens @ d_lens, chunk.pose >= 0
+            shift[seen] += np.einsum("rij,rj->ri", chunk.J_pose[seen], xi[chunk.pose[seen]])
+            by_view = np.einsum("rij,ri->rj", chunk.J_point, shift * chunk.weight[:, None])
+            g = g + sum_by(chunk.point, by_view, last - first)
+            xyz_mu[first:last] -= np.einsum("pij,pj->pi", V_inverse, g)
+        T = state.T_submap_kf.copy()
+        T[self._free] = T[self._free] @ se3.exp(xi)
+        return State(T, xyz_mu, state.lens + d_lens)
+
+    def lens_covariance(self, state: State) -> FloatArray:
+        """Return (M, M): the marginal covariance of the lens, by the weights at a state.
+
+        Raises
+        ------
+        SolverError
+            If the system is not definite.
+        """
+        reduced, _ = self._without_points(state, FIRST_DAMPING, self._linear(state))
+        solved = None if reduced is None else self._solve(reduced, FIRST_DAMPING)
+        if solved is None:
+            raise SolverError("the lens has no covariance: the system is not definite")
+        return np.asarray(np.linalg.inv(solved[2]), np.float64)
+
+    def _linear(self, state: State) -> Iterator[_Linear]:
+        return (self._linearise(chunk, state) for chunk in self._chunks)
+
+    def _without_points(
+        self, state: State, damping: float, linear: Iterable[_Linear]
+    ) -> tuple[_Reduced | None, list[tuple[FloatArray, FloatArray]]]:
+        """Return the reduced system, and of each chunk's points inverse information (P, 3, 3) and gradient (P, 3)."""
+        n, m = len(self._free), len(state.lens)
+        information = np.zeros((m, m)) if self._lens is None else self._lens.information
+        reduced = _Reduced(
+            np.zeros((n, self._band + 1, 6, 6)),
+            np.zeros((n, 6, m)),
+            information.copy(),
+            np.zeros((n, 6)),
+            information @ state.lens,
+        )
+        points = []
         try:
-            for chunk in self._chunks:
-                linear = self._linearise(chunk, T, xyz)
-                points.append(self._eliminate(linear, chunk[1] - chunk[0], damping, blocks, gradient))
-            factor = cholesky_banded(_band_matrix(blocks, damping), overwrite_ab=True, lower=True, check_finite=False)
+            for (first, last), chunk in zip(self._chunks, linear, strict=True):
+                points.append(_eliminate(reduced, chunk, last - first, damping))
+        except np.linalg.LinAlgError:
+            return None, []
+        return reduced, points
+
+    @staticmethod
+    def _solve(reduced: _Reduced, damping: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
+        """Return the poses' step (N, 6) and its change with the lens (N, 6, M), and the lens' own system."""
+        n, _, m = reduced.border.shape
+        try:
+            band = _band_matrix(reduced.blocks, damping)
+            factor = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
         except np.linalg.LinAlgError:
             return None
-        del blocks
-        xi = cho_solve_banded((factor, True), -gradient.ravel(), check_finite=False).reshape(n, 6)
-        moved = xyz.copy()
-        for (first, last), (V_inverse, g) in zip(self._chunks, points, strict=True):
-            linear = self._linearise((first, last), T, xyz)
-            seen = linear.pose >= 0
-            shift = np.einsum("rij,rj->ri", linear.J_pose[seen], xi[linear.pose[seen]]) * linear.weight[seen, None]
-            by_pose = np.einsum("rij,ri->rj", linear.J_point[seen], shift)
-            g = g + sum_by(linear.point[seen], by_pose, last - first)
-            moved[first:last] -= np.einsum("pij,pj->pi", V_inverse, g)
-        T_moved = T.copy()
-        T_moved[self._free] = T[self._free] @ se3.exp(xi)
-        return T_moved, moved
+        right = np.concatenate((reduced.g_pose[:, :, None], reduced.border), axis=2).reshape(6 * n, 1 + m)
+        solved = cho_solve_banded((factor, True), right, check_finite=False)
+        border = reduced.border.reshape(6 * n, m)
+        corner = reduced.corner - border.T @ solved[:, 1:]
+        g_lens = reduced.g_lens - border.T @ solved[:, 0]
+        return -solved[:, 0].reshape(n, 6), solved[:, 1:].reshape(n, 6, m), corner, g_lens
 
-    def _eliminate(
-        self, linear: _Linear, n_points: int, damping: float, blocks: FloatArray, gradient: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Add what a chunk tells of the poses; return the points' inverse information (P, 3, 3) and gradient (P, 3)."""
-        n = len(gradient)
-        V, g = normal_equations(
-            linear.J_point.transpose(1, 2, 0), linear.weight, linear.residuals, linear.point, n_points
-        )
-        V_inverse = np.asarray(np.linalg.inv(V + damping * np.eye(3)), np.float64)
-        root = np.linalg.cholesky(V_inverse)
-        by_pose = np.argsort(linear.pose, kind="stable")
-        by_pose = by_pose[np.searchsorted(linear.pose[by_pose], 0) :]  # not the fixed ones
-        pose, point, J = linear.pose[by_pose], linear.point[by_pose], linear.J_pose[by_pose]
-        weighted = np.ascontiguousarray(J.transpose(0, 2, 1)) * linear.weight[by_pose, None, None]
-        Y = weighted @ linear.J_point[by_pose] @ root[point]
-        own = np.einsum("rij,rj->ri", weighted, linear.residuals[by_pose])
-        own -= np.einsum("rij,rj->ri", Y, np.einsum("pji,pj->pi", root, g)[point])
-        gradient += sum_by(pose, own, n)
-        blocks[:, 0] += sum_by(pose, (weighted @ J).reshape(-1, 36), n).reshape(n, 6, 6)
-        ends = np.searchsorted(pose, np.arange(n + 1))
-        tied = bsr_array((Y, point, ends), shape=(6 * n, 3 * n_points))
-        product = tied @ tied.T
-        row, column = np.repeat(np.arange(n), np.diff(product.indptr)), product.indices
-        lower = row >= column
-        blocks[column[lower], (row - column)[lower]] -= product.data[lower]
-        return V_inverse, g
+
+def _eliminate(reduced: _Reduced, linear: _Linear, n_points: int, damping: float) -> tuple[FloatArray, FloatArray]:
+    """Add what a chunk tells of poses and lens; return its points' inverse information (P, 3, 3) and gradient."""
+    n = len(reduced.g_pose)
+    V, g = normal_equations(linear.J_point.transpose(1, 2, 0), linear.weight, linear.residuals, linear.point, n_points)
+    V_inverse = np.asarray(np.linalg.inv(V + damping * np.eye(3)), np.float64)
+    root = np.linalg.cholesky(V_inverse)
+    root_g = np.einsum("pji,pj->pi", root, g)
+    weighted_lens = linear.J_lens * linear.weight[:, None, None]
+    by_point = linear.J_point.transpose(0, 2, 1) @ weighted_lens  # (R, 3, M)
+    Z = root.transpose(0, 2, 1) @ sum_by(linear.point, by_point, n_points)
+    reduced.corner += np.tensordot(weighted_lens, linear.J_lens, ((0, 1), (0, 1)))
+    reduced.corner -= np.tensordot(Z, Z, ((0, 1), (0, 1)))
+    reduced.g_lens += np.tensordot(weighted_lens, linear.residuals, ((0, 1), (0, 1)))
+    reduced.g_lens -= np.tensordot(Z, root_g, ((0, 1), (0, 1)))
+    by_pose = np.argsort(linear.pose, kind="stable")
+    by_pose = by_pose[np.searchsorted(linear.pose[by_pose], 0) :]  # not the fixed ones
+    pose, point = linear.pose[by_pose], linear.point[by_pose]
+    first = np.flatnonzero(np.diff(pose, prepend=-1))
+    poses = pose[first]
+    weighted = np.ascontiguousarray(linear.J_pose.transpose(0, 2, 1)) * linear.weight[:, None, None]
+    Y = (weighted @ (linear.J_point @ root[linear.point]))[by_pose]
+    own = (weighted @ linear.residuals[:, :, None])[by_pose] - Y @ root_g[point, :, None]
+    reduced.g_pose[poses] += np.add.reduceat(own[:, :, 0], first)
+    if linear.J_lens.shape[2]:
+        border = (weighted @ linear.J_lens)[by_pose] - Y @ Z[point]
+        reduced.border[poses] += np.add.reduceat(border, first)
+    reduced.blocks[poses, 0] += np.add.reduceat((weighted @ linear.J_pose)[by_pose], first)
+    ends = np.searchsorted(pose, np.arange(n + 1))
+    tied = bsr_array((Y, point, ends), shape=(6 * n, 3 * n_points))
+    product = tied @ tied.T
+    row, column = np.repeat(np.arange(n), np.diff(product.indptr)), product.indices
+    lower = row >= column
+    reduced.blocks[column[lower], (row - column)[lower]] -= product.data[lower]
+    return V_inverse, g
 
 
 def _band_matrix(blocks: FloatArray, damping: float) -> FloatArray:

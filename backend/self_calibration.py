@@ -26,12 +26,12 @@ import numpy as np
 
 from dualslam.backend.calibration_bundle import CalibratedOptimum, optimise_with_camera
 from dualslam.backend.observability import compute_depth_sigmas, compute_residuals, take_mask
-from dualslam.backend.solver import GTSAM_ERRORS, SolverFailure
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import LensCorrection, correction_of, given_camera
 from dualslam.core.chi_square import CHI2_999
 from dualslam.core.config.calibration_config import CalibrationConfig
+from dualslam.core.errors import SolverError
 from dualslam.core.estimates import CalibrationEstimate, PreferredCamera
 from dualslam.core.geometry import so3
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
@@ -134,7 +134,7 @@ def find_preferred_camera(
         return None
     try:
         now, preferred = (answer.best.poses_under(each) for each in (present.vector, answer.correction))
-    except (*GTSAM_ERRORS, np.linalg.LinAlgError):
+    except (SolverError, np.linalg.LinAlgError):
         return None
     return PreferredCamera(
         float(answer.off[0]),
@@ -241,8 +241,8 @@ def _answer(
     try:
         best = optimise_with_camera(problem, present.vector, prior, robust_k)
         correction, covariance = _weigh(best, prior, config.inflation * best.noise_ratio)
-    except (*GTSAM_ERRORS, np.linalg.LinAlgError) as error:
-        return Failure(FailureReason.SOLVER, str(SolverFailure.of(error)))
+    except (SolverError, np.linalg.LinAlgError) as error:
+        return Failure(FailureReason.SOLVER, str(error))
     of_difference = covariance if present_covariance is None else covariance + present_covariance
     return _Answer(best, prior, correction, covariance, correction - present.vector, of_difference)
 

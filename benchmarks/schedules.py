@@ -19,6 +19,7 @@ from typing import Any
 
 import dualslam
 from dualslam.core.jobs import JobKind
+from dualslam.core.types import FailureReason
 from dualslam.run.session import run_to_folder
 from dualslam.testing.lossy import Lossy
 from dualslam.workers.schedule import AT_ONCE, DELAYS, After
@@ -51,11 +52,12 @@ def made(args: argparse.Namespace, schedule: After, seed: int, out: Path) -> tup
         overrides.append(f"corruptions=[{{kind: blackout, start: {start}, length: {length}}}]")
     config = dualslam.load_config(overrides=overrides)
     sequence = dualslam.open_source(args.source, start=args.start, max_frames=args.max_frames)
-    lossy = Lossy([JobKind(kind) for kind in args.kill], args.every, seed)
+    reason = FailureReason.TIMEOUT if args.hang else FailureReason.WORKER
+    lossy = Lossy([JobKind(kind) for kind in args.hang or args.kill], args.every, seed, reason)
 
     def build(config: dualslam.Config, camera: Any) -> Any:
         system = dualslam.build_system(config, camera, schedule=schedule, in_process=True)
-        if args.kill:
+        if args.kill or args.hang:
             system.desk.executor = lossy.around(system.desk.executor)
         return system
 
@@ -79,6 +81,7 @@ def main() -> None:
     parser.add_argument("--default", action="store_true", help="the schedule that workers have without a clock, too")
     parser.add_argument("--at-once", action="store_true", help="inline, too")
     parser.add_argument("--kill", nargs="*", default=[], choices=[str(kind) for kind in ANSWERED])
+    parser.add_argument("--hang", nargs="*", default=[], choices=[str(kind) for kind in ANSWERED])
     parser.add_argument("--every", type=int, default=3, help="of so many jobs of these kinds one is lost")
     parser.add_argument("--twice", action="store_true")
     args = parser.parse_args()

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from dualslam.backend import convert, schur
+from dualslam.backend.calibration_bundle import CorrectedLens
 from dualslam.backend.factors import insert_projections, pose_prior
 from dualslam.backend.point_refinement import huber
-from dualslam.backend.schur import Loss, geman_mcclure, optimise
+from dualslam.backend.schur import Loss, System, geman_mcclure, optimise
 from dualslam.backend.solver import optimise_batch
 from dualslam.core.bundle import BundleProblem
 from dualslam.core.errors import SolverError
@@ -74,7 +75,7 @@ def test_the_optimum_is_gtsam_s(loss: Loss, theirs: Any) -> None:
     found = optimise(problem, loss, ITERATIONS, TOLERANCE)
     assert found.cost_after < 0.5 * found.cost_before
     assert found.cost_after == pytest.approx(by_gtsam(problem, theirs), rel=1e-4)
-    np.testing.assert_array_equal(found.T_submap_kf[0], problem.T_submap_kf[0])
+    np.testing.assert_array_equal(found.state.T_submap_kf[0], problem.T_submap_kf[0])
 
 
 @pytest.fixture
@@ -93,8 +94,8 @@ def test_neither_chunks_nor_the_order_of_poses_count(in_small_chunks: Callable[[
         problem, T_submap_kf=problem.T_submap_kf[order], fixed=problem.fixed[order], kf=place[problem.kf]
     )
     again = optimise(shuffled, loss, 3, TOLERANCE)
-    np.testing.assert_allclose(again.T_submap_kf[place], whole.T_submap_kf, atol=1e-7)
-    np.testing.assert_allclose(again.xyz_mu, whole.xyz_mu, atol=1e-5)
+    np.testing.assert_allclose(again.state.T_submap_kf[place], whole.state.T_submap_kf, atol=1e-7)
+    np.testing.assert_allclose(again.state.xyz_mu, whole.state.xyz_mu, atol=1e-5)
 
 
 def test_a_point_behind_a_camera_moves_no_pose() -> None:
@@ -110,7 +111,7 @@ def test_a_point_behind_a_camera_moves_no_pose() -> None:
         uv_px=np.vstack([problem.uv_px, [[300.0, 200.0]] * 3]),
         sigma_px=np.append(problem.sigma_px, [1.0] * 3),
     )
-    t, r = pose_errors(optimise(more, loss, 5, TOLERANCE).T_submap_kf, alone.T_submap_kf)
+    t, r = pose_errors(optimise(more, loss, 5, TOLERANCE).state.T_submap_kf, alone.state.T_submap_kf)
     assert t.max() < 1e-6
     assert r.max() < 1e-6
 
@@ -119,3 +120,42 @@ def test_what_is_no_number_is_a_failure() -> None:
     problem = problem_of(6)
     with pytest.raises(SolverError, match="no optimum"):
         optimise(replace(problem, uv_px=problem.uv_px * np.nan), partial(huber, k=SHAPE), 3, TOLERANCE)
+
+
+def test_a_lens_is_found_with_poses_and_points() -> None:
+    problem = problem_of(16)
+    lens = CorrectedLens(problem.K, np.diag(np.array([0.1, 10.0, 10.0, 0.05, 0.05]) ** -2.0))
+    true = np.array([0.02, 2.0, -1.0, 0.01, -0.005])
+    scene = make_scene(16, 100, 0.0, 0)
+    clean = optimise(replace(problem, fixed=np.arange(16) < 2), partial(huber, k=SHAPE), 10, TOLERANCE).state
+    T, xyz = clean.T_submap_kf, clean.xyz_mu
+    xyz_cam = np.einsum("rji,rj->ri", T[problem.kf, :3, :3], xyz[problem.point] - T[problem.kf, :3, 3])
+    front = xyz_cam[:, 2] > 0.05
+    uv_px = lens.project(xyz_cam[:, :2] / xyz_cam[:, 2:], true)
+    seen = replace(
+        problem,
+        T_submap_kf=T,
+        xyz_mu=xyz,
+        kf=problem.kf[front],
+        point=problem.point[front],
+        uv_px=uv_px[front],
+        sigma_px=problem.sigma_px[front],
+        fixed=np.arange(len(scene.T_true)) == 0,
+    )
+    found = optimise(seen, partial(huber, k=SHAPE), 30, 1e-9, lens, np.zeros(5))
+    sigmas = np.sqrt(np.diag(System(seen, partial(huber, k=SHAPE), lens).lens_covariance(found.state)))
+    assert (np.abs(found.state.lens - true) < sigmas).all()
+    assert found.cost_after < 0.01 * found.cost_before
+
+
+def test_derivatives_of_the_lens() -> None:
+    rng, at = np.random.default_rng(0), np.array([0.05, 3.0, -2.0, 0.05, -0.02])
+    lens = CorrectedLens(problem_of(3).K, np.eye(5))
+    xy, h = rng.uniform(-0.8, 0.8, (20, 2)), 1e-6
+    by_ray, by_lens = lens.derivatives(xy, at)
+    for i in range(2):
+        d = (lens.project(xy + h * np.eye(2)[i], at) - lens.project(xy - h * np.eye(2)[i], at)) / (2 * h)
+        np.testing.assert_allclose(by_ray[:, :, i], d, atol=1e-4)
+    for i in range(5):
+        d = (lens.project(xy, at + h * np.eye(5)[i]) - lens.project(xy, at - h * np.eye(5)[i])) / (2 * h)
+        np.testing.assert_allclose(by_lens[:, :, i], d, atol=1e-4)
