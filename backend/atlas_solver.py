@@ -1,11 +1,10 @@
 """The atlas graph: which connections to believe, and the similarities that agree best with those.
 
 Graduated non-convexity (`gtsam.GncLMOptimizer`) starts from the least-squares solution. A false connection with a tiny
-sigma has bent that to itself, so that its own residual is small and those of the true ones are large: taken at its
-word, it wins. What a connection is asked for the decision is therefore how far it lies from what *all others* say,
-against its own covariance and theirs together (its innovation): a tiny sigma of its own then counts for nothing, and a
-true loop after much drift is not refused for being far from a chain that knows itself to have drifted. The solution
-itself uses each connection's own covariance.
+sigma has bent that to itself. Its own residual is small and those of the true ones are large: taken at its word, it
+wins. The decision therefore uses the innovation: how far a connection lies from the result of *all others*, against its
+own covariance and theirs together. A tiny sigma of its own then counts for nothing. A true loop after much drift is not
+refused for being far from a chain with a large known drift. The solution itself uses each connection's own covariance.
 """
 
 from __future__ import annotations
@@ -155,8 +154,8 @@ class _Graph:
 
         Where a connection that is beyond doubt closes a cycle, the way round has drifted by its innovation. The chain
         that contradicts it was surer of itself than it had a right to be, there and elsewhere: with a lens that is not
-        quite right errors add up as no covariance of pixels says. The lower median of what such connections show is
-        taken, so that one of them that is wrong after all does not make everything seem possible.
+        quite right errors add up as no covariance of pixels says. The lower median of such connections is taken, so
+        that a wrong one among them does not make everything seem possible.
         """
         odometry = np.array([e.kind in ODOMETRY for e in self.problem.edges], bool)
         sure = ~odometry & ~doubtful

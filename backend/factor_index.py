@@ -15,8 +15,8 @@ from dualslam.map.submap import Submap
 from dualslam.map.tables import Table
 
 MAX_DEPTH_SIGMA = 0.25
-"""A landmark enters the graph once its views fix its distance to this relative standard deviation (0.25 is about half
-a degree of parallax at 1 px and a focal length of 700 px); it leaves at twice that."""
+"""A landmark enters the graph once its views fix its distance to this relative standard deviation, and leaves at twice
+that. 0.25 is about half a degree of parallax at 1 px and a focal length of 700 px."""
 MIN_VIEWS = 3
 """Keyframes that must see a landmark before it enters the graph: two views fit almost any pair of poses."""
 YOUNG_KEYFRAMES = 5

@@ -55,7 +55,7 @@ def insert_projections(
 def pose_prior(
     keyframe_id: int, T_submap_kf: FloatArray, rotation_rad: float = GAUGE_SIGMA, translation_mu: float = GAUGE_SIGMA
 ) -> gtsam.PriorFactorPose3:
-    """Return a prior on a keyframe's pose; tight (a gauge) unless told otherwise."""
+    """Return a prior on a keyframe's pose; by default tight (a gauge)."""
     return gtsam.PriorFactorPose3(
         pose_key(keyframe_id), to_pose3(T_submap_kf), pose_sigmas(rotation_rad, translation_mu)
     )

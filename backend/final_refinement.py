@@ -1,9 +1,9 @@
 """The last word on a submap: all that it has observed, in batch, under a loss that forgets what does not fit.
 
-The graph that tracking goes by has a part of the observations, and Huber's loss, under which an outlier keeps pulling
-with the same force however far off it is. A loss that forgets leads astray while a map is made; from a map that is
-right already it leads closer: on rendered streets by a fifth, on a road by a tenth to two fifths (six seeds, three
-others), while hand-held maps stay what they are (docs/notes/2026-11-27-a-last-batch-over-all-observations.md).
+The graph used by tracking has a part of the observations and Huber's loss, under which an outlier always pulls with the
+same force. A loss that forgets leads astray while a map is made; from a map that is right already it leads closer: on
+rendered streets by a fifth, on a road by a tenth to two fifths (six seeds, three others). Hand-held maps do not change
+(docs/notes/2026-11-27-a-last-batch-over-all-observations.md).
 """
 
 from __future__ import annotations

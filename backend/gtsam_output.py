@@ -1,4 +1,4 @@
-"""GTSAM's own printing: some of its factors write to the process's standard output, whatever they are told."""
+"""GTSAM's own printing: some of its factors always write to the process's standard output."""
 
 from __future__ import annotations
 

@@ -13,8 +13,8 @@ OUTLIER_CHI2 = CHI2_99[2]
 freedom, 99 %, since what is dropped here is dropped for good."""
 LEAST_NOISE = 0.6
 """Standard deviation, in the pixels' sigmas, that gates take residuals to have at least. Landmarks of four views and
-more have 0.25 to 0.5 (the error of a lens model is much the same in neighbouring views), those of fewer, seen from
-further apart, some more. 1: gates are never tighter than the pixels' sigmas."""
+more have 0.25 to 0.5, because the error of a lens model is much the same in neighbouring views. Those of fewer views,
+seen from further apart, have some more. 1: gates are never tighter than the pixels' sigmas."""
 
 GAUGE_SIGMA = 1e-5
 """Sigma of the priors that fix a gauge (rad, and submap units): tight, yet far from the limits of a double."""
@@ -28,9 +28,9 @@ the median's own sigma at 7 %."""
 def residual_variance(chi2: FloatArray, n_views: IntArray, least: float) -> float:
     """Return the variance of whitened residuals that gates go by (`variance_by_median`).
 
-    A lens model's error is much the same in neighbouring views, so that residuals are smaller than the error of a
-    pixel, and a gate in the pixel's sigmas lets outliers in. Where pixels are noisier than their sigmas say, a gate
-    that follows opens.
+    A lens model's error is much the same in neighbouring views. So residuals are smaller than the error of a pixel, and
+    a gate in the pixel's sigmas lets outliers in. Where pixels are noisier than their sigmas say, a gate that follows
+    opens.
 
     Parameters
     ----------

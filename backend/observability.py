@@ -1,7 +1,7 @@
 """Which observations a factor graph can bear: residuals, depth and the certainty of points, vectorised.
 
-A landmark with one view, or with views along one line, makes the whole linear system indeterminate, and a point behind
-a camera has no derivative at all. Whoever is to enter is therefore looked at first.
+A landmark with one view, or with views along one line, makes the whole linear system indeterminate. A point behind a
+camera has no derivative at all. So each variable is checked before it enters.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Which of the observations that a graph could bear become its factors: pure numpy, no solver.
 
-An update's cost is that of the cliques which iSAM2 takes apart and puts together again, each landmark one of them. All
-observations of a hand-held map are an order of magnitude more than its poses need, therefore a part of them is chosen,
-spread over the images, long tracks first. What is left out stays in the submap, follows the poses
-(`dualslam.backend.point_refinement`) and is tested for outliers like all others.
+An update's cost is that of the cliques which iSAM2 takes apart and puts together again, each landmark one of them. A
+hand-held map has an order of magnitude more observations than its poses need. A part of them is chosen, spread over the
+images, long tracks first. What is left out stays in the submap, follows the poses (`dualslam.backend.point_refinement`)
+and is tested for outliers like all others.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ def choose_factors(
     """Return which rows are to be factors.
 
     A landmark that was chosen stays as long as two of its views are admitted. Keyframes short of `per_keyframe` are
-    filled, in the order given: first from chosen landmarks that lack views, then from others, which bring views spread
-    evenly over their track, at last from chosen ones beyond their cap. Each time the least occupied cell of the image
-    comes first, and the longest track (in time: the few that bridge a gap are long).
+    filled, in the order given: first from chosen landmarks that lack views, then from others, with views spread evenly
+    over their track, at last from chosen ones beyond their cap. Each time the least occupied cell of the image comes
+    first, and the longest track (in time: the few that bridge a gap are long).
 
     Parameters
     ----------

@@ -1,16 +1,16 @@
 """Self-calibration: what a submap's own observations say about the camera that took them.
 
-A batch bundle adjustment of a window of keyframes in which the calibration is one more variable, shared by all of them,
-with a prior at the calibration that was given. Whether the answer is worth anything depends on the motion: driving
-straight ahead leaves the focal length to the prior, turning fixes it. The verdict is therefore a test, with two
-questions. Do the data fix the focal length, or does the prior? Is the whole too far from the present calibration to be
-chance? All parameters are estimated together and those that the data say little about are left to their priors: holding
-them at zero was tried, and gave the focal length what was theirs (7-Scenes: 4 % instead of 8 %).
+A batch bundle adjustment of a window of keyframes. The calibration is one more variable, shared by all of them, with a
+prior at the given one. Whether the answer is worth anything depends on the motion: driving straight ahead leaves the
+focal length to the prior, turning fixes it. The verdict is therefore a test, with two questions. Do the data fix the
+focal length, or does the prior? Is the whole too far from the present calibration to be chance? All parameters are
+estimated together and those that the data say little about are left to their priors: holding them at zero was tried,
+and gave the focal length what was theirs (7-Scenes: 4 % instead of 8 %).
 
 The noise is that of the residuals, whatever sigmas the submap was made with: those allow for the error of the camera
 model itself, which is what is asked for here. Neighbouring observations err alike (a landmark is matched to the same
 patch again and again), so the Hessian's covariance is too small: on rendered images with the exact camera the squared
-Mahalanobis distance of the correction from zero was 5 to 71 with five degrees of freedom, so the noise is taken to be
+Mahalanobis distance of the correction from zero was 5 to 71, with five degrees of freedom. So the noise is taken to be
 `CalibrationConfig.inflation` times as large. Where the camera is wrong, that distance was 990 to 1450 (7-Scenes' colour
 camera) and 2700 to 3300 (KITTI 03 in its turn).
 """

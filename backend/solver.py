@@ -148,7 +148,7 @@ class IncrementalSolver:
         return bool(self._isam.valueExists(key))
 
     def bayes_tree(self) -> BayesTree:
-        """Return the tree as it is now."""
+        """Return the current tree."""
         try:
             return parse_bayes_tree(self._isam.dot())
         except GTSAM_ERRORS as error:
@@ -204,7 +204,7 @@ def optimise_batch(
         result = optimizer.optimize()
         if optimizer.iterations() == 0 and optimizer.lambda_() >= params.getlambdaUpperBound():
             # No step was good. Where the baseline that fixes the scale must turn, its factor (1e-4 of its length) bears
-            # small steps alone, and its poses have 1e8 and more on the diagonal, beside which no damping counted.
+            # small steps alone. Its poses have 1e8 and more on the diagonal, beside which no damping counted.
             params.setDiagonalDamping(True)
             optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
             result = optimizer.optimize()

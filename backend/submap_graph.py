@@ -82,9 +82,9 @@ class ISam2SubmapGraph:
     Notes
     -----
     Reading was measured at 400 keyframes and 10,000 landmarks (CPU time, best case): the variables of 20 keyframes by
-    their keys 0.25 ms, all of them 3.5 ms, half of it the solver's walk and half the copy into numpy; how 5,000
-    observations fit, 1.2 ms. `update` therefore reads `READ_WINDOW` keyframes and the landmarks that they
-    see, and everything each `READ_ALL_EVERY`-th time, so that no array of the submap is staler than that.
+    their keys 0.25 ms, all of them 3.5 ms (half the solver's walk, half the copy into numpy), the fit of 5,000
+    observations 1.2 ms. `update` therefore reads `READ_WINDOW` keyframes and the landmarks that they see, and
+    everything each `READ_ALL_EVERY`-th time. No array of the submap is older than that.
     """
 
     def __init__(self, config: GraphConfig, rebuild_iterations: int = REBUILD_ITERATIONS) -> None:
@@ -104,8 +104,8 @@ class ISam2SubmapGraph:
     def update(self, submap: Submap) -> GraphEstimate:
         """Take in the rows that were added to the submap or died since the last call, and solve.
 
-        The first call, and one that finds the submap moved to another gauge (`Submap.transform`), or its rows numbered
-        anew without the graph's knowing, makes the graph anew.
+        Some calls make the graph anew: the first, one after a change of the submap's gauge (`Submap.transform`), and
+        one after its rows were renumbered without the graph's knowledge.
 
         Raises
         ------
@@ -231,7 +231,7 @@ class ISam2SubmapGraph:
         return np.flatnonzero(self._factor_index.rows["factor"] >= 0)
 
     def bayes_tree(self) -> BayesTree:
-        """Return the incremental solver's Bayes tree as it is now.
+        """Return the incremental solver's current Bayes tree.
 
         Raises
         ------
@@ -301,8 +301,8 @@ class ISam2SubmapGraph:
     ) -> GraphEstimate:
         """Read the estimate of the window's keyframes (or everything's), and how the window's observations fit.
 
-        The window is the last `READ_WINDOW` keyframes and those just added to. Without a plan, and after a
-        rebuild, it is the whole submap. `optimum`: of all that the graph can bear, to be told in place of its own.
+        The window is the last `READ_WINDOW` keyframes and those just added to. Without a plan, and after a rebuild, it
+        is the whole submap. `optimum`: of all that the graph can bear, for use instead of its own.
         """
         assert self._solver is not None
         rows = self._factor_index.rows

@@ -1,9 +1,9 @@
 """A small bundle that poses a new keyframe: numpy, Schur complement, a few milliseconds, and no state.
 
-It is the first of two levels of solving: tracking and mapping go on from it at once, and the submap's iSAM2
-(`dualslam.backend.submap_graph`), the second one, takes in what has come since its last update later, several
-keyframes at once if need be. Free are the newest keyframes and the points that the newest of all sees; other keyframes
-that see these points hold them in place.
+It is the first of two levels of solving: tracking and mapping continue from it at once. The second level, the submap's
+iSAM2 (`dualslam.backend.submap_graph`), takes in the changes since its last update later, several keyframes at once if
+need be. Free are the newest keyframes and the points that the newest of all sees; other keyframes that see these points
+hold them in place.
 """
 
 from __future__ import annotations

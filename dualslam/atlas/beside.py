@@ -1,10 +1,10 @@
-"""A solution of the atlas that is asked for between two frames, and holds for a map that has gone on when it comes.
+"""A solution of the atlas that is requested between two frames, and applied to a map that has grown when it comes.
 
-What is sent is the problem of a linked set (arrays, a megabyte at 600 nodes); what comes back is where its nodes stand.
-The moves that follow act on the submaps from the left, place by place: what their graphs have found meanwhile is kept,
-and what has come since goes with the place that it came next to. A solution is void, and asked for again, where its
-problem is no more the one that there is: a submap was changed by others than its own graph (a camera, a walk, another
-solution), a node is gone, or has moved so far against the next one that the covariance between them holds no more.
+The request is the problem of a linked set (arrays, a megabyte at 600 nodes); the result is where its nodes stand. The
+moves that follow act on the submaps from the left, place by place: what their graphs have found meanwhile is kept, and
+what has come since goes with the place that it came next to. A solution is void, and asked for again, where its problem
+is no more the one that there is: another process than its graph changed a submap (a camera, a walk, another solution),
+a node is gone, or two nodes moved so far against each other that their covariance no longer holds.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class AtlasQuestion:
 def answer_atlas(
     question: AtlasQuestion, solve: Callable[[AtlasProblem], AtlasSolution]
 ) -> tuple[AtlasSolution, ...] | Failure:
-    """Solve what a question asks for: a job beside the tracking."""
+    """Solve what a question asks for: a background job."""
     try:
         return tuple(solve(problem) for problem in question.problems)
     except SolverError as error:
@@ -130,12 +130,12 @@ class AskedSolution:
         )
 
     def links_now(self, atlas: Atlas) -> list[Link]:
-        """Return the new connections between the submaps as they are now: what holds is how two keyframes lie."""
+        """Return the new connections between the current submaps: what holds is how two keyframes lie."""
         known = zip(self.new, self.ends, self.T_ends, strict=True)
         return [_followed(link, then, _poses(atlas, link, at)) for link, at, then in known]
 
     def skeletons_now(self, atlas: Atlas, new: list[Link]) -> list[Skeleton]:
-        """Return the skeletons with the links of the atlas as they are now; `new`: see `links_now`."""
+        """Return the skeletons with the current links of the atlas; `new`: see `links_now`."""
         now = dict(zip(map(id, self.new), new, strict=True))
         return [
             replace(

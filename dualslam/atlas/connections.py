@@ -29,7 +29,7 @@ from dualslam.map.submap import Submap
 log = logging.getLogger(__name__)
 
 MAX_TRIES = 3
-"""How many times a solution is asked for beside the tracking, where workers die over it or the map changes under it."""
+"""How many times a solution is requested in the background, where workers die over it or the map changes under it."""
 
 
 class Connections:
@@ -46,7 +46,7 @@ class Connections:
     front_ends : callable
         Gives those that go on, or may go on, in a submap of the atlas.
     forget_graph : callable, optional
-        Told of each submap that has been bent: what its graph is solving is of before.
+        Called with each submap that has been bent: what its graph is solving is of before.
     """
 
     def __init__(
@@ -177,7 +177,7 @@ class Connections:
         return report
 
     def foresee(self, link: Link) -> None:
-        """Have computed beside the tracking what the solution with a connection to come needs of the submaps."""
+        """Compute in the background what the solution with a connection to come needs of the submaps."""
         self._problems.foresee({link.a, link.b}, [link])
 
     @property

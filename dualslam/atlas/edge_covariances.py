@@ -1,4 +1,4 @@
-"""What a submap says of the similarities between its keyframes, remembered, and computed beside the tracking."""
+"""What a submap says of the similarities between its keyframes, remembered, and computed in the background."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class EdgeQuestion:
 
 
 def answer_edges(question: EdgeQuestion, compute: Covariances) -> FloatArray | Failure:
-    """Return the covariances (E, 7, 7) that a question asks for: a job beside the tracking."""
+    """Return the covariances (E, 7, 7) that a question asks for: a background job."""
     try:
         return compute(question.submap, question.pairs, question.held)
     except SolverError as error:
@@ -105,7 +105,7 @@ class EdgeCovariances:
         return np.array([self._known[(submap.id, *pair)].covariance for pair in pairs]).reshape(-1, 7, 7)
 
     def foresee(self, submap: Submap, pairs: Sequence[tuple[int, int]], held: frozenset[int]) -> None:
-        """Have those that are missing computed beside the tracking."""
+        """Compute in the background those that are missing."""
         self._collect()
         if new := self._missing(submap, pairs):
             self._desk.submit(JobKind.EDGES, EdgeQuestion(submap.copy(), tuple(new), held))

@@ -1,4 +1,4 @@
-"""What the end of a submap leaves: its last estimate, an event, and frames that go over to the submap after it."""
+"""What the end of a submap leaves: its last estimate, an event, and frames that change to the submap after it."""
 
 from __future__ import annotations
 

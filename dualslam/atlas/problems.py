@@ -39,7 +39,7 @@ class AtlasProblems:
         self._newest: dict[int, int] = {}  # by submap: its newest keyframe when it was foreseen what is to be solved
 
     def foresee(self, touched: set[int], new: Sequence[Link]) -> None:
-        """Have computed beside the tracking what the solution with connections to come needs of the submaps."""
+        """Compute in the background what the solution with connections to come needs of the submaps."""
         atlas = self._record.atlas
         for component, links in self._touched(touched, new):
             foresee_skeleton(atlas, component, links, self.covariances, self.views)
@@ -70,7 +70,7 @@ class AtlasProblems:
         return self._make(touched, new, self.covariances)
 
     def foreseen(self, touched: set[int], new: Sequence[Link], again: bool) -> list[Skeleton]:
-        """Make them with what was foreseen; `again`: with covariances that hold for the submaps as they are now.
+        """Make them with what was prefetched; `again`: with covariances that hold for the current submaps.
 
         Raises
         ------

@@ -112,7 +112,7 @@ class Solved:
         return float(chi2) if np.isfinite(chi2) else None
 
     def report(self, links: Sequence[Link], readmitted: Sequence[int], newly_rejected: Sequence[int]) -> AtlasReport:
-        """Report what was done. `links`: of the atlas, as they are now; the others: rows of it."""
+        """Report what was done. `links`: of the atlas, in its current state; the others: rows of it."""
         return AtlasReport(
             rejected=tuple(link for link in links if link.rejected and link.a in self.skeleton.component),
             newly_rejected=tuple(links[i] for i in newly_rejected),

@@ -1,8 +1,8 @@
 """Frames posed anew at the end of a run, by the landmarks that they were tracked by, as these are then.
 
 A frame is tracked by landmarks as they are when it comes. Where these are young, they may be far off: as a near bench
-leaves the image, what holds the camera's position is a wall that a few centimetres of motion have shown. Keyframes mend
-with the landmarks; the frames between them keep how they lay to one, off by up to a tenth of a metre
+leaves the image, what holds the camera's position is a wall that a few centimetres of motion have shown. Keyframes are
+mended with the landmarks. The frames between them keep their place relative to one, off by up to a tenth of a metre
 (docs/notes/2026-11-27-frames-posed-anew-at-the-end.md).
 """
 

@@ -136,7 +136,7 @@ def build_skeleton(
 def foresee_skeleton(
     atlas: Atlas, component: list[int], links: Sequence[Link], covariances: EdgeCovariances, views: NodeViews
 ) -> None:
-    """Have computed beside the tracking what `build_skeleton` would ask for."""
+    """Compute in the background what `build_skeleton` would ask for."""
     if _is_tree(atlas, component, links):
         return
     for m, knots in _knots_of(atlas, component, links, {}, {}).items():
@@ -253,8 +253,8 @@ def _joined_edges(a: AtlasEdges, b: AtlasEdges) -> AtlasEdges:
 def _are_torn(own: FloatArray, now: FloatArray, covariances: FloatArray) -> BoolArray:
     """Whether two places of each pair were bent together that nothing tied at the time.
 
-    What they share now came of that: landmarks of a loop that became one. The loop's own factor says it, and a tie
-    that had the bend taken out of it would deny it.
+    What they share now resulted from that: landmarks of a loop that became one. The loop's own factor says it, and a
+    tie that had the bend taken out of it would deny it.
     """
     off = sim3.log(sim3.inverse(own) @ now)
     return squared_distances(off, covariances) > CHI2_999[7]

@@ -14,7 +14,7 @@ class Worlds:
     ----------
     atlas : Atlas
     saved : int or None
-        The submap whose frame is the world of the saved map that a run goes on in.
+        The submap whose frame is the world of the saved map that a run continues.
     """
 
     def __init__(self, atlas: Atlas, saved: int | None = None) -> None:

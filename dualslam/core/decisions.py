@@ -131,7 +131,7 @@ class Decision:
 
 
 class DecisionSink:
-    """Passes decisions on to whoever asked for them.
+    """Passes decisions on to the listener, if there is one.
 
     Attributes
     ----------

@@ -51,5 +51,5 @@ class SolverError(DualSlamError):
 
 
 def written(path: Iterable[str | int]) -> str:
-    """Return the path to a field of the configuration as it is told: ``recovery.attempts[1].frontend``."""
+    """Return the path to a field of the configuration as messages write it: ``recovery.attempts[1].frontend``."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).removeprefix(".")

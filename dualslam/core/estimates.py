@@ -112,8 +112,8 @@ class PreferredCamera:
         Whether the pixels contradict the camera.
     keyframe_ids : (K,) int64
     T_now, T_preferred : (K, 4, 4)
-        Their poses by the same pixels, and by these alone, under the camera of now and under the preferred one; each in
-        a frame and unit of its own.
+        Their poses by the same pixels alone, under the current camera and under the preferred one; each in a frame and
+        unit of its own.
     """
 
     log_focal: float
@@ -165,7 +165,7 @@ class ReadoutEstimate:
     sigma_s : float
         Its standard deviation, by the residuals' own noise.
     n_keyframes, n_observations : int
-        That told it.
+        That gave it.
     """
 
     more_s: float

@@ -19,9 +19,9 @@ class GreyImage:
     ----------
     shape : (height, width)
     data : bytes or bytearray
-        Row by row; packed: the difference of each pixel from its left neighbour, Huffman-coded. Of KITTI, 7-Scenes
-        and a HoloLens that leaves 45 to 65 % in 2 to 9 ms; searching for repetitions as well takes three times as long
-        and leaves more, PNG twice as long and the same.
+        Row by row; packed: the difference of each pixel from its left neighbour, Huffman-coded. On KITTI, 7-Scenes and
+        a HoloLens that leaves 45 to 65 % in 2 to 9 ms. Searching for repetitions as well takes three times as long and
+        leaves more; PNG takes twice as long and leaves the same.
     packed : bool
     """
 

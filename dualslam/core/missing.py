@@ -1,4 +1,4 @@
-"""A source that is not there; told without what reads one, so that a mistyped path is answered at once."""
+"""A source that is not there. Nothing that reads sources is imported, so that a mistyped path is answered at once."""
 
 from __future__ import annotations
 

@@ -41,8 +41,8 @@ class Sighting:
     def share(self) -> float:
         """Share of what should be seen that is found, in the middle one of the image's parts; 0 where nothing should.
 
-        A thing that is there in two places (a poster) fills some parts, and nothing is found in the others; a place
-        that is seen from elsewhere, or by other light, shows less of itself everywhere.
+        A thing in two places (a poster) fills some parts, and nothing is found in the others. A place seen from
+        elsewhere, or in other light, shows less of itself everywhere.
         """
         n = np.bincount(self.cell, minlength=CELLS * CELLS)
         found = np.bincount(self.cell[self.feature >= 0], minlength=CELLS * CELLS)

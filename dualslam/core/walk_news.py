@@ -1,4 +1,4 @@
-"""What is told of reverse tracking while it is under way, to those who look on: it never changes the walk.
+"""Progress of reverse tracking, for onlookers: it never changes the walk.
 
 News are whole, not what is new since the last: one that is lost matters to nobody.
 """
@@ -83,7 +83,7 @@ class WalkTrace:
         self._centres[track.view.index] = se3.inverse(track.T_cam_submap)[:3, 3]
 
     def news(self) -> WalkNews | None:
-        """Return how far the walk has come; None where it was told just before."""
+        """Return how far the walk has come; None right after an earlier report."""
         now = time.monotonic()
         if now - self._told_s < EVERY_S:
             return None
@@ -103,7 +103,7 @@ class WalkTrace:
 
 
 class WalkWatch:
-    """Passes on what walks tell, in the process that tracks, to whoever looks on."""
+    """Passes on the reports of walks, in the process that tracks, to all onlookers."""
 
     def __init__(self) -> None:
         self._told: list[Callable[[WalkNews], None]] = []

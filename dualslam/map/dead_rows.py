@@ -23,14 +23,14 @@ log = logging.getLogger(__name__)
 def drop_dead_rows(submap: Submap, follower: RowFollower) -> int:
     """Take out of a submap's table the rows that are dead and followed no more, once they outnumber the live ones.
 
-    The table is therefore never more than about twice as long as it must be, and what a drop costs, which is a copy of
-    the live rows, is paid for by as many that have come and died since the last one: a constant for each.
+    The table is therefore never more than about twice as long as it must be. A drop costs a copy of the live rows; as
+    many rows have come and died since the last one: a constant for each.
 
     Parameters
     ----------
     submap : Submap
     follower : RowFollower
-        All that follows this submap by the numbers of its rows. (One that is not told makes its state anew.)
+        All that follows this submap by the numbers of its rows. (One that does not hear of it makes its state anew.)
 
     Returns
     -------

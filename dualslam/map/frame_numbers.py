@@ -56,7 +56,7 @@ class FrameNumbers:
         self._ended = True
 
     def numbered(self, frame: Frame) -> Frame:
-        """Return the next frame with its number in the place of its index.
+        """Return the next frame with its number instead of its index.
 
         Raises
         ------
@@ -94,7 +94,7 @@ class FrameNumbers:
         return self._index_of.get(number, number - self.first_id)
 
     def in_source(self, data: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what belongs to an event with its frames told by their index."""
+        """Return an event's data with its frames by their index."""
 
         def told(value: Any) -> Any:
             if isinstance(value, list | tuple):

@@ -69,7 +69,7 @@ class FrameObservations:
         return replace(self, changes=(*self.changes, change))
 
     def pose(self, submap: Submap, T_submap_cam: FloatArray, shape: float, min_inliers: int) -> FloatArray | None:
-        """Return (4, 4) ``T_submap_cam`` by the landmarks as they are now; None where they do not tell.
+        """Return (4, 4) ``T_submap_cam`` by the current landmarks; None where they do not fix it.
 
         Parameters
         ----------

@@ -1,12 +1,11 @@
 """A submap's graph in a process of its own: the tracking solves a window meanwhile, and takes the whole when it comes.
 
 `BesideGraph` is the `SubmapGraph` that the tracking sees. Its updates adjust the newest keyframes (`WindowSolver`), and
-note that the graph proper has something to learn. Between two frames `BesideGraphs` sends what has changed in the
-arrays (`dualslam/map/submap_delta.py`) to the process, one job at a time, so that a graph that is behind takes several
-keyframes in at once; and it puts what came back into the submap as it is now: known keyframes and landmarks take their
-values, what has come since follows (`dualslam/map/late_estimate.py`). A process that dies costs its graph: the next job
-brings the whole submap to a fresh one. A graph that fails leaves the submap to its window, and is made anew with the
-next keyframe.
+note that the graph proper has something to learn. Between two frames `BesideGraphs` sends the changes of the arrays
+(`dualslam/map/submap_delta.py`) to the process, one job at a time. A graph that is behind so takes several keyframes at
+once. It puts the result into the current submap: known keyframes and landmarks take their values, what has come since
+follows (`dualslam/map/late_estimate.py`). A process that dies costs its graph: the next job brings the whole submap to
+a fresh one. A graph that fails leaves the submap to its window, and is made anew with the next keyframe.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from dualslam.map.submap_delta import SubmapDelta, SubmapMirror
 log = logging.getLogger(__name__)
 
 MAX_GRAPHS = 3
-"""Graphs that a process keeps: the live one, and those that a merge or a map that was seen again may still ask for."""
+"""Graphs that a process keeps: the live one, and those that a merge or a revisited map may still ask for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,7 +237,7 @@ class Moved:
 
 
 class BesideGraphs:
-    """Sends the changes of submaps to the process that has their graphs, and puts what comes back into them.
+    """Sends the changes of submaps to the process that has their graphs, and puts the results into the submaps.
 
     Parameters
     ----------
@@ -356,5 +355,5 @@ class BesideGraphs:
 
 
 def _level(failure: Failure) -> int:
-    """Return how loudly a failure is told: that the process has let an old map's graph go is no trouble."""
+    """Return the log level of a failure: that the process has let an old map's graph go is no trouble."""
     return logging.INFO if failure.reason is FailureReason.DISABLED else logging.WARNING

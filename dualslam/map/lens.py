@@ -1,7 +1,7 @@
 """The camera as it is known now: when a submap estimates it, what a new estimate changes, and what must wait.
 
-Asking takes up to seconds, so it is a job on a snapshot (`CalibrationJob`), which `answer` does, wherever that is; the
-submap that was asked has gone on when the answer comes (`dualslam/system/camera/background.py`).
+Asking takes up to seconds, so it is a job on a snapshot (`CalibrationJob`), done by `answer` in any process. The submap
+has grown when the answer comes (`dualslam/system/camera/background.py`).
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from dualslam.map.submap import Submap
 GROWTH = 1.5
 """Each next time comes when it has so many times the keyframes."""
 UPDATE_SIGMA_RATIO = 0.7
-"""A camera that was changed on an answer that was not even sure by `max_sigma_ratio` is changed again, however little,
-where the new sigma of the focal length is below this share of that answer's: twice the information. One that was
-sure stays, until another is significantly different."""
+"""A camera may have been changed by an answer less sure than `max_sigma_ratio`. It is changed again, however little, if
+the new sigma of the focal length is below this share of that answer's: twice the information. One that was sure stays,
+until another is significantly different."""
 AT_LOSS = 1.05
 """A map that may be at its end is asked once more, where it has so many times the keyframes of when it was asked: the
 next one begins with what it says. Lower, single frames without a pose would each cost a question."""
@@ -156,7 +156,7 @@ class Calibration:
         return self._config.refine and len(submap.keyframes) >= due_at
 
     def is_due_at_loss(self, submap: Submap) -> bool:
-        """Whether it is time to ask a submap that may be at its end: as long as none has told what the camera is."""
+        """Whether it is time to ask a submap that may be at its end: as long as none has estimated the camera."""
         n, config = len(submap.keyframes), self._config
         has_grown = n >= AT_LOSS * self._asked_with.get(submap.id, 0)
         return config.refine and self._refined_in is None and n >= config.first_keyframes and has_grown
@@ -251,7 +251,7 @@ class Calibration:
 def answer(
     job: CalibrationJob, calibration: Calibration, new_graph: Callable[[], SubmapGraph]
 ) -> CalibrationAnswer | Failure:
-    """Do a job: ask its submap, and change it and the lost ones where the answer is clear.
+    """Do a job: ask its submap, and change it and the lost maps where the answer is clear.
 
     Parameters
     ----------

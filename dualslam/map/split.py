@@ -13,7 +13,7 @@ from dualslam.map.submap import NO_LANDMARK, Submap
 def next_submap(full: Submap, submap_id: int, n_shared: int, newest_id: int | None = None) -> Submap:
     """Start a submap from the newest keyframes of a full one, in the same coordinates.
 
-    Where the newest keyframe does not see what those inserted before it see (the map was full when it was found again),
+    If the newest keyframe does not see what those inserted before it see (the map was full when it was found again),
     from those that do.
 
     Parameters
@@ -29,8 +29,7 @@ def next_submap(full: Submap, submap_id: int, n_shared: int, newest_id: int | No
     -------
     Submap
         With the shared keyframes and those of their landmarks that at least two of them see. Its gauge is the pair of
-        shared keyframes that stand farthest apart, as the full submap knows them, so that the link between the two is
-        the identity.
+        shared keyframes that stand farthest apart in the full submap. So the link between the two is the identity.
     """
     shared = list(full.keyframes)[-n_shared:]
     if newest_id is not None:
@@ -87,7 +86,7 @@ def take_out(submap: Submap, keyframe_ids: Iterable[int], anchor: int) -> None:
 
 
 def sound_copy(submap: Submap) -> Submap:
-    """Return a copy without the keyframes that are condemned, as long as others are left.
+    """Return a copy without the keyframes that are marked invalid, as long as others are left.
 
     What these have seen of the others' landmarks would pair them with the wrong ones of another map.
     """

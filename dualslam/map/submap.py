@@ -19,9 +19,9 @@ NO_LANDMARK = -1
 class Submap:
     """Keyframes, landmarks and observations in one local frame, in that frame's own unit of length.
 
-    Landmark ids only grow and are never reused. Rows of observations are appended, and die, so that a graph can follow
-    the submap by looking at the rows added since its last update and at those that died; rows long dead leave the table
-    (`keep_observations`), the others keep their order. Keyframe ids are the indices of their frames.
+    Landmark ids only grow and are never reused. Rows of observations are appended, and die. So a graph can follow the
+    submap by the rows added since its last update and those that died. Rows long dead leave the table
+    (`keep_observations`), and the others keep their order. Keyframe ids are the indices of their frames.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Submap:
     observations : Table
         ``kf``, ``feature``, ``landmark``, ``alive``.
     n_dropped : int
-        Rows that have left that table: whoever knows rows by their numbers knows by it whether these still hold.
+        Rows that have left that table: a reader of rows by their numbers knows by it whether these still hold.
     anchors : dict of int to Anchor
         Keyframes that were culled as redundant.
     relative_poses : dict of int to RelativePose

@@ -148,7 +148,7 @@ class SubmapMirror:
         """Return what brings the replica up to date with a submap, and take it as done.
 
         Where the camera has changed, all pixels have: the replica is made anew. So it is where rows have left the table
-        that the mirror was not told of.
+        without the mirror's knowledge.
         """
         renumbered = submap.n_dropped != self._n_dropped
         is_new = self._K is None or renumbered or bool((self._K != submap.K).any())

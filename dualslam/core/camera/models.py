@@ -159,8 +159,8 @@ class FovCamera(_RadialCamera):
     def from_tum_mono(cls, fx: float, fy: float, cx: float, cy: float, omega: float, width: int, height: int) -> Camera:
         """Return the camera of a TUM-Mono ``camera.txt``.
 
-        Where cx and cy are below 1, the first four are relative to the image's size and the principal point counts
-        from the corner of the top-left pixel: ``cx * width - 0.5`` here. An omega of 0 means no distortion.
+        If cx and cy are below 1, the first four are relative to the image's size. The principal point then counts from
+        the corner of the top-left pixel: ``cx * width - 0.5`` here. An omega of 0 means no distortion.
         """
         if cx < 1 and cy < 1:
             fx, fy, cx, cy = fx * width, fy * height, cx * width - 0.5, cy * height - 0.5

@@ -82,9 +82,9 @@ class _Sim3Problem:
     def normal_equations(self, S: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return (H (7, 7), g (7,)) of half the summed squared Mahalanobis distances, for right perturbations.
 
-        Both sides are noisy, so the distance is that to the best true point x between the two matched ones, and its
-        exact gradient has the Jacobian at x. With the Jacobian at src and the covariance held, the scale is biased and
-        swapping the maps does not invert the estimate (errors in variables, regression dilution).
+        Both sides are noisy, so the distance is that to the best true point x between the two matched ones. Its exact
+        gradient has the Jacobian at x. With the Jacobian at src and the covariance held, the scale is biased and
+        swapping the maps does not invert the estimate. (Errors in variables, regression dilution.)
         """
         A = S[:3, :3]
         residual = self.dst - (self.src @ A.T + S[:3, 3])
@@ -124,8 +124,8 @@ def estimate_sim3_robust(
     src, dst : (N, 3)
         Matched points, each in its map's frame and unit.
     cov_src, cov_dst : (N, 3, 3)
-        Their covariances. Pairs with a value that is not finite are never inliers, nor is a point that is known no
-        better than to `UNKNOWN` times the extent of all.
+        Their covariances. Pairs with a value that is not finite are never inliers. Nor is a point known no better than
+        to `UNKNOWN` times the extent of all.
     rng : numpy.random.Generator
         The only source of randomness.
     min_inliers : int

@@ -1,8 +1,8 @@
 """Projection by a pinhole camera with its Jacobians, and the robust refinement of a pose against known points.
 
 Perturbations of a pose are left ones: ``T_cam_w <- exp(xi) @ T_cam_w``, xi = (rotation, translation) in the camera
-frame. As ``T_w_cam`` is then multiplied by ``exp(-xi)`` on its right, a covariance of xi is at once the covariance of
-``T_w_cam`` in the camera's own frame, which is what GTSAM means by the covariance of a ``Pose3``.
+frame. ``T_w_cam`` is then multiplied by ``exp(-xi)`` on its right. So a covariance of xi is at once the covariance of
+``T_w_cam`` in the camera's own frame, which is GTSAM's covariance of a ``Pose3``.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ MIN_EIGENVALUE = 1e-11
 
 WIDE = 16.0
 """How many times as wide as at its end the loss is with which a pose begins to settle: a power of two. Of 900 made-up
-poses, 3 to 15 cm off, with a fifth of outliers, one in twelve came to rest a centimetre or more off with 1, two in a
-hundred with 8, and none with this."""
+poses, 3 to 15 cm off, with a fifth of outliers, one in twelve ended a centimetre or more off with 1. Two in a hundred
+did with 8, and none with this."""
 
 
 def project_points(K: FloatArray, T_cam_w: FloatArray, xyz: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -207,9 +207,9 @@ def refine_pose(
 ) -> PoseEstimate | Failure:
     """Refine a camera pose against known points, with outliers.
 
-    Rounds of Gauss-Newton with Huber weights; between rounds every point is judged anew by its chi-square, so that a
-    point given up at a bad pose comes back at a better one. (The scheme of ORB-SLAM's ``PoseOptimization``.) It ends
-    early once a round neither moves the pose nor changes the set of inliers.
+    Rounds of Gauss-Newton with Huber weights. Between rounds every point is judged again by its chi-square, so that a
+    point dropped at a bad pose returns at a better one. (The scheme of ORB-SLAM's ``PoseOptimization``.) It ends early
+    once a round neither moves the pose nor changes the set of inliers.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Rigid poses: the group SE(3) as (4, 4) matrices.
 
 Tangent vectors are (..., 6): rotation (radians) first, then translation. A left perturbation is ``exp(xi) @ T`` (xi in
-the frame a of ``T_a_b``), a right one ``T @ exp(xi)`` (xi in b). Source: T. Barfoot, "State Estimation for Robotics",
-2017, chapter 7, reordered (Barfoot puts translation first).
+the frame a of ``T_a_b``). A right one is ``T @ exp(xi)`` (xi in b). Source: T. Barfoot, "State Estimation for
+Robotics", 2017, chapter 7, reordered (Barfoot puts translation first).
 """
 
 from __future__ import annotations

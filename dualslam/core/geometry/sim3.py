@@ -1,8 +1,8 @@
 """Similarities: the group Sim(3) as (4, 4) matrices ``[[s R, t], [0, 1]]``, so that x -> s R x + t.
 
 Tangent vectors are (..., 7): rotation (radians), translation, log-scale. They are the coordinates of the Lie algebra
-``[[hat(w) + l I, u], [0, 0]]``, and the same numbers that GTSAM's ``Similarity3`` uses, although that class stores
-another translation (``t_ours = s t_gtsam``). A left perturbation is ``exp(xi) @ S``, a right one ``S @ exp(xi)``.
+``[[hat(w) + l I, u], [0, 0]]``. GTSAM's ``Similarity3`` uses the same numbers, although that class stores another
+translation (``t_ours = s t_gtsam``). A left perturbation is ``exp(xi) @ S``, a right one ``S @ exp(xi)``.
 """
 
 from __future__ import annotations

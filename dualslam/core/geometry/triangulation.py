@@ -90,7 +90,7 @@ def triangulate_two_view(
     """Triangulate matched pixels of two views with minimal reprojection error.
 
     A point is (alpha, beta, 1) / rho in camera a: near-infinite points are as regular as others, and view a constrains
-    alpha and beta only. With alpha and beta as observed, view b is linear in rho, which gives the start; Gauss-Newton
+    alpha and beta only. With alpha and beta as observed, view b is linear in rho, which gives the start. Gauss-Newton
     on all three then spreads the error over both views. No loop over points, no decomposition.
 
     Parameters

@@ -1,6 +1,6 @@
 """Geometry of two views: epipolar and homography errors, and the poses that a homography allows.
 
-Everywhere ``T_b_a`` takes camera a to camera b, ``x_b' E x_a == 0``, ``u_b ~ H u_a``, and pixels are rectified (u, v).
+Everywhere ``T_b_a`` takes camera a to camera b, ``x_b' E x_a == 0`` and ``u_b ~ H u_a``. Pixels are rectified (u, v).
 Sources: R. Hartley and A. Zisserman, "Multiple View Geometry", 2004 (HZ); Y. Ma et al., "An Invitation to 3-D Vision",
 2004 (Ma), section 5.3.
 """
@@ -100,8 +100,8 @@ class HomographyPoses:
 def decompose_homography(H_b_a: FloatArray, K: FloatArray) -> HomographyPoses:
     """Return the poses and planes that a homography of pixels allows. Ma, section 5.3.3.
 
-    The sign of `H_b_a` is chosen so that its determinant is positive, which it is where both cameras are on the same
-    side of the plane. Two of the four poses are ruled out by the positive depth of the points.
+    The sign of `H_b_a` is chosen so that its determinant is positive, as it is when both cameras are on the same side
+    of the plane. Two of the four poses are ruled out by the positive depth of the points.
 
     Parameters
     ----------
