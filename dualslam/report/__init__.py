@@ -1,9 +1,9 @@
 """What a person looks at after a run: one self-contained page for it, and one for several runs side by side.
 
 In reading order: `run_data` (a run folder, read), `page` (the page, section by section), `top_view`, `timeline`,
-`failures`, `places`, `charts` (its figures), `compare` (several runs), `markup` (how HTML is made so that text cannot
-break it).
-The figures are SVG written by hand: crisp at any size, a few kilobytes, and no library is needed to make them.
+`failures`, `places`, `charts` (its figures). `compare` (several runs), `explanation` (decisions about a frame),
+`markup` (how HTML is made so that text cannot break it). The figures are SVG written by hand: crisp at any size, a few
+kilobytes, and no library is needed to make them.
 """
 
 from dualslam.report.compare import comparison_page, comparison_table

@@ -15,7 +15,7 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-# Okabe and Ito's colours, which colour-blind people tell apart; told in words beside them.
+# Okabe and Ito's colours, which colour-blind people can distinguish; words beside them say the same.
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999", "#F0E442")
 _STATUS: tuple[tuple[str, str, str], ...] = (
     ("", "no frame", "#FFFFFF"),

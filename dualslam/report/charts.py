@@ -71,7 +71,7 @@ def stage_table(run: RunData) -> Markup:
 
 
 def beside_table(run: RunData) -> Markup:
-    """Return what was done in processes beside the tracking, by kind of job; nothing where there were none."""
+    """Return the work of background processes, by kind of job; nothing where there were none."""
     beside = run.summary.get("beside") or {}
     if not beside:
         return join(None)

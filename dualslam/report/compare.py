@@ -21,7 +21,7 @@ from dualslam.report.timeline import curve, frame_ticks, lane, lane_values
 
 N_STYLES = 6
 """Ways of drawing a run: colour, dash and width each differ."""
-# How high a status stands in its strip: it can be told without its colour.
+# How high a status stands in its strip: it can be identified without its colour.
 _HEIGHTS: dict[FrameStatus, float] = {
     FrameStatus.TRACKED: 1.0,
     FrameStatus.RECOVERED: 0.75,

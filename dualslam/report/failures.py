@@ -1,4 +1,4 @@
-"""Each failure told by itself: what was seen, what happened, which links were tried, and how they were judged."""
+"""One card a failure: what was seen, what happened, which links were tried, and how they were judged."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class FailureStory:
     absorbed : dict or None
         Where a later map had posed all its frames.
     relocalised : dict or None
-        Where it was seen again, before another map had started.
+        Where it was found again, before another map had started.
     """
 
     letter: str
@@ -125,7 +125,7 @@ def _card(run: RunData, scene: PlacedRun | None, story: FailureStory) -> Markup:
 
 
 def verdict(run: RunData, story: FailureStory) -> tuple[str, bool]:
-    """Return what came of a failure, in a few words, and whether the lost map goes on."""
+    """Return the outcome of a failure, in a few words, and whether the lost map continues."""
     rows = [row for row in run.rows if row.submap == story.failed.get("submap")]
     if story.relocalised is not None:
         return "seen again", True
@@ -212,7 +212,7 @@ def _link_words(link: Mapping[str, Any]) -> str:
 
 
 def _close_up(run: RunData, scene: PlacedRun | None, story: FailureStory) -> Markup:
-    """Draw the path around the loss: far enough back to show the keyframes that a link rests on."""
+    """Draw the path around the loss: far enough back to show the keyframes of a link."""
     if scene is None:
         return join(None)
     row_of = run.row_of

@@ -112,7 +112,7 @@ def headline(run: RunData) -> str:
             if len(told) == 1
             else f"Tracking failed {len(told)} times: {', '.join(f'{n} {words}' for words, n in ends.items())}"
         )
-    # What ended a failure has been told with it.
+    # The end of a failure is on its card already.
     also = seen_again(run.summary, -sum(story.relocalised is not None for story in told))
     apart = f"; {count(len(run.unlinked), 'submap')} stayed apart" if run.unlinked else ""
     return f"{'; '.join([failures, *also])}; {posed}{apart}."

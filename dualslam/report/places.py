@@ -1,4 +1,4 @@
-"""Places that were seen again: pictures of both, what was matched, what moved by how much, what was refused and why."""
+"""Revisited places: pictures of both, what was matched, what moved by how much, what was refused and why."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from dualslam.report.samples import MAX_PLACES
 from dualslam.report.statuses import count
 
 NEAR_FRAMES = 45
-"""A picture of a frame so far from the one that is told of, at most, stands for it."""
+"""A picture of a frame so far from the named one, at most, stands for it."""
 Event = dict[str, Any]
 _KINDS = {"loop_closed": "◆ a loop is closed", "merged": "◆ two maps are joined", "relocalised": "↺ found again"}
 _HEADS = ("reason", "how often", "for example")
 
 
 def places_section(run: RunData) -> Markup | None:
-    """Return a card for each place, and what was refused; None where nothing was seen again."""
+    """Return a card for each place, and the refusals; None where no place was revisited."""
     seen, refused = run.events_of(*_KINDS), run.events_of("loop_refused")
     if not seen and not refused:
         return None
@@ -38,7 +38,7 @@ def _card(run: RunData, event: Event) -> Markup:
 
 
 def _told(event: Event) -> str:
-    """Tell what was seen again in a few sentences."""
+    """Describe the revisits in a few sentences."""
     if event["event"] == "relocalised":
         whence = "" if event.get("from_submap") is None else f", and left submap {event['from_submap']} for it"
         place = f" by what keyframe {_frame(event['other_frame'])} shows" if "other_frame" in event else ""

@@ -230,7 +230,7 @@ def _map_points(folder: Path, submap_ids: set[int | None]) -> FloatArray:
 
 
 def are_shown(arrays: Mapping[str, NDArray[Any]]) -> BoolArray:
-    """Return which landmarks of a stored submap belong into a picture: none that a by-pass has condemned."""
+    """Return which landmarks of a stored submap belong into a picture: none that a by-pass has marked invalid."""
     shown = arrays["landmarks_alive"] & (arrays["landmarks_distance_mu"] < MAX_VIEW_DISTANCE_MU)
     return np.asarray(shown & ~arrays[CONDEMNED] if CONDEMNED in arrays else shown)
 

@@ -1,4 +1,4 @@
-"""Sample frames: small pictures around each gap in the tracking and of places seen again, chosen as the run goes on."""
+"""Sample frames: small pictures around each gap in the tracking and of revisited places, chosen as the run goes on."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_GAPS = 12
 MIN_GAP_FRAMES = 3
 """Shorter gaps are a blink that tracking came back from."""
 MAX_PLACES = 12
-"""Places seen again of which pictures are kept, and that have a card: a bound on the size of the report."""
+"""Revisited places of which pictures are kept, and that have a card: a bound on the size of the report."""
 ALBUM_EVERY_S, ALBUM_SIZE = 0.5, 600
 """Time between two pictures that are remembered, and how many are: 5 to 10 MB."""
 WIDTH_PX, THUMB_PX = 320, 160
@@ -68,12 +68,12 @@ class SampleKeeper:
 
 
 class PlaceAlbum:
-    """Remembers what the camera has seen, so that a place that is seen again can be shown as it was then, and is now.
+    """Remembers what the camera has seen, so that a revisited place can be shown then and now.
 
     Parameters
     ----------
     keep : callable
-        Given the frame's index and a JPEG, once a place is seen again.
+        Given the frame's index and a JPEG, once a place is revisited.
     """
 
     def __init__(self, keep: Callable[[int, bytes], None]) -> None:

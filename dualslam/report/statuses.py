@@ -47,7 +47,7 @@ def count(n: int, one: str, many: str | None = None) -> str:
 
 
 def seen_again(summary: Mapping[str, Any], relocalisations_more: int = 0) -> list[str]:
-    """Return how often a place was seen again, by what came of it; nothing for what never did."""
+    """Return how often a place was revisited, by outcome; nothing for outcomes that never occurred."""
     nouns = {"relocalised": "relocalisation", "loops": "loop", "merges": "merge"}
     found = {key: summary.get(key) or 0 for key in nouns}
     found["relocalised"] += relocalisations_more

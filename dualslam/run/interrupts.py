@@ -38,9 +38,9 @@ def held_back() -> Iterator[None]:
 class Interrupts:
     """Takes the signals that end a run, while it is entered; each asks for more than the one before.
 
-    The first one asks for no further frame (`asked`). The second one leaves what is in hand, too, where the code says
-    that this may be left (`leave_at_second`); elsewhere, results are being written, and it is said what they wait for.
-    The third one acts as it would without us. What a parent process has told us to ignore stays ignored (nohup).
+    The first one asks for no further frame (`asked`). The second one abandons the current step, too, where the code
+    allows it (`leave_at_second`). Elsewhere results are being written, and a message says what the wait is for. The
+    third one acts as it would without us. Signals that a parent process has set to be ignored stay ignored (nohup).
     Outside the main thread, where no signal comes, nothing is done.
 
     Attributes

@@ -31,8 +31,8 @@ LOOKED_AT = 60
 N_POSED = 12
 """Frames after which the answer is sure enough: each has some hundred points."""
 TOLERANCE, N_SIGMAS = 0.01, 4.0
-"""Of the log focal length: below the first, poses move by less than a hundredth of the depth, as a link's may; the
-second keeps what frames of a flat scene say from counting."""
+"""Of the log focal length: below the first, poses move by less than a hundredth of the depth, as a link's may. The
+second keeps frames of a flat scene from counting."""
 N_TRIES = 6
 N_ITERATIONS = 20
 HUBER = 2.0

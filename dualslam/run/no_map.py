@@ -13,7 +13,7 @@ SHORT = 10
 """Images, and fewer, are a third of a second of most recordings: whatever refused them, there was no time to move."""
 STILL_PX = 1.0
 """Median shift of an image below which nothing moves: matches of a camera on a tripod differ by their noise, well below
-a pixel, and one that turns in a hand leaves a pixel within a frame or two."""
+a pixel. One that turns in a hand leaves a pixel within a frame or two."""
 STILL_QUANTILE = 0.9
 """Of the shifts, which must be that small: a knock at the tripod is no motion."""
 

@@ -60,7 +60,7 @@ class Trajectories:
 
 
 def trajectories_of(system: System) -> Trajectories:
-    """Compose the poses of all frames, each from its own keyframe, by the map as it is now.
+    """Compose the poses of all frames, each from its own keyframe, by the current map.
 
     Raises
     ------

@@ -48,8 +48,8 @@ class RunReport:
     dropped : tuple of (int, float)
         Index and time of the frames that came too late to be looked at (`realtime`).
     latencies_ms : tuple of float
-        Of each frame that was looked at: in real time from the moment when it was due to its pose, what it waited for
-        included (to the end of its step, where it has none); else the wall time of its step.
+        Of each frame that was looked at: in real time from the moment when it was due to its pose, waiting included (to
+        the end of its step, where it has none). Else the wall time of its step.
     steps_ms : tuple of float
         Wall time of each step.
     n_late : int
@@ -100,10 +100,10 @@ def run_sequence(
 ) -> RunReport:
     """Feed a system all frames of a sequence, then finish it.
 
-    The first SIGINT, SIGTERM or SIGHUP ends the run after the frame in hand, so that what there is can be saved; the
-    second one leaves this frame, or the end of the run, too; the third one acts as ever. A source that breaks after its
-    first frame, by whatever it raises, ends the run in the same way, and so do a system or an `on_frame` that raises
-    and a disk that is full; what was raised is in the report, for the caller to raise again once the rest is saved.
+    The first SIGINT, SIGTERM or SIGHUP ends the run after the current frame, so that the results can be saved. The
+    second one abandons this frame, or the end of the run, too. The third one acts as always. Any exception after the
+    first frame (source, system, `on_frame`, full disk) ends the run in the same way. It is in the report, for the
+    caller to raise again once the rest is saved.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def run_sequence(
         In real time: called with a frame, on a thread of its own, while the one before it is in its step; returns what
         the system is given.
     pace : Pace, optional
-        Is told, in real time, how late each frame is.
+        Receives, in real time, how late each frame is.
     on_frame : callable, optional
         Called with the result of each step.
     is_paused : callable, optional

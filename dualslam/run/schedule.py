@@ -12,9 +12,8 @@ from dualslam.io.run_folder import SCHEDULE
 from dualslam.workers.schedule import Recorded
 
 MAX_LATE_S = 1 / 15
-"""So late a frame may be while the next one waits: two frames of a camera at 30 Hz, which most often are what a
-keyframe takes more than other frames, and are caught up on after it. At 10 Hz a frame that the next one has overtaken
-is later."""
+"""So late a frame may be while the next one waits: two frames of a camera at 30 Hz. A keyframe mostly takes that much
+more than other frames, and is caught up on after it. At 10 Hz a frame that the next one has overtaken is later."""
 CATCH_UP_S = 1.0
 """Who has not been in time for so long does not catch up: the newest frame is then the one to look at."""
 LATE_S = 2e-3

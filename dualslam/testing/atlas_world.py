@@ -117,7 +117,7 @@ class DriftingMap:
             uv, np.full(len(uv), 0.5), np.zeros(len(uv), np.int64), np.zeros((len(uv), 1), np.uint8)
         )
         self.submap.add_keyframe(Keyframe(k, 0.1 * k, features), sim3.act_on_pose(S, np.eye(4)))
-        # What is seen again after a lap is not recognised.
+        # A revisit after a lap is not recognised.
         self.place_of = {p: j for p, j in self.place_of.items() if k - self.last_seen[p] < N_ROUND // 2}
         self.last_seen.update(dict.fromkeys(points.tolist(), k))
         new = np.array([p not in self.place_of for p in points.tolist()], bool)
@@ -133,7 +133,7 @@ class DriftingMap:
             self.submap.gauge = (ids_[0], ids_[-1])
 
     def roll_over(self) -> None:
-        """Go on in a new submap that shares its first keyframes with the full one."""
+        """Continue in a new submap that shares its first keyframes with the full one."""
         full = self.submap
         self.submap = next_submap(full, len(self.atlas.submaps), N_SHARED)
         self.atlas.add(self.submap)

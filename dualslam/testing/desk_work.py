@@ -31,7 +31,7 @@ def lane(*kinds: JobKind, time_limit_s: float = 60.0, **settings: Any) -> Lane:
 
 
 def handlers() -> Handlers:
-    """Graph jobs keep a sum, as a graph keeps a state; walks do what they are told; calibrations double an array."""
+    """Graph jobs keep a sum, as a graph keeps a state; walks obey their job; calibrations double an array."""
     total = 0.0
 
     def add(number: float) -> float:

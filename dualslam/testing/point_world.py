@@ -19,7 +19,7 @@ CAMERA = PinholeCamera(640, 480, 450.0, 450.0, 319.5, 239.5)
 SIZE_PX = (CAMERA.width, CAMERA.height)
 RATE_HZ = 20.0
 GIVEN_UP_S = 0.375
-"""With the ninth frame without a pose a map is given up, if not otherwise told."""
+"""With the ninth frame without a pose a map is given up, by default."""
 SCALE_FACTOR = 1.2
 UNIT_DISTANCE_M = 12.0
 """A patch at this distance is seen at the finest octave, a nearer one at a coarser."""

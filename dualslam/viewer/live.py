@@ -1,6 +1,6 @@
 """The run's side of a live view: it tells a process of its own what there is to see, and never waits for it.
 
-That process may be slow, hang or die: what it does not take in time it is not told, and the run goes on.
+That process may be slow, hang or die: it misses what it does not take in time, and the run goes on.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class LiveView:
 
     @property
     def alive(self) -> bool:
-        """Whether anyone is told anything."""
+        """Whether anyone listens."""
         return not self._over.is_set()
 
     # --- the run's thread

@@ -65,7 +65,7 @@ def serve(pipe: Connection, port: int) -> None:
     Parameters
     ----------
     pipe : Connection
-        Told first where the page is; then each message is answered with what was pressed since the one before.
+        First it receives where the page is; then each message is answered with what was pressed since the one before.
     port : int
         0: a free one.
     """

@@ -1,7 +1,7 @@
 """What a live view draws of a run: submaps, links, the camera and the status of each frame, as arrays in one world.
 
-Linked sets of submaps stand in one frame; what is not linked yet stands beside, in a unit of its own, until a link
-takes it in. Knows no viewer.
+Linked sets of submaps stand in one frame. An unlinked one stands beside them, in a unit of its own, until a link takes
+it in. Knows no viewer.
 """
 
 from __future__ import annotations

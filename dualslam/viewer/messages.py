@@ -131,7 +131,7 @@ class Message:
     walks : tuple of Walk
         Those walks of which anything is known.
     backlog : int
-        Jobs that wait or are done beside the tracking.
+        Background jobs that wait or are under way.
     over : bool
         The run has ended.
     """
@@ -182,11 +182,11 @@ class Teller:
         system.on_pose = keep
 
     def note_walk(self, news: WalkNews) -> None:
-        """Keep what reverse tracking has told, for the next message."""
+        """Keep the progress of reverse tracking, for the next message."""
         self._walks[news.submap_id] = news
 
     def tell(self, frame: Frame, result: FrameResult, over: bool = False, within_step: bool = False) -> Message:
-        """Return what is to be told after a frame; `within_step`: while the next one is in its step."""
+        """Return the message after a frame; `within_step`: while the next one is in its step."""
         system = self._system
         events = self._new_events()
         arrays = tuple(_arrays(s) for s in system.atlas.submaps.values() if self._has_changed(s))

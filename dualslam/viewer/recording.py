@@ -47,7 +47,7 @@ def make_recording(run: RunData) -> bytes:
     """Return a run as the content of an ``.rrd`` file, with the layout that the viewer opens it in.
 
     Entities: ``map`` (the main map, in its own unit) with ``camera``, ``path``, ``keyframes``, ``landmarks`` and
-    ``truth``; the same below ``apart/NN`` for each submap that is not linked to it; ``status``, ``matches``,
+    ``truth``. The same below ``apart/NN`` for each submap that is not linked to it. ``status``, ``matches``,
     ``latency_ms`` and ``events``. Timelines: ``timestamp_s`` and ``frame``.
 
     Raises

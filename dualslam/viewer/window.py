@@ -1,4 +1,4 @@
-"""The window of the Rerun viewer, a program of its own: it is started, watched, and told to call nobody."""
+"""The window of the Rerun viewer, a program of its own: it is started, watched, and kept from the network."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def open_viewer(recording: bytes) -> None:
     """Show the content of an ``.rrd`` file, and wait until the window is closed.
 
     The viewer sends usage data, and asks for newer versions, unless its settings forbid it. It gets settings of its own
-    that forbid the one, so that those of the user stay as they are, and a way out that leads nowhere for the other.
+    that forbid the one, so that the user's stay unchanged, and a way out that leads nowhere for the other.
 
     Raises
     ------

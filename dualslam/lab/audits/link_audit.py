@@ -4,9 +4,9 @@ A monocular map drifts, so that no single similarity takes the whole of it to th
 how the two maps lie to each other at their overlap. Truth is taken there, from the frames of either map near it, and
 from no more of them than it takes to tell: what drifts farther off, before or after, is not the link's doing.
 
-With one exception. Reverse tracking leads from the new map's start to the overlap, and a scale that it loses on the way
-makes a link wrong for all that comes after, however well it fits at the overlap. So the scale is judged a second time
-at the new map's live end, by the first frames that the old map never saw.
+With one exception. Reverse tracking leads from the new map's start to the overlap. A scale lost on the way makes a link
+wrong for everything that comes after, however well it fits at the overlap. So the scale is judged a second time at the
+new map's live end, by the first frames that the old map never saw.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class LinkAudit:
     frames_old, frames_new : (int, int)
         The first and the last of those frames, in either map.
     live_scale, live_scale_sigma : float or None
-        Relative error of the scale that the link gives the new map's live end, and what truth tells of it there; none
-        where the new map has no frames beyond the old one.
+        Relative error of the scale that the link gives the new map's live end, and the uncertainty of the truth there.
+        None if the new map has no frames beyond the old one.
     frames_live : (int, int) or None
         The first and the last frame of that end.
     shared_scale : float or None
@@ -137,10 +137,10 @@ def audit_links(
     truth : mapping of int to (4, 4)
         True ``T_world_cam`` by frame index, for the frames that have it.
     reach : int
-        Truth is taken from the frames of either map among the keyframes that a link stands on, and so many before and
-        after them (in counts of the source's index). Where those do not tell whether the scale is wrong (slow motion
-        tells little of it), twice or four times as many and so on: the fewest that do, or else those that tell most.
-        The same at the live end.
+        Truth comes from the frames of either map among the link's keyframes, and so many before and after them (in
+        counts of the source's index). Where those do not tell whether the scale is wrong (slow motion tells little of
+        it), twice or four times as many and so on: the fewest that do, or else those that tell most. The same at the
+        live end.
     """
     posed = list(poses)
     return [audit_link(atlas, link, posed, truth, reach) for link in atlas.links if link.kind is LinkKind.RECOVERY]

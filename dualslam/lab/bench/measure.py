@@ -42,10 +42,10 @@ def breakages(events: Sequence[Event]) -> tuple[Breakage, ...]:
     """Return every loss of a map with what was tried to recover it.
 
     A recovery starts from a new submap and looks for the maps that are lost by then (``recovery_started``). Each
-    ``recovery_attempt`` of that submap is its next attempt; a map that several recoveries looked for counts the most
-    attempts that one of them made. A walk that is made again (``again``) is a retry: what it tries is no attempt of its
-    own, since it is made where all attempts have failed, of a map that has grown. A map that was seen again before
-    another had started (``relocalised``) may be lost once more.
+    ``recovery_attempt`` of that submap is its next attempt. A map searched by several recoveries counts the most
+    attempts of one of them. A walk that is made again (``again``) is a retry: what it tries is no attempt of its own,
+    since it is made where all attempts have failed, of a map that has grown. A map that was found again before another
+    had started (``relocalised``) may be lost once more.
     """
     found: list[dict[str, Any]] = []
     last: dict[int, dict[str, Any]] = {}  # the last loss of each submap
@@ -112,8 +112,8 @@ def end_point_error(main: Trajectory, truth: Trajectory | None) -> float | None:
     """Return how far the end of the estimate is off where its start is right, for a camera that comes back.
 
     It is the alignment error of Engel et al. (2016), "A photometrically calibrated benchmark for monocular visual
-    odometry": the estimate is laid upon the truth once by its start and once by its end, with a Sim(3) each, and the
-    error is the RMS distance between the two. None without truth at both ends.
+    odometry": the estimate is aligned to the truth once by its start and once by its end, with a Sim(3) each. The error
+    is the RMS distance between the two. None without truth at both ends.
     """
     if truth is None or len(main) == 0:
         return None

@@ -1,7 +1,7 @@
 """From a bench to its trials: where each starts, where its corruption lies, which configuration it runs with.
 
-All variants get the same trials. What is random about one depends on the bench's seed and half, the names of its
-sequence and condition, and its number alone, so that another sequence or more trials leave the others as they are.
+All variants get the same trials. Its random part depends on four things alone: the bench's seed and half, the names of
+its sequence and condition, and its number. So another sequence or more trials do not change the others.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ class Breakage:
     recovery_s : float or None
         Seconds that the recovery took.
     relocalised : bool
-        Whether the map was seen again, and continued, before another had started.
+        Whether the map was found again, and continued, before another had started.
     retries : int
         Reverse tracking that was made again later, once the new map had grown; its attempts are not counted above.
     linked_by_retry : bool

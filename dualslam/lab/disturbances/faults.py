@@ -76,7 +76,7 @@ class FaultScript:
     def active(self, kind: CorruptionKind, timestamp_s: float) -> Corruption | None:
         """Return the fault of a kind at the frame of this time, if that is the live frame.
 
-        Frames are told by their time: inside the system they have another number than in the source.
+        Frames are identified by their time: inside the system they have another number than in the source.
         """
         if timestamp_s != self._time_s:
             return None

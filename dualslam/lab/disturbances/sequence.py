@@ -39,7 +39,7 @@ _ON_STREAM = (CorruptionKind.FREEZE, CorruptionKind.DROP, CorruptionKind.STRIDE)
 def corrupted(sequence: Sequence, corruptions: Collection[Corruption]) -> Sequence:
     """Return the sequence with corruptions put on it: itself, where all of them are faults inside the system.
 
-    One that meets none of the frames is told by a warning.
+    One that meets none of the frames gives a warning.
 
     Raises
     ------

@@ -73,7 +73,7 @@ class TrajectoryScore:
         The same (RMSE), of the length of the true path.
     path_m, spread_m : float or None
         Length of the true path over the compared poses; RMS distance of the true positions from their mean, which is
-        what a camera that never moved would score.
+        the error of a camera that never moved.
     scale : float or None
         Scale that the alignment found, estimate to truth (1 for SE(3)).
     scale_drift : float or None
@@ -260,8 +260,8 @@ def evaluate_run(
     Raises
     ------
     InputError
-        If the run has no trajectory, was made of another sequence, or has no pose at the time of any frame; if the
-        sequence has no ground truth; if a trajectory that is given by itself is empty; if either is something else.
+        If the run has no trajectory, was made of another sequence, or has no pose at the time of any frame. If the
+        sequence has no ground truth. If a trajectory given by itself is empty, or either is something else.
     """
     if not isinstance(run, str | Path):
         raise InputError(f"the run is a {type(run).__name__}; give the path of its folder or of its trajectory.")

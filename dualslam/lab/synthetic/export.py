@@ -16,8 +16,8 @@ def render_to_folder(sequence: SyntheticSequence, out: str | Path, image_format:
     """Render all frames of a sequence into a new folder.
 
     It holds ``images/NNNNNN.png`` (named by frame index, dropped frames are missing), ``times.txt`` (seconds, one line
-    a frame), ``calib.txt`` (``fx fy cx cy width height``), ``groundtruth_tum.txt`` (``t tx ty tz qx qy qz qw``, camera
-    to world, one line a frame) and ``SOURCE.md`` (how to render it again).
+    a frame) and ``calib.txt`` (``fx fy cx cy width height``). ``groundtruth_tum.txt`` has ``t tx ty tz qx qy qz qw``,
+    camera to world, one line a frame. ``SOURCE.md`` says how to render it again.
 
     Parameters
     ----------

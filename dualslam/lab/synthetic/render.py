@@ -1,9 +1,8 @@
 """A renderer of textured rectangles in NumPy: exact visibility per pixel, smooth textures, tens of frames a second.
 
-Everything that is needed per pixel is affine in (u, v): with ``X_cam = s * side_s + t * side_t + origin`` the values
-``s / z``, ``t / z`` and ``1 / z`` are the rows of ``inv([side_s, side_t, origin]) @ inv(K)`` applied to (u, v, 1). So
-the outline of a rectangle is four affine comparisons, occlusion is a comparison of ``1 / z``, and the texture is one
-warp.
+Everything that is needed per pixel is affine in (u, v): let ``X_cam = s * side_s + t * side_t + origin``. Then ``s /
+z``, ``t / z`` and ``1 / z`` are the rows of ``inv([side_s, side_t, origin]) @ inv(K)`` applied to (u, v, 1). So the
+outline of a rectangle is four affine comparisons, occlusion is a comparison of ``1 / z``, and the texture is one warp.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ _BAND_RATIO = 1.5
 # Below this many pixels across, relief is not drawn: it costs more than it shows.
 _MIN_SIZE_PX = 1.0
 # Most surfaces of a street are hidden. Every so many surfaces (more seldom, as less changes) the depth buffer is
-# reduced to cells, and what lies behind all the cells that it touches is left out.
+# reduced to cells. Surfaces behind all the cells that they touch are left out.
 _CELL_PX = 16
 _REFRESH_AT = (24, 80, 200, 500)
 
@@ -39,9 +38,9 @@ _REFRESH_AT = (24, 80, 200, 500)
 class _Candidates:
     """Surfaces that may be in view, nearest first.
 
-    ``index`` (N,) in the scene; ``planes`` (N, 3, 3) the affine forms of s/z, t/z, 1/z over (u, v, 1), where s and t
-    are in [0, 1] on the surface; ``bounds`` (N, 4) first and past-the-last pixel: u0, v0, u1, v1; ``nearest`` (N,) the
-    largest 1/z.
+    ``index`` (N,) in the scene; ``planes`` (N, 3, 3) the affine forms of s/z, t/z, 1/z over (u, v, 1), with s and t in
+    [0, 1] on the surface. ``bounds`` (N, 4) first and past-the-last pixel: u0, v0, u1, v1; ``nearest`` (N,) the largest
+    1/z.
     """
 
     index: NDArray[np.int64]

@@ -63,8 +63,8 @@ class Sensor:
             image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur_px), np.uint8)
         gain = (what.light * 2.0 ** (self._stops + what.exposure_stops)) ** (1 / _GAMMA)
         exposed = cv2.multiply(image, self._lens, scale=gain, dtype=cv2.CV_32F)
-        # Drawn anew for each frame: windows of one sheet of noise would be a world of their own, which a SLAM system
-        # finds and maps as soon as the lens is covered.
+        # Drawn anew for each frame: windows of one sheet of noise would be a world of their own. A SLAM system would
+        # find and map it as soon as the lens is covered.
         rng = np.random.Generator(np.random.SFC64([self._seed, 0x5E45, index]))
         grain = rng.standard_normal((height, width), dtype=np.float32)
         sigma = float(np.hypot(self._noise, what.noise))

@@ -177,10 +177,9 @@ def make_sequence(
     Parameters
     ----------
     scene : str
-        One of `SCENES`. A drive of about 9 m/s between houses, or a hand-held camera in a furnished room; a block of
-        houses driven round and round, a figure of eight, and a straight street of houses that are all the same; two
-        corridors that are alike, and two rooms with the same posters; the others are told in
-        `dualslam/lab/synthetic/traps.py`.
+        One of `SCENES`. A drive of about 9 m/s between houses, or a hand-held camera in a furnished room. A block of
+        houses driven round and round, a figure of eight, and a straight street of identical houses. Two similar
+        corridors, and two rooms with the same posters. `dualslam/lab/synthetic/traps.py` describes the others.
     n_frames : int
     seed : int
         Of the world, the path and the noise: the same seed gives the same images, bit for bit.

@@ -1,7 +1,7 @@
 """Worlds in which a map goes wrong and nothing shows: things that repeat, starts at rest, a bench that leaves the view.
 
-`board` and `parked` repeat at a known period; a camera that slides past them and misses some frames (`--corrupt`, an
-event) sees after the gap what it saw before it, one period on. `takeoff`, `standstill` and `hover` begin badly.
+`board` and `parked` repeat at a known period. A camera slides past them and misses some frames (`--corrupt`, an event).
+After the gap it sees the same as before, one period on. `takeoff`, `standstill` and `hover` begin badly.
 """
 
 from __future__ import annotations
