@@ -1,7 +1,7 @@
 """The composition root: the one place that knows front ends, back end and system, and puts them together.
 
 In reading order: `system` (the system and the live front end), `parts` (solvers, calibration), `walks` (reverse
-tracking), `workers` (what is done beside the tracking), `checks` (mistakes in a config, told at once).
+tracking), `workers` (background work), `checks` (mistakes in a config, reported at once).
 """
 
 from dualslam.build.checks import check_config, fault_of_frontend

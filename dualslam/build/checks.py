@@ -20,8 +20,8 @@ def check_config(config: Config) -> None:
     Raises
     ------
     ConfigError
-        If it is no configuration; if a front end, also one that an attempt at a recovery names, is not known or its
-        options are wrong; or if the initialiser cannot match with it.
+        If it is no configuration. If a front end, also one named by an attempt at a recovery, is not known or its
+        options are wrong. If the initialiser cannot match with it.
     """
     if not isinstance(config, Config):
         raise ConfigError(f"the configuration is a {type(config).__name__}; load_config or config_from_dict makes one")

@@ -1,4 +1,4 @@
-"""What is done beside the tracking, at once or in processes, and the lanes that it stands in."""
+"""Background work, at once or in processes, and its lanes."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def feature_handlers(config: FrontendConfig) -> Handlers:
 def worker_desk(config: Config, camera: Camera, faults: FaultScript, watch: WalkWatch) -> WorkerDesk:
     """Build the desk whose work is done in processes, which are started at once."""
     recovery = config.recovery
-    # Live frames come first: threads beside the walk only where a core is left beside the tracking and the workers.
+    # Live frames come first: threads for the walk only where a core is left beside the tracking and the workers.
     n_threads = min(FEATURE_THREADS, spare_cores(1 + recovery.workers))
     walks = Lane(
         "walks",

@@ -67,7 +67,7 @@ class _Bar(RunState):
 
 
 def final_line(outcome: Outcome) -> str:
-    """Return coverage, submaps, failures, places seen again, speed, why there is no map, and place in one line."""
+    """Return coverage, submaps, failures, revisited places, speed, why there is no map, and place in one line."""
     s = outcome.summary
     n_apart = s["posed_in_all_submaps"] - s["posed"]
     is_one = s["submaps"] > 1 and s["links"] >= s["submaps"] - 1 and not n_apart
@@ -101,7 +101,7 @@ def verdict_line(outcome: Outcome) -> str:
 
 
 def no_map_line(outcome: Outcome) -> str:
-    """Return in one line why a run has no map: an error, which is told where nothing else is (``--quiet``)."""
+    """Return in one line why a run has no map: an error, which is printed even if nothing else is (``--quiet``)."""
     why = outcome.summary.get("no_map")
     return f"{_nothing(outcome)}{f': {why}' if why else ''}; results in {outcome.out}"
 
@@ -111,7 +111,7 @@ def _nothing(outcome: Outcome) -> str:
 
 
 def stage_table(outcome: Outcome) -> str:
-    """Return CPU and wall time of each stage, of the processes beside the tracking, and of the whole."""
+    """Return CPU and wall time of each stage, of the background processes, and of the whole."""
     n_frames = max(len(outcome.report.latencies_ms), 1)
     total_s, system = outcome.report.cpu_s, outcome.system
     lines = [

@@ -15,7 +15,7 @@ from dualslam.io.run_reading import read_numbers, read_summary
 from dualslam.run.sources import open_images_of_run
 
 NOTABLE = 0.05
-"""Change of a scale that is told: a height and a marker are right to 2 % each (docs/exports.md)."""
+"""Change of a scale that is reported: a height and a marker are right to 2 % each (docs/exports.md)."""
 
 
 def execute(args: argparse.Namespace) -> int:

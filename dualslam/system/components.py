@@ -28,14 +28,13 @@ from dualslam.workers.scheduled_desk import ScheduledDesk
 class Components:
     """The parts that the composition root puts in: the system itself knows neither front end nor solver.
 
-    `new_relocaliser`: a front end that finds its submap again wherever it is seen, and tracks from there.
-    `walk_watch`: hears of reverse tracking that is under way. `desk`: does the work beside the tracking. `graphs`:
-    carries changes to submaps' graphs in another process and back, if they are solved there. `refine_at_end`: has the
-    last word on each submap. `patches`: compares frames with the images of older keyframes.
-    `open_graph`: makes a graph of a submap in this process, solved.
-    `open_features`: starts one more process, and returns a function that has the features of a frame found there.
-    `foresee`: has found beside the tracking what reverse tracking may ask for in a frame; none where nothing is done
-    beside it.
+    `new_relocaliser`: a front end that finds its submap again wherever it is seen, and tracks from there. `walk_watch`:
+    hears of reverse tracking that is under way. `desk`: does the background work. `graphs`: carries changes to submaps'
+    graphs in another process and back, if they are solved there. `refine_at_end`: has the last word on each submap.
+    `patches`: compares frames with the images of older keyframes. `open_graph`: makes a graph of a submap in this
+    process, solved. `open_features`: starts one more process, and returns a function that has the features of a frame
+    found there. `foresee`: computes in the background what reverse tracking may ask for in a frame; none where nothing
+    runs in the background.
     """
 
     view_of: Callable[[Frame], View | Failure]

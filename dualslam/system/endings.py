@@ -27,8 +27,8 @@ from dualslam.system.state import State
 log = logging.getLogger(__name__)
 
 ROOM_TO_COME_BACK = 1.2
-"""A full submap of an earlier run takes so many times `graph.max_keyframes`: what later visits add to a place that is
-mapped (the first one about a tenth, hardly any the next) is no reason to map it once more."""
+"""A full submap of an earlier run takes so many times `graph.max_keyframes`: later visits add little to a mapped place
+(the first one about a tenth, hardly any the next). That is no reason to map it once more."""
 
 
 class Endings:

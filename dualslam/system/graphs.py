@@ -1,4 +1,4 @@
-"""Graphs that are solved beside the tracking: submaps move to what was solved, between two frames."""
+"""Graphs that are solved in the background: submaps move to what was solved, between two frames."""
 
 from __future__ import annotations
 

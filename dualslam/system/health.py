@@ -24,9 +24,9 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, Track
 MAJORITY = 0.5
 """Early sign: share of the matches below which those that disagree could hold another pose."""
 JUMP_CHI2 = CHI2_9999[6]
-"""Early sign: squared Mahalanobis distance of a pose from the motion model's, under the pose's covariance and the
-motion model's own error as the last frames show it, above its level there: chi-square, 6 degrees of freedom, 99.99
-% (what drivers and hands do has heavier tails than a Gaussian)."""
+"""Early sign: squared Mahalanobis distance of a pose from the motion model's, above its level there: chi-square, 6
+degrees of freedom, 99.99 % (what drivers and hands do has heavier tails than a Gaussian). The covariance is that of the
+pose plus the motion model's own error in the last frames."""
 SIGN_SIGMAS = 3.09
 """Early sign: standard deviations of a chi-square over its degrees of freedom, above its level as a rule (one-sided
 99.9 %)."""
@@ -71,8 +71,7 @@ class HealthMonitor:
     """Judges the frames of one submap one after the other, each against what the frames before it were like.
 
     The motion model's error has no sigma that could be known beforehand: a car and a hand differ. It is measured on the
-    frames of the last seconds, and so is the level of the chi-square, in which the camera model's own error
-    stands.
+    frames of the last seconds. So is the level of the chi-square, which contains the camera model's own error.
 
     Parameters
     ----------

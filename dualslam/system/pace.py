@@ -1,11 +1,10 @@
 """Whether the system keeps up with its camera, and what it leaves out where it does not.
 
-Two things can be behind: the tracking, when frames are looked at after their time, and the back end, when more
-keyframes wait for the graph that runs beside than it catches up on by taking many at once. In either case keyframes are
-what there is to save: each costs the tracking its insertion and the back end its solution. One that is due but not
-urgent is put off until both have caught up.
-While there is no map, a start is looked for beside the frames (`workers/start_beside.py`), or, without processes, by
-one pair of frames at a time: a start that comes late costs more than frames that are dropped.
+Two things can be behind: the tracking, when frames are processed after their time, and the back end, when more
+keyframes wait for its graph than it catches up on by taking many at once. In either case keyframes are what there is to
+save: each costs the tracking its insertion and the back end its solution. One that is due but not urgent is put off
+until both have caught up. While there is no map, a start is looked for beside the frames (`workers/start_beside.py`),
+or, without processes, by one pair of frames at a time: a start that comes late costs more than frames that are dropped.
 
 Only real time has a pace. Without it nothing here ever changes what a run does.
 """
@@ -20,11 +19,11 @@ BEHIND_S = 1 / 30
 """A frame that is a frame of 30 Hz late was held up by more than chance: the step before it was too long."""
 FAR_BEHIND_KEYFRAMES = 30
 """Keyframes that it may not know in real time: those of a second in which each frame is one, as long as a batch over a
-full submap takes. Below that its lag ends by itself, since five keyframes at once cost a graph half of what five cost
-it one by one, and in a fast turn, where it arises, a keyframe that does not come is what the track is lost for."""
+full submap takes. Below that its lag ends by itself, since five keyframes at once cost a graph half of five one by one.
+In a fast turn, where the lag arises, a missing keyframe loses the track."""
 MAX_PUT_OFF = 5
-"""Frames by which a keyframe is put off at most. At 30 Hz that is a sixth of a second: long enough to work
-off what a keyframe and a relinearisation hold up, too short for the view to change by more than a few degrees."""
+"""Frames by which a keyframe is put off at most. At 30 Hz that is a sixth of a second: long enough to work off the
+delay of a keyframe and a relinearisation, too short for the view to change by more than a few degrees."""
 URGENT_TIMES = 2
 """A frame that tracks fewer than so many times the landmarks of a weak track needs new ones now, or is lost."""
 
@@ -75,7 +74,7 @@ class Pace:
         self.statistics.behind += self.behind
 
     def hold_up(self, seconds: float) -> None:
-        """Note by how much more a frame is late, since what was found beside the tracking came in before it."""
+        """Note by how much more a frame is late, since background results came in before it."""
         self._late_s += seconds
 
     def note_lag(self, n_keyframes: int) -> None:

@@ -1,4 +1,4 @@
-"""Places: when the live map is compared with what was seen before, and when a run goes on in an earlier run's map."""
+"""Places: when the live map is compared with earlier places, and when a run continues in an earlier run's map."""
 
 from __future__ import annotations
 
@@ -103,14 +103,14 @@ class PlaceKeeping:
             return self._handover.follow(track, live)
 
     def seen_instead(self, live: VisualOdometry, view: View) -> Relocalised | None:
-        """Return the submap of an earlier run that the live one was about to go over to, where it shows the frame."""
+        """Return the submap of an earlier run that the live one was about to switch to, where it shows the frame."""
         if self._handover is None:
             return None
         with self._state.record.timer.measure("places"):
             return self._handover.follow_alone(view, live)
 
     def go_over(self, found: Relocalised, from_submap: int, view: View) -> Track:
-        """Go on in the submap of an earlier run that has this place already; the live one is archived."""
+        """Continue in the submap of an earlier run that has this place already; the live one is archived."""
         state = self._state
         state.live, submap, track = found.odometry, found.odometry.submap, found.track
         reference = state.live.reference_id

@@ -27,7 +27,8 @@ EARLY_FRAMES = 8
 FIRM_SIGMA_DEG = 0.25
 """Of the direction of translation of a start, up to which reverse tracking from it crosses a gap as well as from a
 later one: over 1 to 1.5 s without frames (`kitti_03`, three places) the link's scale was known to 0.6 to 1.0 % from
-starts of 0.20 to 0.27 degrees, to 1.1 to 1.6 % up to 0.38; of 0.45 and more to 1.7 % at best, after tries in vain."""
+starts of 0.20 to 0.27 degrees. It was known to 1.1 to 1.6 % up to 0.38, and to 1.7 % at best from 0.45 and more, after
+tries in vain."""
 
 FORESEEN = 3
 """Frames before a loss that reverse tracking over it asks for: two that cross the gap, and one to go on from there."""
@@ -76,7 +77,7 @@ class Starting:
     # --- a map that is there
 
     def find_again(self, view: View) -> Track | None:
-        """Continue in the map that was lost last, or in any other, if the frames of now show it."""
+        """Continue in the map that was lost last, or in any other, if the current frames show it."""
         if self._state.relocaliser.note(view) and (track := self._find_lost(view)):
             return track
         return self._find_any(view)
@@ -134,7 +135,7 @@ class Starting:
         return found.track
 
     def _go_on(self, submap: Submap, since: View) -> None:
-        """Go on in a submap that was found again, and doubt it until the camera's velocity has agreed."""
+        """Continue in a submap that was found again, and doubt it until the camera's velocity has agreed."""
         self._state.motion_watch.begin(since)
         self._recoveries.found_again(submap)
         self._state.buffer.thaw()
@@ -188,9 +189,9 @@ class Starting:
             self._foresee = None
 
     def find_start_instead(self, view: View) -> Start | Failure:
-        """Look for the start of the next map while the present one is lost and may still be seen again.
+        """Look for the start of the next map while the present one is lost and may still be relocalised.
 
-        One that comes early rests on frames close together, and must be firm: it is to be tracked back from.
+        An early one is made of frames close together, and must be firm: it is to be tracked back from.
         """
         self._foresee_from(view)
         present = None if self._state.live is None else self._state.live.submap.id

@@ -59,7 +59,7 @@ class System:
     timer : StageTimer
     buffer : FrameBuffer
     pace : Pace
-        Whoever feeds the system in real time reports here how late its frames are; otherwise without effect.
+        Lag reported by the real-time feeder; unused otherwise.
     blank : set of int
         Frames that show too few features to be posed.
     audit : PhotometricAudit
@@ -88,7 +88,7 @@ class System:
         self.audit = PhotometricAudit(components.patches)
         self._state = State(components, config, record, self.buffer, saved, localise, relocaliser, health, self.audit)
         self.pace = self._state.pace
-        # What is found beside the tracking and comes into the map between two frames.
+        # Background results that come into the map between two frames.
         self._connections = Connections(
             record,
             components.atlas_solver,
@@ -142,7 +142,7 @@ class System:
 
     @property
     def desk(self) -> ScheduledDesk:
-        """Where work beside the tracking is done."""
+        """Where background work is done."""
         return self._state.parts.desk
 
     @property
@@ -212,7 +212,7 @@ class System:
     def watch_walks(self, on_walk: Callable[[WalkNews], None]) -> None:
         """Have a function called with how far reverse tracking has come, while it is under way; some news may be lost.
 
-        It may look at the system, and change nothing. Frames are told by their index in the source.
+        It may look at the system, and change nothing. Frames are given by their index in the source.
         """
         numbers = self.numbers
         self._state.parts.walk_watch.add(lambda news: on_walk(replace(news, frame=numbers.index_of(news.frame))))
@@ -237,7 +237,7 @@ class System:
         state, started, self._tracking.posed_at = self._state, time.perf_counter(), None
         source, frame, began_s = frame, self.numbers.numbered(frame), state.pace.clock()
         self.rows[frame.index] = FrameRow(frame.index, frame.timestamp_s, FrameStatus.INITIALISING)
-        # 1. What was found beside the tracking meanwhile comes into the map between two frames.
+        # 1. Background results come into the map between two frames.
         if (recorded := self.desk.recorded_lateness(source.index)) is not None:
             state.pace.note(recorded.late_s)
         self.desk.begin_frame(source.index, state.pace.in_real_time)
@@ -318,9 +318,9 @@ class System:
         return start if isinstance(start, Failure) else self._begin(start, view)
 
     def _begin(self, start: Start, view: View) -> Track | Failure:
-        """Go on in a new map."""
+        """Continue in a new map."""
         outcome = self._starting.begin(start)
-        # A search beside the tracking finds a start that ends some frames back: go on from there.
+        # A background search finds a start that ends some frames back: go on from there.
         for later in [v for v in self.buffer if start.views[-1].index < v.index <= view.index]:
             if self._state.live is None:
                 break
@@ -330,7 +330,7 @@ class System:
     # --- with a map
 
     def _with_map(self, live: VisualOdometry, view: View) -> Track | Failure:
-        """Pose a frame in the live map; then do what the frame, or the keyframe that it has become, gives rise to."""
+        """Track a frame in the live map, then handle what follows: a break, another map that shows it, a keyframe."""
         state = self._state
         track = self._tracking.track(live, view)
         if isinstance(track, Failure):
@@ -378,19 +378,19 @@ class System:
             self._places.note_keyframe(live, view)
 
     def _ask_shutter(self, live: VisualOdometry, view: View) -> None:
-        """Ask the live map how long its images were read; not where what comes back meanwhile has the pixels of now."""
+        """Ask the live map how long its images were read; not where open results have the present pixels."""
         if self.saved is None:
             self._shutter_watch.ask_if_due(live)
             self._take_shutter(live, view)
 
     def _take_shutter(self, live: VisualOdometry, now: FrameStamp, wait: bool = False) -> None:
-        """Take in how long its images were read; not while what is open for the map has the pixels of now."""
+        """Take in how long its images were read; not while open results for the map have the present pixels."""
         open_ = self._recoveries.is_under_way(live.submap) or self.desk.n_open(JobKind.CALIBRATION, live.submap.id)
         if not open_:
             self._shutter_watch.collect(live, now, self._recoveries.waiting, wait)
 
     def _lose(self, live: VisualOdometry, view: View, failure: Failure) -> Track | Failure:
-        """Take a frame that was not posed: the map may be seen again until the next one starts, or it is given up."""
+        """Take a frame that was not posed: the map may be relocalised until the next one starts, or it is given up."""
         state = self._state
         self.rows[view.index].status = FrameStatus.LOST
         if state.localises:
@@ -410,7 +410,7 @@ class System:
         return failure if isinstance(start, Failure) else self._begin(start, view)
 
     def _begin_to_lose(self, live: VisualOdometry, view: View) -> View:
-        """Keep what is buffered, and ask the map about its camera; return the view under the camera of now."""
+        """Keep what is buffered, and ask the map about its camera; return the view under the present camera."""
         self.buffer.freeze()
         # A map whose end is suspected is no witness.
         if all(frame.failed for frame in self._state.health.suspected()):
@@ -427,7 +427,7 @@ class System:
             self._take_shutter(live, now, wait=True)
 
     def _begin_anew(self) -> None:
-        """Look for the next map's start from the frames since the loss on, rectified by the camera of now."""
+        """Look for the next map's start from the frames since the loss on, rectified by the present camera."""
         lost = {view.index for view in self._state.lost}
         self._starting.begin_anew([view for view in self.buffer if view.index in lost])
 

@@ -28,7 +28,7 @@ class Tracking:
     on_pose : callable or None
         Called with each frame's track as soon as it is posed.
     posed_at : float or None
-        When the frame was posed, on the clock of `time.perf_counter`; whoever gives the next one sets it to None.
+        When the frame was posed, on the clock of `time.perf_counter`; None before that.
     """
 
     def __init__(self, state: State, places: PlaceKeeping) -> None:

@@ -1,8 +1,8 @@
-"""Questions about the camera, asked beside the tracking, and what becomes of a map that has gone on when the answer is.
+"""Questions about the camera, asked in the background, and their answers' effect on a map that has grown meanwhile.
 
 The snapshot that was asked comes back changed to another camera: other pixels, poses and points. All keyframes of the
-live submap take the new camera, those of the snapshot their new poses too, and what has come since follows them
-(`dualslam/map/late_estimate.py`); then the graph is made anew. Inline nothing has come since, and the live submap
+live submap take the new camera, and those of the snapshot their new poses, too. Later ones follow them
+(`dualslam/map/late_estimate.py`). Then the graph is made anew. Inline nothing has come since, and the live submap
 becomes what the snapshot was changed to.
 """
 
@@ -100,7 +100,7 @@ class Calibrations:
         self.collect(live, now, lost)
 
     def collect(self, live: VisualOdometry | None, now: FrameStamp, lost: Collection[int], wait: bool = False) -> bool:
-        """Take in what was answered meanwhile; `live` goes on in its submap as it is after that.
+        """Take in the answers; `live` continues in its submap as it is after that.
 
         It may be the front end that looks for a submap which was lost since it was asked. Returns whether the frames to
         come have another camera. `wait`: for a limited time, for what is open.
@@ -182,7 +182,7 @@ def merge_calibrated(live: Submap, base: Submap, answer: CalibrationAnswer) -> S
     Parameters
     ----------
     live : Submap
-        As it is now: grown, solved again, merged with what a walk found.
+        In its current state: grown, solved again, merged with what a walk found.
     base : Submap
         The snapshot.
     answer : CalibrationAnswer

@@ -1,8 +1,8 @@
 """The shutter of a live map: how long its images were read is asked of the map itself, and taken out of all it is in.
 
-Before a map starts, pairs of frames tell a readout time to five or ten milliseconds, and where the camera does not turn
-fast just then they tell nothing. A map tells it to a fraction of one (`frontends/tracking/map_readout.py`). It matters:
-where a camera turns fast, few landmarks are seen from both sides of the turn, and each millisecond of readout on a fast
+Before a map starts, pairs of frames give a readout time to five or ten milliseconds. If the camera does not turn fast
+just then, they give nothing. A map tells it to a fraction of one (`frontends/tracking/map_readout.py`). It matters:
+where a camera turns fast, few landmarks are seen from both sides of the turn. Each millisecond of readout on a fast
 walk moves the scale behind such a turn by 4 %, which nothing else shows.
 """
 
@@ -41,8 +41,8 @@ MIN_SIGMAS = 3.0
 to 1.2 (KITTI, EuRoC), rolling ones at 5 and more."""
 
 MAX_SIGMA_S = 0.004
-"""Inflated: where the camera turns too slowly to tell a readout time to that, other errors of the pixels pass for one
-(a rendered street, which hardly turns: -0.020 s with 0.008 claimed). There it does not matter either."""
+"""Inflated: where the camera turns too slowly to fix a readout time to that, other errors of the pixels pass for one (a
+rendered street, which hardly turns: -0.020 s with 0.008 claimed). There it does not matter either."""
 
 
 class ReadViews(Views, Protocol):

@@ -1,4 +1,4 @@
-"""How a camera turns, told by the poses of its frames."""
+"""How a camera turns, by the poses of its frames."""
 
 from __future__ import annotations
 
