@@ -23,7 +23,7 @@ from dualslam.map.submap import Submap
 from dualslam.places.handover import Handover
 from dualslam.places.revisits import Revisits
 from dualslam.places.sightings import Relocalised
-from dualslam.recovery.frame_buffer import FrameBuffer
+from dualslam.recovery.frame_buffer import SLOW_HZ, FrameBuffer
 from dualslam.recovery.manager import Recoveries
 from dualslam.recovery.relocaliser import Relocaliser
 from dualslam.system.audit.photometric import PhotometricAudit
@@ -403,11 +403,15 @@ class System:
         start = self._starting.find_start_instead(view)
         # A graph that has failed, and a map of the pixels of before, are not found again.
         may_return = failure.reason is not FailureReason.SOLVER and state.parts.shutter.readout_s == readout_s
-        waited_s = abs(view.timestamp_s - state.lost[0].timestamp_s)
-        if start or not may_return or waited_s >= state.config.tracking.max_lost_s:
+        if start or not may_return or self._has_waited(view):
             self._endings.give_up(live, view, failure, may_return)
             state.lost = []
         return failure if isinstance(start, Failure) else self._begin(start, view)
+
+    def _has_waited(self, view: View) -> bool:
+        """Return whether the map was lost for `max_lost_s`, and for as many frames as a slow camera takes in it."""
+        lost, max_lost_s = self._state.lost, self._state.config.tracking.max_lost_s
+        return abs(view.timestamp_s - lost[0].timestamp_s) >= max_lost_s and len(lost) > SLOW_HZ * max_lost_s
 
     def _begin_to_lose(self, live: VisualOdometry, view: View) -> View:
         """Keep what is buffered, and ask the map about its camera; return the view under the present camera."""

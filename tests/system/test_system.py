@@ -221,6 +221,14 @@ def test_how_long_a_loss_may_be_is_told_in_seconds(world: PointWorld, max_lost_s
     assert failed.frame == 35 + int(np.ceil(max_lost_s * RATE_HZ))
 
 
+def test_a_slow_camera_has_frames_to_be_found_again_in(world: PointWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dualslam.testing.point_world.RATE_HZ", 1.0)
+    covered = PointWorld(world.xyz, world.T_world_cam, covered=frozenset(range(35, 50)))
+    system = run(covered, tracking={"max_lost_s": 1.2})
+    (failed,) = system.events.of_kind(EventKind.FAILED)
+    assert failed.frame == 35 + 6  # by its clock with the third frame; 5 Hz gives six in 1.2 s
+
+
 def test_a_map_that_is_seen_again_in_time_goes_on(world: PointWorld) -> None:
     covered = PointWorld(world.xyz, world.T_world_cam, covered=frozenset(range(35, 50)))
     system = run(covered, tracking={"max_lost_s": 1.0})

@@ -71,8 +71,9 @@ class TrackingConfig(StrictModel):
     min_inliers: int = Field(20, ge=6)
     """Landmarks that must agree with a pose for it to be taken at all."""
     max_lost_s: float = Field(0.75, ge=0)
-    """Seconds, by the frames' times, from the first frame that is not posed, after which the submap is given up. Until
-    then wide matching may find it again, unless the next one starts first: its start is looked for meanwhile."""
+    """Seconds, by the frames' times, from the first frame that is not posed, after which the submap is given up; below
+    5 Hz, as many frames as 5 Hz gives in them. Until then wide matching may find it again, unless the next one starts
+    first: its start is looked for meanwhile."""
 
 
 class KeyframeConfig(StrictModel):
