@@ -42,11 +42,11 @@ BEFORE_FOCAL = {
 """What stands before fx, fy, cx, cy in Kalibr's list of intrinsics."""
 ANY, NONE = "", "none"
 _SAID: dict[str, str] = {
-    ANY: "pinhole simplepinhole perspective rectified",
-    NONE: "none nodistortion undistorted",
+    ANY: "pinhole simplepinhole linearpinhole perspective rectified",
+    NONE: "none nodistortion undistorted distortionnone",
     RadTanCamera.model: (
         "radtan radialtangential plumbbob brown brownconrady rationalpolynomial opencv fullopencv frame simpleradial "
-        "radial"
+        "radial pinholeradialtangential distortionbrownconrady opencvstandard"
     ),
     KannalaBrandtCamera.model: (
         "kannalabrandt kannala kannalabrandt8 kannalabrandt4 kb kb4 equidistant equi fisheye opencvfisheye "
@@ -55,7 +55,7 @@ _SAID: dict[str, str] = {
     FovCamera.model: "fov atan",
     DivisionCamera.model: "division radialdivision simpledivision",
     OmniCamera.model: "omni omnidirectional mei",
-    EucmCamera.model: "eucm ucm",
+    EucmCamera.model: "eucm ucm extendedunified",
     DoubleSphereCamera.model: "doublesphere ds",
 }
 LENSES = {word: lens for lens, words in _SAID.items() for word in words.split()} | {"": ANY}

@@ -36,6 +36,7 @@ from dualslam.io.camera_build import (
     make_camera,
     whole_size,
 )
+from dualslam.io.camera_dialects import in_common_keys
 from dualslam.io.camera_keys import camera_of_mapping
 from dualslam.io.camera_text import read_mappings
 from dualslam.io.trajectory_files import read_text
@@ -102,6 +103,7 @@ def _one_of(path: Path, cameras: list[Camera]) -> Camera:
 
 
 def _of_mapping(content: dict[str, Any], where: str, images_px: Callable[[], Size] | None) -> Camera:
+    content = in_common_keys(content, where)
     if content.get("model") in COLMAP_NAMES and "params" in content:
         words = [content.get("camera_id", 1), content["model"], content.get("width"), content.get("height")]
         return _of_colmap([str(word) for word in (*words, *content["params"])], where)

@@ -1,4 +1,4 @@
-"""A plain folder of images, in natural order; a ``times.txt`` and a ``calib.txt`` among them are read."""
+"""A folder of images, in natural order; `times.txt`, `calib.txt` and `groundtruth_tum.txt` beside them are read."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from dualslam.io.camera_files import read_calib_line
 from dualslam.io.images import IMAGE_SUFFIXES, ImageFiles, fill_gaps, list_images
 from dualslam.io.sequence import Given, Recording
 from dualslam.io.times import NOMINAL_RATE_HZ, check_count, read_times, resolve_times, times_in_names
+from dualslam.io.trajectory_files import read_tum
 
 log = logging.getLogger(__name__)
 
@@ -23,7 +24,7 @@ def recognises(folder: Path) -> bool:
 
 def open_recording(folder: Path, given: Given) -> Recording:
     """Open a folder of images. Without times it is taken to run at the given rate, or at 30 Hz with a warning."""
-    times_path, calib_path = folder / "times.txt", folder / "calib.txt"
+    times_path, calib_path, truth_path = folder / "times.txt", folder / "calib.txt", folder / "groundtruth_tum.txt"
     where = folder / "images" if (folder / "images").is_dir() else folder
     paths = list_images(where)
     clock = ""
@@ -45,6 +46,7 @@ def open_recording(folder: Path, given: Given) -> Recording:
         images=ImageFiles(paths),
         timestamps_s=timestamps_s,
         camera=None if given.camera or not calib_path.exists() else read_calib_line(calib_path),
+        ground_truth=read_tum(truth_path) if truth_path.exists() and clock else None,
         calibration=str(calib_path),
         clock=clock,
     )

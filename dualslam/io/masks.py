@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,14 +10,19 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import BoolArray, Frame
 from dualslam.io.images import list_images
 
+log = logging.getLogger(__name__)
+
 SCENE = 128
 """Grey level from which on a mask's pixel is scene: lossy files have more than two levels."""
+LIKELY = (0.0, 0.7)
+"""Share of an image that a mask hides. Outside, it says nothing, or hides what it should show."""
 MAX_FACTOR = 16
 """By which a mask may be larger than the frames, which were read smaller."""
 
@@ -46,6 +52,8 @@ def masked(sequence: Sequence, path: str | Path | None) -> Sequence:
         read_mask(paths[min(paths)], sequence.camera.size_px)
         return MaskedSequence(sequence, lambda index: read_mask(paths[index], sequence.camera.size_px))
     mask = read_mask(where, sequence.camera.size_px)
+    if not LIKELY[0] < mask.mean() < LIKELY[1]:
+        log.warning("mask %s hides %.0f %% of the image: black is hidden, white is scene", where, 100 * mask.mean())
     return MaskedSequence(sequence, lambda index: mask, mask)
 
 
@@ -59,9 +67,10 @@ def read_mask(path: Path, size_px: tuple[int, int]) -> BoolArray:
     """
     width, height = size_px
     data = np.fromfile(path, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
+    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
     if image is None:
         raise InputError(f"mask {path} cannot be read as an image.")
+    image = _levels(image)
     factor = next((n for n in range(1, MAX_FACTOR + 1) if (image.shape[1] // n, image.shape[0] // n) == size_px), None)
     if factor is None:
         raise InputError(f"mask {path} is {image.shape[1]} x {image.shape[0]} pixels, the frames {width} x {height}.")
@@ -70,6 +79,19 @@ def read_mask(path: Path, size_px: tuple[int, int]) -> BoolArray:
     if not whole.any():
         raise InputError(f"mask {path} is black: it leaves no pixel of the frames; the scene is white.")
     return np.asarray(whole == 0)
+
+
+def _levels(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return a mask as (H, W) grey levels: 0 where it is transparent; one of zeros and ones is black and white."""
+    grey = image
+    if image.ndim == 3:
+        grey = image[..., 0] if image.shape[2] == 2 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
+        if image.shape[2] in (2, 4):
+            grey = np.where(image[..., -1] > 0, grey, 0)
+    highest = int(grey.max())
+    if highest == 1 or highest > 255:
+        grey = grey.astype(np.float64) * (255.0 if highest == 1 else 255.0 / 65535.0)
+    return np.asarray(grey, np.uint8)
 
 
 def _by_frame(sequence: Sequence, folder: Path) -> Mapping[int, Path]:

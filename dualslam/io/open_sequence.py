@@ -14,7 +14,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import camera_from_fov
 from dualslam.core.errors import InputError, NoCalibrationError
 from dualslam.core.missing import check_exists
-from dualslam.io import bags, dataset_folder, euroc, folder, kitti, tum_mono, tum_rgbd, video
+from dualslam.io import bags, euroc, folder, kitti, tum_mono, tum_rgbd, video
 from dualslam.io.camera_build import make_camera
 from dualslam.io.camera_files import read_camera_file
 from dualslam.io.reduced import MAX_SIDE_PX, ReducedImages, reduced_camera, reduction
@@ -42,7 +42,7 @@ NOT_READ = frozenset({".avif", ".cr2", ".dng", ".exr", ".gif", ".heic", ".heif",
 """Images that no reader of ours opens, by how their files end."""
 
 # The surer the sign, the earlier; the plain folder of images takes what no other does.
-FORMATS: tuple[SourceFormat, ...] = (bags, euroc, tum_rgbd, kitti, tum_mono, dataset_folder, folder)
+FORMATS: tuple[SourceFormat, ...] = (bags, euroc, tum_rgbd, kitti, tum_mono, folder)
 
 
 def open_sequence(

@@ -16,9 +16,10 @@ from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.memory import peak_rss_mb
 from dualslam.core.trajectory import Trajectory
-from dualslam.core.types import Frame
+from dualslam.core.types import BoolArray, Frame
 from dualslam.io.export.exported_map import ExportedMap, flatten
 from dualslam.io.map_store import StoredMap, load_atlas
+from dualslam.io.masks import read_mask
 from dualslam.map.frame_records import FrameResult
 from dualslam.report.run_data import RunData, read_run
 from dualslam.run.judgement import judge_run
@@ -47,6 +48,8 @@ class Slam:
         Run folder, or map, to continue.
     localise : bool
         Find poses in the saved map and add nothing to it.
+    mask : path or (H, W) bool, optional
+        What shows no scene in all images: an image in which it is black, or an array that is true there.
 
     Attributes
     ----------
@@ -65,6 +68,7 @@ class Slam:
         config: Config | None = None,
         saved_map: StoredMap | str | Path | None = None,
         localise: bool = False,
+        mask: BoolArray | str | Path | None = None,
     ) -> None:
         if localise and saved_map is None:
             raise InputError("localise finds poses in a saved map: name it with saved_map.")
@@ -73,6 +77,7 @@ class Slam:
         saved = load_atlas(saved_map) if isinstance(saved_map, str | Path) else saved_map
         self.system: System = build_system(self._config, self._camera, saved=saved, localise=localise)
         self._began, self._cpu_began = time.perf_counter(), time.process_time()
+        self._hidden = read_mask(Path(mask), self._camera.size_px) if isinstance(mask, str | Path) else mask
         self._n_frames = 0
         self._ended = False
 
@@ -96,7 +101,8 @@ class Slam:
         InputError
             If the image is no such array, or the map has been saved.
         """
-        frame = Frame(self._n_frames, timestamp_s, image, "" if image is not None else "the camera gave no image")
+        error, hidden = ("the camera gave no image", None) if image is None else ("", self._hidden)
+        frame = Frame(self._n_frames, timestamp_s, image, error, hidden=hidden)
         result = self.system.step(frame)
         self._n_frames += 1
         return result
@@ -148,7 +154,7 @@ class Slam:
         stored = self._stored()
         if not stored.main:
             raise InputError("there is no map to localise in: no frame has a pose.")
-        return Slam(self._camera, config=self._config, saved_map=stored, localise=True)
+        return Slam(self._camera, config=self._config, saved_map=stored, localise=True, mask=self._hidden)
 
     def __enter__(self) -> Self:
         return self

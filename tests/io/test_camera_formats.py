@@ -502,6 +502,24 @@ def opencv(lens: str, n: int, fisheye: str = "") -> str:
     return OPENCV_HEAD + fisheye + OPENCV_MATRIX.format(**f, n=n, lens=lens)
 
 
+THEIA = {
+    "final_reproj_error": 0.17, "fps": 59.94, "image_height": 480, "image_width": 752, "intrinsic_type": "FISHEYE",
+    "intrinsics": {
+        "aspect_ratio": 381.0 / 380.0, "focal_length": 380.0, "principal_pt_x": 367.0, "principal_pt_y": 248.0,
+        "radial_distortion_1": 0.003, "radial_distortion_2": 0.0007, "radial_distortion_3": -0.002, "radial_distortion_4": 0.0002, "skew": 0.0,
+    },
+    "nr_calib_images": 65, "stabelized": False,
+}  # fmt: skip
+GYROFLOW = {
+    "name": "GoPro HERO9", "camera_brand": "GoPro", "camera_model": "HERO9", "lens_model": "Wide", "camera_setting": "4:3",
+    "calib_dimension": {"w": 752, "h": 480}, "orig_dimension": {"w": 1504, "h": 960}, "input_horizontal_stretch": 1.0, "num_images": 15,
+    "fisheye_params": {
+        "RMS_error": 0.9, "camera_matrix": [[380.0, 0.0, 367.0], [0.0, 381.0, 248.0], [0.0, 0.0, 1.0]],
+        "distortion_coeffs": [0.003, 0.0007, -0.002, 0.0002], "radial_distortion_limit": None,
+    },
+}  # fmt: skip
+REALSENSE = {"fx": 458.0, "fy": 457.0, "ppx": 367.0, "ppy": 248.0, "width": 752, "height": 480, "model": "distortion.brown_conrady",
+             "coeffs": [-0.28, 0.07, 0.0002, 0.00002, 0.0]}  # fmt: skip
 FORMATS = [
     ("opencv.yml", opencv("-0.28, 0.07, 0.0002, 0.00002, 0.01", 5, "fisheye_model: 0\n"), FIVE),
     ("opencv_fisheye.yml", opencv("0.003, 0.0007, -0.002, 0.0002", 4, "fisheye_model: 1\n"), FISHEYE),
@@ -546,6 +564,9 @@ FORMATS = [
     ("replica.json", json.dumps(REPLICA), PINHOLE),
     ("cameras.txt", "# Camera list\n# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n# Number of cameras: 1\n"
      "1 OPENCV 752 480 458 457 367 248 -0.28 0.07 0.0002 0.00002\n", replace(RADTAN, **HALF)),
+    ("umi.json", json.dumps(THEIA), FISHEYE),
+    ("gyroflow.json", json.dumps(GYROFLOW), FISHEYE),
+    ("realsense.json", json.dumps(REALSENSE), RADTAN),
     ("dso.txt", "RadTan 458 457 367 248 -0.28 0.07 0.0002 0.00002\n752 480\ncrop\n640 480\n", RADTAN),
     ("dso_equi.txt", "EquiDistant 380 381 367 248 0.003 0.0007 -0.002 0.0002\n752 480\nfull\n640 480\n", FISHEYE),
 ]  # fmt: skip
@@ -611,6 +632,10 @@ def theirs(model: str, params: list[float] | None = None) -> pycolmap.Camera:
 
 
 REFUSED = [
+    ("umi.json", json.dumps(THEIA | {"intrinsic_type": "DIVISION_UNDISTORTION"}), "'DIVISION_UNDISTORTION'"),
+    ("umi.json", json.dumps(THEIA | {"intrinsics": THEIA["intrinsics"] | {"skew": 0.3}}), "skew"),
+    ("gyroflow.json", json.dumps(GYROFLOW | {"input_horizontal_stretch": 1.33}), "input_horizontal_stretch is 1.33"),
+    ("realsense.json", json.dumps(REALSENSE | {"model": "distortion.inverse_brown_conrady"}), "inverse_brown_conrady"),
     ("pano.yaml", OPENVSLAM.format(model="equirectangular", lens=""), "Camera.model: the camera model 'equirectangular'"),
     ("pano.yaml", 'Camera.model: "equirectangular"\nCamera.cols: 1920\nCamera.rows: 960\n', "'equirectangular'"),
     ("transforms.json", json.dumps(NERFSTUDIO | {"camera_model": "EQUIRECTANGULAR"}), "'EQUIRECTANGULAR'"),

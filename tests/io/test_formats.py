@@ -41,6 +41,16 @@ def test_dataset_folder(dataset: Path) -> None:
     assert sequence.ground_truth.T_world_cam[:, 0, 3].tolist() == [i + 0.5 for i in range(N)]
 
 
+def test_a_dataset_folder_without_times_has_those_in_its_names(dataset: Path) -> None:
+    (dataset / "groundtruth_tum.txt").unlink()  # of another clock
+    (dataset / "times.txt").unlink()
+    for i, path in enumerate(sorted((dataset / "images").iterdir())):
+        path.rename(path.with_name(f"{1_403_636_579_763_555_584 + 50_000_000 * i}{path.suffix}"))
+    sequence = open_sequence(dataset)
+    assert sequence.rate_hz == pytest.approx(20.0)
+    assert sequence.frame_timestamps[0] == pytest.approx(1_403_636_579.7635555, abs=1e-6)
+
+
 @pytest.mark.parametrize("numbers", ["0.1 -0.2 0.01 0.02", "0.1 -0.2 0.01 0.02 0.3"])
 def test_dataset_folder_with_distortion(dataset: Path, numbers: str) -> None:
     (dataset / "calib.txt").write_text(f"30 30 16 12 {numbers} 32 24\n")

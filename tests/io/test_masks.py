@@ -64,6 +64,29 @@ def test_a_lossy_mask_has_two_levels_all_the_same(folder: Path) -> None:
     assert int(read_mask(mask, (WIDTH, HEIGHT)).all(axis=1).sum()) == 16
 
 
+@pytest.mark.parametrize("kind", ["grey", "rgb", "zeros and ones", "16 bits", "transparent"])
+def test_masks_of_any_kind(folder: Path, tmp_path: Path, kind: str) -> None:
+    scene = np.ones((HEIGHT, WIDTH), np.uint8)
+    scene[:5] = 0
+    images = {
+        "grey": 255 * scene,
+        "rgb": np.repeat(255 * scene[..., None], 3, axis=2),
+        "zeros and ones": scene,
+        "16 bits": 65535 * scene.astype(np.uint16),
+        "transparent": np.dstack([np.full((HEIGHT, WIDTH, 3), 255, np.uint8), 255 * scene]),
+    }
+    cv2.imwrite(str(tmp_path / "mask.png"), images[kind])
+    assert n_hidden_rows(folder, tmp_path / "mask.png") == [5] * N
+
+
+@pytest.mark.parametrize("n_black_rows", [0, HEIGHT - 1])
+def test_a_mask_that_hides_nothing_or_nearly_all_is_doubted(
+    folder: Path, tmp_path: Path, n_black_rows: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert n_hidden_rows(folder, write(tmp_path / "mask.png", n_black_rows)) == [n_black_rows] * N
+    assert "black is hidden, white is scene" in caplog.text
+
+
 @pytest.mark.parametrize("names", [["000", "001", "002"], ["a", "b", "c"]])
 def test_a_folder_has_a_mask_for_each_frame_by_name_or_in_order(folder: Path, names: list[str]) -> None:
     for n, name in enumerate(names):
