@@ -4,8 +4,9 @@
 
 From its seed a schedule draws the losses of the run (one to three) and a delay for each kind of background job. In a
 third of the schedules workers die or hang. One line of JSON a schedule: frames without a pose in the main map,
-largest error of a position, and the same of the run at once. `is_worse`: it misses frames that this one has, or errs by
-more than half as much again; then the exit status is 1. `--twice`: each is made again, and must repeat to the bit.
+largest error of a position, and the same of the run at once. `is_worse`: it errs by more than half as much again, or
+misses frames that this one has though no job was lost; then the exit status is 1. A map whose jobs are lost may know
+its scale too badly for a link. `--twice`: each is made again, and must repeat to the bit.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_erro
 from dualslam.workers.schedule import DELAYS, After
 
 FRAMES = (60, 80, 110)
+SPEED = 0.6
+"""Of the camera: slow enough that the two sides of a gap show much the same, and no link is refused as ambiguous."""
 DRAWN_DELAYS = (0, 1, 5, 20, math.inf)
 DENSE: dict[str, Any] = {"keyframes": {"max_parallax_deg": 1.0}, "mapping": {"redundant_ratio": 1.0}}
 SMALL: dict[str, Any] = {"graph": {"max_keyframes": 20, "rollover_keyframes": 6}}
@@ -91,7 +94,7 @@ class Made:
 
 def made(drawn: Drawn, at_once: bool = False) -> Made:
     """Make a run; `at_once`: with answers at once, and no worker that dies."""
-    world = PointWorld(cloud(), hand_held(drawn.n_frames), covered=drawn.covered, seed=drawn.seed)
+    world = PointWorld(cloud(), hand_held(drawn.n_frames, SPEED), covered=drawn.covered, seed=drawn.seed)
     settings = DENSE | (SMALL if drawn.rolls_over else {}) | {"seed": drawn.seed}
     if at_once:
         system = system_in(world, recovery={"enabled": True}, **settings)
@@ -126,7 +129,8 @@ def judged(drawn: Drawn, twice: bool) -> dict[str, Any]:
         best = made(drawn, at_once=True)
         told["at_once"] = {"missing": best.n_missing, "max_error_m": round(best.max_error_m, 4)}
         limit_m = max(LEAST_ERROR_M, SAME_ERROR * best.max_error_m)
-        told["is_worse"] = run.n_missing > best.n_missing or run.max_error_m > limit_m
+        misses_more = run.n_missing > best.n_missing and not run.n_lost_jobs
+        told["is_worse"] = misses_more or run.max_error_m > limit_m
     if twice:
         again = made(drawn)
         told["repeats"] = again.index == run.index and np.array_equal(again.T_world_cam, run.T_world_cam)

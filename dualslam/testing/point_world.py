@@ -106,9 +106,9 @@ def path(n: int, step_m: FloatArray, turn_rad: FloatArray) -> FloatArray:
     return se3.from_parts(so3.exp(i * np.asarray(turn_rad, float)), i * np.asarray(step_m, float))
 
 
-def hand_held(n: int) -> FloatArray:
+def hand_held(n: int, speed: float = 1.0) -> FloatArray:
     """A camera that sways to all sides and looks about."""
-    s = 0.04 * np.arange(n)
+    s = 0.04 * speed * np.arange(n)
     R = so3.exp(np.column_stack([0.1 * np.sin(3 * s), 0.3 * np.sin(2 * s), 0.1 * np.sin(2.5 * s)]))
     return se3.from_parts(R, np.column_stack([1.2 * np.sin(2.5 * s), 0.4 * np.sin(3.5 * s), 0.6 * np.sin(1.5 * s)]))
 

@@ -28,17 +28,24 @@ OK, WITHDRAWN, OPEN = "ok", "withdrawn", "open"
 When = int | str | None
 
 DELAYS: Mapping[JobKind, float] = {
-    JobKind.START: 1,
-    JobKind.GRAPH: 2,
-    JobKind.EDGES: 6,
+    JobKind.START: 3,
+    JobKind.GRAPH: 3,
+    JobKind.EDGES: 13,
     JobKind.ATLAS: 2,
-    JobKind.SCALE: 1,
-    JobKind.READOUT: 15,
+    JobKind.SCALE: 3,
+    JobKind.READOUT: 6,
     JobKind.CALIBRATION: 30,
-    JobKind.LOOP: 5,
-    JobKind.WALK: 60,
+    JobKind.LOOP: 10,
+    JobKind.WALK: 18,
 }
-"""Frames after which an answer is used by default: what the job takes, in frames of 30 Hz."""
+"""Frames after which an answer is used by default: twice the median CPU time of a job in frames of 30 Hz, and one more.
+
+Twice, since a worker has about half a core where tracking and features take the rest of two; one more, since answers
+come in where a frame begins. Medians of the jobs above 10 ms, in frames: start search 0.8, graph 0.8 (166 jobs),
+scale watch 0.7, readout 2.3, calibration 15, loop search 4.4, reverse tracking 8.2 (7 jobs, up to 35), edge covariances
+6 (docs/adr/0020-work-beside-tracking.md), atlas below 0.3. Measured on 110 to 180 frames each of `kitti_03` and
+`7scenes_1000` with black frames, `hololens_000` and `tum_fr1_rpy`: CPU time, which does not depend on what else runs.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -237,6 +237,8 @@ def test_a_known_graph_near_its_optimum_is_not_made_anew_in_real_time(in_real_ti
 
 def test_a_graph_in_another_process_keeps_the_promises_of_one_in_this() -> None:
     """Covariances, factors and the tree are those of a graph that is made here, of the submap as it is."""
+    public = {name for name in dir(ISam2SubmapGraph(Config().graph)) if not name.startswith("_")}
+    assert not public - set(dir(BesideGraph))
     submap = guessed_submap(make_scene(6, noise_px=0.5), pose_noise=0.02)
     here = new_isam2()
     submap.apply_estimate(*here.update(submap).values)
@@ -250,6 +252,9 @@ def test_a_graph_in_another_process_keeps_the_promises_of_one_in_this() -> None:
     ids = np.arange(5)
     np.testing.assert_allclose(graph.point_covariances(ids), here.point_covariances(ids), rtol=0.2, atol=1e-8)
     assert isinstance(graph, BesideGraph)
+    np.testing.assert_allclose(
+        graph.triangulated_covariances(submap, ids), here.triangulated_covariances(submap, ids), rtol=0.2, atol=1e-8
+    )
     np.testing.assert_array_equal(graph.factor_rows, here.factor_rows)
     assert graph.statistics
     assert len(graph.bayes_tree().parent) > 0

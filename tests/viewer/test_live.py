@@ -240,6 +240,10 @@ def test_a_walk_is_told_to_the_viewer_at_once(view: LiveView, told: Run) -> None
     assert view._teller.n_told > n_told
 
 
+HELD_UP_S = 5.0
+"""A full pipe that nobody reads holds up for ever, a busy machine for a second."""
+
+
 def step(view: LiveView, told: Run) -> float:
     """Let the view look at a frame; return how long the run was held up."""
     began = time.monotonic()
@@ -263,7 +267,7 @@ def test_a_viewer_that_is_killed_or_hangs_holds_nothing_up(view: LiveView, told:
     os.kill(view._process.pid, sign)
     deadline = time.monotonic() + 1.0
     while time.monotonic() < deadline:
-        assert step(view, told) < 0.5
+        assert step(view, told) < HELD_UP_S
         time.sleep(0.01)
     if sign is signal.SIGKILL:
         assert not view.alive
