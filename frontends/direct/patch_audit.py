@@ -112,8 +112,8 @@ class PatchAudit:
             # Another map of the same frame has its features, without those that the first one found again by patches.
             landmark_of = submap.landmark_of[k]
             ids = np.full(len(patches.feature), NO_LANDMARK, np.int64)
-            known = patches.feature < len(landmark_of)
-            ids[known] = landmark_of[patches.feature[known]]
+            is_shared = patches.feature < len(landmark_of)
+            ids[is_shared] = landmark_of[patches.feature[is_shared]]
             rows = np.flatnonzero(ids >= 0)
             uv, depth = project_points(K, T_cam_submap, submap.landmarks["xyz_mu"][ids[rows]])
             zoom = submap.depths(ids[rows], se3.inverse(submap.T_submap_kf[k])) / np.maximum(depth, 1e-9)
