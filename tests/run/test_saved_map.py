@@ -17,7 +17,7 @@ from dualslam.run.map_camera import camera_that_fits, own_focal_px
 from dualslam.run.sources import open_source
 from dualslam.viewer.playback import play
 
-SOURCE = "synthetic:street,frames=80,seed=3,width=320,height=240"
+SOURCE = "synthetic:street,frames=56,seed=3,width=320,height=240"
 SETTINGS = ["--quiet", "--set", "frontend.n_features=500"]
 
 
@@ -25,14 +25,16 @@ SETTINGS = ["--quiet", "--set", "frontend.n_features=500"]
 def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of a walk's first part."""
     out = tmp_path_factory.mktemp("first") / "run"
-    assert main(["run", SOURCE, "--max-frames", "60", "--out", str(out), *SETTINGS]) == 0
+    assert main(["run", SOURCE, "--max-frames", "40", "--out", str(out), *SETTINGS]) == 0
     return out
 
 
-@pytest.mark.parametrize("localise", [False, True], ids=["extended", "localised"])
+@pytest.mark.parametrize(
+    "localise", [pytest.param(False, id="extended", marks=pytest.mark.slow), pytest.param(True, id="localised")]
+)
 def test_a_run_on_a_saved_map_ends_with_all_its_pages(first: Path, localise: bool, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    options = ["--start", "40", "--map", str(first), *(["--localise"] if localise else [])]
+    options = ["--start", "30", "--map", str(first), *(["--localise"] if localise else [])]
     assert main(["run", SOURCE, *options, "--out", str(out), *SETTINGS]) == 0
     assert {path.name for path in out.iterdir()} >= {"map.html", "report.html", "trajectory.txt", "summary.json"}
     run, before = read_run(out), play(read_run(first)).spaces[0]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dualslam.core.config import strict_yaml
@@ -185,6 +185,7 @@ nested = st.recursive(
 )
 
 
+@settings(max_examples=50)
 @given(nested)
 def test_what_is_written_reads_back(value: object) -> None:
     assert strict_yaml.loads(strict_yaml.dumps(value)) == value

@@ -37,6 +37,11 @@ def run(*corruptions: dict[str, object], backwards: bool = False, **settings: ob
     return system
 
 
+@pytest.fixture(scope="module")
+def clean() -> System:
+    return run()
+
+
 def test_without_faults_nothing_is_touched() -> None:
     def view_of(frame: object) -> Failure:
         return Failure(FailureReason.UNREADABLE)
@@ -86,9 +91,9 @@ def test_faults_count_in_the_source_whichever_way_it_is_read() -> None:
     assert [system.numbers.index_of(number) for number in lost] == [25]
 
 
-def test_a_wrong_pose_that_the_map_contradicts_is_taken_out_again() -> None:
+def test_a_wrong_pose_that_the_map_contradicts_is_taken_out_again(clean: System) -> None:
     """The frame is lost, for a reason that says so; nothing of it stays, and the next frames are as good as ever."""
-    clean, faulty = run(), run({"kind": "wrong_pose", "start": 25, "length": 1, "strength": 15})
+    faulty = run({"kind": "wrong_pose", "start": 25, "length": 1, "strength": 15})
     assert faulty.rows[25].status is FrameStatus.LOST
     assert [i for i in range(5, N) if faulty.rows[i].status is not FrameStatus.TRACKED] == [25]
     assert not faulty.events.of_kind(EventKind.FAILED)
@@ -98,10 +103,10 @@ def test_a_wrong_pose_that_the_map_contradicts_is_taken_out_again() -> None:
     assert clean_to_faulty_deg(clean, faulty, 40) < 0.2
 
 
-def test_a_wrong_pose_goes_into_the_map_as_a_keyframe_where_nothing_is_refused() -> None:
+def test_a_wrong_pose_goes_into_the_map_as_a_keyframe_where_nothing_is_refused(clean: System) -> None:
     """By the angle that was asked for, and by as much of the depth; the frames before it are not touched."""
     fault = {"kind": "wrong_pose", "start": 25, "length": 1, "strength": 8}
-    clean, faulty = run(), run(fault, health={"max_refused": 1.0})
+    faulty = run(fault, health={"max_refused": 1.0})
     submap = faulty.atlas.submaps[0]
     assert 25 in submap.keyframes
     before = [i for i in clean.poses if i < 25]
