@@ -13,6 +13,7 @@ WIDTH = 1000.0
 ASPECT_RANGE = (1.25, 1.8)
 MARGIN = 0.07
 _EDGE_PERCENT = 9.0
+_FOOT_PERCENT = 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,6 +74,7 @@ class Canvas:
         side = ""
         if len(str(text)) > 1:  # near an edge, words stand on its inner side; a mark stays where it is
             side = " inward-right" if left < _EDGE_PERCENT else " inward-left" if left > 100 - _EDGE_PERCENT else ""
+            side += " above" if top > 100 - _FOOT_PERCENT else ""
         return tag("span", text, cls=f"at {cls}{side}", style=f"left:{left:.2f}%;top:{top:.2f}%", title=title)
 
     def scale_bar(self, unit: str, drawn: FloatArray) -> Markup:
