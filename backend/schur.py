@@ -197,7 +197,7 @@ class System:
             shape=(len(free), len(problem.xyz_mu)),
         )
         shares = csr_array(sees @ sees.T)
-        order = reverse_cuthill_mckee(shares, symmetric_mode=True)
+        order = reverse_cuthill_mckee(shares, symmetric_mode=True) if len(free) else free
         self._free = free[order]  # the order of the reduced system
         place[self._free] = np.arange(len(free))
         self._place = place
@@ -315,6 +315,8 @@ class System:
     def _solve(reduced: _Reduced, damping: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
         """Return the poses' step (N, 6) and its change with the lens (N, 6, M), and the lens' own system."""
         n, _, m = reduced.border.shape
+        if not n:
+            return reduced.g_pose, reduced.border, reduced.corner, reduced.g_lens
         try:
             band = _band_matrix(reduced.blocks, damping)
             factor = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)

@@ -116,6 +116,15 @@ def test_a_point_behind_a_camera_moves_no_pose() -> None:
     assert r.max() < 1e-6
 
 
+@pytest.mark.parametrize("n_fixed", [9, 10], ids=["all but one", "all"])
+def test_poses_may_be_held(n_fixed: int, in_small_chunks: Callable[[], None]) -> None:
+    in_small_chunks()
+    problem = replace(problem_of(10), fixed=np.arange(10) < n_fixed)
+    found = optimise(problem, partial(huber, k=SHAPE), 5, TOLERANCE)
+    assert found.cost_after < found.cost_before
+    np.testing.assert_array_equal(found.state.T_submap_kf[:n_fixed], problem.T_submap_kf[:n_fixed])
+
+
 def test_what_is_no_number_is_a_failure() -> None:
     problem = problem_of(6)
     with pytest.raises(SolverError, match="no optimum"):
