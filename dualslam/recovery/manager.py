@@ -210,15 +210,18 @@ class Recoveries:
         """Merge the walks that have ended. `live` goes on in its submap as it is after that."""
         self._take(self._desk.poll(JobKind.WALK), live, now)
 
-    def finish(self, live: VisualOdometry | None, last: FrameStamp | None, interrupted: bool) -> None:
+    def finish(
+        self, live: VisualOdometry | None, last: FrameStamp | None, interrupted: bool, solve: Callable[[], None]
+    ) -> None:
         """Merge the walks that are under way after the last frame, and track in reverse once more.
 
-        `interrupted`: no walk is begun any more.
+        `interrupted`: no walk is begun any more. `solve`: waits for the graphs of merged maps, from which it begins.
         """
         if last is None:
             return
         self._take(self._desk.drain(JobKind.WALK), live, last)
         if live is not None and not interrupted:
+            solve()
             self.retry(live.submap, last, last_chance=True)
             self._take(self._desk.drain(JobKind.WALK), live, last)
 

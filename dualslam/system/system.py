@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 from dualslam.atlas.connections import Connections
 from dualslam.atlas.record import FrameStamp, Record
@@ -285,7 +286,8 @@ class System:
         self._graphs.finish(last)
         if state.live is not None and last is not None:
             self._calibrations.collect(state.live, last, self._recoveries.waiting, wait=True)
-        self._recoveries.finish(state.live, last, interrupted or state.localises)
+        solve = partial(self._graphs.finish, last)
+        self._recoveries.finish(state.live, last, interrupted or state.localises, solve)
         if state.live is not None and last is not None:
             self._take_shutter(state.live, last, wait=True)
         if last is not None:
