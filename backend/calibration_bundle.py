@@ -126,24 +126,24 @@ def optimise_with_camera(
     """
     problem = replace(problem, fixed=np.arange(len(problem.T_submap_kf)) == 0)
     lens = CorrectedLens(problem.K, np.diag(prior**-2.0))
-    problem, found = _in_front(problem, robust_k, lens, start)
-    state = found.state
+    kept, found = _in_front(problem, robust_k, lens, start)
+    state = _in_unit_of(problem, found.state)
     return CalibratedOptimum(
-        _in_unit_of(problem, state),
+        state.T_submap_kf,
         state.lens,
-        System(problem, partial(huber, k=robust_k), lens).lens_covariance(state),
-        _noise_ratio(problem, state),
+        System(kept, partial(huber, k=robust_k), lens).lens_covariance(state),
+        _noise_ratio(kept, state),
         found.cost_before,
         found.cost_after,
-        partial(_poses_under, replace(problem, T_submap_kf=state.T_submap_kf, xyz_mu=state.xyz_mu), robust_k),
+        partial(_poses_under, replace(kept, T_submap_kf=state.T_submap_kf, xyz_mu=state.xyz_mu), robust_k),
     )
 
 
 def _poses_under(problem: BundleProblem, robust_k: float, correction: FloatArray) -> FloatArray:
     """Return the poses (K, 4, 4) at which the cost is least, were the camera another one."""
     lens = _HeldLens(problem.K, correction)
-    problem, found = _in_front(problem, robust_k, lens, np.zeros(0))
-    return _in_unit_of(problem, found.state)
+    _, found = _in_front(problem, robust_k, lens, np.zeros(0))
+    return _in_unit_of(problem, found.state).T_submap_kf
 
 
 def _in_front(problem: BundleProblem, robust_k: float, lens: Lens, start: FloatArray) -> tuple[BundleProblem, Optimum]:
@@ -169,14 +169,15 @@ def _in_front(problem: BundleProblem, robust_k: float, lens: Lens, start: FloatA
     raise SolverError("points go behind their cameras again and again")
 
 
-def _in_unit_of(problem: BundleProblem, state: State) -> FloatArray:
-    """Return poses (K, 4, 4) in the unit in which the farthest from the first is as far as in the problem."""
+def _in_unit_of(problem: BundleProblem, state: State) -> State:
+    """Return a state in the unit in which the pose farthest from the first is as far from it as in the problem."""
     centre = problem.T_submap_kf[0, :3, 3]
     distance = np.linalg.norm(problem.T_submap_kf[:, :3, 3] - centre, axis=1)
     far = int(np.argmax(distance))
     T = state.T_submap_kf.copy()
-    T[:, :3, 3] = centre + distance[far] / np.linalg.norm(T[far, :3, 3] - centre) * (T[:, :3, 3] - centre)
-    return T
+    unit = distance[far] / np.linalg.norm(T[far, :3, 3] - centre)
+    T[:, :3, 3] = centre + unit * (T[:, :3, 3] - centre)
+    return State(T, centre + unit * (state.xyz_mu - centre), state.lens)
 
 
 def _noise_ratio(problem: BundleProblem, state: State) -> float:

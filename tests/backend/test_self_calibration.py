@@ -207,6 +207,10 @@ class TestPreferredCamera:
         for path in (found.T_now[:, :3, 3], found.T_preferred[:, :3, 3]):
             errors.append(distances_when_aligned(path, true[:, :3, 3]).mean())
         assert errors[1] < 0.3 * errors[0]
+        paths = (submap.keyframe_poses(ids), found.T_now, found.T_preferred)
+        reach = [np.linalg.norm(T[:, :3, 3] - T[0, :3, 3], axis=1) for T in paths]
+        far = int(reach[0].argmax())
+        np.testing.assert_allclose([each[far] for each in reach], reach[0][far], rtol=1e-9)
 
     def test_a_camera_that_is_known_no_better_is_not_contradicted(self) -> None:
         camera, ids = wrong_camera(1.03), np.arange(10)
