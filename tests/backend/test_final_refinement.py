@@ -18,6 +18,7 @@ from dualslam.core.types import Features
 from dualslam.lab.metrics.alignment import distances_when_aligned
 from dualslam.map.submap import Submap
 from dualslam.testing.graph_scene import Feeder, GraphScene, guessed_submap, make_features, make_scene
+from tests.seeds import first_of
 
 N, ROBUST_K = 30, 0.8
 
@@ -49,7 +50,7 @@ def solved(scene: GraphScene) -> Submap:
     return submap
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", first_of(range(3)))
 def test_outliers_lose_their_say(seed: int) -> None:
     scene = scene_with_outliers(0.08, seed)
     submap = solved(scene)
@@ -58,7 +59,7 @@ def test_outliers_lose_their_say(seed: int) -> None:
     assert error(submap, scene) < 0.9 * before
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", first_of(range(3)))
 def test_without_outliers_little_changes(seed: int) -> None:
     scene = make_scene(N, 100, 0.3, seed)
     submap = solved(scene)

@@ -225,7 +225,9 @@ class TestRetry:
         main = trajectories_of(system).main
         assert set(main.index.tolist()) == set(range(90)) - COVERED
 
-    @pytest.mark.parametrize("failure", [None, Failure(FailureReason.SOLVER, "singular")])
+    @pytest.mark.parametrize(
+        "failure", [None, pytest.param(Failure(FailureReason.SOLVER, "singular"), marks=pytest.mark.slow)]
+    )
     def test_so_it_is_where_the_atlas_refuses_the_link(
         self, monkeypatch: pytest.MonkeyPatch, failure: Failure | None
     ) -> None:
@@ -238,7 +240,7 @@ class TestRetry:
             return AtlasReport(failure=failure, newly_rejected=() if failure else (replace(links[0], rejected=True),))
 
         monkeypatch.setattr(Connections, "connect", refuse_first)
-        system = self.run(n_failing=0)
+        system = self.run(n_failing=0, n_frames=70)
         first, second = system.events.of_kind(EventKind.RECOVERY_ENDED)
         assert [event.data["linked"] for event in (first, second)] == [False, True]
         refused = system.events.of_kind(EventKind.LINK_REFUSED)[-1]
@@ -253,7 +255,7 @@ class TestRetry:
             return replace(connect(self, links, now), newly_rejected=(older,))
 
         monkeypatch.setattr(Connections, "connect", with_another_rejected)
-        system = self.run(n_failing=0)
+        system = self.run(n_failing=0, n_frames=60)
         assert system.events.of_kind(EventKind.LINKED)
         assert system.events.of_kind(EventKind.FUSED)
         assert not system._recoveries.waiting

@@ -54,6 +54,7 @@ def test_a_lost_map_that_holds_more_than_the_new_one_keeps_its_frames() -> None:
     assert trajectories_of(system).main.index.tolist() == list(range(35))
 
 
+@pytest.mark.slow
 def test_a_lost_map_keeps_its_frames_where_the_walk_has_not_posed_them_all() -> None:
     system, _ = run(110, buffer={"duration_s": 3.5})  # the oldest frames are forgotten by then
     system.finish()

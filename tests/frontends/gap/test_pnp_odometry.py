@@ -22,6 +22,7 @@ from dualslam.frontends.gap.second_pose import SecondPose
 from dualslam.map.submap import NO_LANDMARK
 from dualslam.testing.point_world import CAMERA, SIZE_PX, PointWorld, cloud, path, random_features
 from tests.frontends.tracking.test_tracking import front_end
+from tests.seeds import first_of
 
 POSITION_M, ROTATION_RAD = 0.06, 0.005
 KEYFRAMES = [40, 43, 46, 49]
@@ -426,7 +427,7 @@ class TestGapPose:
 
     def test_uncertainty_is_that_of_the_errors(self) -> None:
         distance2 = []
-        for seed in range(8):
+        for seed in range(4):
             found, T_world_cam = wide_case(seed, 3, 0.1)
             assert isinstance(found, GapPose)
             error = se3.log(found.T_cam_submap @ T_world_cam)
@@ -434,7 +435,7 @@ class TestGapPose:
         # Six degrees of freedom, the covariance inflated by 1.5 squared.
         assert 0.5 < np.mean(distance2) < 12
 
-    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize("seed", first_of(range(3)))
     def test_road_that_looks_alike_bends_no_pose(self, seed: int) -> None:
         found, T_world_cam = wide_case(seed, 3, 0.6, look_alikes=12)
         assert isinstance(found, GapPose)

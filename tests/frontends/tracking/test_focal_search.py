@@ -29,7 +29,7 @@ def search(features: list[Features], seed: int = 0, size_px: tuple[int, int] = S
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_hand_held_camera_tells_its_focal_length(seed: int) -> None:
-    found = search(features_of(PointWorld(cloud(seed=seed), hand_held(60), seed=seed)), seed)
+    found = search(features_of(PointWorld(cloud(seed=seed), hand_held(40), seed=seed)), seed)
     assert isinstance(found, FocalSearch)
     assert found.focal_px == pytest.approx(CAMERA.fx, rel=0.05)
     low, high = found.range_px

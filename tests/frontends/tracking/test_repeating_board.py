@@ -15,7 +15,7 @@ from dualslam.lab.synthetic import make_sequence
 from dualslam.run.results import trajectories_of
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(9, marks=pytest.mark.slow), 11])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (9, 11))])
 def test_a_repeating_board_does_not_bend_the_map(seed: int) -> None:
     sequence = make_sequence("board", n_frames=45, seed=seed, width=480, height=360, supersampling=1.0)
     system = build_system(Config.model_validate({"seed": seed}), sequence.camera)
