@@ -18,6 +18,14 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from dualslam.backend.measurements.base import Mount
+    from dualslam.backend.measurements.direction import Direction
+    from dualslam.backend.measurements.distance import Distance
+    from dualslam.backend.measurements.height import Height
+    from dualslam.backend.measurements.position import Position
+    from dualslam.backend.measurements.relative_pose import RelativePose
+    from dualslam.backend.measurements.rotation_rate import RotationRate
+    from dualslam.backend.measurements.same_place import SamePlace
     from dualslam.build import build_system, create_frontend, recovery_parts
     from dualslam.core.camera.base import Camera
     from dualslam.core.config.files import config_from_dict, dump_config, load_config
@@ -43,6 +51,14 @@ if TYPE_CHECKING:
     from dualslam.viewer.progress import Progress
 
 _WHERE = {
+    "Mount": "backend.measurements.base",
+    "SamePlace": "backend.measurements.same_place",
+    "Distance": "backend.measurements.distance",
+    "Height": "backend.measurements.height",
+    "Direction": "backend.measurements.direction",
+    "RotationRate": "backend.measurements.rotation_rate",
+    "RelativePose": "backend.measurements.relative_pose",
+    "Position": "backend.measurements.position",
     "Camera": "core.camera.base",
     "Config": "core.config.settings",
     "ConfigError": "core.errors",
@@ -85,13 +101,21 @@ __all__ = [
     "Camera",
     "Config",
     "ConfigError",
+    "Direction",
+    "Distance",
     "DualSlamError",
     "Failure",
     "Frame",
     "FrameResult",
+    "Height",
     "InputError",
+    "Mount",
     "OutputError",
+    "Position",
     "Progress",
+    "RelativePose",
+    "RotationRate",
+    "SamePlace",
     "Slam",
     "SolverError",
     "System",

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 
+from dualslam.atlas.edge_covariances import Covariances
 from dualslam.backend.atlas_solver import GtsamAtlasSolver
 from dualslam.backend.local_ba import bundle_adjust, bundle_adjust_arrays
 from dualslam.backend.self_calibration import estimate_calibration
@@ -15,6 +17,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import FocalSearch, ToldFocal
 from dualslam.core.config.settings import Config
 from dualslam.core.interfaces import Frontend, SelfCalibrator, WindowSolver
+from dualslam.core.metric_problem import MeasurementSource, MetricProblem, MetricSolution, RowSource
 from dualslam.core.types import Failure, FloatArray, Frame
 from dualslam.frontends.asking import features_of
 from dualslam.frontends.place_matcher import FrontendPlaceMatcher
@@ -49,6 +52,42 @@ def place_parts(config: Config, frontend: Frontend, camera: Camera) -> PlacePart
 def atlas_solver(config: Config) -> GtsamAtlasSolver:
     """Build what solves the graph over all submaps."""
     return GtsamAtlasSolver(config.atlas.robust, config.graph.robust_k)
+
+
+@dataclass(frozen=True, slots=True)
+class MetricParts:
+    """What puts a map into the frame of measurements.
+
+    Attributes
+    ----------
+    covariances : callable
+        A submap's word on its edges.
+    solve : callable
+        `dualslam.backend.measurements.joint_graph.solve_metric`.
+    """
+
+    covariances: Covariances
+    solve: Callable[[MetricProblem, Sequence[MeasurementSource], Mapping[str, float] | None], MetricSolution]
+
+
+def metric_parts(config: Config) -> MetricParts:
+    """Build what puts a map into the frame of measurements."""
+    from dualslam.backend.measurements.joint_graph import solve_metric
+
+    return MetricParts(atlas_solver(config).edge_covariances, solve_metric)
+
+
+def measurement_sources(rows: Iterable[RowSource]) -> list[MeasurementSource]:
+    """Make readings of files' lines.
+
+    Raises
+    ------
+    InputError
+        Naming the line.
+    """
+    from dualslam.backend.measurements.registry import readings_of
+
+    return [readings_of(source) for source in rows]
 
 
 def window_solver(config: Config) -> WindowSolver:

@@ -97,6 +97,7 @@ def _build_parser() -> _Parser:
     _add_view(commands)
     _add_export(commands)
     _add_scale(commands)
+    _add_measure(commands)
     _add_render(commands)
     _add_config(commands)
     _add_demo(commands)
@@ -164,6 +165,7 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
     clock = parser.add_argument_group("clock").add_mutually_exclusive_group()
     clock.add_argument("--rate", metavar="HZ", type=_rate, help="frames a second, instead of the source's own times")
     clock.add_argument("--time-unit", choices=TIME_UNITS, help="unit of the source's own times; by default seconds")
+    _add_measurements(parser)
     saved = parser.add_argument_group("saved map")
     saved.add_argument(
         "--map", metavar="DIR", type=_path, help="run folder whose map this run finds its frames in, and extends"
@@ -274,6 +276,29 @@ def _add_scale(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser.add_argument(
         "--dictionary", choices=DICTIONARIES, default=DICTIONARIES[0], help=f"of markers (default: {DICTIONARIES[0]})"
     )
+
+
+def _add_measurements(parser: argparse.ArgumentParser, required: bool = False) -> None:
+    group = parser.add_argument_group("measurements")
+    group.add_argument(
+        "--measurements",
+        metavar="FILE",
+        type=_path,
+        action="append",
+        default=[],
+        required=required,
+        help="GPS, odometry, gyroscope, ...: CSV, GPX, SRT, bag, folder of images with EXIF, oxts or imu0; repeatable",
+    )
+    group.add_argument("--sigma", metavar="X", type=_length, help="of files without sigmas: metres, or rad of an IMU")
+    group.add_argument(
+        "--clock-offset", metavar="SECONDS", type=float, default=0.0, help="added to the measurements' times"
+    )
+
+
+def _add_measure(commands: argparse._SubParsersAction[_Parser]) -> None:
+    parser, _ = _command(commands, "measure", "Put the map of a run into the frame of measurements, in metres.")
+    parser.add_argument("run", metavar="RUN", type=_path, help="a run folder")
+    _add_measurements(parser, required=True)
 
 
 class _Distance(argparse.Action):

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from dualslam.build import check_config, fault_of_frontend
+from dualslam.build.parts import measurement_sources
 from dualslam.cli import logs
 from dualslam.cli.configuration import config_of, naming_source
 from dualslam.cli.console import final_line, no_map_line, progress, stage_table, verdict_line, waiting
@@ -22,6 +23,7 @@ from dualslam.io.reduced import MAX_SIDE_PX
 from dualslam.io.run_folder import MAP_PAGE, REPORT
 from dualslam.io.sequence import RecordedSequence
 from dualslam.run.focal import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
+from dualslam.run.measuring import read_rows
 from dualslam.run.session import Outcome, Watchers, check_out, run_to_folder
 from dualslam.run.sources import open_source
 from dualslam.viewer.live import LiveView
@@ -74,6 +76,8 @@ def _run(args: argparse.Namespace, config: Config) -> int:
                 config = with_prior(config, focal)
     if not has_camera:
         _tell(focal, args.quiet)
+    times_s = sequence.frame_timestamps if isinstance(sequence, RecordedSequence) else None
+    measurements = measurement_sources(read_rows(args.measurements, args.sigma, args.clock_offset, times_s))
     logs.release()
     with live_view(args) as live:
         with progress(sequence, args.quiet) as shown:
@@ -88,6 +92,7 @@ def _run(args: argparse.Namespace, config: Config) -> int:
                 focal=focal,
                 replay=args.replay,
                 decisions=args.decisions,
+                measurements=measurements,
                 watcher=Watchers([each for each in (live, shown) if each is not None]),
             )
         status = conclude(outcome, args)

@@ -25,6 +25,7 @@ from dualslam.core.types import BoolArray
 from dualslam.io.atomic import atomic_file, write_text
 from dualslam.io.folder_lock import FolderLock
 from dualslam.io.map_files import METADATA, to_plain
+from dualslam.io.metric_files import METRIC_FILES
 from dualslam.io.trajectory_files import Trajectory, write_kitti, write_tum
 from dualslam.map.frame_records import FrameRow as FrameRow  # a row of frames.csv
 
@@ -64,6 +65,7 @@ _FILES = (
     MAP_PAGE,
     GROUND_TRUTH,
     MASK,
+    *METRIC_FILES,
 )
 _RESULTS = (
     CONFIG,
@@ -260,8 +262,8 @@ class RunFolder:
         write_text(self.path / FRAMES, text.getvalue())
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Write ``summary.json``; NaN becomes null, as JSON has none."""
-        write_text(self.path / SUMMARY, json.dumps(to_plain(summary), indent=2, allow_nan=False) + "\n")
+        """Write ``summary.json``."""
+        write_summary(self.path, summary)
 
     def _write_unlinked(self, unlinked: Mapping[int, Trajectory]) -> None:
         folder = self.path / SUBMAPS
@@ -301,6 +303,11 @@ class RunFolder:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
+
+
+def write_summary(run: Path, summary: Mapping[str, Any]) -> None:
+    """Write ``summary.json`` of a run folder; NaN becomes null, as JSON has none."""
+    write_text(run / SUMMARY, json.dumps(to_plain(summary), indent=2, allow_nan=False) + "\n")
 
 
 def check_vacant(path: Path, *, overwrite: bool) -> None:

@@ -11,6 +11,7 @@ from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import FrameStatus
 from dualslam.map.frame_records import FrameRow
+from dualslam.run.measuring import MANY_REJECTED, Measured
 from dualslam.run.results import Trajectories
 from dualslam.system.audit.photometric import Sample, disagreeing_stretches
 from dualslam.system.audit.steps import measure_steps
@@ -37,7 +38,13 @@ INTERVALS_S = (1e-3, 2.0)
 """Median time between two frames: outside, timestamps are in another unit, or not those of the frames."""
 
 
-def judge_run(system: System, trajectories: Trajectories, rows: Sequence[FrameRow], crashed: bool = False) -> Verdict:
+def judge_run(
+    system: System,
+    trajectories: Trajectories,
+    rows: Sequence[FrameRow],
+    crashed: bool = False,
+    measured: Measured | None = None,
+) -> Verdict:
     """Judge a run that has ended.
 
     Parameters
@@ -48,6 +55,8 @@ def judge_run(system: System, trajectories: Trajectories, rows: Sequence[FrameRo
     rows : sequence of FrameRow
         Of `frame_rows`: one for each frame of the source.
     crashed : bool
+    measured : Measured, optional
+        The run in the frame of measurements from outside.
     """
     if not rows:
         return Verdict(Level.DOUBTFUL)
@@ -58,6 +67,8 @@ def judge_run(system: System, trajectories: Trajectories, rows: Sequence[FrameRo
     if len(trajectories.main):
         reasons += [*_jumps(system, trajectories), *_photometric(system, trajectories), *_scale(rows)]
         reasons += _focal(system, rows)
+    if measured is not None:
+        reasons += _measurements(rows, measured)
     return Verdict.of(reasons)
 
 
@@ -173,6 +184,20 @@ def _scale(rows: Sequence[FrameRow]) -> list[Reason]:
         "Too little is seen on both sides. Move sideways there, or turn more slowly."
     )
     return [Reason(ReasonCode.SCALE, Level.USABLE, text, first, last)]
+
+
+def _measurements(rows: Sequence[FrameRow], measured: Measured) -> list[Reason]:
+    if measured.undone:
+        pairs = ", ".join(f"{link.a} and {link.b}" for link in measured.undone)
+        text = f"The measurements contradict the join of submaps {pairs}: it was undone. Compare the two places."
+        return [_about_all(rows, ReasonCode.MEASUREMENTS, Level.USABLE, text)]
+    if measured.is_consistent and measured.rejected_share <= MANY_REJECTED:
+        return []
+    text = (
+        f"Map and measurements disagree: {100 * measured.rejected_share:.0f} % of the measurements were outvoted, and "
+        f"the rest are {measured.main.misfit:.1f} standard deviations off. Check their sigmas, clock and axes."
+    )
+    return [_about_all(rows, ReasonCode.MEASUREMENTS, Level.USABLE, text)]
 
 
 # --- camera and clock

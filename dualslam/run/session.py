@@ -15,14 +15,16 @@ from typing import Any, Protocol
 
 from dualslam import __version__
 from dualslam.build import build_system
+from dualslam.build.parts import metric_parts
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.config.files import dump_config
 from dualslam.core.config.settings import Config
 from dualslam.core.decisions import Decision
-from dualslam.core.errors import InputError, OutputError
+from dualslam.core.errors import InputError, OutputError, SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Sequence
+from dualslam.core.metric_problem import MeasurementSource
 from dualslam.core.threads import spare_cores
 from dualslam.core.types import Frame
 from dualslam.io.colours import Colours, save_colours, save_pictures
@@ -40,8 +42,9 @@ from dualslam.report import PlaceAlbum, SampleKeeper, read_run, report_page
 from dualslam.run.interrupts import Interrupts
 from dualslam.run.judgement import judge_run
 from dualslam.run.map_camera import camera_that_fits, in_size_of_map
+from dualslam.run.measuring import Measured, measure, write_measured
 from dualslam.run.no_map import StartRefusals
-from dualslam.run.results import frame_rows, summarise, trajectories_of, truth_of_frames
+from dualslam.run.results import Trajectories, frame_rows, summarise, trajectories_of, truth_of_frames
 from dualslam.run.runner import RunReport, run_sequence
 from dualslam.system.system import System
 from dualslam.viewer.map_page import map_page
@@ -152,6 +155,7 @@ def run_to_folder(
     watcher: Watcher | None = None,
     replay: str | Path | None = None,
     decisions: bool = False,
+    measurements: Iterable[MeasurementSource] = (),
 ) -> Outcome:
     """Run on a sequence and write a run folder. What an interrupted run, or one that crashed, has found is kept.
 
@@ -178,6 +182,8 @@ def run_to_folder(
         Run folder whose schedule is repeated, in one process: when answers were used, and which frames were dropped.
     decisions : bool
         Write ``decisions.jsonl``: every decision with its numbers and thresholds.
+    measurements : iterable of MeasurementSource
+        From outside the images: they put the map into their frame at the end.
 
     Raises
     ------
@@ -261,7 +267,7 @@ def run_to_folder(
                 folder.restore()
                 _write_new_events(system, folder)
                 given["no_map"] = None if system.poses or saved_map is not None else refusals.sentence()
-                summary = _write_results(system, report, config, sequence, folder, given)
+                summary = _write_results(system, report, config, sequence, folder, given, list(measurements))
                 if recorded is not None and replay is not None:
                     summary["replay"] = _compared(folder, Path(replay), recorded)
                     folder.write_summary(summary)
@@ -277,11 +283,20 @@ def run_to_folder(
                     raise
                 raise report.bug from error  # the map of a system that broke may be in pieces
     _raise_what_ended(report, interrupts, out)
+    if refused := summary.get("measurements", {}).get("refused"):
+        raise InputError(f"{refused} The run without measurements is in {out}.")
     return Outcome(Path(out), summary, report, system)
 
 
 def save_system(
-    system: System, config: Config, camera: Camera, report: RunReport, out: str | Path, *, overwrite: bool = False
+    system: System,
+    config: Config,
+    camera: Camera,
+    report: RunReport,
+    out: str | Path,
+    *,
+    overwrite: bool = False,
+    measurements: Iterable[MeasurementSource] = (),
 ) -> None:
     """Write the run folder of a finished system that a program fed by itself.
 
@@ -294,9 +309,12 @@ def save_system(
     report : RunReport
     out : path
     overwrite : bool
+    measurements : iterable of MeasurementSource
 
     Raises
     ------
+    InputError
+        If the measurements cannot belong to the map; the folder is written without them.
     OutputError
     """
     sequence = _Fed(camera)
@@ -305,8 +323,10 @@ def save_system(
         folder.write_config(dump_config(config))
         _write_new_events(system, folder)
         given = _given(sequence, False) | {"saved_map": None, "localise": False, "no_map": None}
-        _write_results(system, report, config, sequence, folder, given)
+        summary = _write_results(system, report, config, sequence, folder, given, list(measurements))
         _write_pages(folder)
+    if refused := summary.get("measurements", {}).get("refused"):
+        raise InputError(f"{refused} The run without measurements is in {out}.")
 
 
 class _Fed:
@@ -409,12 +429,21 @@ def refined_camera(system: System, was_searched: bool) -> dict[str, Any] | None:
 
 
 def _write_results(
-    system: System, report: RunReport, config: Config, sequence: Sequence, folder: RunFolder, given: dict[str, Any]
+    system: System,
+    report: RunReport,
+    config: Config,
+    sequence: Sequence,
+    folder: RunFolder,
+    given: dict[str, Any],
+    sources: list[MeasurementSource],
 ) -> dict[str, Any]:
     """Write all that comes at the end of a run, and return the summary, which begins with what was given."""
     trajectories = trajectories_of(system)
+    measured, refused = _measured(system, config, trajectories, sources)
+    if measured is not None and measured.undone:
+        trajectories = trajectories_of(system)
     rows = frame_rows(system, trajectories.main, report.dropped, report.latencies_ms)
-    verdict = judge_run(system, trajectories, rows, crashed=report.bug is not None)
+    verdict = judge_run(system, trajectories, rows, crashed=report.bug is not None, measured=measured)
     rows = [replace(row, doubt=verdict.doubt_about(row.index)) for row in rows]
     truth: Trajectory | None = getattr(sequence, "ground_truth", None)
     summary = (
@@ -426,11 +455,31 @@ def _write_results(
     summary["hidden_share"] = 0.0 if hidden is None else float(hidden.mean())
     if hidden is not None:
         folder.write_mask(hidden)
+    if measured is not None:
+        summary["measurements"] = measured.summary()
+    elif refused:
+        summary["measurements"] = {"refused": refused}
     folder.write(RunRecord(rows, trajectories.main, trajectories.unlinked, summary))
     if truth is not None and "no_errors" not in summary:
         folder.write_truth(truth_of_frames(truth, rows))
     save_atlas(folder.map_path, system.atlas, system.poses, system.camera)
+    if measured is not None:
+        write_measured(folder.path, measured, {i: system.numbers.index_of(i) for i in system.rows})
+        log.info("%s", measured.line())
     return summary
+
+
+def _measured(
+    system: System, config: Config, trajectories: Trajectories, sources: list[MeasurementSource]
+) -> tuple[Measured | None, str]:
+    """Return the run in the frame of its measurements; or None, and the sentence that refuses them."""
+    if not sources or not len(trajectories.main):
+        return None, ""
+    try:
+        found = measure(system.atlas, system.poses, trajectories.main_submaps, sources, metric_parts(config))
+    except (InputError, SolverError) as error:
+        return None, str(error)
+    return found, ""
 
 
 def _write_colours(system: System, sequence: RecordedSequence, folder: RunFolder, before: Colours) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from dualslam.core.config.files import load_config
 from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.memory import peak_rss_mb
+from dualslam.core.metric_problem import MeasurementSource
 from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import BoolArray, Frame
 from dualslam.io.export.exported_map import ExportedMap, flatten
@@ -80,6 +81,7 @@ class Slam:
         self._hidden = read_mask(Path(mask), self._camera.size_px) if isinstance(mask, str | Path) else mask
         self._n_frames = 0
         self._ended = False
+        self._readings: list[Any] = []
 
     def track(self, image: NDArray[np.uint8] | None, timestamp_s: float) -> FrameResult:
         """Take the next image.
@@ -106,6 +108,10 @@ class Slam:
         result = self.system.step(frame)
         self._n_frames += 1
         return result
+
+    def add(self, *readings: Any) -> None:
+        """Take measurements from outside the images, such as `Position`; `save` puts the map into their frame."""
+        self._readings += readings
 
     @property
     def map(self) -> ExportedMap | None:
@@ -135,11 +141,16 @@ class Slam:
 
         Raises
         ------
+        InputError
+            If measurements were added that cannot belong to the map; the folder is written without them.
         OutputError
             If there is a run already and `overwrite` is not set, or the folder cannot be written.
         """
         self.finish()
-        save_system(self.system, self._config, self._camera, self._report(), out, overwrite=overwrite)
+        given = [MeasurementSource("the program's measurements", self._readings)] if self._readings else []
+        save_system(
+            self.system, self._config, self._camera, self._report(), out, overwrite=overwrite, measurements=given
+        )
         return read_run(out)
 
     def localise(self) -> Slam:

@@ -34,6 +34,7 @@ class ReasonCode(StrEnum):
     DROPPED = "dropped"
     CLOCK = "clock"
     FOCAL = "focal"
+    MEASUREMENTS = "measurements"
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,131 @@
+"""The protocol of a measurement: what a sensor beside the camera says about one or two camera poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import ClassVar, Protocol, Self
+
+import numpy as np
+from numpy.random import Generator
+
+from dualslam.core.geometry import se3, so3
+from dualslam.core.types import FloatArray
+
+Residual = tuple[FloatArray, FloatArray]
+"""Residual (d,) and its Jacobian (d, 6 k + n): right perturbations of k poses, then the n shared unknowns."""
+
+
+class Gauge(StrEnum):
+    """What a measurement can fix of the similarity from the map to its own frame."""
+
+    TRANSLATION = "translation"
+    ROTATION = "rotation"
+    SCALE = "scale"
+
+
+def _identity() -> FloatArray:
+    return np.eye(4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mount:
+    """How a sensor is fixed to the camera.
+
+    Attributes
+    ----------
+    T_cam_body : (4, 4)
+        Sensor to camera (x right, y down, z forward), metres.
+    is_given : bool
+        False: the turn of a sensor that measures rotations is estimated; its place is taken to be the camera's.
+    """
+
+    T_cam_body: FloatArray = field(default_factory=_identity)
+    is_given: bool = False
+
+
+class Measurement(Protocol):
+    """One reading with its sigmas: a frozen dataclass. `conformance` checks all that is said here.
+
+    Attributes
+    ----------
+    kind : str
+        The word that names it in files and in the registry.
+    columns : tuple of str
+        Fields of its line in a file, after the kind.
+    units : tuple of str
+        ``m`` or ``rad`` for each component of the residual.
+    fixes : frozenset of Gauge
+    shared_sigmas : tuple of float
+        Standard deviations of the unknowns that all readings of a kind share, such as a bias; their mean is 0.
+    times_s : tuple of float
+        Of the poses that it is about, on the sensor's clock.
+    sigmas : (d,)
+        Standard deviations of the residual.
+    """
+
+    kind: ClassVar[str]
+    columns: ClassVar[tuple[str, ...]]
+    units: ClassVar[tuple[str, ...]]
+    fixes: ClassVar[frozenset[Gauge]]
+    shared_sigmas: ClassVar[tuple[float, ...]]
+
+    @property
+    def times_s(self) -> tuple[float, ...]:
+        """Times of the poses."""
+        ...
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard deviations of the residual."""
+        ...
+
+    def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
+        """Compare the reading with poses.
+
+        Parameters
+        ----------
+        T : (k, 4, 4)
+            Camera to the measurements' frame, metres, at `times_s`.
+        shared : (n,)
+        """
+        ...
+
+    @classmethod
+    def of_row(cls, row: Sequence[float], mount: Mount) -> Self:
+        """Make a reading of the numbers of a line, in the order of `columns`."""
+        ...
+
+    @classmethod
+    def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:
+        """Make the reading that true poses (k, 4, 4) give, with noise of a standard deviation; None: exact."""
+        ...
+
+
+def noise(rng: Generator | None, sigma: float, n: int) -> FloatArray:
+    """Return n normal numbers; zeros without a generator."""
+    return np.zeros(n) if rng is None else rng.normal(0.0, sigma, n)
+
+
+def point_jacobian(T: FloatArray, p_cam: FloatArray) -> FloatArray:
+    """Return the derivative (3, 6) of ``T @ p_cam`` by a right perturbation of a pose."""
+    R = T[:3, :3]
+    return np.asarray(np.hstack((-R @ so3.hat(p_cam), R)))
+
+
+def between(T: FloatArray, T_cam_body: FloatArray, T_a_b: FloatArray) -> Residual:
+    """Compare a motion with two poses (2, 4, 4): residual (6,) and Jacobian (6, 12), rotation then translation.
+
+    Parameters
+    ----------
+    T : (2, 4, 4)
+    T_cam_body : (4, 4)
+    T_a_b : (4, 4)
+        Measured motion of the body: its second pose in its first.
+    """
+    T_b_a = se3.inverse(T[1] @ T_cam_body) @ T[0] @ T_cam_body
+    r = se3.log(se3.inverse(T_b_a @ T_a_b))
+    J_r = se3.right_jacobian_inverse(r)
+    Ad = se3.adjoint(se3.inverse(T_cam_body))
+    return r, np.hstack((-J_r @ se3.adjoint(T_b_a) @ Ad, J_r @ Ad))

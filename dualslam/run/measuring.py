@@ -1,0 +1,221 @@
+"""Measurements at the end of a run: the joint graph of each linked set, and what it says of the run."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dualslam.atlas.atlas import Atlas, Link
+from dualslam.atlas.metric import MetricMap
+from dualslam.atlas.trajectory import FramePose
+from dualslam.build.parts import MetricParts
+from dualslam.core.errors import InputError, SolverError
+from dualslam.core.metric_problem import MeasurementSource, MetricSolution, RowSource
+from dualslam.core.trajectory import Trajectory
+from dualslam.core.types import FloatArray
+from dualslam.io.measurements import read_measurements
+from dualslam.io.metric_files import write_metric
+from dualslam.io.metric_scale import write_scale
+
+log = logging.getLogger(__name__)
+
+MAX_SCALE_SIGMA, MAX_TURN_RAD = 0.1, 0.2
+"""A map that measurements place no better has no place among the others: its scale or turn is not known."""
+MAX_METRIC_SIGMA = 0.5
+"""Of the logarithm of the scale: beyond, a trajectory is not in metres."""
+MAX_MISFIT = 5.0
+"""Standard deviations of the joint cost over its expectation, at the largest drift: measurements and map disagree."""
+MANY_REJECTED = 0.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """A run in the frame of its measurements.
+
+    Attributes
+    ----------
+    frames : Trajectory
+        All frames that could be placed, by their numbers.
+    covariance : (F, 6, 6)
+    main : MetricSolution
+        Of the main map.
+    placed_alone : list of int
+        Submaps outside the main map that only measurements place.
+    undone : list of Link
+        Connections that the measurements contradict.
+    origin : (float, float, float) or None
+    """
+
+    frames: Trajectory
+    covariance: FloatArray
+    main: MetricSolution
+    placed_alone: list[int] = field(default_factory=list)
+    undone: list[Link] = field(default_factory=list)
+    origin: tuple[float, float, float] | None = None
+
+    @property
+    def is_consistent(self) -> bool:
+        """Whether map and measurements agree within their sigmas."""
+        return self.main.misfit <= MAX_MISFIT
+
+    @property
+    def rejected_share(self) -> float:
+        """Share of the measurements that were outvoted."""
+        n_rejected, n_used = sum(self.main.rejected.values()), sum(self.main.used.values())
+        return n_rejected / max(n_rejected + n_used, 1)
+
+    def line(self) -> str:
+        """Return the outcome in one line."""
+        s = self.main
+        used = ", ".join(f"{n} of {kind}" for kind, n in s.used.items())
+        parts = [f"{used} used, {sum(s.rejected.values())} rejected, {sum(s.outside.values())} without a pose"]
+        parts.append(f"scale known to {100 * s.scale_sigma:.2g} %")
+        parts += [f"clock of {name} {t:+.2f} s" for name, t in s.clock_offset_s.items() if t]
+        if self.placed_alone:
+            parts.append(f"submaps placed by measurements alone: {', '.join(map(str, self.placed_alone))}")
+        return f"measurements: {'; '.join(parts)}"
+
+    def summary(self) -> dict[str, Any]:
+        """Return what ``summary.json`` holds."""
+        s = self.main
+        return {
+            "used": dict(s.used),
+            "rejected": dict(s.rejected),
+            "outside": dict(s.outside),
+            "normalised_rms": dict(s.normalised),
+            "clock_offset_s": dict(s.clock_offset_s),
+            "clock_sigma_s": dict(s.clock_sigma_s),
+            "metres_per_unit": s.metres_per_unit,
+            "scale_sigma": s.scale_sigma,
+            "rotation_sigma_rad": s.rotation_sigma_rad,
+            "translation_sigma_m": s.translation_sigma_m,
+            "drift": s.drift,
+            "misfit_sigmas": s.misfit,
+            "frames": len(self.frames),
+            "submaps_placed_by_measurements_alone": self.placed_alone,
+            "joins_undone": [[link.a, link.b] for link in self.undone],
+            "origin": None if self.origin is None else list(self.origin),
+        }
+
+
+def read_rows(
+    paths: Sequence[Path], sigma: float | None, clock_offset_s: float, frame_times_s: FloatArray | None
+) -> list[RowSource]:
+    """Read files of measurements; positions by latitude and longitude have the first one's origin.
+
+    Raises
+    ------
+    InputError
+    """
+    found: list[RowSource] = []
+    origin = None
+    for path in paths:
+        found.append(read_measurements(path, sigma, clock_offset_s, frame_times_s, origin))
+        origin = origin or found[-1].origin
+    return found
+
+
+def measure(
+    atlas: Atlas,
+    poses: Mapping[int, FramePose],
+    main: list[int],
+    sources: Sequence[MeasurementSource],
+    parts: MetricParts,
+) -> Measured:
+    """Put all maps that measurements can place into their frame.
+
+    Connections that the measurements contradict are marked as rejected in the atlas, and the main map is solved again.
+
+    Parameters
+    ----------
+    atlas : Atlas
+    poses : mapping of int to FramePose
+    main : list of int
+        Submaps of the main map.
+    sources : sequence of MeasurementSource
+    parts : MetricParts
+
+    Raises
+    ------
+    InputError
+        In one sentence, where the measurements cannot belong to the main map.
+    SolverError
+    """
+    undone: list[Link] = []
+    while True:
+        metric = MetricMap.of(atlas, list(poses.values()), main, parts.covariances)
+        if metric is None:
+            raise InputError(f"{', '.join(s.name for s in sources)}: no map to measure: too few frames have poses.")
+        solution = parts.solve(metric.problem, sources, None)
+        refuted = metric.refuted(solution)
+        if not refuted:
+            break
+        undone += refuted
+        atlas.links = [replace(link, rejected=True) if link in refuted else link for link in atlas.links]
+        n_posed = {m: sum(pose.submap_id == m for pose in poses.values()) for m in main}
+        left = [c for c in atlas.components() if set(c) <= set(main)]
+        main = max(left, key=lambda c: sum(n_posed[m] for m in c))
+    if solution.scale_sigma > MAX_METRIC_SIGMA:
+        raise InputError(
+            f"{', '.join(s.name for s in sources)}: these measurements do not fix the scale of the map; "
+            "add positions, distances or odometry."
+        )
+    frames, covariance = [metric.placed(solution)], [metric.covariances(solution)]
+    alone: list[int] = []
+    for component in atlas.components():
+        if component == main:
+            continue
+        placed = _place_alone(atlas, poses, component, sources, parts, solution.clock_offset_s)
+        if placed is not None:
+            frames.append(placed[0])
+            covariance.append(placed[1])
+            alone += component
+    origin = next((s.origin for s in sources if s.origin is not None), None)
+    return Measured(_together(frames), np.concatenate(covariance), solution, alone, undone, origin)
+
+
+def _place_alone(
+    atlas: Atlas,
+    poses: Mapping[int, FramePose],
+    component: list[int],
+    sources: Sequence[MeasurementSource],
+    parts: MetricParts,
+    offsets_s: Mapping[str, float],
+) -> tuple[Trajectory, FloatArray] | None:
+    """Place a linked set that the main map is not joined with; None where measurements do not fix it."""
+    clocks = {s.name: offsets_s.get(s.name, 0.0) for s in sources}
+    try:
+        metric = MetricMap.of(atlas, list(poses.values()), component, parts.covariances)
+        if metric is None:
+            return None
+        solution = parts.solve(metric.problem, sources, clocks)
+    except (InputError, SolverError) as error:
+        log.info("submaps %s are not placed by measurements: %s", component, error)
+        return None
+    if solution.scale_sigma > MAX_SCALE_SIGMA or solution.rotation_sigma_rad > MAX_TURN_RAD:
+        return None
+    return metric.placed(solution), metric.covariances(solution)
+
+
+def _together(frames: Sequence[Trajectory]) -> Trajectory:
+    return Trajectory(
+        np.concatenate([t.timestamps_s for t in frames]),
+        np.concatenate([t.T_world_cam for t in frames]),
+        np.concatenate([t.index for t in frames]),
+    )
+
+
+def write_measured(folder: Path, measured: Measured, index_of: Mapping[int, int]) -> None:
+    """Write the metric files of a run folder; `index_of`: of a frame's number in the source, where it has one."""
+    kept = np.array([i in index_of for i in measured.frames.index.tolist()], bool)
+    frames = measured.frames.take(kept)
+    frames = Trajectory(
+        frames.timestamps_s, frames.T_world_cam, np.array([index_of[i] for i in frames.index.tolist()], np.int64)
+    )
+    write_metric(folder, frames, measured.covariance[kept], measured.main.exports, measured.origin)
+    write_scale(folder, measured.main.metres_per_unit, measured.main.scale_sigma, "measurements")
