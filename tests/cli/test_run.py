@@ -69,6 +69,19 @@ def test_a_run_leaves_all_that_it_should(
         assert field in summary
 
 
+def test_decisions_are_written_where_they_are_asked_for(
+    folder: Path, fake: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, options in (("without", []), ("with", ["--decisions"])):
+        assert main(["run", str(folder), "--out", str(tmp_path / name), "--quiet", *options]) == 0
+    assert not (tmp_path / "without" / "decisions.jsonl").exists()
+    started = json.loads((tmp_path / "with" / "decisions.jsonl").read_text().splitlines()[0])
+    assert (started["what"], started["accepted"]) == ("start", True)
+    capsys.readouterr()
+    assert main(["explain", str(tmp_path / "with"), "--frame", str(started["frame"])]) == 0
+    assert "A map starts." in capsys.readouterr().out
+
+
 def test_versions_name_an_extra_that_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("torch", "kornia"):
         monkeypatch.delitem(sys.modules, name, raising=False)
