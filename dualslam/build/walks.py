@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -12,17 +12,18 @@ from dualslam.backend.self_calibration import find_preferred_camera
 from dualslam.build.checks import auxiliary_config, naming_attempt
 from dualslam.build.parts import bundle_adjuster, graph_maker, window_solver
 from dualslam.core.camera.base import Camera
-from dualslam.core.config.settings import AttemptConfig, Config
+from dualslam.core.config.settings import AttemptConfig, Config, FrontendConfig
+from dualslam.core.errors import ConfigError
 from dualslam.core.estimates import PreferredCamera
 from dualslam.core.interfaces import Frontend, SubmapGraph
 from dualslam.core.support import judge_track
-from dualslam.core.types import IntArray, View
+from dualslam.core.types import Failure, FailureReason, IntArray, View
 from dualslam.frontends.features.image_features import ImageFeatures
 from dualslam.frontends.gap.auxiliary_features import Auxiliary, BufferedFeatures, OwnFeatures
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry
 from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.gap.route import Route, find_lack
-from dualslam.frontends.registry import FOR_WALKS, create_frontend
+from dualslam.frontends.registry import FOR_WALKS, create_frontend, find_missing
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
 from dualslam.linking.gates import DESCRIPTOR_RADIUS_PX
@@ -68,16 +69,16 @@ def recovery_parts(
         n_covering = 0 if job.lost else config.recovery.covering_keyframes
         return VisualFrontEnd(frontend, config, submap, graph, camera, refinder, n_covering, window_solver(config))
 
-    auxiliaries: dict[str, ImageFeatures] = {}  # of the attempts, by their settings
+    auxiliaries = _auxiliaries(config, n_threads)
 
     def foresee(view: View) -> None:
-        images = next(iter(auxiliaries.values()), None)
+        images = next((each.images for each in auxiliaries.values() if each.is_built), None)
         if images is not None and view.image is not None and find_lack(view, config.tracking.min_inliers) is None:
             images.of(view.image)
 
     matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, DESCRIPTOR_RADIUS_PX)
     return RecoveryParts(
-        attempts=_attempts(config, frontend, live, camera, n_threads, auxiliaries),
+        attempts=_attempts(config, frontend, live, camera, auxiliaries),
         posing=Attempt("live", live),
         new_graph=new_graph or graph_maker(config),
         link=lambda old, new, onset: estimate_link(
@@ -94,40 +95,77 @@ def recovery_parts(
     )
 
 
+class _ImagesOf:
+    """What another front end finds in the buffered images. The front end is built when it is first needed."""
+
+    def __init__(self, wanted: FrontendConfig, n_threads: int) -> None:
+        self._wanted = wanted
+        self._n_threads = n_threads
+
+    @property
+    def is_built(self) -> bool:
+        """Whether the front end is there."""
+        return "images" in self.__dict__
+
+    @cached_property
+    def images(self) -> ImageFeatures:
+        """Build the front end."""
+        return ImageFeatures(create_frontend(self._wanted, FOR_WALKS), self._n_threads)
+
+    def find_lack(self) -> Failure | None:
+        """Return why the front end cannot be built here."""
+        missing = find_missing(self._wanted.name)
+        if missing is not None:
+            return Failure(FailureReason.NOT_INSTALLED, missing)
+        try:
+            self.images  # noqa: B018
+        except ConfigError as error:
+            return Failure(FailureReason.NOT_INSTALLED, error.problem)
+        return None
+
+
+def _auxiliaries(config: Config, n_threads: int) -> dict[str, _ImagesOf]:
+    """Return the front ends of the attempts by their settings. Attempts with the same settings share features.
+
+    Front ends that a run may do without are built when an attempt needs them: their packages take seconds to import.
+    """
+    auxiliaries: dict[str, _ImagesOf] = {}
+    for number, attempt in enumerate(config.recovery.attempts):
+        if attempt.is_live:
+            continue
+        wanted = auxiliary_config(attempt)
+        images = auxiliaries.setdefault(wanted.model_dump_json(), _ImagesOf(wanted, n_threads))
+        if not attempt.if_installed:
+            with naming_attempt(number):
+                images.images  # noqa: B018
+    return auxiliaries
+
+
 def _attempts(
     config: Config,
     frontend: Frontend,
     live: Callable[[RecoveryJob, Submap, SubmapGraph], VisualFrontEnd],
     camera: Camera,
-    n_threads: int,
-    auxiliaries: dict[str, ImageFeatures],
+    auxiliaries: dict[str, _ImagesOf],
 ) -> tuple[Attempt, ...]:
-    """Build the attempts; those with the same auxiliary front end share what it finds in the images: `auxiliaries`."""
+    """Build the attempts."""
     own = Auxiliary(frontend, OwnFeatures())
     attempts = []
-    for number, attempt in enumerate(config.recovery.attempts):
+    for attempt in config.recovery.attempts:
         if attempt.is_live:
             attempts.append(_attempt_by(lambda camera: (own,), attempt, config, live, camera))
             continue
-        wanted = auxiliary_config(attempt)
-        key = wanted.model_dump_json()
-        if key not in auxiliaries:
-            with naming_attempt(number):
-                auxiliaries[key] = ImageFeatures(create_frontend(wanted, FOR_WALKS), n_threads)
-        by_images = partial(_after, (), auxiliaries[key], config.camera.model_sigma_px)
-        thorough = replace(_attempt_by(by_images, attempt, config, live, camera), features=key)
-        if attempt.tracking == "live":
-            own_first = partial(_after, (own,), auxiliaries[key], config.camera.model_sigma_px)
-            short = _attempt_by(own_first, attempt, config, live, camera)
-            attempts.append(replace(short, features=key, thorough=thorough))
-        else:
-            attempts.append(thorough)
+        others = auxiliaries[auxiliary_config(attempt).model_dump_json()]
+        first = (own,) if attempt.tracking == "live" else ()
+        made = _attempt_by(partial(_after, first, others, config.camera.model_sigma_px), attempt, config, live, camera)
+        attempts.append(replace(made, find_lack=others.find_lack) if attempt.if_installed else made)
     return tuple(attempts)
 
 
 def _after(
-    first: tuple[Auxiliary, ...], images: ImageFeatures, model_sigma_px: float, camera: Camera
+    first: tuple[Auxiliary, ...], others: _ImagesOf, model_sigma_px: float, camera: Camera
 ) -> tuple[Auxiliary, ...]:
+    images = others.images
     return (*first, Auxiliary(images.frontend, BufferedFeatures(images, model_sigma_px, camera)))
 
 

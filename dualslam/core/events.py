@@ -32,6 +32,7 @@ class EventKind(StrEnum):
     RECOVERY_STARTED = "recovery_started"
     RECOVERY_ATTEMPT = "recovery_attempt"
     RECOVERY_FAILED = "recovery_failed"
+    ATTEMPT_UNAVAILABLE = "attempt_unavailable"
     RECOVERY_ENDED = "recovery_ended"
     LINKED = "linked"
     LINK_REFUSED = "link_refused"

@@ -345,11 +345,6 @@ class VisualOdometry(Protocol):
         ...
 
     @property
-    def took_short_cut(self) -> bool:
-        """Whether features at hand have crossed a gap where others, that give more matches, were not asked."""
-        ...
-
-    @property
     def rivals(self) -> tuple[Rival, ...]:
         """Other answers to where the camera is beyond the gaps that were crossed, and the one at hand."""
         ...

@@ -332,6 +332,7 @@ class FailureReason(StrEnum):
     DEGENERATE = "degenerate"
     SOLVER = "solver"
     UNREADABLE = "unreadable"
+    NOT_INSTALLED = "not_installed"
     SCALE = "scale"
     SCALE_LOST = "scale_lost"
     CAMERA = "camera"

@@ -292,6 +292,9 @@ class Recoveries:
         """Take over the events of a walk's attempts; each attempt says what was known of the loss, too."""
         told = self._circumstances.get(result.submap.id, {})
         for event in result.events:
+            reported = self._record.events.of_kind(EventKind.ATTEMPT_UNAVAILABLE)
+            if event.event is EventKind.ATTEMPT_UNAVAILABLE and any(event.data == each.data for each in reported):
+                continue
             data = event.data | (told if event.event is EventKind.RECOVERY_ATTEMPT else {})
             at = event.frame, event.timestamp_s, event.submap
             self._record.events.add(event.event, *at, event.gates, **data)

@@ -24,11 +24,9 @@ class Progress:
     n_gaps: int = 0
     n_skipped: int = 0  # frames without a pose between some that have one
     n_unusable: int = 0  # the last frames
-    took_short_cut: bool = False
     out_of_time: bool = False
     given_up: bool = False
     needs_camera: bool = False  # no other walk would do better, before the camera is calibrated
-    needs_live_end: bool = False  # nor before the live end has grown, from which all of them set out
     needs_old_map: bool = False  # nor ever: all keyframes of the lost maps leave the scale open
     looks_alike: bool = False  # beyond a gap: what one front end cannot tell apart another may not even notice
     before_gap: int | None = None  # the frame from which the first gap was crossed

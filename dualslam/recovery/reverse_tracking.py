@@ -52,14 +52,12 @@ Steps = Generator[WalkNews | None, bool | None, Outcome]
 class Attempt:
     """One way to track in reverse, by the name of the front end that its poses come from.
 
-    `features`: names what it sees in the images; two ways with the same see the same.
-    `thorough`: the same way without short cuts, made where those that it took lead to no link.
+    `find_lack`: returns why the attempt cannot be made in this installation. It is asked before each attempt.
     """
 
     name: str
     new_odometry: Callable[[RecoveryJob, Submap, SubmapGraph], VisualOdometry]
-    features: str = ""
-    thorough: Attempt | None = None
+    find_lack: Callable[[], Failure | None] = lambda: None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,12 +99,13 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Steps[RecoveryRe
     problem = Failure(FailureReason.SOLVER)
     events: list[Event] = []
     looks_alike, needs_camera, tries = False, False, job.tries.copy()
-    ways = list(parts.attempts if job.lost else (parts.posing,))
-    thorough: Attempt | None = None
-    while ways:
-        attempt = ways.pop(0)
+    for attempt in parts.attempts if job.lost else (parts.posing,):
         if best is not None and best.out_of_time:
             break
+        if (lack := attempt.find_lack()) is not None:
+            problem = lack
+            events.append(_unavailable(job, attempt, lack))
+            continue
         progress = yield from _make_told_apart(job, parts, attempt, tries)
         if isinstance(progress, Failure):
             problem = progress
@@ -114,16 +113,10 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Steps[RecoveryRe
         events += progress.events
         looks_alike = looks_alike or progress.looks_alike
         needs_camera = progress.needs_camera or progress.needs_old_map
-        came_as_far = best is not None and len(progress.frames) >= len(best.frames)
-        if best is None or progress.link is not None or (attempt is thorough and came_as_far):
+        if best is None or progress.link is not None:
             best, way = progress, attempt
-        if progress.link is not None or needs_camera or progress.needs_live_end or progress.looks_alike:
+        if progress.link is not None or needs_camera or progress.looks_alike:
             break
-        if progress.took_short_cut and attempt.thorough is not None:
-            thorough = attempt.thorough
-            # Beyond a gap that these features have crossed, or not, they pose no more by going from frame to frame as
-            # well: of 16 such third attempts none has come to a link, nor of 28 after `gap` and `live`.
-            ways = [thorough, *(way for way in ways if way.features != attempt.features)]
     if best is None:
         return problem
     if (gap := best.lost_scale_from(parts.max_scale_sigma)) is not None:
@@ -132,6 +125,12 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Steps[RecoveryRe
     frames = tuple(best.frames.values())
     ending = looks_alike, needs_camera, tries
     return RecoveryResult(best.submap, frames, best.link, tuple(events), seconds, cpu_s, *ending)
+
+
+def _unavailable(job: RecoveryJob, attempt: Attempt, lack: Failure) -> Event:
+    stamp = job.submap.keyframes[job.newest_id].timestamp_s
+    data = {"attempt": attempt.name, "verdict": lack.detail}
+    return Event(EventKind.ATTEMPT_UNAVAILABLE, job.newest_id, stamp, job.submap.id, data)
 
 
 def _as_far_as(gap: int, job: RecoveryJob, parts: RecoveryParts, attempt: Attempt) -> Steps[Progress]:
@@ -199,7 +198,6 @@ def _make_attempt(
         if isinstance(step.track, Failure):
             progress.note_unusable(step.track)
             continue
-        progress.took_short_cut = reverse_tracker.took_short_cut
         if step.track.wide and progress.before_gap is None:
             progress.before_gap = min(progress.frames, default=job.newest_id)
         progress.note_posed(_recovered_frame(reverse_tracker, step.view, step.track), step.report is not None)
@@ -220,10 +218,6 @@ def _make_attempt(
             # A lost map of few keyframes hardly knows its scale: another way over the same ones knows it no better.
             at_overlap = isinstance(tried.result, Failure) and tried.result.reason is FailureReason.SCALE
             progress.needs_old_map |= at_overlap and relinker.holds_all
-            # What was lost across a gap the others lose as well: they cross it by the same matches, or by fewer. Only
-            # where a short cut was taken there are more.
-            was_lost = found.reason is FailureReason.SCALE_LOST and progress.n_gaps > 0
-            progress.needs_live_end |= was_lost and not progress.took_short_cut
             progress.given_up |= progress.needs_camera or found.reason is FailureReason.SCALE_LOST
             # As long as the walk is not far enough beyond the gap nothing is measured, and more may tell.
             is_of_motion = found.reason in (FailureReason.LEAP, FailureReason.LOOK_ALIKE)

@@ -85,7 +85,6 @@ class PnpOdometry:
         self._following = False  # whether the last frame that was given has a pose
         self._relocalised: int | None = None  # the last frame that a gap relocalisation has posed
         self._crossing: Crossing | None = None  # of the frame that was given last
-        self._took_short_cut = False
         self._rivals: tuple[Rival, ...] = ()
 
     # --- the VisualOdometry protocol, as far as the live front end does it
@@ -103,11 +102,6 @@ class PnpOdometry:
     def keep(self, keyframe_ids: Set[int]) -> None:
         """Never cull these keyframes."""
         self._live.keep(keyframe_ids)
-
-    @property
-    def took_short_cut(self) -> bool:
-        """Whether any but the last of the front ends has crossed a gap."""
-        return self._took_short_cut
 
     @property
     def rivals(self) -> tuple[Rival, ...]:
@@ -221,7 +215,6 @@ class PnpOdometry:
             if isinstance(found, Failure):
                 found = finder.relocalise(view, ahead)
             if not isinstance(found, Failure):
-                self._took_short_cut |= isinstance(found, Crossing) and finder is not self._finders[-1]
                 return found
             if finder.waits and not has_waited and not self._finders[-1].waits:
                 return found  # the next frame may confirm it

@@ -195,11 +195,6 @@ class VisualFrontEnd:
         self._note_gap(track)
 
     @property
-    def took_short_cut(self) -> bool:
-        """False: there are no other features."""
-        return False
-
-    @property
     def rivals(self) -> tuple[Rival, ...]:
         """None: a pose that has one is not believed."""
         return ()

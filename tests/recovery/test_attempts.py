@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,13 +18,15 @@ from dualslam.build import build_system, recovery_parts
 from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.config.corruption import Corruption
 from dualslam.core.config.corruption import CorruptionKind as SpoilKind
-from dualslam.core.config.settings import AttemptConfig, Config, LinkingConfig, RecoveryConfig
+from dualslam.core.config.settings import AttemptConfig, Config, FrontendConfig, LinkingConfig, RecoveryConfig
 from dualslam.core.errors import ConfigError, SolverError
 from dualslam.core.events import Event, EventKind
+from dualslam.core.extras import how_to_install
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.jobs import JobKind, Limit
 from dualslam.core.types import Failure, FailureReason, Features, View
+from dualslam.frontends import registry
 from dualslam.frontends.features.sift import SiftFrontend
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry
 from dualslam.lab.audits.link_audit import LinkAudit, audit_links
@@ -51,6 +53,8 @@ class TestConfig:
         assert [attempt.frontend for attempt in attempts] == ["live", "sift", "orb"]
         assert attempts[0].is_live
         assert attempts[2] == AttemptConfig(frontend="orb", n_features=4000)
+        (learned,) = config(attempts=["learned"]).attempts
+        assert (learned.frontend, learned.tracking, learned.if_installed) == ("kornia", "own", True)
         (gap,) = config(attempts=["gap"]).attempts
         assert (gap.frontend, gap.tracking, gap.name) == ("sift", "live", "gap (sift)")
 
@@ -106,32 +110,70 @@ class TestOrder:
         assert {k: v for k, v in alone.items() if k != "seconds"} == {k: v for k, v in second.items() if k != "seconds"}
 
     @pytest.mark.parametrize(
-        ("given", "links", "made"),
-        [
-            (["gap"], True, ["gap (sift)"]),
-            (["gap"], False, ["gap (sift)", "gap (sift)"]),
-            (["gap", "sift", "live"], False, ["gap (sift)", "gap (sift)", "live"]),
-        ],
+        ("links", "made"), [(True, ["gap (sift)"]), (False, ["gap (sift)", "live"])], ids=["linked", "not linked"]
     )
-    def test_a_short_cut_without_a_link_is_followed_by_the_thorough_way(
-        self, given: list[str], links: bool, made: list[str]
-    ) -> None:
-        """Live features cross the gap; where no link comes of it other features are asked, which here see nothing.
-
-        They are asked once.
-        """
+    def test_a_crossed_gap_without_a_link_is_followed_by_the_next_attempt(self, links: bool, made: list[str]) -> None:
         world = PointWorld(cloud(), hand_held(60), covered=COVERED)
         linking = {} if links else {"min_inliers": 100_000}
-        system = system_in(world, recovery={"attempts": given, "retry_keyframes": []}, linking=linking)
+        system = system_in(world, recovery={"attempts": ["gap", "live"], "retry_keyframes": []}, linking=linking)
         for frame in world.frames():
             system.step(frame)
         attempts = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)
         assert attempts[0].data["gaps"] == 1
         assert [attempt.data["attempt"] for attempt in attempts] == made
-        if not links:
-            assert attempts[1].data["gaps"] == 0
 
-    @pytest.mark.parametrize(("buffer_s", "made"), [(10.0, ["live"]), (1.4, ["live", "gap (sift)", "gap (sift)"])])
+    def test_an_attempt_that_is_not_installed_is_left_out_and_reported_once(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(registry, "find_spec", lambda package: None)
+        monkeypatch.setattr(registry, "BUILT_IN", {"orb": registry.BUILT_IN["orb"]})  # to import it fails the test
+        given = {"attempts": ["learned", "live", "learned"], "retry_keyframes": []}
+        world = PointWorld(cloud(), hand_held(60), covered=COVERED)
+        system = system_in(world, recovery=given, linking={"min_inliers": 100_000})
+        for frame in world.frames():
+            system.step(frame)
+        (made,) = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)
+        assert made.data["attempt"] == "live"
+        (unavailable,) = system.events.of_kind(EventKind.ATTEMPT_UNAVAILABLE)
+        assert unavailable.data == {"attempt": "kornia", "verdict": how_to_install("kornia")}
+
+    def test_an_installed_attempt_is_built_when_it_is_made(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Its front end is a fake: the walk asks it for features of the images, of which a world of points has none."""
+        built: list[str] = []
+
+        def create(wanted: FrontendConfig, needs: Iterable[str] = ()) -> SiftFrontend:
+            built.append(wanted.name)
+            return SiftFrontend(wanted.n_features)
+
+        monkeypatch.setattr(registry, "find_spec", lambda package: object())
+        monkeypatch.setattr("dualslam.build.walks.create_frontend", create)
+        world = PointWorld(cloud(), hand_held(60), covered=COVERED)
+        given = {"attempts": ["live", "learned"], "retry_keyframes": []}
+        system = system_in(world, recovery=given, linking={"min_inliers": 100_000})
+        assert built == []
+        for frame in world.frames():
+            system.step(frame)
+        assert built == ["kornia"]
+        made = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)
+        assert [attempt.data["attempt"] for attempt in made] == ["live", "kornia"]
+        assert not system.events.of_kind(EventKind.ATTEMPT_UNAVAILABLE)
+
+    def test_a_broken_installation_is_reported_and_the_run_goes_on(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def create(wanted: FrontendConfig, needs: Iterable[str] = ()) -> SiftFrontend:
+            raise ConfigError("'kornia' cannot be imported: libcudart.so.12 is missing", ("frontend", "name"))
+
+        monkeypatch.setattr(registry, "find_spec", lambda package: object())
+        monkeypatch.setattr("dualslam.build.walks.create_frontend", create)
+        world = PointWorld(cloud(), hand_held(60), covered=COVERED)
+        system = system_in(world, recovery={"attempts": ["learned", "live"], "retry_keyframes": []})
+        for frame in world.frames():
+            system.step(frame)
+        (unavailable,) = system.events.of_kind(EventKind.ATTEMPT_UNAVAILABLE)
+        assert "libcudart.so.12 is missing" in unavailable.data["verdict"]
+        (linked,) = system.events.of_kind(EventKind.LINKED)
+        assert linked.data["attempt"] == "live"
+
+    @pytest.mark.parametrize(("buffer_s", "made"), [(10.0, ["live"]), (1.4, ["live", "gap (sift)"])])
     def test_where_all_of_the_lost_map_leaves_the_scale_open_no_other_way_is_tried(
         self, monkeypatch: pytest.MonkeyPatch, buffer_s: float, made: list[str]
     ) -> None:
