@@ -18,7 +18,7 @@ from scipy.special import ndtri
 from dualslam.atlas.atlas import Link
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.jobs import Desk, Handlers, InlineDesk, JobKind
-from dualslam.core.types import Failure, IntArray
+from dualslam.core.types import Failure, FloatArray, IntArray
 from dualslam.linking.gates import PIXEL_CHI2
 from dualslam.linking.scale_observability import N_AROUND, ScaleQuestion, answer_scale, ask_scale
 from dualslam.map.submap import Submap
@@ -37,6 +37,9 @@ whole: six runs of `hololens_000` lose 2 % of their frames by that, and the erro
 FIRM_TIES = 20
 """Landmarks that two keyframes before the group and two after it have seen, from which on nothing is asked: each would
 have to be off by half its depth for the scale to be lost. They are counted in a hundredth of the time."""
+TIE_PARALLAX_DEG = 0.7
+"""Parallax of a landmark that counts as a tie: that of near ones (`mapping.min_parallax_deg`), less what the graph has
+moved since. Far ones may be off by half their depth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,10 +179,29 @@ def question_about(
 
 
 def count_ties(submap: Submap, ids: IntArray, end: int, begin: int, n_views: int = 1) -> int:
-    """Return how many landmarks are seen by `n_views` or more of the keyframes before `end`, and from `begin` on."""
-    sides = ids[max(end - N_AROUND, 0) : end], ids[begin : begin + N_AROUND]
-    before, after = (submap.n_views_among(side.tolist()) for side in sides)
-    return int(((before >= n_views) & (after >= n_views)).sum())
+    """Return how many landmarks are seen by `n_views` or more of the keyframes before `end`, and from `begin` on.
+
+    Far ones, whose depth is hardly known, are not counted.
+    """
+    sides = ids[max(end - N_AROUND, 0) : end].tolist(), ids[begin : begin + N_AROUND].tolist()
+    before, after = (submap.n_views_among(side) for side in sides)
+    tied = (before >= n_views) & (after >= n_views)
+    return int((tied & (_parallax_rad(submap, [*sides[0], *sides[1]]) >= np.radians(TIE_PARALLAX_DEG))).sum())
+
+
+def _parallax_rad(submap: Submap, keyframe_ids: list[int]) -> FloatArray:
+    """Return for each landmark (N,) the largest angle between the first of these keyframes' rays and another."""
+    xyz = submap.landmarks["xyz_mu"]
+    first, cosine = np.full(xyz.shape, np.nan), np.ones(len(xyz))
+    for k in keyframe_ids:
+        seen = submap.landmark_of[k]
+        seen = seen[seen >= 0]
+        ray = xyz[seen] - submap.T_submap_kf[k][:3, 3]
+        ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
+        new = np.isnan(first[seen, 0])
+        first[seen[new]] = ray[new]
+        cosine[seen] = np.minimum(cosine[seen], np.einsum("ij,ij->i", first[seen], ray))
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def _is_linked(submap_id: int, first: int, links: Iterable[Link]) -> bool:

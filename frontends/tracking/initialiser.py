@@ -33,6 +33,7 @@ from dualslam.core.types import (
     View,
 )
 from dualslam.frontends.features.motion_statistics import match_by_motion, nearest_search
+from dualslam.frontends.gates import MIN_CONSENSUS
 from dualslam.frontends.tracking.direction import direction_angle_deg, direction_sigma_deg
 from dualslam.frontends.tracking.near_points import N_PROOF, nearer_than_proven, stands_before
 from dualslam.frontends.tracking.resection import resect
@@ -54,10 +55,6 @@ MAX_PAIRS = 2  # tried with each view, in turn: what two views farther apart lac
 N_POSING = 3  # points that fix a pose
 N_WITNESSES = 3  # frames between the two views that must agree
 PROVEN = 1 / 3  # share of the points that are proven, at least: a start is made of these alone
-CARRYING = 2 / 3
-"""Of the points that a start needs, the share that is proven at least. A map goes on with half (`health.min_inliers`),
-and of a start's points the next frame finds 78 % or fewer in one case of ten, 70 % or fewer in one of twenty (107
-starts on streets). Each of 33 maps that the next one absorbed, lost at once, had begun with 20 to 31."""
 NEAR = 0.5  # share of the points that a start needs at least which must be near: on a road these fix the motion
 RUNNER_UP = 0.75  # a pose that explains less than this share of what the best one does is out of the question,
 UNEXPLAINED_TIMES, UNEXPLAINED_MORE = 2, 20  # and so is one that leaves more than twice as many, and a layer's worth
@@ -357,7 +354,7 @@ class Initialiser:
         # weigh most, a point is taken on the word of all of them, unless others that all have seen are as near.
         proven &= ~nearer_than_proven(result.xyz_mu[:, 2], proven & (n_views == len(views)))
         numbers["n_proven"] = float(proven.sum())
-        least = float(max(PROVEN * keep.sum(), CARRYING * self._config.min_points))
+        least = float(max(PROVEN * keep.sum(), MIN_CONSENSUS))
         enough = Gate("points that three views prove", int(proven.sum()), ">=", least)
         fits = Gate("chi-square per degree of freedom", chi2, "<", MAX_CHI2)
         if not enough.passed:

@@ -27,6 +27,11 @@ MIN_OBSERVATIONS = 3
 TRIANGULATE_AGAINST = 6
 """Older keyframes that a new keyframe is paired with."""
 
+FEW = 0.5
+"""Share of `max_observations` below which a keyframe takes far points as landmarks, too."""
+FAR_SIGMAS = 2.0
+"""Parallax of a far point, in standard deviations of its two pixels: its depth is known to half."""
+
 FUSE_RADIUS_PX = 3.0  # about 3 sigma of a well-posed landmark's pixel at the finest octave
 CELLS_ACROSS = 16  # cells of the image's width by which observations are spread
 YOUNG_KEYFRAMES = 3  # a landmark is on probation for this many keyframes
@@ -194,19 +199,33 @@ class Mapper:
         return known[1]
 
     def _triangulate(self, k: int, neighbours: list[int], candidates: BoolArray) -> IntArray:
-        """Triangulate the keyframe's free features against several older keyframes."""
-        created = [self._triangulate_pair(k, other, candidates) for other in neighbours]
+        """Triangulate the keyframe's free features against several older keyframes.
+
+        A camera that turns towards far scenery finds matches there, but no landmarks. Far points hold its rotation
+        until near ones come into view again. A keyframe with landmarks enough does without them: on a road the depths
+        of far points err towards near.
+        """
+        near_deg = self._config.min_parallax_deg
+        created = [self._triangulate_pair(k, other, candidates, near_deg) for other in neighbours]
+        if np.count_nonzero(self._submap.landmark_of[k] >= 0) < FEW * self._config.max_observations:
+            far_deg = min(near_deg, self._far_parallax_deg(k))
+            created += [self._triangulate_pair(k, other, candidates, far_deg) for other in neighbours]
         return np.concatenate(created) if created else np.zeros(0, np.int64)
 
-    def _triangulate_pair(self, k: int, other: int, candidates: BoolArray) -> IntArray:
-        submap, config = self._submap, self._config
+    def _far_parallax_deg(self, k: int) -> float:
+        """Return the smallest parallax that the keyframe's pixels tell from none, degrees."""
+        noise_px = np.sqrt(2.0) * float(np.median(self._submap.keyframes[k].features.sigma_px))
+        return float(np.degrees(np.arctan(FAR_SIGMAS * noise_px / self._submap.K[0, 0])))
+
+    def _triangulate_pair(self, k: int, other: int, candidates: BoolArray, min_parallax_deg: float) -> IntArray:
+        submap = self._submap
         a, b = submap.keyframes[k].features, submap.keyframes[other].features
         rows_a = np.flatnonzero((submap.landmark_of[k] == NO_LANDMARK) & candidates)
         rows_b = np.flatnonzero(submap.landmark_of[other] == NO_LANDMARK)
         T_submap_a, T_submap_b = submap.T_submap_kf[k], submap.T_submap_kf[other]
         baseline = float(np.linalg.norm(T_submap_a[:3, 3] - T_submap_b[:3, 3]))
         depth = self._median_depth(other)
-        if not self._wide_enough(depth, baseline) or len(rows_a) == 0 or len(rows_b) == 0:
+        if not _wide_enough(depth, baseline, min_parallax_deg) or len(rows_a) == 0 or len(rows_b) == 0:
             return np.zeros(0, np.int64)
         T_b_a = se3.inverse(T_submap_b) @ T_submap_a
         matches = match_epipolar(
@@ -223,7 +242,7 @@ class Mapper:
         ok = (
             (points.depth_a > 0)
             & (points.depth_b > 0)
-            & (points.cos_parallax < np.cos(np.radians(config.min_parallax_deg)))
+            & (points.cos_parallax < np.cos(np.radians(min_parallax_deg)))
             & (points.error2_a < self._gate_chi2 * a.sigma_px[fa] ** 2)
             & (points.error2_b < self._gate_chi2 * b.sigma_px[fb] ** 2)
             & self._scales_agree(a, b, fa, fb, points.depth_a, points.depth_b)
@@ -233,10 +252,6 @@ class Mapper:
         submap.add_observations(other, fb, ids)
         submap.add_observations(k, fa, ids)
         return ids
-
-    def _wide_enough(self, depth_mu: float, baseline_mu: float) -> bool:
-        """Whether the baseline can give the scene's median depth the smallest parallax that is asked for."""
-        return baseline_mu > 0.5 * np.radians(self._config.min_parallax_deg) * depth_mu
 
     def _octave_tolerance(self, depth_mu: float, baseline_mu: float) -> int:
         """Octaves between two views of a point: one, and as many as going so far towards the scene brings in scale."""
@@ -319,3 +334,8 @@ class Mapper:
         octave = np.concatenate(octaves) if octaves else landmark
         as_fine = np.bincount(landmark[octave <= own[landmark] + 1], minlength=len(submap.landmarks))
         return self._are_nearly_all(as_fine[ids] >= N_OTHERS)
+
+
+def _wide_enough(depth_mu: float, baseline_mu: float, min_parallax_deg: float) -> bool:
+    """Whether the baseline can give the scene's median depth the smallest parallax that is asked for."""
+    return bool(baseline_mu > 0.5 * np.radians(min_parallax_deg) * depth_mu)

@@ -10,15 +10,25 @@ from dualslam.backend.submap_graph import ISam2SubmapGraph
 from dualslam.core.config.settings import GraphConfig, LinkingConfig
 from dualslam.core.events import EventKind
 from dualslam.core.jobs import Ended, InlineDesk, JobKind
+from dualslam.core.types import Keyframe
 from dualslam.linking.scale_observability import N_AROUND
 from dualslam.map.solving import solve
 from dualslam.map.split import submap_of
 from dualslam.map.submap import Submap
-from dualslam.recovery.scale_watch import BEHIND, GROUP, SCALE_HANDLERS, ScaleLoss, ScaleWatch
+from dualslam.recovery.scale_watch import BEHIND, GROUP, SCALE_HANDLERS, ScaleLoss, ScaleWatch, count_ties
 from dualslam.run.results import trajectories_of
 from dualslam.system.system import System
 from dualslam.testing.link_worlds import FRAME_STEP, Recipe, build, make_world, thinned
-from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
+from dualslam.testing.point_world import (
+    CAMERA,
+    PointWorld,
+    cloud,
+    hand_held,
+    make_features,
+    path,
+    pose_errors,
+    system_in,
+)
 
 N = 24
 PLACE = 11 * FRAME_STEP
@@ -66,6 +76,22 @@ def test_a_map_that_hangs_by_next_to_nothing_is_parted_there(n_ties: int) -> Non
 def test_ties_that_hold_the_scale_are_enough() -> None:
     submap = thinned(solved("street"), PLACE, 12)
     assert watch_since(submap).judge(submap, []) is None
+
+
+def test_far_landmarks_are_no_ties() -> None:
+    """They may be off by half their depth, however many of them both sides have seen."""
+    rng = np.random.default_rng(0)
+    near = rng.uniform([-0.3, -0.3, 3.0], [0.3, 0.3, 4.0], (12, 3))
+    xyz = np.concatenate([near, 100.0 * near])
+    n, ids = len(xyz), np.arange(8)
+    features = make_features(np.zeros((n, 2)), np.ones(n), np.zeros(n, np.int64), np.zeros((n, 32), np.uint8))
+    submap = Submap(0, CAMERA.K, features.descriptors[0])
+    for k, T_submap_kf in enumerate(path(len(ids), np.array([0.1, 0.0, 0.0]), np.zeros(3))):
+        submap.add_keyframe(Keyframe(k, float(k), features), T_submap_kf)
+    landmarks = submap.add_landmarks(xyz, features.descriptors, np.ones(n), 0)
+    for k in ids.tolist():
+        submap.add_observations(k, np.arange(n), landmarks)
+    assert count_ties(submap, ids, 4, 4, n_views=2) == len(near)
 
 
 def test_what_a_map_began_with_is_not_asked_about() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dualslam.backend.local_ba import bundle_adjust_arrays
-from dualslam.core.config.settings import HealthConfig, InitialiserConfig
+from dualslam.core.config.settings import InitialiserConfig
 from dualslam.core.types import Failure, FailureReason, FloatArray, Start, View
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.tracking.initialiser import Initialiser
@@ -172,9 +172,9 @@ def test_witnesses_that_disagree_refuse_the_start() -> None:
     assert refusal.numbers["support"] == 0
 
 
-@pytest.mark.parametrize(("n_seen", "starts"), [(34, False), (50, True)])
-def test_a_map_starts_with_points_enough_to_go_on_with(n_seen: int, starts: bool) -> None:
-    """The next frame must find `health.min_inliers`: a map of hardly more is lost at once."""
+@pytest.mark.parametrize(("n_seen", "starts"), [(26, False), (34, True)])
+def test_a_map_starts_with_a_third_of_its_points_proven(n_seen: int, starts: bool) -> None:
+    """These fix the poses; by them the start grows to the landmarks that the next frame needs."""
     world = PointWorld(cloud(), path(4, np.array([0.3, 0, 0]), np.zeros(3)))
     starter = initialiser()
     first, between, last = (world.view(i) for i in range(3))
@@ -189,7 +189,7 @@ def test_a_map_starts_with_points_enough_to_go_on_with(n_seen: int, starts: bool
     start = starter.try_pair(0, 2)
     if starts:
         assert isinstance(start, Start)
-        assert len(start.xyz) > 1.25 * HealthConfig().min_inliers
+        assert n_seen * 0.7 < len(start.xyz) <= n_seen
     else:
         assert isinstance(start, Failure)
         assert "prove" in start.detail

@@ -269,6 +269,21 @@ class TestMapping:
         live.grow_weak_start(noise2=1.0)
         assert len(live.submap.landmarks) == n_before
 
+    def test_a_turn_towards_far_scenery_is_tracked_by_far_landmarks(self) -> None:
+        """Nothing out there shows a degree of parallax before the near points are out of view."""
+        rng = np.random.default_rng(3)
+        far = rng.uniform([40, -25, -30], [110, 25, 110], (1500, 3))
+        far = far[np.linalg.norm(far[:, [0, 2]], axis=1) > 60]
+        way = path(46, np.array([0.08, 0.0, 0.0]), np.array([0.0, 0.035, 0.0]))
+        world = PointWorld(np.concatenate([cloud(400) * (0.6, 1.0, 1.0), far]), way)
+        live = front_end(world, [0, 4, 8], start_at=8)
+        for i in range(9, len(way)):
+            track = tracked(live, world.view(i))
+            if live.keyframe_due(track):
+                live.insert_keyframe(track)
+            error = se3.log(track.T_cam_submap @ way[i])
+            assert np.linalg.norm(error[:3]) < 2 * ROTATION_RAD
+
     def test_a_keyframe_is_posed_by_the_map_before_it_places_anything(self, world: PointWorld) -> None:
         """Tracked a degree off, it maps as much as one that was tracked right, and as truly."""
         found = []
