@@ -1,4 +1,4 @@
-"""What the container of a video (QuickTime, MP4) says of the camera that took it: its focal length.
+"""What the container of a video (QuickTime, MP4) says: the focal length of its camera, and how much of it is played.
 
 A QuickTime file is a tree of boxes: size, four letters, content. Apple's cameras, and programs that write as they do,
 keep names (`keys`) and values (`ilst`) in a box `meta` of the film or of a track. Others note no focal length.
@@ -15,6 +15,7 @@ from typing import BinaryIO
 KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 PARENTS = (b"moov", b"trak", b"udta")
 """Boxes in which there may be a `meta`, within each other."""
+EDITS = (b"trak", b"edts", b"elst")
 MAX_BOXES, MAX_DEPTH = 10_000, 4
 """In one file, and within each other: a broken one may hold any number."""
 MAX_BYTES = 2**20
@@ -39,6 +40,42 @@ def equivalent_focal_mm(path: Path) -> float | None:
     except (OSError, struct.error):
         return None
     return None
+
+
+def edited_s(path: Path) -> float | None:
+    """Return the seconds that the edit lists of a film leave of its longest track; None where it has none.
+
+    A clip that was trimmed without encoding it again has all of its frames, and a list of those that are played.
+    """
+    try:
+        with path.open("rb") as file:
+            boxes = _Boxes(file)
+            films = list(_inside(boxes, 0, file.seek(0, 2), (b"moov",)))
+            heads = [boxes.content(*at) for film in films for at in _inside(boxes, *film, (b"mvhd",))]
+            lists = [boxes.content(*at) for film in films for at in _inside(boxes, *film, EDITS)]
+            units_s = struct.unpack_from(">I", heads[0], 20 if heads[0][0] else 12)[0] if heads else 0
+            lengths = [_edited_units(content) for content in lists]
+    except (OSError, struct.error, IndexError):
+        return None
+    return max(lengths) / units_s if lengths and units_s else None
+
+
+def _inside(boxes: _Boxes, start: int, stop: int, names: tuple[bytes, ...]) -> Iterator[tuple[int, int]]:
+    """Yield where the content of each box is that lies in boxes of these names, one within the other."""
+    for name, first, end in boxes.within(start, stop):
+        if name == names[0]:
+            if len(names) == 1:
+                yield first, end
+            else:
+                yield from _inside(boxes, first, end, names[1:])
+
+
+def _edited_units(content: bytes) -> int:
+    """Return the length of an edit list in the film's unit of time; stretches of nothing do not count."""
+    entry = ">Qqi" if content[0] else ">Iii"
+    (n,) = struct.unpack_from(">I", content, 4)
+    parts = [struct.unpack_from(entry, content, 8 + struct.calcsize(entry) * i) for i in range(min(n, MAX_BOXES))]
+    return sum(length for length, begins, _ in parts if begins >= 0)
 
 
 class _Boxes:

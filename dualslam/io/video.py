@@ -21,7 +21,7 @@ from dualslam.core.camera.models import camera_from_fov
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, Frame
 from dualslam.io.camera_build import make_camera
-from dualslam.io.container import equivalent_focal_mm
+from dualslam.io.container import edited_s, equivalent_focal_mm
 from dualslam.io.exif import is_likely, over_longer_side
 from dualslam.io.images import ImageReader, UnreadableImageError
 from dualslam.io.read_ahead import read_ahead
@@ -187,8 +187,11 @@ def _scan(path: Path) -> FloatArray:
     capture.release()
     if not found:
         raise InputError(f"{path} holds no frame that can be decoded; check the file, or convert it to another codec.")
+    played_s = edited_s(path)
+    if played_s is not None and np.isfinite(fps):
+        announced = min(announced, played_s * fps)
     if len(found) < WHOLE_SHARE * announced:
-        log.warning("%s ends early: %d of the %d frames that it announces are there", path, len(found), announced)
+        log.warning("%s ends early: %d of the %.0f frames that it announces are there", path, len(found), announced)
     times = np.array(found)
     if np.isfinite(times).all() and (np.diff(times) > 0).all():
         return times

@@ -29,6 +29,7 @@ from dualslam.core.threads import spare_cores
 from dualslam.core.types import Frame
 from dualslam.io.colours import Colours, save_colours, save_pictures
 from dualslam.io.export.colours import keyframe_indices, landmark_colours
+from dualslam.io.image_faults import ImageFaults
 from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.masks import hidden_pixels, masked
 from dualslam.io.run_folder import SCHEDULE, TRAJECTORY, RunFolder, RunRecord, check_vacant
@@ -241,7 +242,8 @@ def run_to_folder(
         if realtime and isinstance(system.desk.executor, WorkerDesk):
             system.desk.executor.wait_until_ready()
         album = PlaceAlbum(folder.write_sample)
-        watched = _Watched(system, SampleKeeper(folder.write_sample), album, watcher)
+        faults = ImageFaults()
+        watched = _Watched(system, SampleKeeper(folder.write_sample), album, watcher, faults)
         with Interrupts() as interrupts:
             report = run_sequence(
                 watched,
@@ -266,7 +268,8 @@ def run_to_folder(
             try:
                 folder.restore()
                 _write_new_events(system, folder)
-                given["no_map"] = None if system.poses or saved_map is not None else refusals.sentence()
+                has_map = bool(system.poses) or saved_map is not None
+                given["no_map"] = None if has_map else faults.sentence() or refusals.sentence()
                 summary = _write_results(system, report, config, sequence, folder, given, list(measurements))
                 if recorded is not None and replay is not None:
                     summary["replay"] = _compared(folder, Path(replay), recorded)
@@ -502,14 +505,24 @@ def _write_pages(folder: RunFolder) -> None:
 class _Watched:
     """A system whose frames are looked at: for sample pictures, and by who watches the run."""
 
-    def __init__(self, system: System, samples: SampleKeeper, album: PlaceAlbum, watcher: Watcher | None) -> None:
+    def __init__(
+        self,
+        system: System,
+        samples: SampleKeeper,
+        album: PlaceAlbum,
+        watcher: Watcher | None,
+        faults: ImageFaults,
+    ) -> None:
         self._system, self._samples, self._album, self._watcher = system, samples, album, watcher
+        self._faults = faults
         self._n_events = len(system.events)
         if watcher is not None:
             watcher.begin(system)
 
     def step(self, frame: Frame) -> FrameResult:
         result = self._system.step(frame)
+        if frame.image is not None and not self._system.poses:
+            self._faults.note(frame.image)
         self._samples.take(frame, result.status)
         self._album.take(frame, result.status)
         self._show_places()

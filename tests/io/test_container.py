@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dualslam.io.container import KEY, MAX_BOXES, equivalent_focal_mm
+from dualslam.io.container import KEY, MAX_BOXES, edited_s, equivalent_focal_mm
 from dualslam.io.video import CROP_SIGMA, LOG_CROP, VideoFile
 
 OTHER = "com.apple.quicktime.camera.lens_model"
@@ -202,3 +202,23 @@ def test_a_variable_frame_rate_is_told_by_each_frame(tmp_path: Path) -> None:
         content[size : size + 4] = (int.from_bytes(content[size : size + 4], "big") + 8).to_bytes(4, "big")
     path.write_bytes(content)
     assert VideoFile(path).timestamps_s == pytest.approx(np.array([0, 1, 2, 4]) / 30)
+
+
+def test_a_clip_trimmed_in_place_does_not_end_early(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    whole = tmp_path / "whole.mp4"
+    writer = cv2.VideoWriter(str(whole), cv2.VideoWriter_fourcc(*"mp4v"), 30.0, (64, 48))
+    for i in range(30):
+        writer.write(np.full((48, 64, 3), 8 * i, np.uint8))
+    writer.release()
+    assert edited_s(whole) == pytest.approx(1.0)
+    content = bytearray(whole.read_bytes())
+    at = content.find(b"elst") + 12
+    (length,) = struct.unpack_from(">I", content, at)
+    content[at : at + 4] = struct.pack(">I", length // 3)
+    trimmed = tmp_path / "trimmed.mp4"
+    trimmed.write_bytes(content)
+    assert edited_s(trimmed) == pytest.approx(1 / 3, abs=0.01)
+    assert len(VideoFile(trimmed)) == pytest.approx(10, abs=1)
+    assert caplog.text == ""
+    (tmp_path / "none.mp4").write_bytes(box(b"moov", box(b"trak", box(b"edts", box(b"elst", b"\0\0")))))
+    assert edited_s(tmp_path / "none.mp4") is None
