@@ -208,7 +208,7 @@ def went(world: PointWorld, system: System) -> tuple[System, list[float]]:
 def test_the_table_of_a_camera_that_stays_is_bounded_and_its_poses_are_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    world = there_and_back(160)
+    world = there_and_back(100)
     thin, lengths = went(world, system_in(world, **DENSE))
     monkeypatch.setattr(dead_rows, "MIN_DEAD", 1 << 60)
     plain, unbounded = went(world, system_in(world, **DENSE))

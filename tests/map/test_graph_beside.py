@@ -195,6 +195,7 @@ def test_what_a_graph_was_solving_when_its_submap_was_bent_straightens_nothing()
     assert any(each.rebuilt for each in graphs.finish({submap.id: submap}))
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_costs_the_map_nothing(world: PointWorld) -> None:
     """With a real one: its graph is lost, and made anew from the arrays by the next."""
     settings = {"recovery": {"enabled": False, "workers": 1}, "calibration": {"refine": False}}

@@ -215,7 +215,7 @@ def test_a_short_loss_is_bridged(world: PointWorld) -> None:
 
 @pytest.mark.parametrize("max_lost_s", [0.125, 0.225])
 def test_how_long_a_loss_may_be_is_told_in_seconds(world: PointWorld, max_lost_s: float) -> None:
-    covered = PointWorld(world.xyz, world.T_world_cam, covered=frozenset(range(35, 50)))
+    covered = PointWorld(world.xyz, world.T_world_cam[:46], covered=frozenset(range(35, 46)))
     system = run(covered, tracking={"max_lost_s": max_lost_s})
     (failed,) = system.events.of_kind(EventKind.FAILED)
     assert failed.frame == 35 + int(np.ceil(max_lost_s * RATE_HZ))
@@ -223,7 +223,7 @@ def test_how_long_a_loss_may_be_is_told_in_seconds(world: PointWorld, max_lost_s
 
 def test_a_slow_camera_has_frames_to_be_found_again_in(world: PointWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dualslam.testing.point_world.RATE_HZ", 1.0)
-    covered = PointWorld(world.xyz, world.T_world_cam, covered=frozenset(range(35, 50)))
+    covered = PointWorld(world.xyz, world.T_world_cam[:46], covered=frozenset(range(35, 46)))
     system = run(covered, tracking={"max_lost_s": 1.2})
     (failed,) = system.events.of_kind(EventKind.FAILED)
     assert failed.frame == 35 + 6  # by its clock with the third frame; 5 Hz gives six in 1.2 s
@@ -377,7 +377,7 @@ def test_the_main_map_is_the_one_with_most_frames(world: PointWorld) -> None:
     assert list(found.unlinked) == [0]
 
 
-@pytest.mark.parametrize("fails", [False, True])
+@pytest.mark.parametrize("fails", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_rolling_over_loses_nothing(world: PointWorld, monkeypatch: pytest.MonkeyPatch, fails: bool) -> None:
     settings = {
         "graph": {"max_keyframes": 20, "rollover_keyframes": 6},
