@@ -101,6 +101,11 @@ class Link:
         S_a_b = T_a @ S_ka_kb @ sim3.inverse(T_b)
         return cls(a[0], b[0], S_a_b, Ad @ covariance @ Ad.T, kind, (), a[1], b[1], doubtful)
 
+    @property
+    def sigma_scale(self) -> float:
+        """Standard deviation of the logarithm of its scale, which is the same in any frame."""
+        return float(np.sqrt(self.covariance[6, 6]))
+
     def attached_as(self, other: Link) -> bool:
         """Whether it is the same connection as another state of it."""
         places = ((k.a, k.b, k.keyframe_a, k.keyframe_b, k.keyframes, k.kind) for k in (self, other))

@@ -1,15 +1,20 @@
 """3D-3D matches across two submaps that saw the same frames -> a verified Sim(3) link, or why there is none.
 
-In reading order: `correspondences` (which landmarks are the same), `estimate` (the decision, step by step), `timeline`
-(what the keyframes say one by one, in order of time), `deformation` (how the maps are bent beyond a similarity),
-`verify` (the gates), `live_end` and `camera_bend` (whether the new map bears the link to where it is needed); below
-them `pairs`, the matches as measurements, and `scale_observability`, how firmly a map holds its scale.
+In reading order:
+
+- `correspondences`: which landmarks are the same,
+- `estimate`: the decision, step by step,
+- `timeline`: what the keyframes say one by one, in order of time,
+- `deformation`: how the maps are bent beyond a similarity,
+- `join_test`: the gates of all joins, and `verify`: what they ask of a link,
+- `live_end` and `camera_bend`: whether the new map bears the link to where it is needed,
+- `pairs`: the matches as measurements, `scale_observability`: how firmly a map holds its scale,
+- `motion`, `rivals` and `link_tries`: the camera's motion across gaps and seams, other poses, earlier tries.
 """
 
 from dualslam.linking.camera_bend import NO_BEND, Bend, check_camera
 from dualslam.linking.correspondences import Correspondences, DescriptorMatcher, propose_correspondences
-from dualslam.linking.estimate import LinkEstimate, estimate_link
-from dualslam.linking.evidence import LinkRefusal
+from dualslam.linking.estimate import LinkEstimate, LinkRefusal, estimate_link
 from dualslam.linking.live_end import propagate_to_live_end
 
 __all__ = [

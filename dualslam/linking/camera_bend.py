@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,10 +41,13 @@ class Bend:
     log_scale : float
         Logarithm of its scale there, over that of now.
     rotation_rad : float
+    doubt : Failure or None
+        Why a link is not to be relied on with it.
     """
 
     log_scale: float = 0.0
     rotation_rad: float = 0.0
+    doubt: Failure | None = None
 
     def beyond_chance(self, distance2: float) -> Bend:
         """Return what counts of it, if the pixels ask for the other camera by this squared distance."""
@@ -98,8 +101,9 @@ def check_camera(
     Returns
     -------
     Bend or Failure
-        A failure where the link would not be known well enough with it: of the camera where that is contradicted beyond
-        chance, else of the scale, which more keyframes may tell.
+        A failure where the link would not be known well enough with it to join the maps, or a bend with a `doubt` where
+        it would not be well enough to be relied on. Of the camera where that is contradicted beyond chance, else of the
+        scale, which more keyframes may tell.
     """
     ids = np.array(sorted(submap.keyframes), np.int64)
     here, there = _places(ids, link.agreeing_keyframes, live_since)
@@ -115,7 +119,8 @@ def check_camera(
         bend = measure_bend(found.T_now, found.T_preferred, *rows).beyond_chance(found.distance2)
     turn_deg = math.degrees(bend.rotation_rad)
     sigma = math.hypot(link.sigma_scale, bend.log_scale)
-    if sigma <= config.max_live_scale_sigma and turn_deg <= config.max_live_rotation_deg:
+    turns = turn_deg > config.max_live_rotation_deg
+    if sigma <= config.max_live_scale_sigma and not turns:
         return bend
     numbers = {
         "log_focal": found.log_focal,
@@ -125,9 +130,10 @@ def check_camera(
     }
     by = f"focal length {found.log_focal:+.1%}, known to {found.log_focal_sigma:.1%}"
     by += f", would bend it by {abs(bend.log_scale):.1%} and {turn_deg:.1f} deg"
+    why = Failure(FailureReason.SCALE, f"the new map hardly knows its camera: {by}", numbers)
     if found.beyond_chance:
-        return Failure(FailureReason.CAMERA, f"the new map contradicts its camera: {by}", numbers)
-    return Failure(FailureReason.SCALE, f"the new map hardly knows its camera: {by}", numbers)
+        why = Failure(FailureReason.CAMERA, f"the new map contradicts its camera: {by}", numbers)
+    return why if turns or sigma > config.max_joined_scale_sigma else replace(bend, doubt=why)
 
 
 def _places(ids: IntArray, agreeing: IntArray, live_since: int) -> tuple[IntArray, IntArray]:

@@ -29,7 +29,6 @@ from dualslam.linking.correspondences import (
     place_pairs,
 )
 from dualslam.linking.deformation import deformation_covariance, measure_deformation
-from dualslam.linking.evidence import LinkRefusal
 from dualslam.linking.gates import (
     LOOK_BACK,
     MAX_HYPOTHESES,
@@ -80,6 +79,25 @@ class LinkEstimate:
     suspected_onset: int | None
     sigma_scale: float
     numbers: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class LinkRefusal(Failure):
+    """A link that is not made, or not yet. `Failure.numbers` are for the event log alone.
+
+    Attributes
+    ----------
+    torn_at : int or None
+        The keyframe before which the new map is torn.
+    walk_sigma : float
+        Relative sigma of the scale that reverse tracking has handed on; 0 where another gate came first.
+    unsure : LinkEstimate or None
+        The link that may be made with a doubt, where nothing but its scale is too loose.
+    """
+
+    torn_at: int | None = None
+    walk_sigma: float = 0.0
+    unsure: LinkEstimate | None = None
 
 
 def estimate_link(
@@ -213,7 +231,8 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
     newer = later.can_vote & (all_pairs.keyframes > agreeing[-1])
     parted = all_pairs.keyframes[newer & ~later.agrees & (all_pairs.keyframes < (np.inf if onset is None else onset))]
     if len(parted) >= config.min_keyframes:
-        refused = verify.check_parting(whole, consensus.estimate.S_dst_src, old, new, agreeing, parted)
+        evidence = verify.judge_parting(whole, consensus.estimate.S_dst_src, old, new, agreeing, parted)
+        refused = evidence.refusal({"change_point": float(parted[0])})
         if refused is not None:
             return refused
     # How far the maps are bent against each other beyond it: that is part of what is not known.
@@ -221,12 +240,18 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
     deformation = measure_deformation(model, S_old_new, consensus.inliers, consensus.keyframes, config)
     covariance = consensus.estimate.covariance + deformation_covariance(model, deformation)
     # The gates.
-    if len(agreeing) < config.min_keyframes:
-        return Failure(FailureReason.AGREEMENT, f"{len(agreeing)} keyframes agree, {config.min_keyframes} needed")
-    refused = verify.check_sigmas(model, S_old_new, covariance, config)
+    sigmas = verify.sigma_numbers(model, S_old_new, covariance)
+    evidence = verify.judge_overlap(sigmas, len(agreeing), config)
+    refused = evidence.refusal(sigmas)
     if refused is not None:
         return refused
-    return _link(model, whole, later, consensus, covariance, deformation, onset, limit)
+    link = _link(model, whole, later, consensus, covariance, sigmas, deformation, onset, limit)
+    doubt = evidence.doubt(sigmas)
+    return (
+        link
+        if doubt is None
+        else LinkRefusal(doubt.reason, doubt.detail, doubt.numbers, unsure=link, gates=doubt.gates)
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -332,6 +357,7 @@ def _link(
     later: KeyframeVotes,
     consensus: _Consensus,
     covariance: FloatArray,
+    sigmas: dict[str, float],
     deformation: float,
     onset: int | None,
     limit: int | None,
@@ -349,7 +375,6 @@ def _link(
     holds |= later.agrees & (every.keyframes < (np.inf if change_point is None else change_point))
     same = (whole.mahalanobis2(S) < PAIR_CHI2) & every.pairs_seen_in(holds)
     on = consensus.keyframes
-    sigmas = verify.sigma_numbers(model, S, covariance)
     numbers = {
         "scale": float(sim3.scale(S)),
         **sigmas,

@@ -11,9 +11,9 @@ from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3
 from dualslam.core.types import Failure, FailureReason
 from dualslam.linking.camera_bend import NO_BEND, Bend
-from dualslam.linking.estimate import LinkEstimate
-from dualslam.linking.evidence import LinkRefusal
+from dualslam.linking.estimate import LinkEstimate, LinkRefusal
 from dualslam.linking.gates import PIXEL_CHI2
+from dualslam.linking.join_test import LinkEvidence, live_scale_gate
 from dualslam.linking.scale_observability import scale_sigma_between
 from dualslam.map.submap import Submap
 
@@ -55,17 +55,22 @@ def propagate_to_live_end(
     numbers = {"sigma_scale": sigma, "sigma_scale_reverse": walk}
     if bend.log_scale:
         numbers["sigma_scale_camera"] = abs(bend.log_scale)
-    if sigma > config.max_live_scale_sigma:
-        detail = "nothing holds the scale between the overlap and the live end"
-        if math.isfinite(walk):
-            detail = f"scale known to {sigma:.1%} at the live end, {walk:.1%} of it by the walk"
-        settled = len(link.agreeing_keyframes) >= SETTLED_KEYFRAMES
-        hopeless = walk > (SETTLED if settled else HOPELESS) * config.max_live_scale_sigma
-        reason = FailureReason.SCALE_LOST if hopeless else FailureReason.SCALE
-        return LinkRefusal(reason, detail, numbers, walk_sigma=walk)
+    detail = "nothing holds the scale between the overlap and the live end"
+    if math.isfinite(walk):
+        detail = f"scale known to {sigma:.1%} at the live end, {walk:.1%} of it by the walk"
+    settled = len(link.agreeing_keyframes) >= SETTLED_KEYFRAMES
+    hopeless = walk > (SETTLED if settled else HOPELESS) * config.max_live_scale_sigma
+    reason = FailureReason.SCALE_LOST if hopeless else FailureReason.SCALE
+    evidence = LinkEvidence((live_scale_gate(sigma, detail, reason, config),))
+    compared = evidence.comparisons
+    if not evidence.is_accepted:
+        return LinkRefusal(reason, detail, numbers, walk_sigma=walk, gates=compared)
     # The live end grows and shrinks about the place where the maps overlap.
     held = [k for k in link.agreeing_keyframes.tolist() if k in new.keyframes]
     about = sim3.adjoint(se3.from_parts(np.eye(3), new.keyframe_poses(held)[:, :3, 3].mean(0)))
     lost = np.diag([bend.rotation_rad**2] * 3 + [0.0] * 3 + [walk**2 + bend.log_scale**2])
     covariance = link.covariance + about @ lost @ about.T
-    return replace(link, covariance=covariance, sigma_scale=sigma, numbers=link.numbers | numbers)
+    carried = replace(link, covariance=covariance, sigma_scale=sigma, numbers=link.numbers | numbers)
+    if evidence.is_sure:
+        return carried
+    return LinkRefusal(reason, detail, numbers, walk_sigma=walk, unsure=carried, gates=compared)

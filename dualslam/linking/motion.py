@@ -18,7 +18,7 @@ import numpy as np
 
 from dualslam.atlas.trajectory import Path
 from dualslam.core.geometry import sim3
-from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
+from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 WINDOW_S = 0.3
 """Seconds over which a velocity is measured on either side, or `WINDOW_FRAMES`, if these take longer."""
@@ -87,14 +87,6 @@ class Motion:
         """Whether the camera cannot have moved so, as far as the run can tell."""
         return self.n_asked >= MIN_ASKED and self.off_mu > self.allowed_mu
 
-    @property
-    def refusal(self) -> Failure:
-        """Return why the motion is not believed."""
-        times = self.off_mu / max(self.usual_mu, 1e-12)
-        detail = f"the camera is {times:.0f} times further from where its velocities lead than elsewhere"
-        numbers = {"leap_off": self.off_mu, "leap_usual": self.usual_mu, "leap_asked": float(self.n_asked)}
-        return Failure(FailureReason.LEAP, detail, numbers)
-
 
 def measure_motion(path: Path, last_before: int, known: Path, slack_mu: float = 0.0) -> Motion | None:
     """Compare the displacement behind a frame of a path with what its velocities predict.
@@ -117,26 +109,19 @@ def measure_motion(path: Path, last_before: int, known: Path, slack_mu: float = 
     return _measure(_Fits.of(path), last_before, _Fits.of(known), slack_mu)
 
 
-def refuse_gaps(path: Path, known: Path) -> Failure | None:
-    """Return why a path cannot be the camera's, by its motion across its gaps (`measure_motion`)."""
-    return refuse_steps(path, gaps_of(path.times_s), known)
-
-
-def refuse_steps(path: Path, rows: IntArray, known: Path) -> Failure | None:
-    """Return why a path cannot be the camera's, by its motion behind some of its frames (`measure_motion`)."""
+def step_motions(path: Path, rows: IntArray, known: Path) -> Iterator[Motion]:
+    """Measure the motion behind some frames of a path (`measure_motion`), where it can be."""
     fits, fits_known = _Fits.of(path), _Fits.of(known)
-    for i in rows.tolist():
-        motion = _measure(fits, i, fits_known)
-        if motion is not None and motion.is_refused:
-            return motion.refusal
-    return None
+    measured = (_measure(fits, i, fits_known) for i in rows.tolist())
+    return (motion for motion in measured if motion is not None)
 
 
-def refuse_seams(old: Path, new: Path, slack: Slack = lambda i, j: 0.0) -> Failure | None:
-    """Return why two maps cannot be joined, by the camera's motion wherever one of them follows on the other.
+def seam_motions(old: Path, new: Path, slack: Slack = lambda i, j: 0.0) -> Iterator[Motion]:
+    """Measure the camera's motion wherever one of two maps follows on the other.
 
     The usual error is the old map's, or the new one's where the old one is too short. The end of the old map may be
-    corrupted: a seam is only refused if it is as well without the old map's last frames.
+    corrupted: a seam that is refused is measured once more without the old map's last frames, and left out where these
+    are all that speak against it.
 
     Parameters
     ----------
@@ -147,18 +132,18 @@ def refuse_seams(old: Path, new: Path, slack: Slack = lambda i, j: 0.0) -> Failu
     """
     known = next((fits for fits in map(_Fits.of, (old, new)) if fits.can_be_asked), None)
     if known is None:
-        return None
+        return
     for before, after in _seams(old, new):
         slack_mu = slack(int(before.index[-1]), int(after.index[0]))
         motion = _measure_seam(before, after, known, slack_mu)
-        if motion is None or not motion.is_refused:
+        if motion is None:
             continue
-        is_old = before.index[-1] in old.index
-        sound = before.take(np.arange(len(before)) < len(before) - TAIL) if is_old else before
-        without = _measure_seam(sound, after, known, slack_mu) if len(sound) else motion
-        if without is None or without.is_refused:
-            return motion.refusal
-    return None
+        if motion.is_refused and before.index[-1] in old.index:
+            sound = before.take(np.arange(len(before)) < len(before) - TAIL)
+            without = _measure_seam(sound, after, known, slack_mu) if len(sound) else motion
+            if without is not None and not without.is_refused:
+                continue
+        yield motion
 
 
 def join_slack(S_old_new: FloatArray, covariance: FloatArray, place: FloatArray) -> float:

@@ -16,6 +16,7 @@ from scipy.spatial.distance import pdist
 
 from dualslam.atlas.trajectory import Path
 from dualslam.core.types import Failure, FailureReason, FloatArray, Rival
+from dualslam.linking.join_test import judge_motion
 from dualslam.linking.motion import Motion, gaps_of, measure_motion
 
 
@@ -73,7 +74,7 @@ def choose_by_velocity(walked: Path, known: Path, rivals: Sequence[Rival]) -> Ch
         n_frames += 1
         if told > 0:
             better.append(beside[told - 1])
-            refusal = own.refusal
+            refusal = judge_motion([own]).refusal()
     if 0 < len(better) < n_frames:
         return _nothing_told(own)
     return Choice(refusal, tuple(better))
@@ -81,7 +82,7 @@ def choose_by_velocity(walked: Path, known: Path, rivals: Sequence[Rival]) -> Ch
 
 def _nothing_told(own: Motion) -> Choice:
     detail = "beyond the gap several poses are alike, and velocities do not tell which the camera has come to"
-    return Choice(Failure(FailureReason.LOOK_ALIKE, detail, own.refusal.numbers))
+    return Choice(Failure(FailureReason.LOOK_ALIKE, detail, judge_motion([own]).numbers))
 
 
 def _measure(walked: Path, known: Path, rivals: Sequence[Rival]) -> tuple[list[Motion], FloatArray] | None:

@@ -10,37 +10,11 @@ from dualslam.atlas.atlas import Atlas
 from dualslam.atlas.record import Record
 from dualslam.atlas.trajectory import Path, compose
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import Failure, FailureReason, FloatArray
-from dualslam.linking.motion import DRIFT, join_slack, refuse_seams
+from dualslam.core.types import Failure, FloatArray
+from dualslam.linking.join_test import LinkEvidence, drift_gate, judge_motion
+from dualslam.linking.motion import DRIFT, join_slack, seam_motions
 from dualslam.places.sightings import SAME_WITHIN, same_pose, turn_between
 from dualslam.places.verification import PlaceMatch
-
-MAX_DRIFT, MAX_DRIFT_DEG, MAX_DRIFT_LOG_SCALE = 0.5, 60.0, float(np.log(3.0))
-"""What a map that was never lost between two places can have drifted at most: a share of the way, a turn, a scale. Half
-the way is what lies between two copies of a thing that stand next to each other; the largest drift that was seen on a
-real sequence is 47 % in scale."""
-MAX_SLIP = 0.1
-"""Share of the way that a map can have lost beyond what its drift in turn and scale explains: what these have undone
-again. Right loops lost 3 % in all at most, and none of it beyond (32 on HoloLens, TUM, 7-Scenes and a phone); the copy
-of a thing lies at a whole period, turned and scaled as the thing itself."""
-
-
-def can_have_drifted(share_of_way: float, turn_deg: float, log_scale: float) -> bool:
-    """Whether a map that was never lost can have drifted by so much between two places.
-
-    A place is displaced by the turn and the scale that were lost before it: at most by what was lost in the end, as if
-    that had been so all the way.
-
-    Parameters
-    ----------
-    share_of_way : float
-        Distance between where the map and where the pixels put a place, over the length of the way.
-    turn_deg, log_scale : float
-        Between the two, as well.
-    """
-    if share_of_way > MAX_DRIFT or turn_deg > MAX_DRIFT_DEG or abs(log_scale) > MAX_DRIFT_LOG_SCALE:
-        return False
-    return share_of_way <= MAX_SLIP + float(np.radians(turn_deg) + np.expm1(abs(log_scale)))
 
 
 def agree(atlas: Atlas, first: PlaceMatch, second: PlaceMatch) -> bool:
@@ -86,16 +60,11 @@ def plausible(record: Record, match: PlaceMatch) -> PlaceMatch | Failure:
     log_scale = float(np.log(sim3.scale(match.S_place_query) / sim3.scale(S_a_b)))
     way = _way(atlas, component, S_world, k_a, k_b) / float(sim3.scale(S_world[a]))
     apart = float(np.linalg.norm(by_chain[:3, 3] - by_pixels[:3, 3]))
-    numbers = {"drift_rot_deg": float(np.degrees(turn_between(by_chain, by_pixels))), "drift_log_scale": log_scale}
-    numbers |= {"drift": apart / max(way, 1e-12)}
-    match.numbers.update(numbers)
-    if not can_have_drifted(numbers["drift"], numbers["drift_rot_deg"], log_scale):
-        detail = (
-            f"the map would have drifted by {numbers['drift']:.0%} of the way, {numbers['drift_rot_deg']:.0f} deg"
-            f" and {np.expm1(log_scale):+.0%} in scale"
-        )
-        return Failure(FailureReason.CONTRADICTION, detail, match.numbers)
-    return match
+    turn_deg = float(np.degrees(turn_between(by_chain, by_pixels)))
+    evidence = LinkEvidence((drift_gate(apart / max(way, 1e-12), turn_deg, log_scale),))
+    match.numbers.update(evidence.numbers)
+    refused = evidence.refusal(match.numbers)
+    return match if refused is None else refused
 
 
 def reachable(record: Record, match: PlaceMatch) -> PlaceMatch | Failure:
@@ -120,7 +89,7 @@ def reachable(record: Record, match: PlaceMatch) -> PlaceMatch | Failure:
         way = old.way_between(k_a, at_old) + new.way_between(k_b, at_new)
         return DRIFT * way + join_slack(match.S_place_query, match.covariance, new.centres[new.index == at_new][0])
 
-    refused = refuse_seams(old, new, slack)
+    refused = judge_motion(seam_motions(old, new, slack)).refusal()
     return match if refused is None else refused
 
 

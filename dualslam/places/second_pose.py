@@ -18,9 +18,6 @@ from dualslam.core.geometry.alignment import estimate_sim3_robust
 from dualslam.core.place_matcher import PlaceMatcher
 from dualslam.core.types import BoolArray, Failure, FloatArray, IntArray
 
-NEARLY_AS_MUCH = 0.5
-"""Share of the first one's support at which a second similarity makes the first doubtful: as for the majority that a
-link needs, a half is where the better explanation no longer stands out."""
 SAME_SHARE = 0.1
 """Distance, of the size of what they move, within which two similarities are one: twice the 5 % of a wrong link."""
 N_ALIKE = 4
@@ -41,11 +38,6 @@ class SecondSimilarity:
     S_dst_src: FloatArray
     support: int
     first_support: int
-
-    @property
-    def makes_doubtful(self) -> bool:
-        """Whether it explains nearly as much as the first."""
-        return self.support >= NEARLY_AS_MUCH * self.first_support
 
 
 def alike(a: NDArray[np.generic], b: NDArray[np.generic], matcher: PlaceMatcher) -> tuple[IntArray, IntArray]:

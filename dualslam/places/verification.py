@@ -20,7 +20,6 @@ from dualslam.core.geometry import se3, sim3
 from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
 from dualslam.core.place_matcher import PlaceMatcher, Sighting
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, IntArray
-from dualslam.linking.evidence import Gate, first_refusal, sigma_gates
 from dualslam.linking.gates import (
     MAX_HYPOTHESES,
     MAX_SCALE,
@@ -29,6 +28,7 @@ from dualslam.linking.gates import (
     MIN_PAIRS_PER_KEYFRAME,
     PAIR_CHI2,
 )
+from dualslam.linking.join_test import JoinGate, LinkEvidence, ambiguity_gate, similarity_gates, support_gate
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 from dualslam.places.second_pose import SecondSimilarity, alike, find_second_pose
@@ -156,8 +156,8 @@ class PlaceVerifier:
         place = side_of(submap, keyframe_id)
         look = self._matcher.look(submap, place.landmarks, T_cam_submap, submap.K, features, SEARCH_RADIUS_PX)
         own = self._own_found(place)
-        numbers = {"found": look.share, "own_found": own, "n_visible": float(len(look.feature))}
-        return first_refusal([_found_gate(look.share, own)], numbers)
+        numbers = {"own_found": own, "n_visible": float(len(look.feature))}
+        return LinkEvidence.of([_found_gate(look.share, own)]).refusal(numbers)
 
     # --- steps
 
@@ -266,27 +266,27 @@ class PlaceVerifier:
             "scale": float(sim3.scale(S)),
             **sigmas,
         }
-        n_least = min(len(keyframes_place), len(keyframes_query))
+        share = n / len(inliers)
+        known = sigmas["sigma_scale"], sigmas["sigma_rot_deg"], sigmas["sigma_trans_rel"]
+        agree = f"{n} of {len(inliers)} pairs agree"
+        covered = f"{spread:.0%} of the image is covered"
         gates = [
-            Gate(n > MIN_MAJORITY * len(inliers), FailureReason.LOW_INLIER_RATIO, f"{n} of {len(inliers)} pairs agree"),
-            Gate(
-                n_least >= MIN_KEYFRAMES,
-                FailureReason.AGREEMENT,
-                f"{len(keyframes_place)} and {len(keyframes_query)} keyframes agree, {MIN_KEYFRAMES} needed",
-            ),
+            JoinGate.at_least("inlier_ratio", share, MIN_MAJORITY, FailureReason.LOW_INLIER_RATIO, agree),
+            support_gate(min(len(keyframes_place), len(keyframes_query)), MIN_KEYFRAMES),
             _found_gate(found, own),
-            Gate(spread >= MIN_IMAGE_SPREAD, FailureReason.SPREAD, f"{spread:.0%} of the image is covered"),
-            *sigma_gates(sigmas["sigma_scale"], sigmas["sigma_rot_deg"], sigmas["sigma_trans_rel"], self._config),
+            JoinGate.at_least("spread", spread, MIN_IMAGE_SPREAD, FailureReason.SPREAD, covered),
+            *similarity_gates(*known, self._config),
         ]
-        refused = first_refusal(gates, numbers)
+        refused = LinkEvidence.of(gates).doubt(numbers)
         if refused is not None:
             return refused
         second = self._second_pose(place, query, S, rng)
         if second is not None:
-            numbers |= {"second_support": float(second.support), "first_support": float(second.first_support)}
-            if second.makes_doubtful:
-                detail = f"a second pose explains {second.support} landmarks, the first {second.first_support}"
-                return Failure(FailureReason.AMBIGUOUS_MODEL, detail, numbers)
+            evidence = LinkEvidence((ambiguity_gate(second.support, second.first_support),))
+            numbers |= evidence.numbers
+            refused = evidence.refusal(numbers)
+            if refused is not None:
+                return refused
         landmark_pairs = np.stack([pairs.place[inliers], pairs.query[inliers]], 1)
         return PlaceMatch(
             place.id,
@@ -339,7 +339,7 @@ class PlaceVerifier:
         )
 
 
-def _found_gate(found: float, own: float) -> Gate:
+def _found_gate(found: float, own: float) -> JoinGate:
     """Return the gate of the share of a place's landmarks that an image shows, against the place's own images."""
     detail = f"{found:.0%} of what the place should show is there, {own:.0%} in its own keyframes"
-    return Gate(found >= MIN_FOUND * own, FailureReason.REPROJECTION, detail)
+    return JoinGate.at_least("found", found, MIN_FOUND * own, FailureReason.REPROJECTION, detail)

@@ -13,7 +13,8 @@ from dualslam.atlas.trajectory import Path
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure, FloatArray, FrameStatus
-from dualslam.linking.motion import refuse_steps
+from dualslam.linking.join_test import judge_motion
+from dualslam.linking.motion import step_motions
 from dualslam.map.frame_observations import Change
 from dualslam.map.submap import Submap
 from dualslam.recovery.job import RecoveredFrame, refusal_data
@@ -124,14 +125,19 @@ def condemn_tail(
 
 
 def absorb(
-    record: Record, recovered_frames: Collection[RecoveredFrame], new_id: int, lost: Collection[int], now: FrameStamp
+    record: Record,
+    recovered_frames: Collection[RecoveredFrame],
+    new_id: int,
+    lost: Collection[int],
+    now: FrameStamp,
+    at_end: bool = False,
 ) -> Absorption:
     """Let lost maps go of which the new one has posed every frame, where it holds more frames besides.
 
     A map of a few frames hardly knows its own scale, so that no similarity to it is sure. None is needed: what it saw
     has its place in the larger map. The smaller one stays archived, without frames. A lost map that holds more than
-    the new one stays: what a long map says is not given up for a short one that would not fit it. So does one whose
-    frames would move as the camera does not (`linking/motion.py`).
+    the new one stays until the end of the run: until then a link may still join it. A map whose frames would move as
+    the camera does not stays for good (`linking/motion.py`).
 
     Parameters
     ----------
@@ -142,6 +148,8 @@ def absorb(
     lost : collection of int
         Submaps that wait for a link; with those that they are linked to they go or stay.
     now : FrameStamp
+    at_end : bool
+        No link can join a lost map any more.
 
     Returns
     -------
@@ -154,7 +162,7 @@ def absorb(
         is_covered = bool(frames) and frames <= found.keys()
         if new_id in component or not is_covered or set(lost).isdisjoint(component):
             continue
-        if len(frames) >= n_own:
+        if len(frames) >= n_own and not at_end:
             n_stay.append(len(frames))
             continue
         refused = _refuse_motion(record, found, frames, new_id)
@@ -182,7 +190,7 @@ def _refuse_motion(
     known = replace(known, refound=record.are_refound(known.index.tolist()))
     path = Path.of([*own, *(frame.pose for frame in found.values())], submap)
     lost = np.isin(path.index, list(frames))
-    return refuse_steps(path, np.flatnonzero(lost[:-1] | lost[1:]), known)
+    return judge_motion(step_motions(path, np.flatnonzero(lost[:-1] | lost[1:]), known)).refusal()
 
 
 def n_frames(record: Record, submap_id: int) -> int:

@@ -84,6 +84,10 @@ class FoundLink:
     estimate: LinkEstimate
     attempt: str
 
+    def is_surer_than(self, other: FoundLink | None) -> bool:
+        """Whether its scale is known better; any link is surer than none."""
+        return other is None or self.estimate.sigma_scale < other.estimate.sigma_scale
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecoveryResult:

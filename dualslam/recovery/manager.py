@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import takewhile
+from itertools import chain, takewhile
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,9 @@ from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.jobs import Desk, Ended, JobKind
 from dualslam.core.types import Failure, FailureReason, View
+from dualslam.linking.join_test import judge_motion
 from dualslam.linking.link_tries import LinkTries
-from dualslam.linking.motion import join_slack, refuse_gaps, refuse_seams
+from dualslam.linking.motion import gaps_of, join_slack, seam_motions, step_motions
 from dualslam.map.frame_observations import Change
 from dualslam.map.lens import Calibration, rectified_where_possible
 from dualslam.map.solving import solve
@@ -99,6 +100,7 @@ class Recoveries:
         self._under_way: dict[int, _UnderWay] = {}  # by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
         self._retries = RetrySchedule(config.retry_keyframes)
+        self._is_ending = False
         self._outgrown_at: dict[int, int] = {}  # by the submap that has posed all frames of a lost one: how many
         self._tries = LinkTries()  # at linking lost submaps
 
@@ -156,7 +158,7 @@ class Recoveries:
         if submap.id in self._under_way:
             return
         due = self._retries.take_if_due(submap, now.index, self._calibration.camera, last_chance)
-        if not (due or self._outgrows(submap.id)):
+        if not (due or self._outgrows(submap.id, last_chance)):
             return
         lost = {k for m in self._lost for k in self._record.atlas.submaps[m].keyframes}
         own = [view for view in self._buffer if view.index in submap.keyframes]
@@ -166,9 +168,13 @@ class Recoveries:
         elif way := self._way_to_gaps(submap):
             self._submit(submap, way[0], way[1:], {}, now)
 
-    def _outgrows(self, submap_id: int) -> bool:
-        """Whether a submap has come to hold more than a lost one of which a walk has posed every frame: told once."""
-        outgrows = submap_id in self._outgrown_at and n_frames(self._record, submap_id) > self._outgrown_at[submap_id]
+    def _outgrows(self, submap_id: int, last_chance: bool) -> bool:
+        """Whether a submap takes over the frames of a lost one, all of which a walk has posed: told once.
+
+        It does once it holds more, or at the end of the run.
+        """
+        at = self._outgrown_at.get(submap_id)
+        outgrows = at is not None and (last_chance or n_frames(self._record, submap_id) > at)
         if outgrows:
             del self._outgrown_at[submap_id]
         return outgrows
@@ -219,6 +225,7 @@ class Recoveries:
         """
         if last is None:
             return
+        self._is_ending = True
         self._take(self._desk.drain(JobKind.WALK), live, last)
         if live is not None and not interrupted:
             solve()
@@ -278,8 +285,8 @@ class Recoveries:
         def slack(i: int, j: int) -> float:
             return join_slack(S_new_old, moved, known.centres[np.isin(known.index, (i, j))][0])
 
-        refused = refuse_gaps(path, known)
-        return refused if refused is not None else refuse_seams(old, new, slack)
+        gaps = step_motions(path, gaps_of(path.times_s), known)
+        return judge_motion(chain(gaps, seam_motions(old, new, slack))).refusal()
 
     def _path_of(self, result: RecoveryResult) -> Path:
         """Return the path of what reverse tracking has posed, and of the frames that it set out from."""
@@ -381,7 +388,7 @@ class Recoveries:
                 recovery_s=result.seconds,
                 seconds=seconds,
             )
-        absorbed = absorb(self._record, recovered_frames, submap.id, self._lost.keys(), now)
+        absorbed = absorb(self._record, recovered_frames, submap.id, self._lost.keys(), now, self._is_ending)
         for gone in absorbed.gone:
             self._lost.pop(gone, None)
         if job.onsets and absorbed.outgrown_at is not None:

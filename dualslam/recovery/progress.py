@@ -20,6 +20,7 @@ class Progress:
     frames: dict[int, RecoveredFrame] = field(default_factory=dict)  # in the order in which they were posed first
     events: list[Event] = field(default_factory=list)
     link: FoundLink | None = None
+    unsure: FoundLink | None = None  # instead, one whose scale is too loose to be relied on
     n_keyframes: int = 0
     n_gaps: int = 0
     n_skipped: int = 0  # frames without a pose between some that have one

@@ -96,6 +96,7 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Steps[RecoveryRe
     """Do what `run_recovery` does, in steps: yields how far it has come, and is sent whether its time is over."""
     started, cpu_started = time.perf_counter(), time.process_time()
     best: Progress | None = None
+    unsure: Progress | None = None
     problem = Failure(FailureReason.SOLVER)
     events: list[Event] = []
     looks_alike, needs_camera, tries = False, False, job.tries.copy()
@@ -113,12 +114,16 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Steps[RecoveryRe
         events += progress.events
         looks_alike = looks_alike or progress.looks_alike
         needs_camera = progress.needs_camera or progress.needs_old_map
+        if progress.unsure is not None and progress.unsure.is_surer_than(None if unsure is None else unsure.unsure):
+            unsure = progress
         if best is None or progress.link is not None:
             best, way = progress, attempt
         if progress.link is not None or needs_camera or progress.looks_alike:
             break
     if best is None:
         return problem
+    if best.link is None and unsure is not None:
+        best, best.link = unsure, unsure.unsure
     if (gap := best.lost_scale_from(parts.max_scale_sigma)) is not None:
         best = yield from _as_far_as(gap, job, parts, way)
     seconds, cpu_s = time.perf_counter() - started, time.process_time() - cpu_started
@@ -159,7 +164,7 @@ def _make_told_apart(
         expected = {rival.index: rival.T_cam_rival for rival in better}
         by_better = replace(job, expected=expected)
         progress = yield from _make_attempt(by_better, parts, attempt, walked := tries.copy())
-    if not isinstance(progress, Failure) and progress.link is None and has_rivals:
+    if not isinstance(progress, Failure) and progress.link is None and progress.unsure is None and has_rivals:
         events += progress.events
         as_far = replace(job, notes_rivals=False)
         progress = yield from _make_attempt(as_far, parts, attempt, walked := tries.copy())
@@ -188,6 +193,7 @@ def _make_attempt(
     # Frames before a start are worth a look each, however many show nothing; no map waits for the end of that walk.
     max_gap_frames = parts.config.max_gap_frames if job.lost else len(job.views)
     views = job.views if job.lost else _there_and_back(job.views, progress)
+    unsure_of: int | None = None  # the lost map with which a link would be, but for a loose scale
     trace = WalkTrace(submap.id, attempt.name, job.newest_id, submap.T_submap_kf[job.newest_id][:3, 3])
     for step in track_in_reverse(reverse_tracker, views, parts.judge, relinker.keyframe_ids, max_gap_frames):
         trace.note(step.view, step.track)
@@ -207,10 +213,11 @@ def _make_attempt(
         if step.view.index not in submap.keyframes:
             continue
         for tried in relinker.attempts(step.view.index):
-            found = _confirm(tried, job, submap, attempt.name, parts, tries, progress)
+            found = _confirm(tried.old_id, tried.result, job, submap, attempt.name, parts, tries, progress)
             if not isinstance(found, Failure):
                 progress.link = found
                 break
+            unsure_of = tried.old_id if _accepted(found, True) is not found else unsure_of
             tries.note_try(tried.old_id, found.reason)
             progress.why_not_linked = found.detail
             progress.walk_sigma = found.walk_sigma if isinstance(found, LinkRefusal) else 0.0
@@ -227,6 +234,11 @@ def _make_attempt(
         if progress.link is not None or progress.given_up:
             break
     progress.needs_old_map |= bool(job.lost) and relinker.is_hopeless
+    if progress.link is None and unsure_of is not None:
+        # The map has grown since that try.
+        result = parts.link(job.lost[unsure_of], submap, job.onsets[unsure_of])
+        found = _confirm(unsure_of, result, job, submap, attempt.name, parts, tries, progress, with_doubt=True)
+        progress.unsure = None if isinstance(found, Failure) else found
     if job.lost:
         event = _event_of(job, progress, attempt.name, time.perf_counter() - started)
         gap = Gate("frames in a row without a pose", progress.n_unusable, "<=", max_gap_frames)
@@ -244,35 +256,48 @@ def _there_and_back(views: tuple[View, ...], progress: Progress) -> Iterator[Vie
 
 
 def _confirm(
-    tried: LinkTry,
+    old_id: int,
+    result: LinkEstimate | Failure,
     job: RecoveryJob,
     submap: Submap,
     attempt: str,
     parts: RecoveryParts,
     tries: LinkTries,
     progress: Progress,
+    with_doubt: bool = False,
 ) -> FoundLink | Failure:
-    """Return a link that holds as far as the live end, under the camera that the pixels ask for."""
-    found = tried.result
+    """Return a link that holds as far as the live end, under the camera that the pixels ask for.
+
+    `with_doubt`: its scale may be too loose to be relied on.
+    """
+    found = _accepted(result, with_doubt)
     if isinstance(found, Failure):
         return found
-    link = parts.propagate(found, submap, job.newest_id, NO_BEND)
+    link = _accepted(parts.propagate(found, submap, job.newest_id, NO_BEND), with_doubt)
     if isinstance(link, Failure):
         return link
     bend = parts.check_camera(submap, link, job)
     if isinstance(bend, Failure):
         return bend
-    link = parts.propagate(found, submap, job.newest_id, bend)
+    if bend.doubt is not None and not with_doubt:
+        return LinkRefusal(bend.doubt.reason, bend.doubt.detail, bend.doubt.numbers, unsure=link)
+    link = _accepted(parts.propagate(found, submap, job.newest_id, bend), with_doubt)
     if isinstance(link, Failure):
         return link
-    again = tries.judge(tried.old_id, link.sigma_scale, parts.max_scale_sigma)
+    again = None if with_doubt else tries.judge(old_id, link.sigma_scale, parts.max_scale_sigma)
     if again is not None:
         return again
-    refused = _refuse_rivalled(job, submap, progress, tried.old_id, link)
+    refused = _refuse_rivalled(job, submap, progress, old_id, link)
     if refused is not None:
         return refused
-    told = {"tries": tries.refused[tried.old_id] + 1.0, "rivals": float(len(progress.rivals))}
-    return FoundLink(tried.old_id, replace(link, numbers=link.numbers | told), attempt)
+    told = {"tries": tries.refused[old_id] + 1.0, "rivals": float(len(progress.rivals))}
+    return FoundLink(old_id, replace(link, numbers=link.numbers | told), attempt)
+
+
+def _accepted(result: LinkEstimate | Failure, with_doubt: bool) -> LinkEstimate | Failure:
+    """Return the link of a result; `with_doubt`: also one that is refused for a loose scale alone."""
+    unsure = result.unsure if with_doubt and isinstance(result, LinkRefusal) else None
+    return result if unsure is None else unsure
 
 
 def _refuse_rivalled(

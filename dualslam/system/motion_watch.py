@@ -9,7 +9,8 @@ import numpy as np
 from dualslam.atlas.record import FrameStamp, Record
 from dualslam.atlas.trajectory import Path
 from dualslam.core.types import Failure
-from dualslam.linking.motion import MISSING, WINDOW_FRAMES, WINDOW_S, measure_motion
+from dualslam.linking.join_test import judge_motion
+from dualslam.linking.motion import MISSING, WINDOW_FRAMES, WINDOW_S, step_motions
 from dualslam.map.submap import Submap
 
 HISTORY_S = 30.0
@@ -74,8 +75,6 @@ class MotionWatch:
         recent = [p for p, s in zip(poses, since_s, strict=True) if p.index > last_before.index or s <= HISTORY_S]
         path = Path.of(recent, submap)
         path = replace(path, refound=record.are_refound(path.index.tolist()))
-        row = int(np.searchsorted(path.index, last_before.index))
-        motion = measure_motion(path, row, path.take(path.index <= last_before.index))
-        if motion is None or not motion.is_refused:
-            return None
-        return Break(poses[int(missing[-1]) + 1].index, motion.refusal)
+        gap = np.array([np.searchsorted(path.index, last_before.index)])
+        refused = judge_motion(step_motions(path, gap, path.take(path.index <= last_before.index))).refusal()
+        return None if refused is None else Break(poses[int(missing[-1]) + 1].index, refused)

@@ -31,8 +31,11 @@ from dualslam.frontends.tracking.resection import resect
 NEARLY_AS_MUCH = 0.5
 """Times what the first pose explains of its view at which a second makes it doubtful, as for two maps: at a half, the
 better explanation no longer stands out."""
-N_ALIKE = 4
-"""Features that one point is paired with: copies of a thing that are told apart."""
+N_ALIKE = 16
+"""Features that one point is paired with. Fewer than an image has copies of a thing, and another pose seems to explain
+too little: on a board of thirty like prints a pose that is a period off lost half of its points with four."""
+N_DRAWN = 4
+"""Of these, the nearest that RANSAC draws from."""
 N_POINTS, N_FEATURES = 300, 1500
 """Of a kind that are compared, all with all, at most (spread over them): half a million pairs are 50 ms."""
 N_MODES = 4
@@ -133,7 +136,7 @@ def find_other_poses(
     """
     chosen, seen = _spread(len(xyz), n_points), _spread(len(features), N_FEATURES)
     xyz, features = xyz[chosen], features.take(seen)
-    point, feature = _alike(frontend, descriptors[chosen], features.descriptors)
+    point, feature, rank = _alike(frontend, descriptors[chosen], features.descriptors)
     explained = _explained(T_cam_w, xyz[point], features, feature, K)
     first_support, first_in_view = len(np.unique(point[explained])), _n_in_view(T_cam_w, xyz, K, camera)
     rest = np.flatnonzero(~explained)
@@ -142,7 +145,9 @@ def find_other_poses(
     uv, sigma = features.uv_rect_px[feature[rest]], features.sigma_px[feature[rest]]
     sigma_px = float(np.median(sigma))
     starts = [*_shifted(T_cam_w, xyz[point[rest]], uv, K, sigma_px)]
-    starts.append(resect(K, camera.size_px, uv, xyz[point[rest]], sigma_px, seed, HYPOTHESES).T_cam_w)
+    drawn = np.flatnonzero(rank[rest] < N_DRAWN)
+    if len(drawn) >= MIN_CONSENSUS:
+        starts.append(resect(K, camera.size_px, uv[drawn], xyz[point[rest[drawn]]], sigma_px, seed, HYPOTHESES).T_cam_w)
     found: list[SecondPose] = []
     for T_start in starts:
         near = _within(T_start, xyz[point[rest]], uv, K, SAME_PX * sigma)
@@ -218,16 +223,17 @@ def _spread(n: int, at_most: int) -> IntArray:
     return np.linspace(0, n - 1, min(n, at_most)).round().astype(np.int64)
 
 
-def _alike(frontend: Frontend, a: NDArray[np.generic], b: NDArray[np.generic]) -> tuple[IntArray, IntArray]:
-    """Return all pairs of rows that look alike: for each of a the `N_ALIKE` nearest of b that are near enough."""
+def _alike(frontend: Frontend, a: NDArray[np.generic], b: NDArray[np.generic]) -> tuple[IntArray, IntArray, IntArray]:
+    """Return pairs of similar rows, for each of a the `N_ALIKE` nearest of b, and the rank among these, from 0 on."""
     if not len(a) or not len(b):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)
     distance = all_distances(frontend, a, b)
     i, j = np.nonzero(distance <= frontend.max_distance_strict)
     nearest_first = np.lexsort((distance[i, j], i))
     i, j = i[nearest_first], j[nearest_first]
-    among_nearest = rank_in_runs(i) < N_ALIKE
-    return i[among_nearest], j[among_nearest]
+    rank = rank_in_runs(i)
+    among_nearest = rank < N_ALIKE
+    return i[among_nearest], j[among_nearest], rank[among_nearest]
 
 
 def _explained(T_cam_w: FloatArray, xyz: FloatArray, features: Features, feature: IntArray, K: FloatArray) -> BoolArray:

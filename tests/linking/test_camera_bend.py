@@ -91,7 +91,8 @@ def test_a_camera_that_bends_the_map_is_a_reason_for_no_link(link: LinkEstimate)
 
 
 @pytest.mark.parametrize(
-    ("log_scale", "turn_deg", "passes"), [(0.01, 0.5, True), (-0.01, 0.5, True), (0.04, 0.5, False), (0.01, 2.0, False)]
+    ("log_scale", "turn_deg", "passes"),
+    [(0.01, 0.5, True), (-0.01, 0.5, True), (0.04, 0.5, True), (0.06, 0.5, False), (0.01, 2.0, False)],
 )
 def test_what_counts_is_the_bend_and_not_the_contradiction(
     link: LinkEstimate, log_scale: float, turn_deg: float, passes: bool
@@ -101,15 +102,17 @@ def test_what_counts_is_the_bend_and_not_the_contradiction(
         find = partial(found, log_scale=log_scale, turn_deg=turn_deg, beyond_chance=beyond_chance)
         verdict = check_camera(submap, link, LIVE_SINCE, find, CONFIG, CALIBRATION)
         assert isinstance(verdict, Bend) is passes
-        assert passes or (isinstance(verdict, Failure) and verdict.reason is reason)
+        doubt = verdict.doubt if isinstance(verdict, Bend) else verdict
+        assert (doubt is None) is (abs(log_scale) < CONFIG.max_live_scale_sigma and turn_deg < 1.0)
+        assert doubt is None or doubt.reason is reason
 
 
 def test_it_counts_beside_what_else_is_unknown(link: LinkEstimate) -> None:
     submap = make_submap(TRUE, turning=True, n=N)
     find = partial(found, log_scale=0.02, turn_deg=0.0)
     unsure = replace(link, sigma_scale=0.02)
-    assert isinstance(check_camera(submap, link, LIVE_SINCE, find, CONFIG, CALIBRATION), Bend)
-    assert isinstance(check_camera(submap, unsure, LIVE_SINCE, find, CONFIG, CALIBRATION), Failure)
+    bends = [check_camera(submap, each, LIVE_SINCE, find, CONFIG, CALIBRATION) for each in (link, unsure)]
+    assert [isinstance(bend, Bend) and bend.doubt is not None for bend in bends] == [False, True]
 
 
 def test_of_a_large_map_a_window_is_asked_that_reaches_both_ends(link: LinkEstimate) -> None:
@@ -166,4 +169,6 @@ def test_a_camera_within_one_sigma_bends_nothing(link: LinkEstimate) -> None:
         def find(submap: Submap, ids: IntArray, distance2: float = distance2) -> PreferredCamera:
             return replace(found(submap, ids, 0.04, 0.0, beyond_chance=False), distance2=distance2)
 
-        assert isinstance(check_camera(submap, link, LIVE_SINCE, find, CONFIG, CALIBRATION), Bend) is passes
+        bend = check_camera(submap, link, LIVE_SINCE, find, CONFIG, CALIBRATION)
+        assert isinstance(bend, Bend)
+        assert (bend.doubt is None) is passes

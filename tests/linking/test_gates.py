@@ -6,10 +6,11 @@ from scipy import stats
 
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.types import FailureReason
+from dualslam.core.types import FailureReason, FloatArray
 from dualslam.linking import propose_correspondences, verify
 from dualslam.linking.deformation import measure_deformation
 from dualslam.linking.gates import PAIR_CHI2, PIXEL_CHI2
+from dualslam.linking.join_test import LinkEvidence
 from dualslam.linking.pairs import PairModel
 from dualslam.linking.timeline import ask_keyframes, find_discontinuities, leading_run
 from dualslam.testing.adversaries import ONSET_ID, corrupted_tail
@@ -116,10 +117,27 @@ def test_sigma_gate_refuses_what_the_landmarks_do_not_fix():
     model = model_of(case)
     small = np.diag(np.full(7, 1e-10))
     to_centre = sim3.adjoint(se3.from_parts(np.eye(3), model.centre_new))
-    assert verify.check_sigmas(model, case.S_old_new, small, CONFIG) is None
+    assert judged(model, case, small).is_sure
     for index, reason in ((6, FailureReason.SCALE), (0, FailureReason.DEGENERATE), (4, FailureReason.DEGENERATE)):
         C = small.copy()
         C[index, index] = 100.0 if index == 4 else 0.1**2
-        refused = verify.check_sigmas(model, case.S_old_new, to_centre @ C @ to_centre.T, CONFIG)
+        refused = judged(model, case, to_centre @ C @ to_centre.T).refusal()
         assert refused is not None
         assert refused.reason is reason
+
+
+@pytest.mark.parametrize(
+    ("sigma", "accepted", "sure"), [(0.016, True, True), (0.04, True, False), (0.06, False, False)]
+)
+def test_a_scale_that_is_known_to_five_percent_joins_with_a_doubt(sigma: float, accepted: bool, sure: bool) -> None:
+    case = make_case("street", 0)
+    C = np.diag([1e-10] * 6 + [sigma**2])
+    model = model_of(case)
+    to_centre = sim3.adjoint(se3.from_parts(np.eye(3), model.centre_new))
+    evidence = judged(model, case, to_centre @ C @ to_centre.T)
+    assert (evidence.is_accepted, evidence.is_sure) == (accepted, sure)
+    assert (evidence.refusal() is None, evidence.doubt() is None) == (accepted, sure)
+
+
+def judged(model: PairModel, case: Case, covariance: FloatArray) -> LinkEvidence:
+    return verify.judge_overlap(verify.sigma_numbers(model, case.S_old_new, covariance), 4, CONFIG)

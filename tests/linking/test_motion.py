@@ -10,15 +10,18 @@ import pytest
 from dualslam.atlas.trajectory import Path
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
-from dualslam.core.types import FailureReason, FloatArray
+from dualslam.core.types import Failure, FailureReason, FloatArray
+from dualslam.linking.join_test import judge_motion
 from dualslam.linking.motion import (
     MIN_ASKED,
     WINDOW_FRAMES,
     Motion,
+    Slack,
+    gaps_of,
     join_slack,
     measure_motion,
-    refuse_gaps,
-    refuse_seams,
+    seam_motions,
+    step_motions,
 )
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, system_in
 from dualslam.testing.walks import WatchedWalks, replace_walks
@@ -43,6 +46,14 @@ def path_of(t: FloatArray, p: FloatArray) -> Path:
     T = np.tile(np.eye(4), (len(t), 1, 1))
     T[:, :3, 3] = p
     return Path(np.round(t * RATE_HZ).astype(np.int64), t, T, np.zeros(len(t), bool))
+
+
+def refuse_gaps(path: Path, known: Path) -> Failure | None:
+    return judge_motion(step_motions(path, gaps_of(path.times_s), known)).refusal()
+
+
+def refuse_seams(old: Path, new: Path, slack: Slack = lambda i, j: 0.0) -> Failure | None:
+    return judge_motion(seam_motions(old, new, slack)).refusal()
 
 
 def motion_behind(path: Path, row: int) -> Motion:

@@ -14,9 +14,10 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking import DescriptorMatcher, LinkEstimate, estimate, estimate_link, propagate_to_live_end
 from dualslam.linking.correspondences import propose_correspondences
 from dualslam.linking.gates import GATE_SIGMAS, MIN_TIES, PIXEL_CHI2
+from dualslam.linking.join_test import LinkEvidence
 from dualslam.linking.pairs import PairModel
 from dualslam.linking.scale_observability import scale_sigma_between
-from dualslam.linking.verify import check_parting
+from dualslam.linking.verify import judge_parting
 from dualslam.map.solving import solve
 from dualslam.map.submap import Submap
 from dualslam.testing.link_worlds import (
@@ -165,7 +166,7 @@ def test_a_link_on_the_far_side_of_a_bent_walk_is_refused(seed: int, rate: float
 
 
 def test_without_the_gate_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estimate.verify, "check_parting", lambda *_: None)
+    monkeypatch.setattr(estimate.verify, "judge_parting", lambda *_: LinkEvidence(()))
     made = [
         isinstance(estimate_link(case.old, case.new, CONFIG, np.random.default_rng(0), None, MATCHER), LinkEstimate)
         for case, _ in (bent_walk(seed, rate) for seed in range(3) for rate in (0.02, 0.05))
@@ -178,7 +179,7 @@ AGREEING, PARTED = FRAME_STEP * np.arange(8), FRAME_STEP * np.arange(13, 19)
 
 def blame(case: Case, old: Submap, new: Submap) -> Failure | None:
     model = PairModel(propose_correspondences(old, new, MATCHER), old, new, CONFIG.deformation_sigma)
-    return check_parting(model, case.S_old_new, old, new, AGREEING, PARTED)
+    return judge_parting(model, case.S_old_new, old, new, AGREEING, PARTED).refusal()
 
 
 def test_the_old_map_is_to_blame_where_it_hangs_loose() -> None:

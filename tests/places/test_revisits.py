@@ -12,7 +12,7 @@ from dualslam.atlas.atlas import LinkKind
 from dualslam.core.events import EventKind
 from dualslam.core.jobs import Ended, InlineDesk, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
-from dualslam.places.plausibility import can_have_drifted
+from dualslam.linking.join_test import drift_gate
 from dualslam.places.search import PlaceSearch
 from dualslam.run.results import trajectories_of
 from dualslam.system.system import System
@@ -90,7 +90,7 @@ def test_the_same_run_twice_is_the_same_to_the_bit() -> None:
 
 @cache
 def drifted(scale_rate: float, turn_rate: float) -> tuple[float, float, float]:
-    """Walk 100 steps whose scale and heading drift by a rate each step; return what `can_have_drifted` takes."""
+    """Walk 100 steps whose scale and heading drift by a rate each step; return what `drift_gate` takes."""
     steps = np.arange(100)
     headings, scales = np.radians(turn_rate * steps), np.exp(scale_rate * steps)
     walked = (scales[:, None] * np.stack([np.cos(headings), np.sin(headings)], axis=1)).sum(axis=0)
@@ -101,13 +101,13 @@ def drifted(scale_rate: float, turn_rate: float) -> tuple[float, float, float]:
 @pytest.mark.parametrize(("scale_rate", "turn_rate"), [(0, 0), (0.004, 0), (-0.004, 0), (0, 0.3), (0.002, 0.2)])
 def test_what_turn_and_scale_have_lost_is_drift(scale_rate: float, turn_rate: float) -> None:
     share, turn_deg, log_scale = drifted(scale_rate, turn_rate)
-    assert can_have_drifted(share, turn_deg, log_scale)
+    assert drift_gate(share, turn_deg, log_scale).passed
 
 
 def test_a_copy_of_the_place_is_no_drift() -> None:
-    assert not can_have_drifted(0.4, 0.2, 0.003)  # displaced by a period, and nothing else
-    assert not can_have_drifted(0.6, 10.0, np.log(1.5))
-    assert not can_have_drifted(0.1, 90.0, 0.0)
+    assert not drift_gate(0.4, 0.2, 0.003).passed  # displaced by a period, and nothing else
+    assert not drift_gate(0.6, 10.0, np.log(1.5)).passed
+    assert not drift_gate(0.1, 90.0, 0.0).passed
 
 
 def two_maps() -> System:

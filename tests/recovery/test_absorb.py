@@ -36,10 +36,10 @@ def book(n_new: int) -> Record:
     return record
 
 
-def walked(record: Record, n: int = N_LOST) -> Absorption:
+def walked(record: Record, n: int = N_LOST, at_end: bool = False) -> Absorption:
     """Absorb what the new map has posed: the `n` newest frames of the lost one."""
     frames = [RecoveredFrame(pose(i, 1), 90, 80) for i in range(N_LOST - n, N_LOST)]
-    return absorb(record, frames, 1, {0}, record.rows[N_LOST])
+    return absorb(record, frames, 1, {0}, record.rows[N_LOST], at_end)
 
 
 def test_a_smaller_map_goes_and_its_frames_change_to_the_new_one() -> None:
@@ -61,6 +61,13 @@ def test_a_map_that_holds_no_less_stays_until_it_is_outgrown(n_new: int) -> None
     assert [record.poses[i].submap_id for i in range(N_LOST)] == [0] * N_LOST
     assert not record.events.of_kind(EventKind.ABSORBED)
     assert not record.atlas.submaps[0].condemned
+
+
+@pytest.mark.parametrize("n_new", [3, N_LOST])
+def test_at_the_end_a_map_of_any_size_goes(n_new: int) -> None:
+    record = book(n_new)
+    assert walked(record, at_end=True) == Absorption([0], None)
+    assert {p.submap_id for p in record.poses.values()} == {1}
 
 
 def test_a_map_of_which_a_frame_was_not_posed_stays_for_good() -> None:

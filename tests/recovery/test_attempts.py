@@ -31,6 +31,7 @@ from dualslam.frontends.features.sift import SiftFrontend
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry
 from dualslam.lab.audits.link_audit import LinkAudit, audit_links
 from dualslam.lab.synthetic import make_sequence
+from dualslam.linking.join_test import JoinGate
 from dualslam.recovery.job import RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.run.results import trajectories_of
@@ -85,6 +86,10 @@ def events_of(attempts: list[str], **settings: object) -> list[Event]:
     for frame in PointWorld(cloud(), hand_held(60), covered=COVERED).frames():
         system.step(frame)
     return system.events.of_kind(EventKind.RECOVERY_ATTEMPT, EventKind.LINKED, EventKind.RECOVERY_ENDED)
+
+
+def refused_scale(sigma: float, detail: str, reason: FailureReason, config: LinkingConfig) -> JoinGate:
+    return JoinGate("sigma_scale", sigma, 0.0, False, reason, detail)
 
 
 class TestOrder:
@@ -178,6 +183,7 @@ class TestOrder:
         self, monkeypatch: pytest.MonkeyPatch, buffer_s: float, made: list[str]
     ) -> None:
         monkeypatch.setattr(LinkingConfig, "max_scale_sigma", 1e-6)
+        monkeypatch.setattr(LinkingConfig, "max_joined_scale_sigma", 1e-6)
         world = PointWorld(cloud(), hand_held(60), covered=COVERED)
         recovery = {"attempts": ["live", "gap"], "retry_keyframes": []}
         system = system_in(world, recovery=recovery, buffer={"duration_s": buffer_s})
@@ -193,6 +199,7 @@ class TestOrder:
     ) -> None:
         """By a bound that no walk can hold: what lies before the gap stays, and the next walk crosses it anew."""
         monkeypatch.setattr(LinkingConfig, "max_live_scale_sigma", 1e-6)
+        monkeypatch.setattr("dualslam.linking.live_end.live_scale_gate", refused_scale)
         world = PointWorld(cloud(), hand_held(60), covered=COVERED)
         recovery = {"attempts": ["live"], "retry_keyframes": [2]}
         system = system_in(world, recovery=recovery)
@@ -203,6 +210,23 @@ class TestOrder:
         assert "by the walk" in first.data["verdict"]
         assert min(system.live.submap.keyframes) > max(COVERED)
         assert any(attempt.data["gaps"] == 1 and attempt.data["new_keyframes"] >= 4 for attempt in later)
+
+    @pytest.mark.parametrize("limit", ["max_scale_sigma", "max_live_scale_sigma"])
+    def test_where_no_attempt_finds_a_sure_link_an_unsure_one_joins(
+        self, monkeypatch: pytest.MonkeyPatch, limit: str
+    ) -> None:
+        """At the overlap or at the live end its scale is known to 5 %, and no link to what is asked for."""
+        monkeypatch.setattr(LinkingConfig, limit, 1e-6)
+        world = PointWorld(cloud(), hand_held(60), covered=COVERED)
+        system = system_in(world, recovery={"attempts": ["live"], "retry_keyframes": []})
+        for frame in world.frames():
+            system.step(frame)
+        (attempt,) = system.events.of_kind(EventKind.RECOVERY_ATTEMPT)
+        assert "no link: scale known to" in attempt.data["verdict"]
+        (linked,) = system.events.of_kind(EventKind.LINKED)
+        (link,) = system.atlas.believed
+        assert linked.data["sigma_scale"] == pytest.approx(link.sigma_scale, rel=0.01)
+        assert link.sigma_scale < LinkingConfig().wrong_scale
 
     def test_all_may_fail(self) -> None:
         events = events_of(["live", "sift"], max_gap_frames=3)

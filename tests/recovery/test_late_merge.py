@@ -13,6 +13,8 @@ from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, View
+from dualslam.linking.join_test import LinkEvidence, motion_gate
+from dualslam.linking.motion import MIN_ASKED, Motion
 from dualslam.recovery.job import RecoveryJob
 from dualslam.run.results import trajectories_of
 from dualslam.system.system import System
@@ -25,6 +27,7 @@ from tests.system.camera.test_lens import CalibrationWorld as CalibrationWorld
 
 COVERED = frozenset(range(35, 50))
 POSITION_M, ROTATION_RAD = 0.08, 0.01
+LEAP = LinkEvidence((motion_gate(Motion(off_mu=9.0, usual_mu=1.0, n_asked=MIN_ASKED)),))
 
 
 class LateExecutor:
@@ -271,8 +274,7 @@ def test_the_lost_map_has_been_found_again_meanwhile(world: PointWorld, again: b
 
 
 def test_a_link_that_leaps_must_hold_anew(world: PointWorld, monkeypatch: pytest.MonkeyPatch) -> None:
-    leap = Failure(FailureReason.LEAP, "a leap 9 times further off than velocities lead elsewhere")
-    monkeypatch.setattr("dualslam.recovery.manager.refuse_gaps", lambda *_: leap)
+    monkeypatch.setattr("dualslam.recovery.manager.judge_motion", lambda _: LEAP)
     monkeypatch.setattr("dualslam.linking.link_tries.tightened", lambda *_: 0.0)  # sure as it may be, it holds twice
     system, frames = late_system(world, 12), iter(world.frames())
     tries = system._recoveries._tries
@@ -284,8 +286,8 @@ def test_a_link_that_leaps_must_hold_anew(world: PointWorld, monkeypatch: pytest
 
 
 def test_a_link_that_leaps_is_tried_again_as_its_map_grows(world: PointWorld, monkeypatch: pytest.MonkeyPatch) -> None:
-    leaps = [Failure(FailureReason.LEAP, "a leap 9 times further off than velocities lead elsewhere")]
-    monkeypatch.setattr("dualslam.recovery.manager.refuse_gaps", lambda *_: leaps.pop() if leaps else None)
+    leaps = [LEAP]
+    monkeypatch.setattr("dualslam.recovery.manager.judge_motion", lambda _: leaps.pop() if leaps else LinkEvidence(()))
     system = late_system(world, 1, recovery={"enabled": True, "retry_keyframes": [4]})
     for frame in world.frames():
         system.step(frame)

@@ -17,9 +17,9 @@ from dualslam.run.results import trajectories_of
 from dualslam.system.system import System
 
 
-def past_a_gap(world: str, seed: int, missing: Container[int]) -> tuple[System, IntArray, FloatArray]:
+def past_a_gap(world: str, seed: int, missing: Container[int], n: int = 130) -> tuple[System, IntArray, FloatArray]:
     """Run a world without some frames; the frames of the main map and how far (N,) each is off, in metres."""
-    sequence = make_sequence(world, n_frames=130, seed=seed, width=480, height=360, supersampling=1.0)
+    sequence = make_sequence(world, n_frames=n, seed=seed, width=480, height=360, supersampling=1.0)
     system = build_system(Config.model_validate({"seed": seed}), sequence.camera)
     for frame in sequence:
         if frame.index not in missing:
@@ -60,3 +60,12 @@ def test_where_the_camera_may_have_come_to_two_the_maps_stay_apart() -> None:
     assert off_m.max() < 0.1 * BOARD_PERIOD_M
     later = list(trajectories_of(system).unlinked.values())
     assert [int(component.index.min()) >= 99 for component in later] == [True]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("world", "period_m"), [("parked", CAR_PERIOD_M), ("board", BOARD_PERIOD_M)])
+def test_after_two_seconds_nothing_is_posed_a_period_off(world: str, period_m: float) -> None:
+    """Of thirty like prints in each image, all of which may be the right one, and of a row of like cars."""
+    system, _, off_m = past_a_gap(world, 104, range(75, 135), n=170)
+    assert off_m.max() < 0.1 * period_m
+    assert len(system.atlas.submaps) > 1

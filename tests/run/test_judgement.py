@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dualslam.atlas.atlas import Link, LinkKind
 from dualslam.core.camera.corrected import LensCorrection, correct
 from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.events import EventKind
@@ -152,3 +153,18 @@ def test_a_scale_that_is_not_handed_on_makes_a_run_usable() -> None:
     (reason,) = judge_run(system, trajectories, rows).reasons  # type: ignore[arg-type]
     assert (reason.code, reason.level) == (ReasonCode.SCALE, Level.USABLE)
     assert (reason.first_frame, reason.last_frame) == (80, 89)
+
+
+@pytest.mark.parametrize(("sigma", "level"), [(0.02, Level.GOOD), (0.04, Level.USABLE)])
+def test_a_join_that_hardly_knows_its_scale_makes_the_smaller_part_doubtful(sigma: float, level: Level) -> None:
+    system = run(ahead(), lost=(60,))
+    old, new = sorted(system.atlas.submaps)
+    C = np.diag([1e-8] * 6 + [sigma**2])
+    system.atlas.link(Link(old, new, np.eye(4), C, LinkKind.RECOVERY, keyframe_a=0, keyframe_b=61))
+    verdict = judged(system)
+    assert verdict.level is level
+    assert verdict.doubt_about(59) == ("" if level is Level.GOOD else "scale")
+    assert verdict.doubt_about(100) == ""
+    # A loop that knows its scale joins the same two.
+    system.atlas.link(Link(old, new, np.eye(4), 1e-8 * np.eye(7), LinkKind.LOOP, keyframe_a=0, keyframe_b=61))
+    assert judged(system) == Verdict(Level.GOOD)

@@ -292,6 +292,13 @@ class LinkingConfig(StrictModel):
         return self.wrong_scale / 2
 
     @property
+    def max_joined_scale_sigma(self) -> float:
+        """Largest standard deviation of the scale with which two maps are joined at all: one sigma. Beyond half of it,
+        at the live end, the join carries a doubt, and reverse tracking looks for a better one first.
+        """
+        return self.wrong_scale
+
+    @property
     def max_live_rotation_deg(self) -> float:
         """Rotation by which the new map may bend, from the overlap to its live end, under the camera that its pixels
         ask for.
