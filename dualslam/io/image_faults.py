@@ -18,6 +18,8 @@ FLICKER_STOPS = 1.0
 """Between an image and the next; an automatic exposure takes several frames for as much."""
 MOST = 0.5
 """Share of the images, or of their pairs, that must show it."""
+MIN_SIDE_PX = 32
+"""Of an image that is looked at for a mosaic."""
 STEP = 4
 """Rows and columns of the pixels whose brightness is looked at."""
 
@@ -58,6 +60,8 @@ class ImageFaults:
 def _is_mosaic(grey: NDArray[np.uint8]) -> bool:
     """Return whether pixels resemble those two apart more than their neighbours, along rows and along columns."""
     height, width = grey.shape
+    if min(height, width) < MIN_SIDE_PX:
+        return False
     middle = grey[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4].astype(np.int16)
     for pixels in (middle, middle.T):
         near, far = (float(np.abs(pixels[:, n:] - pixels[:, :-n]).mean()) for n in (1, 2))
