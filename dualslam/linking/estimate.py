@@ -11,12 +11,13 @@ to the refinement, where they would count twice.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.random import Generator
 
 from dualslam.core.config.settings import LinkingConfig
+from dualslam.core.decisions import Gate
 from dualslam.core.geometry import sim3
 from dualslam.core.geometry.alignment import Sim3Estimate, estimate_sim3_robust
 from dualslam.core.types import BoolArray, Failure, FailureReason, FloatArray, IntArray
@@ -67,6 +68,8 @@ class LinkEstimate:
         Relative sigma of the scale: at the overlap, or at the live end once it is propagated there.
     numbers : dict
         For the event log.
+    gates : tuple of Gate
+        The comparisons that it has passed, for ``decisions.jsonl``.
     """
 
     S_old_new: FloatArray
@@ -79,6 +82,7 @@ class LinkEstimate:
     suspected_onset: int | None
     sigma_scale: float
     numbers: dict[str, float]
+    gates: tuple[Gate, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,6 +250,7 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
     if refused is not None:
         return refused
     link = _link(model, whole, later, consensus, covariance, sigmas, deformation, onset, limit)
+    link = replace(link, gates=evidence.comparisons)
     doubt = evidence.doubt(sigmas)
     return (
         link

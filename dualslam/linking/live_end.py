@@ -70,7 +70,8 @@ def propagate_to_live_end(
     about = sim3.adjoint(se3.from_parts(np.eye(3), new.keyframe_poses(held)[:, :3, 3].mean(0)))
     lost = np.diag([bend.rotation_rad**2] * 3 + [0.0] * 3 + [walk**2 + bend.log_scale**2])
     covariance = link.covariance + about @ lost @ about.T
-    carried = replace(link, covariance=covariance, sigma_scale=sigma, numbers=link.numbers | numbers)
+    known = link.numbers | numbers
+    carried = replace(link, covariance=covariance, sigma_scale=sigma, numbers=known, gates=(*link.gates, *compared))
     if evidence.is_sure:
         return carried
     return LinkRefusal(reason, detail, numbers, walk_sigma=walk, unsure=carried, gates=compared)

@@ -49,6 +49,7 @@ def fuse(
         EventKind.LINKED,
         now,
         new_id,
+        link.gates,
         old_submap=found.old_id,
         attempt=found.attempt,
         matches=link.n_matches,

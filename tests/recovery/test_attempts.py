@@ -100,6 +100,8 @@ class TestOrder:
         assert attempt.data["frames"] >= attempt.data["new_keyframes"] >= 4
         assert attempt.data["inliers"] <= attempt.data["matches"]
         assert attempt.data["skipped_frames"] >= len(COVERED)
+        assert {gate.name for gate in linked.gates} >= {"n_agreeing_keyframes", "sigma_scale", "sigma_rot_deg"}
+        assert all(gate.passed for gate in linked.gates)
         assert ended.data["linked"]
 
     def test_one_that_fails_is_followed_by_the_next(self) -> None:
