@@ -32,7 +32,7 @@ from dualslam.core.camera.corrected import LensCorrection, correction_of, given_
 from dualslam.core.chi_square import CHI2_999
 from dualslam.core.config.calibration_config import CalibrationConfig
 from dualslam.core.errors import SolverError
-from dualslam.core.estimates import CalibrationEstimate, PreferredCamera
+from dualslam.core.estimates import MAX_PRIOR_SIGMAS, CalibrationEstimate, PreferredCamera
 from dualslam.core.geometry import so3
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
@@ -60,8 +60,6 @@ MIN_VIEWS = 3
 MAX_DEPTH_SIGMA = 0.3
 """Relative; landmarks whose distance is known no better make the problem singular and say nothing."""
 MIN_OBSERVATIONS = 1000
-MAX_PRIOR_SIGMAS = 6.0
-"""A correction farther from the given calibration than this says that something else is wrong."""
 
 
 def estimate_calibration(
@@ -188,12 +186,13 @@ def estimate_correction(
         len(problem.T_submap_kf),
         len(problem.kf),
         time.perf_counter() - start,
+        float((np.abs(answer.correction) / answer.prior).max()),
     )
     sigma = math.sqrt(answer.covariance[0, 0])
     far = abs(float(answer.off[0])) > FAR_SIGMAS * math.sqrt(answer.of_difference[0, 0])
     if sigma > (MAX_SIGMA if far else min(config.max_sigma_ratio * answer.prior[0], MAX_SIGMA)):
         return Failure(FailureReason.DEGENERATE, "the motion does not fix the focal length", estimate.numbers)
-    if (np.abs(answer.correction) > MAX_PRIOR_SIGMAS * answer.prior).any():
+    if estimate.prior_sigmas > MAX_PRIOR_SIGMAS:
         return Failure(FailureReason.SCALE, "the calibration would be too far from the given one", estimate.numbers)
     return estimate
 

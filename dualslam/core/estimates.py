@@ -49,6 +49,10 @@ class GraphEstimate:
         return self.keyframe_ids, self.T_submap_kf, self.landmark_ids, self.xyz_mu
 
 
+MAX_PRIOR_SIGMAS = 6.0
+"""A correction farther from the given calibration than this says that something else is wrong."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationEstimate:
     """What a submap's observations say about the camera that took them.
@@ -68,6 +72,8 @@ class CalibrationEstimate:
         Sum of the Huber losses; before: poses and points as they were.
     n_keyframes, n_observations : int
     seconds : float
+    prior_sigmas : float
+        The largest part of the correction, in standard deviations of its prior.
     """
 
     correction: LensCorrection
@@ -79,6 +85,7 @@ class CalibrationEstimate:
     n_keyframes: int
     n_observations: int
     seconds: float
+    prior_sigmas: float = 0.0
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -94,6 +101,7 @@ class CalibrationEstimate:
             "keyframes": self.n_keyframes,
             "observations": self.n_observations,
             "seconds": self.seconds,
+            "prior_sigmas": self.prior_sigmas,
         }
 
 

@@ -16,6 +16,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.corrected import correct
 from dualslam.core.config.calibration_config import CalibrationConfig
 from dualslam.core.errors import InputError, SolverError
+from dualslam.core.estimates import CalibrationEstimate
 from dualslam.core.interfaces import SelfCalibrator, SubmapAdjuster, SubmapGraph
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Keyframe, View
 from dualslam.map.submap import Submap
@@ -29,6 +30,8 @@ until another is significantly different."""
 AT_LOSS = 1.05
 """A map that may be at its end is asked once more, where it has so many times the keyframes of when it was asked: the
 next one begins with what it says. Lower, single frames without a pose would each cost a question."""
+MIN_AT_END = 10
+"""Keyframes of a map that is asked at the end of a run, since it was never old enough, or its question failed."""
 SURE_SIGMA = 0.01
 """Of the log focal length: an answer that is no surer than this is not the last, however little was known before."""
 
@@ -132,6 +135,7 @@ class Calibration:
         self._asked_with: dict[int, int] = {}
         self._refined_in: int | None = None
         self._covariance = covariance
+        self._estimated: set[int] = set()  # the submaps that have said something of the camera
 
     @property
     def camera(self) -> Camera:
@@ -161,6 +165,15 @@ class Calibration:
         has_grown = n >= AT_LOSS * self._asked_with.get(submap.id, 0)
         return config.refine and self._refined_in is None and n >= config.first_keyframes and has_grown
 
+    def is_due_at_end(self, submap: Submap) -> bool:
+        """Whether to ask a submap as the run ends: where it has not said anything of the camera."""
+        is_open = submap.id not in self._estimated and self._refined_in in (None, submap.id)
+        return self._config.refine and is_open and len(submap.keyframes) >= MIN_AT_END
+
+    def estimate(self, submap: Submap) -> CalibrationEstimate | Failure:
+        """Return what a submap says of the camera; nothing is changed."""
+        return self._estimate(submap, self._camera, self._covariance)
+
     def ask(self, submap: Submap, lost: dict[int, Submap]) -> CalibrationJob:
         """Return the question to a submap, on copies of it and of those that are to change with it.
 
@@ -172,12 +185,15 @@ class Calibration:
 
     def note(self, job: CalibrationJob, failure: Failure) -> None:
         """Note that a question had no clear answer: where the motion said nothing yet, the next comes sooner."""
+        if failure.numbers:
+            self._estimated.add(job.submap.id)
         if failure.reason is FailureReason.DEGENERATE:
             self._said_nothing(job.submap.id, len(job.submap.keyframes))
 
     def take(self, answer: CalibrationAnswer) -> None:
         """Let the frames to come be rectified by the camera that was found."""
         self._camera, self._refined_in, self._covariance = answer.camera, answer.submap.id, answer.covariance
+        self._estimated.add(answer.submap.id)
 
     def _asked(self, submap_id: int, n: int) -> None:
         self._due_at[submap_id], self._asked_with[submap_id] = int(np.ceil(GROWTH * n)), n

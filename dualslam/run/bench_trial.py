@@ -32,8 +32,6 @@ from dualslam.lab.bench.run import trial_folder
 from dualslam.lab.bench.spec import SequenceSpec
 from dualslam.lab.bench.truth import compare, read_verdict, submaps_of, true_frames
 from dualslam.map.frame_records import FrameResult
-from dualslam.run.audit_scores import audit_scores
-from dualslam.run.results import trajectories_of
 from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import SYNTHETIC, open_source
 
@@ -131,7 +129,6 @@ def _measure(trial: Trial, folder: Path, sequence: Sequence, outcome: Outcome) -
         breakages=losses,
         cpu_s=outcome.report.cpu_s,
         **read_verdict(outcome.summary),
-        scores=audit_scores(outcome.system),
     )
     truth: Trajectory | None = getattr(sequence, "ground_truth", None)
     if truth is None:
@@ -139,7 +136,7 @@ def _measure(trial: Trial, folder: Path, sequence: Sequence, outcome: Outcome) -
     corruptions = config_from_dict(trial.config, trial.key).corruptions
     source = cast(_Recorded, sequence)
     frames = true_frames(source.source_indices, source.frame_timestamps, truth, corruptions)
-    main = trajectories_of(outcome.system).main
+    main = outcome.trajectories.main
     on_true_clock, known = frames.on_true_clock(main), frames.truth
     if len(main) and len(known):
         ate_m, path_m = trajectory_error(on_true_clock, known, frames.times_s)

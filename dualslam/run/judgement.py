@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from dualslam.atlas.atlas import joined
-from dualslam.core.camera.corrected import correction_of
+from dualslam.core.estimates import MAX_PRIOR_SIGMAS
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
+from dualslam.core.trajectory import Trajectory
 from dualslam.core.types import FrameStatus
 from dualslam.map.frame_records import FrameRow
 from dualslam.run.measuring import MANY_REJECTED, Measured
 from dualslam.run.results import Trajectories
-from dualslam.system.audit.photometric import Sample, disagreeing_stretches
-from dualslam.system.audit.steps import measure_steps
+from dualslam.system.audit.photometric import Disagreement, Sample, find_disagreement
+from dualslam.system.audit.steps import Steps, measure_steps
 from dualslam.system.audit.verdict import Level, Reason, ReasonCode, Verdict
 from dualslam.system.system import System
 
@@ -31,12 +33,11 @@ MAX_JOIN_SIGMA = 0.025
 """Standard deviation of the scale by which maps are joined: twice as much, 5 %, is wrong."""
 MAX_FOCAL_SIGMA = 0.03
 """Standard deviation of the logarithm of the focal length."""
-MIN_FOCAL_CHANGE, MAX_FOCAL_SIGMAS = 0.05, 4.0
-"""Of the logarithm, between the last estimate and the camera in use. Right runs show 0.02 and 2.2 sigmas at most, a
-calibration of half the image size 0.41 and 24 sigmas."""
-WRONG_FOCAL = 0.3
-"""From here on it is more than self-calibration corrects, six sigmas of its prior, and maps break. With 0.2 on a road
-the trajectory is right to 0.4 %."""
+MIN_FOCAL_CHANGE, MAX_FOCAL_SIGMAS = 0.1, 4.0
+"""Of the logarithm of the focal length against the calibration given, whether the map has taken it over or not: two
+sigmas of what a data sheet is off. What was tracked until then may be broken. Its own sigma is that of one submap."""
+STOOD_S = 1.0
+"""For so long at least a camera has stood when it is found to: seven images, a fifth of a second apart, show it."""
 INTERVALS_S = (1e-3, 2.0)
 """Median time between two frames: outside, timestamps are in another unit, or not those of the frames."""
 
@@ -63,17 +64,26 @@ def judge_run(
     """
     if not rows:
         return Verdict(Level.DOUBTFUL)
-    reasons = [*_coverage(system, rows), *_clock(rows)]
+    reasons, scores = [*_coverage(system, rows), *_clock(rows)], {}
     if crashed:
         text = "The run crashed: what it had found until then was kept. Report the error, and run again."
         reasons.append(_about_all(rows, ReasonCode.CRASHED, Level.USABLE, text))
     if len(trajectories.main):
-        reasons += [*_jumps(system, trajectories), *_photometric(system, trajectories), *_scale(rows)]
-        reasons += _loose_joins(system, trajectories)
-        reasons += _focal(system, rows)
+        steps, found = _steps(system, trajectories), find_disagreement(_held_samples(system, trajectories))
+        told = _camera_estimates(system)
+        reasons += [*_jumps(system, trajectories, *steps), *_photometric(system, found), *_scale(rows)]
+        reasons += [*_loose_joins(system, trajectories), *_still(system, trajectories), *_camera(system, told, rows)]
+        scores = {
+            str(ReasonCode.JUMP): float(steps[1].ratio.max(initial=0.0)),
+            str(ReasonCode.PHOTOMETRIC): found.worst,
+        }
+        if told:
+            scores[str(ReasonCode.CAMERA)] = told[-1]["prior_sigmas"]
+        if system.log_focal_sigma is not None:
+            scores[str(ReasonCode.FOCAL)] = system.log_focal_sigma
     if measured is not None:
         reasons += _measurements(rows, measured)
-    return Verdict.of(reasons)
+    return Verdict.of(reasons, scores)
 
 
 def _about_all(rows: Sequence[FrameRow], code: ReasonCode, level: Level, text: str) -> Reason:
@@ -127,11 +137,15 @@ def _longest_run(indices: list[int]) -> tuple[int, int]:
 # --- what is wrong
 
 
-def _jumps(system: System, trajectories: Trajectories) -> list[Reason]:
+def _steps(system: System, trajectories: Trajectories) -> tuple[Trajectory, Steps]:
+    """Return the main trajectory without frames that repeat the image before them, and its steps."""
     main = trajectories.main.in_time_order()
     repeated = {system.numbers.index_of(i) for i in system.audit.repeated}
     main = main.take(np.array([i not in repeated for i in main.index.tolist()], bool))
-    steps = measure_steps(main.timestamps_s, main.T_world_cam[:, :3, 3])
+    return main, measure_steps(main.timestamps_s, main.T_world_cam[:, :3, 3])
+
+
+def _jumps(system: System, trajectories: Trajectories, main: Trajectory, steps: Steps) -> list[Reason]:
     suspected = np.flatnonzero(steps.ratio > MAX_STEP_RATIO).tolist()
     depth = {n: _median_depth(system, trajectories, int(main.index[n])) for n in suspected}
     found = [n for n in suspected if steps.excess[n] > MIN_JUMP_DEPTHS * depth[n]]
@@ -157,16 +171,17 @@ def _median_depth(system: System, trajectories: Trajectories, index: int) -> flo
     return scale * float(np.median(depths)) if len(depths) else 0.0
 
 
-def _photometric(system: System, trajectories: Trajectories) -> list[Reason]:
-    def holds(sample: Sample) -> bool:
-        """Whether the frame is still posed in the map that was compared, and that map is part of the main one."""
-        pose = system.poses.get(sample.index)
-        return pose is not None and pose.submap_id == sample.submap_id in trajectories.S_world_submap
+def _held_samples(system: System, trajectories: Trajectories) -> list[Sample]:
+    """Return the samples whose frame is still posed in the map that was compared, which is part of the main one."""
+    poses = system.poses
+    held = [s for s in system.audit.samples if s.submap_id in trajectories.S_world_submap and s.index in poses]
+    return [s for s in held if poses[s.index].submap_id == s.submap_id]
 
-    stretches = disagreeing_stretches(sample for sample in system.audit.samples if holds(sample))
-    if not stretches:
+
+def _photometric(system: System, found: Disagreement) -> list[Reason]:
+    if not found.stretches:
         return []
-    worst = max(stretches, key=lambda s: s.last - s.first)
+    worst = max(found.stretches, key=lambda s: s.last - s.first)
     first, last = sorted(system.numbers.index_of(i) for i in (worst.first, worst.last))
     text = (
         f"From frame {first} to {last} the images disagree with the map: {100 * worst.agreement:.0f} % of the patches "
@@ -223,21 +238,47 @@ def _loose_joins(system: System, trajectories: Trajectories) -> list[Reason]:
     return [Reason(ReasonCode.SCALE, Level.USABLE, text, first, last)]
 
 
+def _still(system: System, trajectories: Trajectories) -> list[Reason]:
+    """Return where most of the image stood still, as that of a camera at rest, and the map moved the camera."""
+    main, numbers = trajectories.main, system.numbers
+    for event in system.events.of_kind(EventKind.CAMERA_STANDS):
+        near = np.flatnonzero(np.abs(main.timestamps_s - event.timestamp_s) <= STOOD_S)
+        rows = np.array([n for n in near.tolist() if numbers.number_of(int(main.index[n])) <= event.frame], np.int64)
+        if len(rows) < 2:
+            continue
+        moved = float(np.ptp(main.T_world_cam[rows, :3, 3], axis=0).max())
+        if moved > MIN_JUMP_DEPTHS * _median_depth(system, trajectories, int(main.index[rows[0]])):
+            first, last = sorted((int(main.index[rows[0]]), int(main.index[rows[-1]])))
+            text = (
+                f"From frame {first} to {last} most of the image stands still, but the camera moves in the map. "
+                "Something that moves may have been followed. Do not use this map. Mask what moves."
+            )
+            return [Reason(ReasonCode.STILL, Level.DOUBTFUL, text, first, last)]
+    return []
+
+
 # --- camera and clock
 
 
-def _focal(system: System, rows: Sequence[FrameRow]) -> list[Reason]:
-    told = [event.data for event in system.events.of_kind(EventKind.CALIBRATED, EventKind.CALIBRATION_KEPT)]
-    told = [data for data in told if "log_focal_sigma" in data]
-    # Of the last estimate: the ones before it knew less.
-    apart = told[-1]["log_focal"] - correction_of(system.camera).log_focal if told else 0.0
-    if abs(apart) > max(MIN_FOCAL_CHANGE, MAX_FOCAL_SIGMAS * told[-1]["log_focal_sigma"] if told else 0.0):
-        text = (
-            f"The images show a focal length {100 * abs(np.expm1(apart)):.0f} % {'longer' if apart > 0 else 'shorter'} "
-            "than the one used. Check that the calibration is of this camera, lens and image size."
-        )
-        level = Level.DOUBTFUL if abs(apart) > WRONG_FOCAL else Level.USABLE
-        return [_about_all(rows, ReasonCode.CAMERA, level, text)]
+def _camera_estimates(system: System) -> list[dict[str, Any]]:
+    """Return what the maps have said of their camera. Of these the last counts: the ones before it knew less."""
+    told = system.events.of_kind(EventKind.CALIBRATED, EventKind.CALIBRATION_KEPT)
+    return [event.data for event in told if "log_focal_sigma" in event.data]
+
+
+def _camera(system: System, told: Sequence[Mapping[str, Any]], rows: Sequence[FrameRow]) -> list[Reason]:
+    if told:
+        apart, sigma = told[-1]["log_focal"], told[-1]["log_focal_sigma"]
+        check = "Check that the calibration is of this camera, lens and image size."
+        is_beyond = told[-1]["prior_sigmas"] > MAX_PRIOR_SIGMAS
+        level = Level.DOUBTFUL if is_beyond else Level.USABLE
+        if abs(apart) > max(MIN_FOCAL_CHANGE, MAX_FOCAL_SIGMAS * sigma):
+            share = f"{100 * abs(np.expm1(apart)):.0f} % {'longer' if apart > 0 else 'shorter'}"
+            text = f"The images show a focal length {share} than the calibration says. {check}"
+            return [_about_all(rows, ReasonCode.CAMERA, level, text)]
+        if is_beyond:
+            text = f"The images show another lens than the calibration says: its distortion or its centre. {check}"
+            return [_about_all(rows, ReasonCode.CAMERA, level, text)]
     sigma = system.log_focal_sigma
     if sigma is None or sigma < MAX_FOCAL_SIGMA:
         return []
@@ -263,5 +304,5 @@ def _clock(rows: Sequence[FrameRow]) -> list[Reason]:
         if backwards
         else f"The median time between two frames is {abs(usual_s):.3g} s"
     )
-    text = f"{problem}. Check the clock or the unit of the timestamps: motion is predicted by them."
-    return [_about_all(rows, ReasonCode.CLOCK, Level.USABLE, text)]
+    text = f"{problem}. Check the clock or the unit of the timestamps: the trajectory has them, too."
+    return [_about_all(rows, ReasonCode.CLOCK, Level.GOOD, text)]

@@ -128,12 +128,14 @@ class Outcome:
     report : RunReport
     system : System
         With the whole map.
+    trajectories : Trajectories
     """
 
     out: Path
     summary: dict[str, Any]
     report: RunReport
     system: System
+    trajectories: Trajectories
 
     @property
     def has_map(self) -> bool:
@@ -270,7 +272,9 @@ def run_to_folder(
                 _write_new_events(system, folder)
                 has_map = bool(system.poses) or saved_map is not None
                 given["no_map"] = None if has_map else faults.sentence() or refusals.sentence()
-                summary = _write_results(system, report, config, sequence, folder, given, list(measurements))
+                summary, trajectories = _write_results(
+                    system, report, config, sequence, folder, given, list(measurements)
+                )
                 if recorded is not None and replay is not None:
                     summary["replay"] = _compared(folder, Path(replay), recorded)
                     folder.write_summary(summary)
@@ -288,7 +292,7 @@ def run_to_folder(
     _raise_what_ended(report, interrupts, out)
     if refused := summary.get("measurements", {}).get("refused"):
         raise InputError(f"{refused} The run without measurements is in {out}.")
-    return Outcome(Path(out), summary, report, system)
+    return Outcome(Path(out), summary, report, system, trajectories)
 
 
 def save_system(
@@ -326,7 +330,7 @@ def save_system(
         folder.write_config(dump_config(config))
         _write_new_events(system, folder)
         given = _given(sequence, False) | {"saved_map": None, "localise": False, "no_map": None}
-        summary = _write_results(system, report, config, sequence, folder, given, list(measurements))
+        summary, _ = _write_results(system, report, config, sequence, folder, given, list(measurements))
         _write_pages(folder)
     if refused := summary.get("measurements", {}).get("refused"):
         raise InputError(f"{refused} The run without measurements is in {out}.")
@@ -439,8 +443,8 @@ def _write_results(
     folder: RunFolder,
     given: dict[str, Any],
     sources: list[MeasurementSource],
-) -> dict[str, Any]:
-    """Write all that comes at the end of a run, and return the summary, which begins with what was given."""
+) -> tuple[dict[str, Any], Trajectories]:
+    """Write all that comes at the end of a run; return the summary, which begins with `given`, and the trajectories."""
     trajectories = trajectories_of(system)
     measured, refused = _measured(system, config, trajectories, sources)
     if measured is not None and measured.undone:
@@ -469,7 +473,7 @@ def _write_results(
     if measured is not None:
         write_measured(folder.path, measured, {i: system.numbers.index_of(i) for i in system.rows})
         log.info("%s", measured.line())
-    return summary
+    return summary, trajectories
 
 
 def _measured(

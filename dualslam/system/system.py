@@ -285,7 +285,8 @@ class System:
         state, last = self._state, next(reversed(self.rows.values()), None)
         self._graphs.finish(last)
         if state.live is not None and last is not None:
-            self._calibrations.collect(state.live, last, self._recoveries.waiting, wait=True)
+            asks = not interrupted and self.saved is None
+            self._calibrations.finish(state.live, last, self._recoveries.waiting, asks)
         solve = partial(self._graphs.finish, last)
         self._recoveries.finish(state.live, last, interrupted or state.localises, solve)
         if state.live is not None and last is not None:

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from dualslam.atlas.atlas import Link, LinkKind
-from dualslam.core.camera.corrected import LensCorrection, correct
-from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.events import EventKind
 from dualslam.core.types import FloatArray, Frame
 from dualslam.run.judgement import judge_run
@@ -92,8 +90,9 @@ def test_a_stretch_that_disagrees_with_the_images_makes_a_run_doubtful_while_its
 
 
 def test_a_clock_in_another_unit_or_that_repeats_is_told() -> None:
-    (reason,) = judged(run(ahead(), interval_s=33.3)).reasons
-    assert reason.code is ReasonCode.CLOCK
+    verdict = judged(run(ahead(), interval_s=33.3))
+    assert (verdict.level, verdict.reasons[0].code) == (Level.GOOD, ReasonCode.CLOCK), "a remark: the poses are right"
+    assert verdict.doubt_about(5) == ""
     system = run(ahead())
     system.rows[7].timestamp_s = system.rows[6].timestamp_s
     (reason,) = judged(system).reasons
@@ -119,18 +118,48 @@ def test_a_focal_length_far_from_the_one_used_is_told(log_focal: float, level: L
     system = run(ahead())
     estimates = [{"log_focal": -0.6, "log_focal_sigma": 0.2}, {"log_focal": log_focal, "log_focal_sigma": 0.004}]
     for frame, estimate in zip((60, 90), estimates, strict=True):
-        system.events.add(EventKind.CALIBRATION_KEPT, frame, frame / 30, 0, reason="too far", **estimate)
+        far = abs(estimate["log_focal"]) / 0.05
+        system.events.add(
+            EventKind.CALIBRATION_KEPT, frame, frame / 30, 0, reason="too far", prior_sigmas=far, **estimate
+        )
     system.events.add(EventKind.CALIBRATION_KEPT, 120, 4.0, 0, reason="too little turning")
     verdict = judged(system)
     assert verdict.level is level
     assert [reason.code for reason in verdict.reasons] == [ReasonCode.CAMERA] * (level is not Level.GOOD)
 
 
-def test_an_estimate_that_was_taken_over_is_no_doubt() -> None:
+@pytest.mark.parametrize(("log_focal", "level"), [(-0.08, Level.GOOD), (-0.2, Level.USABLE)])
+def test_what_was_tracked_before_a_large_correction_was_taken_over_may_be_broken(
+    log_focal: float, level: Level
+) -> None:
     system = run(ahead())
-    system.camera = correct(PinholeCamera(640, 480, 450.0, 450.0, 319.5, 239.5), LensCorrection(log_focal=-0.2))
-    system.events.add(EventKind.CALIBRATED, 60, 2.0, 0, log_focal=-0.2, log_focal_sigma=0.004)
-    assert judged(system).level is Level.GOOD
+    told = {"log_focal": log_focal, "log_focal_sigma": 0.004, "prior_sigmas": abs(log_focal) / 0.05}
+    system.events.add(EventKind.CALIBRATED, 60, 2.0, 0, **told)
+    assert judged(system).level is level
+
+
+def test_another_lens_than_the_one_used_makes_a_run_doubtful() -> None:
+    system = run(ahead())
+    estimate = {"log_focal": 0.03, "log_focal_sigma": 0.007, "k1": -0.27, "k1_sigma": 0.002, "prior_sigmas": 9.0}
+    system.events.add(EventKind.CALIBRATION_KEPT, 60, 2.0, 0, reason="too far", **estimate)
+    verdict = judged(system)
+    assert (verdict.level, verdict.reasons[0].code) == (Level.DOUBTFUL, ReasonCode.CAMERA)
+    assert verdict.scores["camera"] == 9.0
+
+
+@pytest.mark.parametrize(("stood_since", "level"), [(100, Level.DOUBTFUL), (70, Level.GOOD)])
+def test_a_camera_that_moves_in_the_map_alone_makes_a_run_doubtful(stood_since: int, level: Level) -> None:
+    """Not where it stands in the map, too: until it was found to stand, and goes on at any time afterwards."""
+    truth = ahead()
+    for i in range(stood_since, N):
+        truth[i][0, 3] = truth[min(stood_since, 100)][0, 3] + max(i - 100, 0) / 30
+    system = run(truth)
+    system.events.add(EventKind.CAMERA_STANDS, 100, 100 / 30, None)
+    system.events.add(EventKind.CAMERA_MOVES, 150, 5.0, None)
+    verdict = judged(system)
+    assert verdict.level is level
+    about = [(reason.code, reason.first_frame, reason.last_frame) for reason in verdict.reasons]
+    assert about == [(ReasonCode.STILL, 70, 100)] * (level is Level.DOUBTFUL)
 
 
 def test_a_camera_that_hung_has_not_jumped() -> None:

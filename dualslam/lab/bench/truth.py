@@ -225,9 +225,9 @@ def submaps_of(rows: Iterable[FrameRow], index: IntArray) -> IntArray:
 
 
 def read_verdict(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the level and the reasons that a run's summary claims; nothing of a run that gives no verdict."""
+    """Return level, reasons and scores that a run's summary claims; nothing of a run that gives no verdict."""
     verdict = summary.get("verdict")
     if verdict is None:
         return {}
     reasons = tuple(Reason(str(r["code"]), r.get("first_frame"), r.get("last_frame")) for r in verdict["reasons"])
-    return {"level": str(verdict["level"]), "reasons": reasons}
+    return {"level": str(verdict["level"]), "reasons": reasons, "scores": verdict.get("scores", {})}

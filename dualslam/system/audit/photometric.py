@@ -99,19 +99,43 @@ class PhotometricAudit:
     def broken_since(self, submap_id: int) -> int | None:
         """Return the frame since which the images disagree with a map, after the last sample that agreed, if any."""
         newest = self.samples[-MIN_SAMPLES:]
-        if not disagreeing_stretches(newest) or newest[0].submap_id != submap_id:
+        if not find_disagreement(newest).stretches or newest[0].submap_id != submap_id:
             return None
         before = self.samples[-MIN_SAMPLES - 1 : -MIN_SAMPLES]
         agreed = before and before[0].submap_id == newest[0].submap_id
         return before[0].index + 1 if agreed else newest[0].index
 
 
-def disagreeing_stretches(samples: Iterable[Sample]) -> list[Stretch]:
-    """Return the stretches of one map in which consecutive samples disagree, by ascending time."""
-    found = []
-    for (_, disagrees), group in groupby(samples, key=lambda s: (s.submap_id, s.agreement < MIN_AGREEMENT)):
-        stretch = list(group)
-        if disagrees and len(stretch) >= MIN_SAMPLES:
-            agreement = float(np.median([each.agreement for each in stretch]))
-            found.append(Stretch(stretch[0].index, stretch[-1].index, agreement))
-    return found
+@dataclass(frozen=True, slots=True)
+class Disagreement:
+    """Where the samples of a run disagree with the map.
+
+    Attributes
+    ----------
+    stretches : tuple of Stretch
+        By ascending time.
+    worst : float
+        Largest share of patches that disagree in all of `MIN_SAMPLES` consecutive samples of one map. Above
+        ``1 - MIN_AGREEMENT`` there is a stretch.
+    """
+
+    stretches: tuple[Stretch, ...]
+    worst: float
+
+
+def find_disagreement(samples: Iterable[Sample]) -> Disagreement:
+    """Return the stretches of one map in which consecutive samples disagree, and the worst disagreement."""
+    stretches, worst = [], 0.0
+    for _, of_map in groupby(samples, key=lambda s: s.submap_id):
+        part = list(of_map)
+        agreement = np.array([sample.agreement for sample in part])
+        if len(part) < MIN_SAMPLES:
+            continue
+        best = np.lib.stride_tricks.sliding_window_view(agreement, MIN_SAMPLES).max(axis=1)
+        worst = max(worst, 1.0 - float(best.min()))
+        begins = np.flatnonzero(best < MIN_AGREEMENT)
+        for run in np.split(begins, np.flatnonzero(np.diff(begins) > 1) + 1) if len(begins) else []:
+            first, last = int(run[0]), int(run[-1]) + MIN_SAMPLES - 1
+            median = float(np.median(agreement[first : last + 1]))
+            stretches.append(Stretch(part[first].index, part[last].index, median))
+    return Disagreement(tuple(stretches), worst)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
@@ -14,6 +14,7 @@ class Level(StrEnum):
     """How far to trust a run."""
 
     GOOD = "good"
+    """A reason of this level is a remark: it does not speak against the trajectory."""
     USABLE = "usable"
     """What is posed can be used; something is missing, or less sure than usual."""
     DOUBTFUL = "doubtful"
@@ -26,6 +27,7 @@ class ReasonCode(StrEnum):
     NO_MAP = "no_map"
     JUMP = "jump"
     PHOTOMETRIC = "photometric"
+    STILL = "still"
     CAMERA = "camera"
     SCALE = "scale"
     CRASHED = "crashed"
@@ -67,18 +69,21 @@ class Verdict:
     ----------
     level : Level
     reasons : tuple of Reason
-        The gravest first, at most three; none where the run is good.
+        The gravest first, at most three; of a good run only remarks.
+    scores : dict of str to float
+        By the reasons' codes: how strongly the run speaks for each, given or not. The higher, the worse.
     """
 
     level: Level
     reasons: tuple[Reason, ...] = ()
+    scores: dict[str, float] = field(default_factory=dict, compare=False)
 
     @classmethod
-    def of(cls, reasons: Iterable[Reason]) -> Verdict:
+    def of(cls, reasons: Iterable[Reason], scores: dict[str, float] | None = None) -> Verdict:
         """Return the verdict that some reasons lead to."""
         grades, codes = list(Level), list(ReasonCode)
         ordered = sorted(reasons, key=lambda r: (-grades.index(r.level), codes.index(r.code), r.first_frame))
-        return cls(ordered[0].level if ordered else Level.GOOD, tuple(ordered[:MAX_REASONS]))
+        return cls(ordered[0].level if ordered else Level.GOOD, tuple(ordered[:MAX_REASONS]), scores or {})
 
     def as_dict(self) -> dict[str, Any]:
         """Return what ``summary.json`` holds."""
@@ -86,11 +91,12 @@ class Verdict:
             {"code": str(r.code), "text": r.text, "first_frame": r.first_frame, "last_frame": r.last_frame}
             for r in self.reasons
         ]
-        return {"level": str(self.level), "reasons": reasons}
+        return {"level": str(self.level), "reasons": reasons, "scores": self.scores}
 
     def doubt_about(self, frame: int) -> str:
-        """Return the code of the gravest reason that is about a frame; empty where none is."""
-        return next((str(r.code) for r in self.reasons if r.first_frame <= frame <= r.last_frame), "")
+        """Return the code of the gravest reason that is about a frame; empty where none is. Remarks are no doubt."""
+        doubts = (r for r in self.reasons if r.level is not Level.GOOD)
+        return next((str(r.code) for r in doubts if r.first_frame <= frame <= r.last_frame), "")
 
     def __str__(self) -> str:
         """Return the verdict in one line."""

@@ -91,6 +91,21 @@ class Calibrations:
         if self._calibration.is_due_at_loss(live.submap):
             self._ask(live, now, lost)
 
+    def finish(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int], ask: bool) -> None:
+        """Take in what is open at the end of the run; `ask`: a live submap that has said nothing yet is asked.
+
+        A wrong camera bends a short map as it does a long one. The map stays as it is: one that a wrong camera has
+        broken is not mended by a better one.
+        """
+        self.collect(live, now, lost, wait=True)
+        if not ask or not self._calibration.is_due_at_end(live.submap):
+            return
+        with self._record.timer.measure("calibration"):
+            found = self._calibration.estimate(live.submap)
+        if found.numbers:
+            kept, reason = EventKind.CALIBRATION_KEPT, "asked at the end of the run"
+            self._record.event(kept, now, live.submap.id, reason=reason, **found.numbers)
+
     def _ask(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int]) -> None:
         if self._desk.n_open(JobKind.CALIBRATION, live.submap.id):
             return

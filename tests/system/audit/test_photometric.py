@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.types import Features, FloatArray, Track, View
 from dualslam.map.submap import Submap
-from dualslam.system.audit.photometric import MIN_SAMPLES, PhotometricAudit, Sample, Stretch, disagreeing_stretches
+from dualslam.system.audit.photometric import MIN_SAMPLES, PhotometricAudit, Sample, Stretch, find_disagreement
 
 EMPTY = np.zeros((0, 2))
 FEATURES = Features(EMPTY, EMPTY, EMPTY[:, 0], EMPTY[:, 0], np.zeros(0, np.int64), EMPTY[:, 0], EMPTY)
@@ -39,14 +40,23 @@ def samples(agreements: list[float], submap_id: int = 0) -> list[Sample]:
 
 
 def test_a_single_low_sample_is_no_stretch_and_several_are() -> None:
-    assert disagreeing_stretches(samples([0.8, 0.0, 0.8, 0.1, 0.0, 0.8, 0.2])) == []
-    low = [0.05] * MIN_SAMPLES
-    assert disagreeing_stretches(samples([0.8, *low, 0.8])) == [Stretch(6, 6 * MIN_SAMPLES, 0.05)]
+    assert not find_disagreement(samples([0.8, 0.0, 0.8, 0.1, 0.0, 0.8, 0.2])).stretches
+    low = [0.05] * (MIN_SAMPLES + 1)
+    found = find_disagreement(samples([0.8, *low, 0.8, *low]))
+    ends = [(1, MIN_SAMPLES + 1), (MIN_SAMPLES + 3, 2 * MIN_SAMPLES + 3)]
+    assert found.stretches == tuple(Stretch(6 * first, 6 * last, 0.05) for first, last in ends)
+
+
+def test_the_worst_stretch_counts_not_the_worst_sample() -> None:
+    found = find_disagreement(samples([0.9, 0.0, 0.9, 0.5, 0.4, 0.3, 0.6, 0.9]))
+    assert found.worst == pytest.approx(0.5), "of 0.5, 0.4, 0.3"
+    assert not found.stretches
 
 
 def test_a_stretch_is_of_one_map() -> None:
     low = [0.0] * (MIN_SAMPLES - 1)
-    assert disagreeing_stretches([*samples(low), *samples(low, submap_id=1)]) == []
+    found = find_disagreement([*samples(low), *samples(low, submap_id=1)])
+    assert (found.stretches, found.worst) == ((), 0.0)
 
 
 def test_frames_are_sampled_by_their_times_and_doubt_is_there_while_they_disagree() -> None:
@@ -64,7 +74,7 @@ def test_frames_are_sampled_by_their_times_and_doubt_is_there_while_they_disagre
     assert len(audit.samples) == 28, "every sixth frame, from the first that could be compared"
     assert doubtful == list(range(60, 120)), "from the first sample that disagrees to the next that agrees"
     assert broken[0] == (72, 55), "with the third, since the last that agreed"
-    (stretch,) = disagreeing_stretches(audit.samples)
+    (stretch,) = find_disagreement(audit.samples).stretches
     assert (stretch.first, stretch.last) == (60, 114)
 
 

@@ -11,8 +11,15 @@ JUMP = Reason(ReasonCode.JUMP, Level.DOUBTFUL, "It jumps.", 50, 51)
 def test_a_run_without_a_reason_is_good() -> None:
     verdict = Verdict.of([])
     assert verdict == Verdict(Level.GOOD)
-    assert verdict.as_dict() == {"level": "good", "reasons": []}
+    assert verdict.as_dict() == {"level": "good", "reasons": [], "scores": {}}
     assert str(verdict) == "good"
+
+
+def test_a_remark_leaves_a_run_good_and_its_frames_undoubted() -> None:
+    verdict = Verdict.of([Reason(ReasonCode.CLOCK, Level.GOOD, "Check the clock.", 0, 9)], {"jump": 3.0})
+    assert str(verdict) == "good: Check the clock."
+    assert verdict.doubt_about(5) == ""
+    assert verdict.as_dict()["scores"] == {"jump": 3.0}
 
 
 def test_the_gravest_reason_comes_first_and_gives_the_level() -> None:

@@ -231,9 +231,9 @@ class CalibrationWorld:
         return View(frame.index, frame.timestamp_s, rectify(features, calibration.camera, 0.0))
 
 
-def run_point_world(refine: bool) -> System:
+def run_point_world(refine: bool, first_keyframes: int = 12) -> System:
     settings = {
-        "calibration": {"first_keyframes": 12, "max_observations": 6000, "refine": refine},
+        "calibration": {"first_keyframes": first_keyframes, "max_observations": 6000, "refine": refine},
         # Small steps and no culling: many keyframes of few frames.
         "keyframes": {"max_parallax_deg": 1.0},
         "mapping": {"redundant_ratio": 1.0},
@@ -264,6 +264,14 @@ def test_the_system_finds_its_camera() -> None:
     again = run_point_world(refine=True)
     for i, pose in system.poses.items():
         assert np.array_equal(pose.T_kf_cam, again.poses[i].T_kf_cam)
+
+
+def test_a_map_that_was_never_asked_is_asked_at_the_end() -> None:
+    system = run_point_world(refine=True, first_keyframes=1000)
+    (found,) = system.events.of_kind(EventKind.CALIBRATED, EventKind.CALIBRATION_KEPT)
+    assert (found.event, found.frame) == (EventKind.CALIBRATION_KEPT, N_FRAMES - 1)
+    assert abs(found.data["log_focal"] + np.log(WRONG)) < 2 * found.data["log_focal_sigma"]
+    np.testing.assert_array_equal(system.atlas.submaps[0].K, wrong_camera(WRONG).K)
 
 
 def test_it_can_be_switched_off() -> None:
