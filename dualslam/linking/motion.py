@@ -189,12 +189,16 @@ def _measure(fits: _Fits, last_before: int, known: _Fits, slack_mu: float = 0.0)
         return None
     weights = has[0] / sum(has), has[1] / sum(has)
     apart_s = float(fits.times_s[j] - fits.times_s[i])
-    change = 0.0
+    change, may_halt = 0.0, 1.0
     if all(has):
-        difference = float(np.linalg.norm(fits.before.velocity[i] - fits.after.velocity[j]))
+        difference, mean = (
+            float(np.linalg.norm(fits.before.velocity[i] + sign * fits.after.velocity[j])) for sign in (-1.0, 1.0)
+        )
         change = 0.5 * difference * (apart_s + fits.reach_s)
+        may_halt = min(1.0, difference / max(mean, 1e-300))
     usual, n_asked, asked_s = _usual_error(known, apart_s, *weights)
-    off = fits.error_of_a_halt(i, j, *weights, apart_s - asked_s)
+    # A camera that goes on at the speed that it had has hardly stood still: it may rather be at a similar place.
+    off = fits.error_of_a_halt(i, j, *weights, may_halt * (apart_s - asked_s))
     return Motion(off, usual, n_asked, sum(has), change, slack_mu)
 
 

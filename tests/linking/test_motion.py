@@ -132,12 +132,21 @@ def test_a_change_of_velocity_explains_what_it_can() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_camera_may_halt_for_as_long_as_it_was_not_watched(seed: int) -> None:
-    """A robot at constant speed stops dead while nothing is seen, and goes on as before."""
-    for gap_s, halt_s, refused in ((4.0, 2.5, False), (4.0, -2.5, True), (1.0, 0.8, True)):
+    """A robot at constant speed stops dead while nothing is seen, and goes on slowly.
+
+    One that goes on as before is refused: it may as well be at the next of several like places.
+    """
+    for gap_s, halt_s, speed, refused in (
+        (4.0, 2.5, 0.3, False),
+        (4.0, 2.5, 0.0, False),
+        (4.0, 2.5, 1.0, True),
+        (4.0, -2.5, 1.0, True),
+        (1.0, 0.8, 1.0, True),
+    ):
         t, p = way(180, seed, sway_m=0.002)
         length = round(RATE_HZ * gap_s)
         t, p = without(np.arange(180 + length) / RATE_HZ, np.concatenate([p, np.zeros((length, 3))]), 100, length)
-        p[100:] = p[99] + np.outer(t[100:] - t[99] - halt_s, [0.8, 0.0, 0.3])
+        p[100:] = p[99] + speed * np.outer(t[100:] - t[99] - halt_s, [0.8, 0.0, 0.3])
         assert motion_behind(path_of(t[20:], p[20:]), 79).is_refused is refused
 
 
