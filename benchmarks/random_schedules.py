@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 
 from dualslam.core.jobs import JobKind
+from dualslam.core.schedule import DELAYS, After
 from dualslam.core.types import FailureReason, FloatArray
 from dualslam.run.results import trajectories_of
 from dualslam.testing.lossy import Lossy
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
-from dualslam.workers.schedule import DELAYS, After
 
 FRAMES = (60, 80, 110)
 SPEED = 0.6

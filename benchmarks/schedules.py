@@ -19,10 +19,10 @@ from typing import Any
 
 import dualslam
 from dualslam.core.jobs import JobKind
+from dualslam.core.schedule import AT_ONCE, DELAYS, After
 from dualslam.core.types import FailureReason
 from dualslam.run.session import run_to_folder
 from dualslam.testing.lossy import Lossy
-from dualslam.workers.schedule import AT_ONCE, DELAYS, After
 
 ANSWERED = tuple(DELAYS)
 

@@ -11,6 +11,7 @@ import pytest
 
 from dualslam.atlas.record import FrameStamp
 from dualslam.core.jobs import JobKind
+from dualslam.core.schedule import DELAYS, After, Policy, Recorded, header_of, never
 from dualslam.core.types import FailureReason
 from dualslam.map.submap import Submap
 from dualslam.recovery.manager import Recoveries
@@ -18,7 +19,6 @@ from dualslam.run.results import trajectories_of
 from dualslam.system.system import System
 from dualslam.testing.lossy import Lossy
 from dualslam.testing.point_world import PointWorld, cloud, hand_held, pose_errors, system_in
-from dualslam.workers.schedule import DELAYS, After, Policy, Recorded, header_of, never
 
 COVERED = frozenset(range(35, 44))
 N = 80

@@ -33,6 +33,7 @@ from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Frontend, SubmapGraph
 from dualslam.core.jobs import InlineDesk, JobKind
+from dualslam.core.schedule import AT_ONCE, After, Policy, Recorded
 from dualslam.core.types import View
 from dualslam.core.walk_news import WalkWatch
 from dualslam.frontends.direct.patch_audit import PatchAudit
@@ -53,7 +54,6 @@ from dualslam.map.submap import Submap
 from dualslam.system.components import Components
 from dualslam.system.system import System
 from dualslam.workers.desk import WorkerDesk
-from dualslam.workers.schedule import AT_ONCE, After, Policy, Recorded
 from dualslam.workers.scheduled_desk import ScheduledDesk
 from dualslam.workers.start_beside import StartBeside
 
@@ -84,7 +84,7 @@ def build_system(
     new_graph : callable, optional
         Makes the factor graph of a submap, each time anew, in the place of `ISam2SubmapGraph`; in one process alone.
     schedule : Policy, optional
-        When answers of background work are used (`dualslam/workers/schedule.py`): `After` so many frames, or as
+        When answers of background work are used (`dualslam/core/schedule.py`): `After` so many frames, or as
         `Recorded` by another run. By default at once without workers, else after `DELAYS`, and in real time as they
         come.
     in_process : bool

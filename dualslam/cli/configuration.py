@@ -12,7 +12,7 @@ from dualslam.core.config import strict_yaml
 from dualslam.core.config.files import CONFIG, Override, load_config
 from dualslam.core.config.settings import Config
 from dualslam.core.errors import ConfigError, InputError
-from dualslam.run.schedule import recorded_selection
+from dualslam.core.schedule import SCHEDULE, Recorded
 
 
 def config_of(args: argparse.Namespace) -> Config:
@@ -46,7 +46,7 @@ def take_selection(args: argparse.Namespace) -> None:
         return
     if args.realtime or args.inline or args.workers is not None:
         raise InputError("--replay repeats a run in one process: leave out --realtime, --inline and --workers.")
-    selection = recorded_selection(args.replay)
+    selection = Recorded.read(args.replay / SCHEDULE).header.get("selection")
     if selection and (args.start, args.stride, args.max_frames, args.reverse) == (0, 1, None, False):
         for name in ("start", "stride", "max_frames", "reverse"):
             setattr(args, name, selection[name])

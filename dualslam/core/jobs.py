@@ -3,7 +3,7 @@
 A job is a snapshot of arrays that nobody else changes, and its kind says what is made of it. What comes back is a
 change, which the part that asked for it merges, between two frames, into a map that has grown meanwhile. An executor
 does the work: `InlineDesk` at once, in the process that tracks, `WorkerDesk` (`dualslam/workers/desk.py`) in others.
-The schedule (`dualslam/workers/schedule.py`) says when the results are used: the same one gives the same run to the
+The schedule (`dualslam/core/schedule.py`) says when the results are used: the same one gives the same run to the
 bit. A job may fail: then its outcome is a `Failure`, and nothing else has changed.
 """
 

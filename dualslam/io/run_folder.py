@@ -21,6 +21,7 @@ import yaml
 from dualslam.core.config.files import CONFIG as CONFIG
 from dualslam.core.errors import OutputError
 from dualslam.core.events import Event
+from dualslam.core.schedule import SCHEDULE
 from dualslam.core.types import BoolArray
 from dualslam.io.atomic import atomic_file, write_text
 from dualslam.io.folder_lock import FolderLock
@@ -40,7 +41,6 @@ DECISIONS = "decisions.jsonl"
 SUMMARY = "summary.json"
 REPORT = "report.html"
 MAP_PAGE = "map.html"
-SCHEDULE = "schedule.jsonl"
 GROUND_TRUTH = "groundtruth.txt"
 MASK = "mask.png"
 SUBMAPS = "submaps"

@@ -12,12 +12,12 @@ from typing import Any, Protocol
 
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.interfaces import Sequence
+from dualslam.core.schedule import Recorded
 from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult
 from dualslam.run.interrupts import Interrupts
 from dualslam.run.schedule import Schedule, as_recorded, prepared
 from dualslam.system.pace import Pace
-from dualslam.workers.schedule import Recorded
 
 PAUSE_S = 0.05
 """Between two looks at whether a run is to go on."""

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
+from dualslam.core.schedule import Recorded
 from dualslam.core.types import Frame
 from dualslam.io.read_ahead import read_ahead
-from dualslam.io.run_folder import SCHEDULE
-from dualslam.workers.schedule import Recorded
 
 MAX_LATE_S = 1 / 15
 """So late a frame may be while the next one waits: two frames of a camera at 30 Hz. A keyframe mostly takes that much
@@ -18,18 +15,6 @@ CATCH_UP_S = 1.0
 """Who has not been in time for so long does not catch up: the newest frame is then the one to look at."""
 LATE_S = 2e-3
 """What a sleeping process wakes up too late by is no lateness of ours."""
-
-
-def recorded_selection(run: Path) -> dict[str, Any] | None:
-    """Return which frames a run has read, by its recorded schedule.
-
-    Raises
-    ------
-    InputError
-        If the folder has no schedule that can be read.
-    """
-    selection: dict[str, Any] | None = Recorded.read(run / SCHEDULE).header.get("selection")
-    return selection
 
 
 class Schedule:

@@ -25,6 +25,7 @@ from dualslam.core.errors import InputError, OutputError, SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Sequence
 from dualslam.core.metric_problem import MeasurementSource
+from dualslam.core.schedule import SCHEDULE, Recorded, header_of
 from dualslam.core.threads import spare_cores
 from dualslam.core.types import Frame
 from dualslam.io.colours import Colours, save_colours, save_pictures
@@ -32,7 +33,7 @@ from dualslam.io.export.colours import keyframe_indices, landmark_colours
 from dualslam.io.image_faults import ImageFaults
 from dualslam.io.map_store import load_atlas, save_atlas
 from dualslam.io.masks import hidden_pixels, masked
-from dualslam.io.run_folder import SCHEDULE, TRAJECTORY, RunFolder, RunRecord, check_vacant
+from dualslam.io.run_folder import TRAJECTORY, RunFolder, RunRecord, check_vacant
 from dualslam.io.sequence import RecordedSequence, Selection
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.io.video import WebcamSequence
@@ -50,7 +51,6 @@ from dualslam.run.runner import RunReport, run_sequence
 from dualslam.system.system import System
 from dualslam.viewer.map_page import map_page
 from dualslam.workers.desk import WorkerDesk
-from dualslam.workers.schedule import Recorded, header_of
 
 log = logging.getLogger(__name__)
 

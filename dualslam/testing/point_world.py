@@ -11,9 +11,9 @@ from dualslam.build import build_system
 from dualslam.core.camera.models import PinholeCamera
 from dualslam.core.config.settings import Config
 from dualslam.core.geometry import se3, so3
+from dualslam.core.schedule import Policy
 from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Frame, View
 from dualslam.system.system import System
-from dualslam.workers.schedule import Policy
 
 CAMERA = PinholeCamera(640, 480, 450.0, 450.0, 319.5, 239.5)
 SIZE_PX = (CAMERA.width, CAMERA.height)

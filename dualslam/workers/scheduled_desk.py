@@ -1,7 +1,7 @@
 """The desk of a system: jobs are done by an executor, and their answers are given out as a schedule says.
 
 An executor does the work, in this process (`InlineDesk`) or in others (`WorkerDesk`), and knows nothing of frames. The
-schedule (`dualslam/workers/schedule.py`) says in which frame an answer is used: with the same one a run takes the same
+schedule (`dualslam/core/schedule.py`) says in which frame an answer is used: with the same one a run takes the same
 way whichever executor does the work. In real time nothing is waited for: answers are used in the first frame that
 begins after they are there, and recorded.
 """
@@ -14,8 +14,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from dualslam.core.jobs import PAUSE_S, Ended, Executor, JobKind, Limit
-from dualslam.core.types import Failure, FailureReason
-from dualslam.workers.schedule import (
+from dualslam.core.schedule import (
     AT_END,
     AT_ONCE,
     OK,
@@ -28,6 +27,7 @@ from dualslam.workers.schedule import (
     Request,
     When,
 )
+from dualslam.core.types import Failure, FailureReason
 
 MAX_OPEN = 8
 """Jobs of a kind that may be open: with more the back end is behind, and they hold their snapshots in memory."""

@@ -13,13 +13,13 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.config.files import load_config
 from dualslam.core.config.settings import Config
 from dualslam.core.jobs import JobKind
+from dualslam.core.schedule import After, Recorded
 from dualslam.core.types import Frame
 from dualslam.run.schedule import as_recorded
 from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import open_source
 from dualslam.system.system import System
 from dualslam.testing.lossy import Lossy
-from dualslam.workers.schedule import After, Recorded
 
 SOURCE = "synthetic:street,frames=46,seed=5"
 LOSS = ["recovery.workers=1", "corruptions=[{kind: blackout, start: 22, length: 6}]", "tracking.max_lost_s=0.1"]

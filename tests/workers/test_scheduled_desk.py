@@ -15,12 +15,12 @@ import pytest
 
 from dualslam.core.errors import InputError
 from dualslam.core.jobs import Executor, InlineDesk, JobKind, Limit
+from dualslam.core.schedule import AT_ONCE, After, Policy, Recorded, header_of
 from dualslam.core.types import Failure, FailureReason
 from dualslam.testing.desk_work import handlers, lane
 from dualslam.testing.lossy import Lossy
 from dualslam.testing.waiting import wait_until
 from dualslam.workers.desk import WorkerDesk
-from dualslam.workers.schedule import AT_ONCE, After, Policy, Recorded, header_of
 from dualslam.workers.scheduled_desk import MAX_OPEN, ScheduledDesk
 
 GRAPH, CALIBRATION, WALK = JobKind.GRAPH, JobKind.CALIBRATION, JobKind.WALK

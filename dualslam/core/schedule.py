@@ -18,6 +18,8 @@ from dualslam.core.errors import InputError
 from dualslam.core.jobs import JobKind, Limit
 from dualslam.core.types import Failure, FailureReason
 
+SCHEDULE = "schedule.jsonl"
+"""In a run folder."""
 VERSION = 1
 """Of the file: another one is not read."""
 AT_END = "end"
