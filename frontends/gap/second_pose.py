@@ -41,11 +41,14 @@ N_POINTS, N_FEATURES = 300, 1500
 """Of a kind that are compared, all with all, at most (spread over them): half a million pairs are 50 ms."""
 N_MODES = 4
 """Shifted poses that are tried."""
+RAYLEIGH_MEDIAN = 1.1774
+"""Of distances in the plane, in sigmas."""
 HYPOTHESES = 5000
 """Of three points: of four candidates for each point one is right at best, and of many points none."""
 SAME_PX = 12.0
 """Median distance in the image, in sigmas of the pixels, up to which two poses show the points at one place: four times
-what the gate of a match lets through. Texture alone makes nearer neighbours alike."""
+what the gate of a match lets through. Texture alone makes nearer neighbours alike. Where points are uncertain
+themselves, as in a map of few keyframes, the sigma is that of the pairs that the first pose explains."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,6 +152,7 @@ def find_other_poses(
     drawn = np.flatnonzero(rank[rest] < N_DRAWN)
     if len(drawn) >= MIN_CONSENSUS:
         starts.append(resect(K, camera.size_px, uv[drawn], xyz[point[rest[drawn]]], sigma_px, seed, HYPOTHESES).T_cam_w)
+    same_px = SAME_PX * max(sigma_px, _spread_px(T_cam_w, xyz, features, point, feature, K))
     found: list[SecondPose] = []
     for T_start in starts:
         near = _within(T_start, xyz[point[rest]], uv, K, SAME_PX * sigma)
@@ -159,12 +163,12 @@ def find_other_poses(
             continue
         T = refined.T_cam_w
         held = np.unique(point[_explained(T, xyz[point], features, feature, K)])
-        if len(held) < MIN_CONSENSUS or _are_one(T_cam_w, T, xyz[held], K, sigma_px):
+        if len(held) < MIN_CONSENSUS or _are_one(T_cam_w, T, xyz[held], K, same_px):
             continue
         found.append(SecondPose(T, len(held), first_support, _n_in_view(T, xyz, K, camera), first_in_view))
     others: list[SecondPose] = []
     for second in sorted(found, key=lambda second: second.support / second.in_view, reverse=True):
-        if not any(_are_one(second.T_cam_w, other.T_cam_w, xyz, K, sigma_px) for other in others):
+        if not any(_are_one(second.T_cam_w, other.T_cam_w, xyz, K, same_px) for other in others):
             others.append(second)
     return others
 
@@ -252,8 +256,20 @@ def _n_in_view(T_cam_w: FloatArray, xyz: FloatArray, K: FloatArray, camera: Came
     return int(np.count_nonzero((depth > 0) & camera.shows(uv)))
 
 
-def _are_one(T_a: FloatArray, T_b: FloatArray, xyz: FloatArray, K: FloatArray, sigma_px: float) -> bool:
+def _spread_px(
+    T_cam_w: FloatArray, xyz: FloatArray, features: Features, point: IntArray, feature: IntArray, K: FloatArray
+) -> float:
+    """Return the sigma of the pairs that a pose explains or nearly does: pixels and points are uncertain."""
+    uv, depth = project_points(K, T_cam_w, xyz[point])
+    off_px = np.where(depth > 0, np.linalg.norm(uv - features.uv_rect_px[feature], axis=1), np.inf)
+    nearest = np.full(len(xyz), np.inf)
+    np.minimum.at(nearest, point, off_px)
+    near = nearest[nearest < 4 * SAME_PX * float(np.median(features.sigma_px))]
+    return float(np.median(near)) / RAYLEIGH_MEDIAN if len(near) else 0.0
+
+
+def _are_one(T_a: FloatArray, T_b: FloatArray, xyz: FloatArray, K: FloatArray, same_px: float) -> bool:
     """Whether two poses show the points at one place."""
     (uv_a, depth_a), (uv_b, _) = project_points(K, T_a, xyz), project_points(K, T_b, xyz)
     apart = np.where(depth_a > 0, np.linalg.norm(uv_a - uv_b, axis=1), np.inf)
-    return bool(np.median(apart) < SAME_PX * sigma_px)
+    return bool(np.median(apart) < same_px)
