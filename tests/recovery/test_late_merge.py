@@ -226,6 +226,7 @@ def test_maps_of_a_wrong_camera_are_linked_after_both_have_been_calibrated() -> 
         "mapping": {"redundant_ratio": 1.0},
         "camera": {"model_sigma_px": 0.0},
         "recovery": {"attempts": ["live"]},
+        "linking": {"wrong_scale": 0.026},  # so that none is joined with a doubt before
     }
     system, world = miscalibrated(1.03, range(26, 38), settings)
     for i in range(75):

@@ -267,8 +267,10 @@ def test_frames_since_a_loss_wait_for_the_next_map_however_short_the_buffer() ->
 
 
 def turning_back(n_away: int) -> PointWorld:
-    """A walk that stops dead, a turn in place to where no map can start, as long as it lasts, and back to walk on."""
+    """A walk that slows down, a turn in place to where no map can start, as long as it lasts, and back to walk on."""
     walk = path(45, np.array([0.08, 0, 0]), np.zeros(3))
+    # Had it stopped unseen and gone on at the same speed, its motion would contradict it.
+    walk[:, 0, 3] = np.cumsum(0.08 * np.minimum(np.abs(np.arange(45) - 24.5) / 10, 1.0))
     away = walk[24] @ path(2, np.zeros(3), np.array([0, np.pi, 0]))[1]
     behind = cloud(seed=1) * (1, 1, -1) + walk[24][:3, 3]
     T = np.concatenate([walk[:25], np.repeat(away[None], n_away, 0), walk[25:]])
