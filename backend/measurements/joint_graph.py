@@ -37,7 +37,7 @@ FEW_REJECTED = 0.125
 """Share of readings that are outvoted at which the map need not be asked whether it bends instead."""
 MAX_REJECTED = 0.4
 """Share of readings of a kind that may be outvoted: beyond, it is not known who is wrong."""
-GAUGE_SIGMAS = np.array([1.0] * 3 + [1.0] * 3 + [1.0])
+GAUGE_SIGMAS = np.ones(7)
 """Of a prior on one node of each submap (rad, extents of the map, log-scale): it holds what no measurement fixes."""
 GNC_GROWTH, GNC_END = 3.0, 1e3
 CLOCK_SIGMAS = 2.5
@@ -80,7 +80,9 @@ def solve_metric(
     try:
         solution = graph.solve()
     except GTSAM_ERRORS as error:
-        raise SolverError(f"the joint graph of {len(graph.nodes)} nodes failed: {SolverFailure.of(error)}") from error
+        raise SolverError(
+            f"the joint graph of {len(problem.S_world_node)} nodes failed: {SolverFailure.of(error)}"
+        ) from error
     outside_by_kind = Counter(r.kind for r in outside)
     rejected = Counter(solution.rejected)
     if start.frozen:
@@ -121,7 +123,6 @@ class _Joint:
     offsets_s: Sequence[float]
     S_start: FloatArray
     known_clocks: frozenset[str]
-    nodes: list[int] = field(init=False)
     doubtful: list[int] = field(init=False)
     link_weights: FloatArray = field(init=False)
     values: gtsam.Values = field(init=False)
@@ -129,8 +130,8 @@ class _Joint:
 
     def __post_init__(self) -> None:
         n = len(self.problem.S_world_node)
-        self.nodes = list(range(n))
         edges = self.problem.edges
+        self._held = self._one_of_each_piece()
         self.doubtful = [i for i, kind in enumerate(edges.kind) if kind not in ODOMETRY]
         self.link_weights = np.ones(len(self.doubtful))
         self.values = gtsam.Values()
@@ -150,6 +151,7 @@ class _Joint:
                 self._shared[reading.kind] = n + len(self.sources) + len(self._shared)
                 self.values.insert(self._shared[reading.kind], np.zeros(len(reading.shared_sigmas)))
 
+    _held: list[int] = field(init=False)
     _clock: dict[int, int] = field(init=False)
     _shared: dict[str, int] = field(init=False)
 
@@ -193,7 +195,7 @@ class _Joint:
 
         An offset that is estimated in vain costs accuracy along the way: 0.07 s are 0.7 m at 10 m/s.
         """
-        marginals = self._marginals(graph)
+        marginals = gtsam.Marginals(graph, self.values)
         right = []
         for source, key in self._clock.items():
             sigma = float(np.sqrt(marginals.marginalCovariance(key)[0, 0]))
@@ -256,7 +258,7 @@ class _Joint:
                 C = self._edge_covariance(i) / weight
                 graph.push_back(gtsam.BetweenFactorSimilarity3(e.first, e.second, S, gaussian(C)))
         extent = float(np.ptp(self.problem.T_world_cam[:, :3, 3], axis=0).max())
-        for node in self._held():
+        for node in self._held:
             S = self.S_start @ self.problem.S_world_node[node]
             unit = extent / max(float(sim3.scale(self.problem.S_world_node[node])), 1e-12)
             sigmas = GAUGE_SIGMAS * np.repeat([1.0, max(unit, 1e-6), 1.0], [3, 3, 1])
@@ -275,12 +277,9 @@ class _Joint:
                 graph.push_back(gtsam.CustomFactor(noise, self._keys(term), self._error_of(term)))
         return graph
 
-    def _marginals(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.Marginals:
-        return gtsam.Marginals(graph, self.values)
-
-    def _held(self) -> list[int]:
+    def _one_of_each_piece(self) -> list[int]:
         """Return a node of each piece that odometry ties together."""
-        piece = np.arange(len(self.nodes))
+        piece = np.arange(len(self.problem.S_world_node))
         for e in self.problem.edges:
             if e.kind in ODOMETRY and piece[e.first] != piece[e.second]:
                 piece[piece == piece[e.second]] = piece[e.first]
@@ -367,9 +366,10 @@ class _Joint:
         return float((2.0 * graph.error(self.values) - dof) / np.sqrt(2.0 * dof))
 
     def _solution(self, graph: gtsam.NonlinearFactorGraph, excess: float) -> MetricSolution:
-        marginals = self._marginals(graph)
-        C = np.array([marginals.marginalCovariance(n) for n in self.nodes]).reshape(-1, 7, 7)
-        S = np.array([convert.from_similarity3(self.values.atSimilarity3(n)) for n in self.nodes])
+        marginals = gtsam.Marginals(graph, self.values)
+        nodes = range(len(self.problem.S_world_node))
+        C = np.array([marginals.marginalCovariance(n) for n in nodes]).reshape(-1, 7, 7)
+        S = np.array([convert.from_similarity3(self.values.atSimilarity3(n)) for n in nodes])
         used, rejected, sums, dims = Counter[str](), Counter[str](), Counter[str](), Counter[str]()
         for term in self.terms:
             kind = term.reading.kind
@@ -387,7 +387,7 @@ class _Joint:
             sigmas[name] = float(np.sqrt(marginals.marginalCovariance(key)[0, 0]))
         believed = np.ones(len(self.problem.edges), bool)
         believed[np.array(self.doubtful, int)[self.link_weights < 0.5]] = False
-        middle = len(self.nodes) // 2
+        middle = len(nodes) // 2
         s = float(sim3.scale(S[middle]))
         per_world = s / float(sim3.scale(self.problem.S_world_node[middle]))
         return MetricSolution(

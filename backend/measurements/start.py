@@ -75,16 +75,15 @@ def find_start(
     for source in sources:
         _check_overlap(source, path)
         _check_moving(source)
-    offsets = [
-        known_offsets_s.get(s.name, 0.0) if s.name in known_offsets_s else _offset(problem, path, s) for s in sources
-    ]
+    up = _up(problem)
+    offsets = [known_offsets_s[s.name] if s.name in known_offsets_s else _offset(path, s, up) for s in sources]
     sources = [_with_mounts(path, s, offset) for s, offset in zip(sources, offsets, strict=True)]
     found = None
     for source, offset in zip(sources, offsets, strict=True):
         c, p, sigma, _ = _positions(path, source, offset)
         if len(p) >= 3 and found is None:
-            found = _align(c, p, sigma, _up(problem))
-            _check_axes(problem, source, found, c, p, sigma)
+            found = _align(c, p, sigma, up)
+            _check_axes(source, found, c, p, sigma, up)
     if found is None:
         found = Aligned(_by_rigid_fits(problem, path, sources, offsets), 0.0)
     kept, n = [], 0
@@ -186,11 +185,9 @@ def _along_line(c: FloatArray, p: FloatArray, up: FloatArray | None) -> FloatArr
     middle_c, middle_p = np.median(c, axis=0), np.median(p, axis=0)
     d_c = np.linalg.svd(c - middle_c)[2][0]
     along = (c - middle_c) @ d_c
-    slope = np.median((p[-1:] - p[:1]) / max(float(along[-1] - along[0]), 1e-12), axis=0)
     pairs = [(i, j) for i in range(len(c)) for j in range(i + max(len(c) // 3, 1), len(c))]
     steps = np.array([(p[j] - p[i]) / (along[j] - along[i]) for i, j in pairs if along[j] != along[i]])
-    if len(steps):
-        slope = np.median(steps, axis=0)
+    slope = np.median(steps, axis=0) if len(steps) else (p[-1] - p[0]) / max(float(along[-1] - along[0]), 1e-12)
     s = float(np.linalg.norm(slope))
     v_c = np.array([0.0, -1.0, 0.0]) if up is None else up
     R = frame(slope / s, np.array([0.0, 0.0, 1.0]) if up is not None else v_c) @ frame(d_c, v_c).T
@@ -205,16 +202,15 @@ def _up(problem: MetricProblem) -> FloatArray | None:
 
 
 def _check_axes(
-    problem: MetricProblem,
     source: MeasurementSource,
     found: Aligned,
     c: FloatArray,
     p: FloatArray,
     sigma: FloatArray,
+    up: FloatArray | None,
 ) -> None:
     """Refuse positions that fit far better with their axes read otherwise."""
     middle = np.median(p, axis=0)
-    up = _up(problem)
     sky = None if up is None or source.origin is None else float((sim3.rotation(found.S) @ up)[2])
     for words, A in _other_axes(source).items():
         other = _align(c, (p - middle) @ A.T + middle, (sigma**2 @ (A**2).T) ** 0.5, up)
@@ -255,7 +251,7 @@ def _frozen(path: CameraPath, source: MeasurementSource, offset_s: float, scale:
 # --- clocks and mounts
 
 
-def _offset(problem: MetricProblem, path: CameraPath, source: MeasurementSource) -> float:
+def _offset(path: CameraPath, source: MeasurementSource, up: FloatArray | None) -> float:
     """Return the offset of a source's clock at which its readings agree best with the map, to a quarter of a second."""
     if not source.has_clock:
         return 0.0
@@ -265,15 +261,15 @@ def _offset(problem: MetricProblem, path: CameraPath, source: MeasurementSource)
     first, last = path.span_s
     inner = [r for r in source.readings if first + MAX_OFFSET_S <= r.times_s[0] <= last - MAX_OFFSET_S]
     common = replace(source, readings=inner)
-    costs = [_offset_cost(problem, path, common, float(offset)) for offset in grid]
+    costs = [_offset_cost(path, common, float(offset), up) for offset in grid]
     best = int(np.argmin(costs))
     return float(grid[best]) if costs[best] < CLEARLY_BETTER * costs[0] else 0.0
 
 
-def _offset_cost(problem: MetricProblem, path: CameraPath, source: MeasurementSource, offset_s: float) -> float:
+def _offset_cost(path: CameraPath, source: MeasurementSource, offset_s: float, up: FloatArray | None) -> float:
     c, p, sigma, _ = _positions(path, source, offset_s)
     if len(p) >= 6:
-        S = _align(c, p, sigma, _up(problem)).S
+        S = _align(c, p, sigma, up).S
         r = np.linalg.norm(sim3.act(S, c) - p, axis=1)
         return float(np.median(r))
     turns = _turns(path, source, offset_s)
@@ -312,7 +308,7 @@ def _with_mounts(path: CameraPath, source: MeasurementSource, offset_s: float) -
     measured, seen = _turns(path, source, offset_s)
     if len(measured) < 3:
         return source
-    bias = np.median(measured, axis=0) * 0.0
+    bias = np.zeros(3)
     for _ in range(3):
         M = seen.T @ (measured - bias)
         U, values, Vt = np.linalg.svd(M)
@@ -383,7 +379,7 @@ def _rigid_fit(
         for term, T_w in zip(terms, T_world, strict=True):
             T = sim3.act_on_pose(S, T_w)
             r, J = term.reading.residual(T, np.zeros(len(term.reading.shared_sigmas)))
-            J = np.hstack([J[:, : 6 * len(T)]]) @ np.vstack([gauge_jacobian(each, centre) for each in T])
+            J = J[:, : 6 * len(T)] @ np.vstack([gauge_jacobian(each, centre) for each in T])
             r, J = r / term.reading.sigmas, J / term.reading.sigmas[:, None]
             chi2 = float(r @ r)
             weight = 1.0 / (1.0 + chi2 / 9.0)

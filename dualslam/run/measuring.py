@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -157,7 +158,7 @@ def measure(
             break
         undone += refuted
         atlas.links = [replace(link, rejected=True) if link in refuted else link for link in atlas.links]
-        n_posed = {m: sum(pose.submap_id == m for pose in poses.values()) for m in main}
+        n_posed = Counter(pose.submap_id for pose in poses.values())
         left = [c for c in atlas.components() if set(c) <= set(main)]
         main = max(left, key=lambda c: sum(n_posed[m] for m in c))
     if solution.scale_sigma > MAX_METRIC_SIGMA:

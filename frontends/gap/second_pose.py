@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from dualslam.core.camera.base import Camera
-from dualslam.core.chi_square import CHI2_99
+from dualslam.core.chi_square import CHI2_99, MEDIAN_CHI2
 from dualslam.core.geometry.projection import project_points, refine_pose
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Failure, FailureReason, Features, FloatArray, IntArray, Matches
 from dualslam.frontends.features.all_pairs import all_distances
-from dualslam.frontends.features.groups import best_per_group, rank_in_runs
+from dualslam.frontends.features.groups import best_per_group, lowest_in_group, rank_in_runs
 from dualslam.frontends.gates import MIN_CONSENSUS
 from dualslam.frontends.tracking.resection import resect
 
@@ -41,8 +41,6 @@ N_POINTS, N_FEATURES = 300, 1500
 """Of a kind that are compared, all with all, at most (spread over them): half a million pairs are 50 ms."""
 N_MODES = 4
 """Shifted poses that are tried."""
-RAYLEIGH_MEDIAN = 1.1774
-"""Of distances in the plane, in sigmas."""
 HYPOTHESES = 5000
 """Of three points: of four candidates for each point one is right at best, and of many points none."""
 SAME_PX = 12.0
@@ -262,10 +260,9 @@ def _spread_px(
     """Return the sigma of the pairs that a pose explains or nearly does: pixels and points are uncertain."""
     uv, depth = project_points(K, T_cam_w, xyz[point])
     off_px = np.where(depth > 0, np.linalg.norm(uv - features.uv_rect_px[feature], axis=1), np.inf)
-    nearest = np.full(len(xyz), np.inf)
-    np.minimum.at(nearest, point, off_px)
+    nearest = lowest_in_group(point, off_px, len(xyz))
     near = nearest[nearest < 4 * SAME_PX * float(np.median(features.sigma_px))]
-    return float(np.median(near)) / RAYLEIGH_MEDIAN if len(near) else 0.0
+    return float(np.median(near) / np.sqrt(MEDIAN_CHI2[2])) if len(near) else 0.0
 
 
 def _are_one(T_a: FloatArray, T_b: FloatArray, xyz: FloatArray, K: FloatArray, same_px: float) -> bool:
