@@ -18,6 +18,7 @@ from dualslam.cli import main
 
 pytestmark = [
     pytest.mark.data,
+    pytest.mark.slow,
     pytest.mark.skipif("DUALSLAM_DATA" not in os.environ, reason="DUALSLAM_DATA names no folder of real sequences"),
 ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cache
 from operator import attrgetter
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from dualslam.atlas.atlas import LinkKind
-from dualslam.core.events import EventKind
+from dualslam.core.events import Event, EventKind
 from dualslam.core.jobs import Ended, InlineDesk, JobKind
 from dualslam.core.types import Failure, FailureReason, FloatArray, FrameStatus
 from dualslam.linking.join_test import drift_gate
@@ -21,6 +22,7 @@ from dualslam.testing.point_world import PointWorld, pose_errors, system_in
 from tests.places.worlds import N_LAP, N, driven_lap, lap, ring, run, wall
 
 ROLLING = {"graph": {"max_keyframes": 25, "rollover_keyframes": 6}}
+COVARIANCES = "_connections._problems.covariances"
 
 
 @cache
@@ -28,14 +30,22 @@ def closed_lap() -> System:
     return run(lap())
 
 
-def late_lap(part: str, polls: int) -> System:
-    """The lap, not yet at its end, where what a part of the system asks for comes after so many polls."""
-    world = lap()
-    system = system_in(world)
+@cache
+def rolled_lap() -> System:
+    return run(lap(), **ROLLING)
+
+
+def late_lap(part: str, polls: int, **settings: object) -> Iterator[System]:
+    """Drive the lap, not to its end: what a part of the system asks for comes after so many polls."""
+    system = system_in(lap(), **settings)
     attrgetter(part)(system)._desk = LateDesk(system._state.parts.desk, polls)
-    for frame in world.frames():
+    for frame in lap().frames():
         system.step(frame)
-    return system
+        yield system
+
+
+def first_loop(system: System) -> Event:
+    return system.events.of_kind(EventKind.LOOP_CLOSED)[0]
 
 
 def errors(system: System) -> FloatArray:
@@ -68,7 +78,7 @@ def test_a_loop_takes_drift_back() -> None:
 
 
 def test_a_loop_across_submaps_that_rolled_over() -> None:
-    system = run(lap(), **ROLLING)
+    system = rolled_lap()
     assert len(system.atlas.submaps) > 2
     loops = system.events.of_kind(EventKind.LOOP_CLOSED)
     assert loops
@@ -76,13 +86,14 @@ def test_a_loop_across_submaps_that_rolled_over() -> None:
     assert len(trajectories_of(system).main) == N
 
 
-@pytest.mark.parametrize("settings", [{"loops": {"enabled": False}}, {"places": {"enabled": False}}])
-def test_switched_off_nothing_is_asked(settings: dict[str, object]) -> None:
-    system = run(lap(), n=N_LAP + 5, **settings)
+@pytest.mark.parametrize("what", ["loops", pytest.param("places", marks=pytest.mark.slow)])
+def test_switched_off_nothing_is_asked(what: str) -> None:
+    system = driven_lap() if what == "loops" else run(lap(), **{what: {"enabled": False}})
     assert not system.atlas.links
     assert not system.events.of_kind(EventKind.LOOP_CLOSED, EventKind.LOOP_REFUSED)
 
 
+@pytest.mark.slow
 def test_the_same_run_twice_is_the_same_to_the_bit() -> None:
     again = trajectories_of(run(lap())).main
     assert np.array_equal(again.T_world_cam, trajectories_of(closed_lap()).main.T_world_cam)
@@ -128,6 +139,7 @@ def test_maps_that_share_no_frame_are_merged_by_sight() -> None:
     assert pose_errors(main.T_world_cam, ring(N + 12)[main.index])[0].max() < 0.05 * size
 
 
+@pytest.mark.slow
 def test_without_recovery_a_lost_map_stays_apart() -> None:
     system = run(lap(N + 12, covered=frozenset(range(60, 80))), recovery={"enabled": False})
     assert len(system.atlas.components()) == 2
@@ -149,43 +161,25 @@ def test_frames_without_a_map_are_found_in_any_submap(loops: bool) -> None:
     assert np.linalg.norm(main.T_world_cam[-1, :3, 3] - main.T_world_cam[10, :3, 3]) < 0.05
 
 
-@pytest.mark.parametrize("polls", [3, 12])
+@pytest.mark.parametrize("polls", [pytest.param(3, marks=pytest.mark.slow), 12])
 def test_a_loop_whose_covariances_come_late_is_closed_when_they_have_come(polls: int) -> None:
-    world = lap()
-    system = system_in(world)
-    system._connections._problems.covariances._desk = desk = LateDesk(system._state.parts.desk, polls)
-    closed_at = None
-    for frame in world.frames():
-        system.step(frame)
-        if closed_at is None and system.atlas.links:
-            closed_at = frame.index
+    *_, system = late_lap(COVARIANCES, polls)
+    assert system._connections._problems.covariances._desk.n_polls[JobKind.EDGES] > polls
     system.finish()
-    first = closed_lap().events.of_kind(EventKind.LOOP_CLOSED)[0]
-    assert desk.n_polls[JobKind.EDGES] > polls
-    assert closed_at is not None
-    assert closed_at > first.frame, "not before they were there"
-    loop = system.events.of_kind(EventKind.LOOP_CLOSED)[0]
+    first, loop = first_loop(closed_lap()), first_loop(system)
+    assert loop.frame > first.frame, "not before they were there"
     assert (loop.data["keyframe"], loop.data["other_frame"]) == (first.data["keyframe"], first.data["other_frame"])
     assert errors(system).max() < errors(driven_lap()).max()
 
 
-@pytest.mark.parametrize("polls", [2, 15])
-@pytest.mark.parametrize("settings", [{}, ROLLING])
-def test_a_loop_whose_solution_comes_late_is_closed_when_it_has_come(polls: int, settings: dict[str, object]) -> None:
-    world = lap()
-    system = system_in(world, **settings)
-    system._connections._desk = desk = LateDesk(system._state.parts.desk, polls)
-    closed_at = None
-    for frame in world.frames():
-        system.step(frame)
-        if closed_at is None and system.events.of_kind(EventKind.LOOP_CLOSED):
-            closed_at = frame.index
-    assert desk.n_polls[JobKind.ATLAS] > polls
+@pytest.mark.parametrize(("settings", "polls"), [({}, 2), pytest.param(ROLLING, 15, marks=pytest.mark.slow)])
+def test_a_loop_whose_solution_comes_late_is_closed_when_it_has_come(settings: dict[str, object], polls: int) -> None:
+    *_, system = late_lap("_connections", polls, **settings)
+    assert system._connections._desk.n_polls[JobKind.ATLAS] > polls
     system.finish()
-    as_if = run(lap(), **settings) if settings else closed_lap()
-    first, loop = (each.events.of_kind(EventKind.LOOP_CLOSED)[0] for each in (as_if, system))
-    assert closed_at is not None
-    assert closed_at > first.frame, "not before it was there"
+    as_if = rolled_lap() if settings else closed_lap()
+    first, loop = first_loop(as_if), first_loop(system)
+    assert loop.frame > first.frame, "not before it was there"
     assert (loop.data["keyframe"], loop.data["other_frame"]) == (first.data["keyframe"], first.data["other_frame"])
     in_sigmas = [np.sqrt(each.data["chi2_drift"]) for each in (first, loop)]
     assert in_sigmas[1] == pytest.approx(in_sigmas[0], abs=0.1), "a tenth of a sigma adds 1 % to a variance"
@@ -194,14 +188,16 @@ def test_a_loop_whose_solution_comes_late_is_closed_when_it_has_come(polls: int,
     assert not system._connections.is_solving
 
 
+@pytest.mark.slow
 def test_a_loop_that_is_being_solved_when_the_run_ends_is_closed_then() -> None:
-    system = late_lap("_connections", 100_000)
+    *_, system = late_lap("_connections", 100_000)
     assert not system.atlas.links
     system.finish()
     assert [link.kind for link in system.atlas.believed] == [LinkKind.LOOP]
     assert len(system.events.of_kind(EventKind.LOOP_CLOSED)) == 1
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_over_a_search_costs_that_search_alone() -> None:
     """The first two searches that would have found the loop come to nothing; those after them close it."""
     world = lap()
@@ -221,33 +217,22 @@ def test_a_worker_that_dies_over_a_search_costs_that_search_alone() -> None:
     for frame in world.frames():
         system.step(frame)
     system.finish()
-    (first,) = closed_lap().events.of_kind(EventKind.LOOP_CLOSED)[:1]
-    (loop,) = system.events.of_kind(EventKind.LOOP_CLOSED)[:1]
     assert len(lost) == 2
-    assert loop.frame > first.frame
+    assert first_loop(system).frame > first_loop(closed_lap()).frame
     assert len(system.poses) == len(closed_lap().poses)
     assert errors(system).max() < errors(driven_lap()).max()
 
 
-def test_a_loop_that_still_waits_when_the_run_ends_is_closed_then() -> None:
-    system = late_lap("_connections._problems.covariances", 100_000)
+def test_a_believed_place_waits_for_its_covariances_and_is_closed_when_the_run_ends() -> None:
+    waits = None
+    for system in late_lap(COVARIANCES, 100_000):
+        believed = system._revisits._believed
+        assert waits is None or believed is waits, "no other takes its place"
+        waits = believed
+    assert waits is not None
     assert not system.atlas.links
     system.finish()
     assert [link.kind for link in system.atlas.believed] == [LinkKind.LOOP]
-
-
-def test_while_a_believed_place_waits_no_other_takes_its_place() -> None:
-    world = lap()
-    system = system_in(world)
-    system._connections._problems.covariances._desk = LateDesk(system._state.parts.desk, 100_000)
-    waits = None
-    for frame in world.frames():
-        system.step(frame)
-        believed = system._revisits._believed
-        if waits is not None:
-            assert believed is waits
-        waits = believed
-    assert waits is not None
 
 
 @pytest.mark.slow
