@@ -1,10 +1,11 @@
-"""Front ends by name: the built-in ones, imported when asked for, and those of other packages (entry points)."""
+"""Front ends and pixel matchers by name: built-in ones, imported when asked for, and entry points of other packages."""
 
 from __future__ import annotations
 
 import importlib
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from typing import Any, Protocol, TypeVar
@@ -12,10 +13,10 @@ from typing import Any, Protocol, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from dualslam.core.config.problems import nearest_of
-from dualslam.core.config.settings import FrontendConfig
+from dualslam.core.config.settings import FrontendConfig, PixelsConfig
 from dualslam.core.errors import ConfigError, written
 from dualslam.core.extras import how_to_install
-from dualslam.core.interfaces import Frontend
+from dualslam.core.interfaces import Frontend, PixelMatcher
 
 ENTRY_POINT_GROUP = "dualslam.frontends"
 """A package offers a front end by ``[project.entry-points."dualslam.frontends"] name = "module:Class"``."""
@@ -27,6 +28,12 @@ BUILT_IN: Mapping[str, str] = {
     "kornia": "dualslam.frontends.features.kornia.frontend:KorniaFrontend",
 }
 """Name to ``module:attribute``; the module is imported only when its name is asked for."""
+
+PIXEL_MATCHERS_GROUP = "dualslam.pixel_matchers"
+"""The same for pixel matchers."""
+
+PIXEL_MATCHERS: Mapping[str, str] = {}
+"""The built-in ones."""
 
 EXTRAS: Mapping[str, str] = {"kornia": "kornia"}
 """The extra to install for a built-in front end that needs more than the core's dependencies."""
@@ -41,8 +48,27 @@ FOR_WALKS = ("extract", "match_wide")
 FOR_MAPS = (*FOR_WALKS, "distance", "scale_factor", "n_octaves", "max_distance", "max_distance_strict")
 """What a front end must have: to pose the frames of reverse tracking as a further attempt, and to make maps."""
 
-NAME, OPTIONS = ("frontend", "name"), ("frontend", "options")
-"""Fields of the config: what a mistake is about."""
+NAME = ("frontend", "name")
+"""Field of the config: what a mistake is about."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What a name stands for: how messages call it, where names are registered, and the section of the config."""
+
+    noun: str
+    group: str
+    built_in: Mapping[str, str]
+    section: str
+
+    @property
+    def known(self) -> list[str]:
+        """Names that can be loaded, sorted."""
+        return sorted({*self.built_in, *entry_points(group=self.group).names})
+
+
+FRONTENDS = Kind("front end", ENTRY_POINT_GROUP, BUILT_IN, "frontend")
+MATCHERS = Kind("pixel matcher", PIXEL_MATCHERS_GROUP, PIXEL_MATCHERS, "pixels")
 
 OptionsT = TypeVar("OptionsT", bound=BaseModel)
 
@@ -57,7 +83,32 @@ class FrontendFactory(Protocol):
 
 def known_frontends() -> list[str]:
     """Names that `create_frontend` accepts, sorted."""
-    return sorted({*BUILT_IN, *entry_points(group=ENTRY_POINT_GROUP).names})
+    return FRONTENDS.known
+
+
+class PixelMatcherFactory(Protocol):
+    """What the name of a pixel matcher must point to: usually its class."""
+
+    def from_options(self, options: Mapping[str, Any]) -> PixelMatcher:
+        """Build it; raise ConfigError where an option is unknown or out of range."""
+        ...
+
+
+def create_pixel_matcher(config: PixelsConfig) -> PixelMatcher | None:
+    """Build the pixel matcher that the config names, by the same rules as a front end; None where it names none.
+
+    Raises
+    ------
+    ConfigError
+        The name is unknown, what it points to cannot be imported or is no pixel matcher, or an option is wrong.
+    """
+    if config.name is None:
+        return None
+    factory: PixelMatcherFactory = _factory(config.name, MATCHERS)
+    matcher = factory.from_options(config.options)
+    if not callable(getattr(matcher, "find", None)):
+        raise ConfigError(f"'{config.name}' is no pixel matcher: it has no find", (MATCHERS.section, "name"))
+    return matcher
 
 
 def create_frontend(config: FrontendConfig, needs: Iterable[str] = FOR_MAPS) -> Frontend:
@@ -71,7 +122,8 @@ def create_frontend(config: FrontendConfig, needs: Iterable[str] = FOR_MAPS) -> 
         The name is unknown, what it points to cannot be imported, or an option is wrong; or what is built lacks one of
         `needs`.
     """
-    frontend = _factory(config.name).from_options(config.n_features, config.options)
+    factory: FrontendFactory = _factory(config.name)
+    frontend = factory.from_options(config.n_features, config.options)
     lacking = [name for name in needs if not hasattr(frontend, name)]
     if lacking:
         raise ConfigError(f"'{config.name}' is no front end: it has no {', '.join(lacking)}", NAME)
@@ -79,11 +131,12 @@ def create_frontend(config: FrontendConfig, needs: Iterable[str] = FOR_MAPS) -> 
 
 
 def package_of(name: str) -> str | None:
-    """Return the package that a front end's name points into; None for a built-in one, and for an unknown name."""
-    if name in BUILT_IN:
+    """Return the package that a front end's or pixel matcher's name points into; None: a built-in or unknown one."""
+    if name in BUILT_IN or name in PIXEL_MATCHERS:
         return None
     if ":" not in name:
-        name = next((entry.module for entry in entry_points(group=ENTRY_POINT_GROUP, name=name)), "")
+        groups = (ENTRY_POINT_GROUP, PIXEL_MATCHERS_GROUP)
+        name = next((entry.module for group in groups for entry in entry_points(group=group, name=name)), "")
     return name.partition(":")[0].partition(".")[0] or None
 
 
@@ -117,14 +170,15 @@ def check_frontend(config: FrontendConfig) -> Frontend | None:
     return None
 
 
-def parse_options(model: type[OptionsT], frontend: str, options: Mapping[str, Any]) -> OptionsT:
-    """Check the `frontend.options` of the config against a front end's own strict model.
+def parse_options(model: type[OptionsT], owner: str, options: Mapping[str, Any], kind: Kind = FRONTENDS) -> OptionsT:
+    """Check the `options` of a section of the config against a front end's or pixel matcher's own strict model.
 
     Raises
     ------
     ConfigError
         Of the first offending option; it tells the others too, and lists those that exist.
     """
+    place = (kind.section, "options")
     try:
         # By way of JSON, as the rest of the config: strict about types there, yet lists become tuples.
         return model.model_validate_json(json.dumps(dict(options)), strict=True)
@@ -135,32 +189,33 @@ def parse_options(model: type[OptionsT], frontend: str, options: Mapping[str, An
         )
         problem += "".join(f"; {written(other)}: {of_it}" for other, of_it in others)
         known = ", ".join(model.model_fields)
-        raise ConfigError(f"{problem} (front end '{frontend}'; its options: {known})", (*OPTIONS, *option)) from error
+        raise ConfigError(f"{problem} ({kind.noun} '{owner}'; its options: {known})", (*place, *option)) from error
     except TypeError as error:
-        raise ConfigError(f"front end '{frontend}' is given what YAML cannot hold: {error}", OPTIONS) from error
+        raise ConfigError(f"{kind.noun} '{owner}' is given what YAML cannot hold: {error}", place) from error
 
 
-def _factory(name: str) -> FrontendFactory:
+def _factory(name: str, kind: Kind = FRONTENDS) -> Any:
     """Import what a name points to."""
+    field = (kind.section, "name")
     try:
-        found = _import(name)
+        found = _import(name, kind)
     except (ImportError, AttributeError, ValueError, SyntaxError) as error:
         missing_extra = isinstance(error, ModuleNotFoundError) and name in EXTRAS
         advice = f"; {how_to_install(EXTRAS[name])}" if missing_extra else ""
-        raise ConfigError(f"'{name}' cannot be imported: {error}{advice}", NAME) from error
+        raise ConfigError(f"'{name}' cannot be imported: {error}{advice}", field) from error
     if not callable(getattr(found, "from_options", None)):
-        raise ConfigError(f"'{name}' is no front end: it has no from_options", NAME)
-    factory: FrontendFactory = found
-    return factory
+        raise ConfigError(f"'{name}' is no {kind.noun}: it has no from_options", field)
+    return found
 
 
-def _import(name: str) -> Any:
-    if name in BUILT_IN or ":" in name:
-        module, _, attribute = BUILT_IN.get(name, name).partition(":")
+def _import(name: str, kind: Kind) -> Any:
+    field = (kind.section, "name")
+    if name in kind.built_in or ":" in name:
+        module, _, attribute = kind.built_in.get(name, name).partition(":")
         if not all(part.isidentifier() for part in (*module.split("."), attribute)):
-            raise ConfigError(f"'{name}' is not of the form module:Class", NAME)
+            raise ConfigError(f"'{name}' is not of the form module:Class", field)
         return getattr(importlib.import_module(module), attribute)
-    for entry in entry_points(group=ENTRY_POINT_GROUP, name=name):
+    for entry in entry_points(group=kind.group, name=name):
         return entry.load()
-    known = known_frontends()
-    raise ConfigError(f"no front end is called '{name}'{nearest_of(name, known)}; known: {', '.join(known)}", NAME)
+    known = ", ".join(kind.known) or "none"
+    raise ConfigError(f"no {kind.noun} is called '{name}'{nearest_of(name, kind.known)}; known: {known}", field)

@@ -10,7 +10,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.errors import ConfigError, FrontendError, InputError
 from dualslam.frontends.features.motion_statistics import nearest_search
-from dualslam.frontends.registry import check_frontend, package_of
+from dualslam.frontends.registry import check_frontend, create_pixel_matcher, package_of
 from dualslam.io.map_store import StoredMap
 
 
@@ -20,14 +20,15 @@ def check_config(config: Config) -> None:
     Raises
     ------
     ConfigError
-        If it is no configuration. If a front end, also one named by an attempt at a recovery, is not known or its
-        options are wrong. If the initialiser cannot match with it.
+        If it is no configuration. If a front end (also of an attempt at a recovery) or the pixel matcher is not known,
+        or its options are wrong. If the initialiser cannot match with it.
     """
     if not isinstance(config, Config):
         raise ConfigError(f"the configuration is a {type(config).__name__}; load_config or config_from_dict makes one")
     frontend = check_frontend(config.frontend)
     if frontend is not None and config.initialiser.matching == "gms":
         nearest_search(frontend)
+    create_pixel_matcher(config.pixels)
     for number, attempt in enumerate(config.recovery.attempts):
         if not attempt.is_live:
             with naming_attempt(number):
@@ -48,15 +49,17 @@ def check_given(camera: Camera, saved: StoredMap | None) -> None:
 
 
 def fault_of_frontend(error: BaseException, config: Config) -> FrontendError | None:
-    """Return what to say of an exception that a front end of another package has raised; None where none has."""
-    names = [config.frontend.name, *(a.frontend for a in config.recovery.attempts if not a.is_live)]
-    for name in names:
+    """Return what to say of an exception of another package's front end or pixel matcher; None where none raised it."""
+    frontends = [config.frontend.name, *(a.frontend for a in config.recovery.attempts if not a.is_live)]
+    named = [("front end", name) for name in frontends]
+    named += [] if config.pixels.name is None else [("pixel matcher", config.pixels.name)]
+    for noun, name in named:
         package = package_of(name)
         for frame, line in reversed(list(walk_tb(error.__traceback__))):
             module = str(frame.f_globals.get("__name__", ""))
             if package is not None and module.partition(".")[0] == package:
                 where = f"{frame.f_code.co_filename}, line {line}, in {frame.f_code.co_name}"
-                return FrontendError(f"front end '{name}' raised {type(error).__name__}: {error} ({where}).")
+                return FrontendError(f"{noun} '{name}' raised {type(error).__name__}: {error} ({where}).")
     return None
 
 

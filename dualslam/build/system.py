@@ -39,10 +39,12 @@ from dualslam.core.walk_news import WalkWatch
 from dualslam.frontends.direct.patch_audit import PatchAudit
 from dualslam.frontends.frame_reader import FrameReader
 from dualslam.frontends.gap.refinding import Refinder
-from dualslam.frontends.registry import create_frontend
+from dualslam.frontends.registry import create_frontend, create_pixel_matcher
 from dualslam.frontends.scene_mask import SceneMask
 from dualslam.frontends.still_pixels import StillPixels
 from dualslam.frontends.tracking.initialiser import Initialiser
+from dualslam.frontends.tracking.keyframe_images import KeyframeImages
+from dualslam.frontends.tracking.pixel_search import PixelSearch
 from dualslam.frontends.tracking.rolling_shutter import RollingShutter
 from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.io.map_store import StoredMap
@@ -209,8 +211,17 @@ class LiveParts:
     def _front_end(self, submap: Submap, graph: SubmapGraph, n_covering: int) -> VisualFrontEnd:
         config, frontend = self.config, self.frontend
         refinder = Refinder(submap, frontend, self.camera, config.camera.model_sigma_px)
-        window = window_solver(config)
-        return VisualFrontEnd(frontend, config, submap, graph, self.given, refinder, n_covering, window, self.first_id)
+        window, pixels = window_solver(config), self._pixel_search(refinder.images)
+        return VisualFrontEnd(
+            frontend, config, submap, graph, self.given, refinder, n_covering, window, self.first_id, pixels
+        )
+
+    def _pixel_search(self, images: KeyframeImages) -> PixelSearch | None:
+        """Make what finds landmarks by their pixels, if a pixel matcher is chosen."""
+        config, matcher = self.config, create_pixel_matcher(self.config.pixels)
+        if matcher is None:
+            return None
+        return PixelSearch(matcher, images, self.frontend, self.camera, config.camera.model_sigma_px)
 
 
 def _camera_of(saved: StoredMap, camera: Camera) -> Camera:

@@ -17,6 +17,7 @@ from dualslam.core.estimates import (
     GraphEstimate,
     KeyframeReport,
 )
+from dualslam.core.pixels import PixelMatches, PosedImage
 from dualslam.core.types import (
     BoolArray,
     Failure,
@@ -101,6 +102,50 @@ class NearestSearch(Protocol):
         """Row in b of the feature nearest to each of a, (N,), by descriptor alone and without any test.
 
         Several may share one. At least one feature in b.
+        """
+        ...
+
+
+class PixelMatcher(Protocol):
+    """Finds landmarks in a new image by the pixels of older ones, without features; chosen by `pixels.name`.
+
+    The tracker asks it where guided search finds too few landmarks, before it matches whole images. Its matches are
+    observations like any other: the pose is estimated from them, with outliers, and they enter the map. It has no
+    state: the same arguments give the same matches. `dualslam.testing.pixel_matching` checks what is said here.
+
+    Attributes
+    ----------
+    name : str
+        The word that selects it in the config.
+    """
+
+    name: str
+
+    def find(
+        self,
+        references: tuple[PosedImage, ...],
+        image: NDArray[np.uint8],
+        camera: Camera,
+        T_cam_submap: FloatArray,
+    ) -> PixelMatches:
+        """Find landmarks of the references in an image.
+
+        Parameters
+        ----------
+        references : tuple of PosedImage
+            The last posed frame, then keyframes that see the same, the newest first. At least one.
+        image : (H, W) uint8
+            Grey, of the references' size.
+        camera : Camera
+            Takes pixels to rays and back.
+        T_cam_submap : (4, 4)
+            Pose of the image as the motion model predicts it; it may be off by many pixels.
+
+        Returns
+        -------
+        PixelMatches
+            Each landmark at most once, inside the image. `sigma_px` is the noise model: the right matches' residuals
+            are to be explained by it. Empty where nothing is found.
         """
         ...
 

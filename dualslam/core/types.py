@@ -43,7 +43,7 @@ class FrameMethod(StrEnum):
     WIDE = "wide"
     """Whole images matched: at a start, beyond a gap, when a map is relocalised."""
     DIRECT = "direct"
-    """Image patches aligned."""
+    """Most of its landmarks found by a pixel matcher."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -251,6 +251,8 @@ class Track:
         Whether guided matching failed and the pose came from wide matching.
     covariance : (6, 6) float64
         Of `T_cam_submap`, for a left perturbation (rotation, translation).
+    n_by_pixels : int
+        Inliers that a pixel matcher found; the others are features that were matched.
     """
 
     view: View
@@ -263,10 +265,13 @@ class Track:
     chi2: float
     wide: bool
     covariance: FloatArray
+    n_by_pixels: int = 0
 
     @property
     def method(self) -> FrameMethod:
-        """How the pose was found."""
+        """How the pose was found: `DIRECT` where pixels found most of the inliers."""
+        if 2 * self.n_by_pixels > self.n_inliers:
+            return FrameMethod.DIRECT
         return FrameMethod.WIDE if self.wide else FrameMethod.GUIDED
 
 

@@ -20,17 +20,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dualslam.core.camera.base import Camera
-from dualslam.core.camera.rectification import rectified_sigma
 from dualslam.core.columns import concatenate
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import projection_jacobians, refine_pose
-from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend
 from dualslam.core.types import BoolArray, Failure, Features, FloatArray, IntArray, Track, View
 from dualslam.frontends.direct.search import HALF_PX, match_patches
 from dualslam.frontends.direct.warp import Pyramid, build_pyramid, warp_points
+from dualslam.frontends.features.found_features import features_found
 from dualslam.frontends.gap.uncertainty import track_uncertainty
-from dualslam.frontends.tracking.row_shifts import find_as_read, straighten
+from dualslam.frontends.tracking.keyframe_images import KeyframeImages
+from dualslam.frontends.tracking.row_shifts import find_as_read
 from dualslam.map.landmark_views import landmark_covariances
 from dualslam.map.submap import Submap
 
@@ -38,8 +38,6 @@ RIM_KEYFRAMES = 6
 """Keyframes before a gap whose landmarks are looked for beyond it."""
 FAR_KEYFRAMES = 8
 """Keyframes beyond a gap in which they are: the wider these stand, the better they know the landmarks' depths."""
-KEPT_IMAGES = 12
-"""Those nearest in time to the latest keyframe: twice the rim, since not each keyframe is there to stay."""
 SEARCH_RAD = 0.022
 """About the predicted place, in the coarser image, as an angle: a pose from few matches is off by as much."""
 SEARCH_SIGMAS = 3.0
@@ -89,6 +87,10 @@ class _Found:
 class Refinder:
     """Knows the images of a front end's latest keyframes, and whether a gap lies behind it.
 
+    Attributes
+    ----------
+    images : KeyframeImages
+
     Parameters
     ----------
     submap : Submap
@@ -105,30 +107,25 @@ class Refinder:
         self._frontend = frontend
         self._camera = camera
         self._model_sigma_px = model_sigma_px
-        self._images: dict[int, GreyImage] = {}
-        self._turns_rad: dict[int, FloatArray | None] = {}  # that were taken out of their features
+        self.images = KeyframeImages()
         self._rim: list[int] = []
         self._levels: dict[int, Pyramid] = {}
         self._n_left = 0
 
     def remember(self, view: View) -> None:
         """Keep the image of a keyframe, and the turn by which its features are elsewhere than it shows them."""
-        if view.image is None:
-            return
-        self._images[view.index], self._turns_rad[view.index] = view.image, view.turn_rad
-        for index in sorted(self._images, key=lambda i: abs(i - view.index))[KEPT_IMAGES:]:
-            del self._images[index], self._turns_rad[index]
+        self.images.remember(view)
 
     def forget(self, keyframe_ids: Iterable[int]) -> None:
         """Forget the images of keyframes whose features are not where they were when they were remembered."""
-        for k in keyframe_ids:
-            self._images.pop(k, None)
-            self._turns_rad.pop(k, None)
+        gone = list(keyframe_ids)
+        self.images.forget(gone)
+        for k in gone:
             self._levels.pop(k, None)
 
     def begin(self, index: int) -> None:
         """Note that a gap lies between frame `index` and the keyframes so far."""
-        near = [k for k in self._submap.keyframes_near(index) if k in self._images and k != index]
+        near = [k for k in self._submap.keyframes_near(index) if k in self.images and k != index]
         self._rim, self._n_left = near[:RIM_KEYFRAMES], FAR_KEYFRAMES
         self._levels = {k: levels for k, levels in self._levels.items() if k in self._rim}
 
@@ -170,7 +167,7 @@ class Refinder:
         pose_covariance = None if pose_prior is None else self._pose_covariance(track, pose_prior)
         found = []
         for k in self._rim:
-            if k not in submap.keyframes or k not in self._images:
+            if k not in submap.keyframes or k not in self.images:
                 continue
             feature = np.flatnonzero(submap.landmark_of[k] >= 0)
             feature = feature[~np.isin(submap.landmark_of[k][feature], taken)]
@@ -224,7 +221,7 @@ class Refinder:
         depth = self._submap.depths(sought.landmark_ids, T_kf_submap)
         warp = warp_points(camera, uv_kf, depth, T_cam_kf)
         uv, J, zoom = warp.uv_px, warp.J_b_a, warp.zoom
-        turn_rad, turn_kf_rad = track.view.turn_rad, self._turns_rad[sought.keyframe_id]
+        turn_rad, turn_kf_rad = track.view.turn_rad, self.images[sought.keyframe_id].turn_rad
         uv = uv if turn_rad is None else find_as_read(uv, warp.uv_rect_px, camera, turn_rad)
         uv_kf = uv_kf if turn_kf_rad is None else find_as_read(uv_kf, warp.uv_rect_a_px, camera, turn_kf_rad)
         margin = HALF_PX * np.maximum(zoom, 1.0)[:, None]
@@ -239,22 +236,23 @@ class Refinder:
             SEARCH_RAD * camera.K[0, 0],
         )
         row = usable[matches.row]
-        found_px = matches.uv_px if turn_rad is None else straighten(matches.uv_px, camera, turn_rad)
-        uv_rect, magnification = camera.rectify(found_px)
-        held = np.isfinite(uv_rect).all(axis=1) & np.isfinite(magnification)
-        row, uv_px, uv_rect = row[held], found_px[held], uv_rect[held]
-        sigma = rectified_sigma(SIGMA_PX * matches.spacing_px[held], magnification[held], self._model_sigma_px)
-        of = sought.features.take(row)
-        scale = np.maximum(of.scale * zoom[row], 1.0)
-        octave = np.rint(np.log(scale) / np.log(self._frontend.scale_factor)).astype(np.int64)
-        octave = np.minimum(octave, self._frontend.n_octaves - 1)
         turn = np.arctan2(J[row, 1, 0] - J[row, 0, 1], J[row, 0, 0] + J[row, 1, 1])
-        features = Features(uv_px, uv_rect, sigma, scale, octave, of.angle_rad + turn, of.descriptors)
-        return _Found(row, features)
+        held, features = features_found(
+            sought.features.take(row),
+            matches.uv_px,
+            SIGMA_PX * matches.spacing_px,
+            zoom[row],
+            turn,
+            self._frontend,
+            camera,
+            self._model_sigma_px,
+            turn_rad,
+        )
+        return _Found(row[held], features)
 
     def _levels_of(self, keyframe_id: int) -> Pyramid:
         if keyframe_id not in self._levels:
-            self._levels[keyframe_id] = build_pyramid(self._images[keyframe_id].pixels())
+            self._levels[keyframe_id] = build_pyramid(self.images[keyframe_id].image.pixels())
         return self._levels[keyframe_id]
 
     def _posed(self, track: Track, features: Features, landmark_ids: IntArray, pose_prior: _PosePrior | None) -> Track:

@@ -22,6 +22,7 @@ from dualslam.frontends.gates import MIN_CONSENSUS
 from dualslam.frontends.tracking.beyond_gap import refuse_lost_scale, refuse_second_pose
 from dualslam.frontends.tracking.local_map import LocalMap, Prediction, covering_keyframes, trusted
 from dualslam.frontends.tracking.motion import Motion
+from dualslam.frontends.tracking.pixel_search import PixelSearch
 from dualslam.frontends.tracking.resection import estimate_pose
 from dualslam.map.submap import NO_LANDMARK, Submap
 
@@ -69,6 +70,7 @@ class Tracker:
     `n_covering`: beyond the keyframes nearest in time, wide matching tries so many that show the most of the map.
     `max_gap_scale_sigma`: largest standard deviation (relative) of the scale beyond frames that wide matching has
     skipped, unless the step is small against the depth of the scene; where it is larger the frame counts as lost.
+    `pixels`: finds landmarks where guided search finds too few; without it wide matching comes next.
     """
 
     def __init__(
@@ -80,7 +82,9 @@ class Tracker:
         seed: int,
         n_covering: int = 0,
         max_gap_scale_sigma: float = 0.025,
+        pixels: PixelSearch | None = None,
     ) -> None:
+        self._pixels = pixels
         self._frontend = frontend
         self._max_gap_scale_sigma = max_gap_scale_sigma
         self._config = config
@@ -133,7 +137,7 @@ class Tracker:
         """
         assert self._last is not None, "start() comes first"
         features = view.features
-        if len(features) < self._config.min_inliers:
+        if len(features) < self._config.min_inliers and self._pixels is None:
             return Failure(FailureReason.NO_TEXTURE, f"{len(features)} features in the image")
         grid = FeatureGrid.build(features.uv_rect_px)
         T_predicted = self._motion.predict(self._last, view.timestamp_s)
@@ -142,24 +146,31 @@ class Tracker:
             found = self._pose_from_last(view, grid, T_predicted, radius_px)
             if found:
                 break
-        wide, local = not found or self.lies_beyond_gap(view), self._local
+        wide, local = self.lies_beyond_gap(view), self._local
         assert local is not None
+        outcome: Track | Failure
         if isinstance(found, Failure):
-            found = self._pose_from_wide_matches(view) if may_relocalise else found
+            outcome = found
+        else:
+            outcome = self._pose_from_local_map(local, view, grid, *found, T_predicted, wide)
+        if self._pixels is not None and self._pixels.is_due(view, outcome):
+            outcome = self._pose_from_pixels(self._pixels, view, T_predicted, wide, outcome)
+        if not found and not outcome:
+            found, wide = self._pose_from_wide_matches(view) if may_relocalise else found, True
             if isinstance(found, Failure):
                 return found
             local = self._local_map(found[1][found[1] >= 0])
-        track = self._pose_from_local_map(local, view, grid, *found, T_predicted, wide)
-        if isinstance(track, Failure):
-            return track
+            outcome = self._pose_from_local_map(local, view, grid, *found, T_predicted, wide)
+        if isinstance(outcome, Failure):
+            return outcome
         if wide:
-            refused = refuse_lost_scale(self._submap, track, self._last, self._max_gap_scale_sigma)
+            refused = refuse_lost_scale(self._submap, outcome, self._last, self._max_gap_scale_sigma)
             if refused is None:
-                refused = self._refuse_look_alike(track)
+                refused = self._refuse_look_alike(outcome)
             if refused is not None:
                 return refused
-        self._accept(track, local)
-        return track
+        self._accept(outcome, local)
+        return outcome
 
     def lies_beyond_gap(self, view: View) -> bool:
         """Whether so much time has passed since the last posed frame that its motion does not lead to this one."""
@@ -261,6 +272,27 @@ class Tracker:
         )
         rows, feature = prediction.rows[matches.index[:, 0]], matches.index[:, 1]
         return self._refine(view, T_predicted, ids[rows], local.xyz_mu.take(rows, axis=0), feature)
+
+    def _pose_from_pixels(
+        self, pixels: PixelSearch, view: View, T_predicted: FloatArray, wide: bool, guided: Track | Failure
+    ) -> Track | Failure:
+        """Return the track by landmarks that their pixels find, where more agree with it than with the guided one."""
+        assert self._last is not None
+        extended = pixels.extend(self._submap, self._last, view, T_predicted)
+        if extended is None:
+            return guided
+        seen, landmark_ids = extended
+        feature = np.flatnonzero(landmark_ids >= 0)
+        ids = landmark_ids[feature]
+        found = self._refine(seen, T_predicted, ids, self._submap.landmarks["xyz_mu"].take(ids, axis=0), feature)
+        if isinstance(found, Failure):
+            return guided
+        local, grid = self._local_map(found[1][found[1] >= 0]), FeatureGrid.build(seen.features.uv_rect_px)
+        track = self._pose_from_local_map(local, seen, grid, *found, T_predicted, wide)
+        if isinstance(track, Failure) or (isinstance(guided, Track) and guided.n_inliers >= track.n_inliers):
+            return guided
+        n_by_pixels = np.count_nonzero(track.landmark_ids[len(view.features) :] >= 0)
+        return replace(track, n_by_pixels=int(n_by_pixels))
 
     def _pose_from_wide_matches(
         self, view: View, keyframe_ids: list[int] | None = None
@@ -406,6 +438,8 @@ class Tracker:
         assert self._last is not None
         self._motion = self._motion.next(self._last, track)
         self._last, self._local, self._doubt = track, local, None
+        if self._pixels is not None:
+            self._pixels.note(track)
 
     # --- the local map
 

@@ -16,11 +16,12 @@ from dualslam.core.decisions import Ruling
 from dualslam.core.estimates import GraphEstimate, KeyframeReport
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import N_WINDOW, Frontend, SubmapGraph, WindowSolver
-from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray, Rival, Track, View
+from dualslam.core.types import Failure, FailureReason, FloatArray, FrameMethod, IntArray, Rival, Track, View
 from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.gap.uncertainty import track_uncertainty
 from dualslam.frontends.tracking.keyframing import keyframe_due, keyframe_like
 from dualslam.frontends.tracking.mapper import Mapper
+from dualslam.frontends.tracking.pixel_search import PixelSearch
 from dualslam.frontends.tracking.tracker import GivenPose, Tracker
 from dualslam.frontends.tracking.unmapped import passes_unmapped
 from dualslam.map.anchors import RelativePose
@@ -44,8 +45,8 @@ class VisualFrontEnd:
 
     `camera`: as it was given; it says what an image shows. `refinder`: finds landmarks across gaps in the images
     themselves; without it features alone tie the keyframes there. `n_covering`: see `Tracker`. `window`: poses new
-    keyframes between the graph's updates; without it the graph does. `first_id`: number of this run's first frame;
-    keyframes before it are those of the saved map that it goes on in.
+    keyframes between the graph's updates; without it the graph does. `pixels`: see `Tracker`. `first_id`: number of
+    this run's first frame; keyframes before it are those of the saved map that it goes on in.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class VisualFrontEnd:
         n_covering: int = 0,
         window: WindowSolver | None = None,
         first_id: int = 0,
+        pixels: PixelSearch | None = None,
     ) -> None:
         self.submap = submap
         self.graph = graph
@@ -72,6 +74,7 @@ class VisualFrontEnd:
             config.seed,
             n_covering,
             config.linking.max_live_scale_sigma,  # all that is mapped beyond inherits it
+            pixels,
         )
         self._mapper = Mapper(frontend, config.mapping, submap, camera)
         self._refinder = refinder
@@ -214,6 +217,8 @@ class VisualFrontEnd:
 
     def keyframe_due(self, track: Track) -> Ruling:
         """Whether the frame should become a keyframe: not where an earlier run has left one that shows the same."""
+        if track.method is FrameMethod.DIRECT:
+            return Ruling(False, (), "its landmarks were found by pixels alone")
         ruling = self._shows_other(track)
         if ruling and self._known(track) is not None:
             return Ruling(False, ruling.gates, "a keyframe of an earlier run shows the same")

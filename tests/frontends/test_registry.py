@@ -96,7 +96,7 @@ class Half:
 
 
 def test_what_a_front_end_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_import", lambda name: Half)
+    monkeypatch.setattr(registry, "_import", lambda name, kind: Half)
     said = (
         "^frontend.name: 'half:Half' is no front end: it has no distance, scale_factor, n_octaves, max_distance, "
         "max_distance_strict$"

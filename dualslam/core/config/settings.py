@@ -24,6 +24,16 @@ class FrontendConfig(StrictModel):
     """Settings of the chosen front end alone; it checks their names itself."""
 
 
+class PixelsConfig(StrictModel):
+    """The pixel matcher, which finds landmarks in the image itself where guided search finds too few."""
+
+    name: str | None = None
+    """Which pixel matcher: one that a package offers as an entry point of `dualslam.pixel_matchers`, or
+    `module:Class`, of what can be imported. null: none."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """Settings of the chosen pixel matcher alone; it checks their names itself."""
+
+
 class CameraConfig(StrictModel):
     """What is known of the camera beyond its calibration file."""
 
@@ -348,6 +358,7 @@ class Config(StrictModel):
     seed: int = Field(0, ge=0, le=2**64 - 1)
     """Seed of every random choice of the run; the solvers take 64 bits."""
     frontend: FrontendConfig = FrontendConfig()
+    pixels: PixelsConfig = PixelsConfig()
     camera: CameraConfig = CameraConfig()
     initialiser: InitialiserConfig = InitialiserConfig()
     tracking: TrackingConfig = TrackingConfig()
