@@ -160,6 +160,10 @@ class Atlas:
         """Return the linked sets of submaps, each ascending, in order of their first submap."""
         return joined(self.submaps, self.believed)
 
+    def sure_sets(self, max_scale_sigma: float) -> list[list[int]]:
+        """Return the sets of submaps that are linked by connections which know their scale so well."""
+        return joined(self.submaps, [link for link in self.believed if link.sigma_scale <= max_scale_sigma])
+
     def component_of(self, submap_id: int) -> list[int]:
         """Return the linked set of a submap, ascending."""
         return next(component for component in self.components() if submap_id in component)

@@ -103,6 +103,22 @@ class Connections:
                 self._problems.foresee_rollover(link.a)
         return report
 
+    def tighten(self, link: Link, now: FrameStamp) -> bool:
+        """Replace the connection of the same kind between two submaps, if `link` knows the scale better; say whether.
+
+        What it moves follows with the next solution.
+        """
+        links = self._atlas.links
+        ends = link.a, link.b, link.kind
+        row = next((i for i, known in enumerate(links) if (known.a, known.b, known.kind) == ends), None)
+        if row is None or link.sigma_scale >= links[row].sigma_scale:
+            return False
+        links[row] = link
+        self._count_change([link.a, link.b])  # a solution under way has the former one in it
+        self._due |= {link.a, link.b}
+        self._ask_due(now)
+        return True
+
     def connect_later(self, link: Link, now: FrameStamp) -> AtlasReport | None:
         """Take a connection in as soon as the atlas has been solved with it; not while it `is_solving`.
 

@@ -13,15 +13,19 @@ class Worlds:
     Parameters
     ----------
     atlas : Atlas
+    max_scale_sigma : float
+        Of a link that may be relied on.
     saved : int or None
         The submap whose frame is the world of the saved map that a run continues.
     """
 
-    def __init__(self, atlas: Atlas, saved: int | None = None) -> None:
+    def __init__(self, atlas: Atlas, max_scale_sigma: float, saved: int | None = None) -> None:
         self._atlas = atlas
+        self._max_scale_sigma = max_scale_sigma
         self._saved = saved
         self._made_from: list[object] = []
         self._found: dict[int, tuple[FloatArray, int]] = {}
+        self._sure: set[int] = set()
 
     def of(self, submap_id: int) -> tuple[FloatArray, int]:
         """Return where a submap lies in its world, and whose frame that is.
@@ -33,14 +37,25 @@ class Worlds:
         int
             The submap whose frame and unit the world has: the first of its linked set, or the saved map's.
         """
+        self._compose()
+        return self._found[submap_id]
+
+    def is_sure(self, submap_id: int) -> bool:
+        """Whether links that know their scale well join a submap with the one whose unit its world has."""
+        self._compose()
+        return submap_id in self._sure
+
+    def _compose(self) -> None:
         atlas = self._atlas
         state: list[object] = [*atlas.submaps.values(), *atlas.links, *atlas.placement.values()]
         same = len(state) == len(self._made_from) and all(map(lambda a, b: a is b, state, self._made_from))
         if not same:
-            self._made_from, self._found = state, {}
+            self._made_from, self._found, self._sure = state, {}, set()
+            sure_sets = atlas.sure_sets(self._max_scale_sigma)
             for component in atlas.components():
                 S_first = atlas.S_world_submap(component)
                 world = self._saved if self._saved in S_first else None
                 S = S_first if world is None else {m: sim3.inverse(S_first[world]) @ S_first[m] for m in component}
-                self._found |= {m: (S[m], component[0] if world is None else world) for m in component}
-        return self._found[submap_id]
+                world = component[0] if world is None else world
+                self._found |= {m: (S[m], world) for m in component}
+                self._sure |= next(set(sure) for sure in sure_sets if world in sure)

@@ -35,6 +35,7 @@ class EventKind(StrEnum):
     ATTEMPT_UNAVAILABLE = "attempt_unavailable"
     RECOVERY_ENDED = "recovery_ended"
     LINKED = "linked"
+    RELINKED = "relinked"
     LINK_REFUSED = "link_refused"
     FUSED = "fused"
     ABSORBED = "absorbed"
@@ -87,6 +88,7 @@ _DECIDED = {
     EventKind.INITIALISED: (DecisionKind.START, True),
     EventKind.REINITIALISED: (DecisionKind.START, True),
     EventKind.LINKED: (DecisionKind.LINK, True),
+    EventKind.RELINKED: (DecisionKind.LINK, True),
     EventKind.LINK_REFUSED: (DecisionKind.LINK, False),
     EventKind.LOOP_CLOSED: (DecisionKind.PLACE, True),
     EventKind.MERGED: (DecisionKind.PLACE, True),

@@ -33,35 +33,63 @@ def fuse(
     The link was measured between a copy of the old submap and the new one at the end of the walk. Both may have
     moved since, and the link with them.
     """
-    link, new_id = found.estimate, job.submap.id
-    agreeing = link.agreeing_keyframes.tolist()
-    S_old_now_then = change_of_frame(job.lost[found.old_id], record.atlas.submaps[found.old_id], agreeing)
-    S_old_new = S_old_now_then @ link.S_old_new @ sim3.inverse(S_now_then)
-    Ad = sim3.adjoint(S_now_then)
-    covariance = Ad @ link.covariance @ Ad.T
-    joined = Link(found.old_id, new_id, S_old_new, covariance, LinkKind.RECOVERY, tuple(agreeing))
+    new_id = job.submap.id
+    joined = _current(record, job.lost[found.old_id], new_id, found, S_now_then)
     report = connections.connect([joined], now)
     if not report or any(link.attached_as(joined) for link in report.newly_rejected):
         why = report.failure or Failure(FailureReason.CONTRADICTION, "the rest of the atlas contradicts the link")
         note_refused(record, found, new_id, why, now)
         return False
+    _note_link(record, EventKind.LINKED, found, joined, now, seconds)
+    _hand_over(record, job, found, recovered_frames, now)
+    return True
+
+
+def tighten(
+    record: Record, connections: Connections, job: RecoveryJob, relinked: FoundLink, grown: Submap, now: FrameStamp
+) -> None:
+    """Replace the link of two joined submaps where it was measured again, and its scale is known better.
+
+    `grown`: the job's submap in which it was measured.
+    """
+    keyframe_ids = relinked.estimate.agreeing_keyframes.tolist()
+    S_now_then = change_of_frame(grown, record.atlas.submaps[grown.id], keyframe_ids)
+    link = _current(record, job.joined[relinked.old_id], grown.id, relinked, S_now_then)
+    if connections.tighten(link, now):
+        _note_link(record, EventKind.RELINKED, relinked, link, now)
+
+
+def _current(record: Record, old: Submap, new_id: int, found: FoundLink, S_now_then: FloatArray) -> Link:
+    """Return a link that was measured between copies of two submaps as one between what they have become since.
+
+    `old`: the copy of the old one; `S_now_then`: what has become of the new one.
+    """
+    link, keyframe_ids = found.estimate, found.estimate.agreeing_keyframes.tolist()
+    S_old_now_then = change_of_frame(old, record.atlas.submaps[old.id], keyframe_ids)
+    S_old_new = S_old_now_then @ link.S_old_new @ sim3.inverse(S_now_then)
+    Ad = sim3.adjoint(S_now_then)
+    return Link(old.id, new_id, S_old_new, Ad @ link.covariance @ Ad.T, LinkKind.RECOVERY, tuple(keyframe_ids))
+
+
+def _note_link(
+    record: Record, kind: EventKind, found: FoundLink, joined: Link, now: FrameStamp, seconds: float | None = None
+) -> None:
+    link = found.estimate
     record.event(
-        EventKind.LINKED,
+        kind,
         now,
-        new_id,
+        joined.b,
         link.gates,
         old_submap=found.old_id,
         attempt=found.attempt,
         matches=link.n_matches,
         inliers=link.n_inliers,
-        agreeing_keyframes=agreeing,
+        agreeing_keyframes=list(joined.keyframes),
         change_point=link.change_point,
-        S_old_new=S_old_new.tolist(),
-        seconds=seconds,
-        **(link.numbers | {"scale": float(sim3.scale(S_old_new))}),
+        S_old_new=joined.S_a_b.tolist(),
+        **({} if seconds is None else {"seconds": seconds}),
+        **(link.numbers | {"scale": float(sim3.scale(joined.S_a_b))}),
     )
-    _hand_over(record, job, found, recovered_frames, now)
-    return True
 
 
 def gauge_at_overlap(submap: Submap, keyframe_ids: IntArray) -> tuple[int, int]:

@@ -28,7 +28,7 @@ class RecoveryJob:
     lost : dict of int to Submap
         Copies of the lost submaps that it may link to. With none the walk only poses the frames before the start.
     onsets : dict of int to int
-        For each of them the frame from which on it is suspected to be corrupted.
+        For each of them, and of `joined`, the frame from which on it is suspected to be corrupted.
     views : tuple of View
         What is buffered, latest first, from the frame before `newest_id` on. Where a walk is made again for the sake of
         frames without a pose: those, and what leads to them.
@@ -48,6 +48,11 @@ class RecoveryJob:
         Whether a pose beyond a gap that has rivals is gone by; the velocities must tell them apart.
     expected : dict of int to (4, 4)
         ``T_cam_submap`` of frames beyond a gap, where the velocities have told.
+    joined : dict of int to Submap
+        Copies of lost submaps that are joined with it by a scale too loose to be relied on: these links are measured
+        again, by the keyframes that both hold.
+    live_since : int
+        The keyframe that the submap's first walk set out from.
     """
 
     submap: Submap
@@ -63,6 +68,8 @@ class RecoveryJob:
     paths: dict[int, Path] = field(default_factory=dict)
     notes_rivals: bool = False
     expected: dict[int, FloatArray] = field(default_factory=dict)
+    joined: dict[int, Submap] = field(default_factory=dict)
+    live_since: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,6 +118,8 @@ class RecoveryResult:
         lost maps leave the scale open.
     tries : LinkTries
         The job's, with the tries of this walk.
+    relinked : tuple of FoundLink
+        The links with `joined` submaps, measured again.
     """
 
     submap: Submap
@@ -122,6 +131,7 @@ class RecoveryResult:
     looks_alike: bool = False
     needs_camera: bool = False
     tries: LinkTries = field(default_factory=LinkTries)
+    relinked: tuple[FoundLink, ...] = ()
 
 
 def refusal_data(attempt: str, old_id: int, why: Failure, **known: Any) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, takewhile
@@ -32,8 +32,8 @@ from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
 from dualslam.recovery.bypass import absorb, n_frames, pose_frames
 from dualslam.recovery.frame_buffer import FrameBuffer
-from dualslam.recovery.fusion import fuse, gauge_at_overlap, note_refused
-from dualslam.recovery.job import RecoveryJob, RecoveryResult
+from dualslam.recovery.fusion import fuse, gauge_at_overlap, note_refused, tighten
+from dualslam.recovery.job import FoundLink, RecoveryJob, RecoveryResult
 from dualslam.recovery.merge import merge_recovery
 from dualslam.recovery.schedule import RetrySchedule, as_far_as_it_leads, way_to_gaps
 
@@ -75,6 +75,9 @@ class Recoveries:
     config : RecoveryConfig
     front_ends : callable
         Gives those that go on, or may go on, in a submap of the atlas.
+    max_scale_sigma : float
+        Of a link that may be relied on. A map that is joined more loosely still counts as lost. That ends when the link
+        is tightened, or the newer map is lost as well.
     """
 
     def __init__(
@@ -87,6 +90,7 @@ class Recoveries:
         connections: Connections,
         config: RecoveryConfig,
         front_ends: Callable[[], Iterable[VisualOdometry]],
+        max_scale_sigma: float,
     ) -> None:
         self._record = record
         self._buffer = buffer
@@ -96,7 +100,8 @@ class Recoveries:
         self._connections = connections
         self._config = config
         self._front_ends = front_ends
-        self._lost: dict[int, Loss] = {}  # submaps that are not linked yet
+        self._max_scale_sigma = max_scale_sigma
+        self._lost: dict[int, Loss] = {}  # submaps that are not linked yet, or too loosely
         self._under_way: dict[int, _UnderWay] = {}  # by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
         self._retries = RetrySchedule(config.retry_keyframes)
@@ -106,12 +111,13 @@ class Recoveries:
 
     @property
     def waiting(self) -> list[int]:
-        """The lost submaps that are not linked yet."""
+        """The lost submaps that are not linked yet, or too loosely to be relied on."""
         return sorted(self._lost)
 
     def declare_lost(self, submap_id: int, onset: int, cause: str, first_lost: int) -> None:
         """Let the walks to come look for a submap: lost at frame `first_lost`, suspected from `onset` on."""
         if self._config.enabled:
+            self._lost = self._apart_from(submap_id)
             self._lost[submap_id] = Loss(onset, cause, first_lost)
 
     def is_under_way(self, submap: Submap) -> bool:
@@ -128,45 +134,50 @@ class Recoveries:
 
     def settle(self, live: VisualOdometry) -> None:
         """Let no walk look any more for what has become one map with the live one."""
-        self._settle(live.submap.id, live)
+        settled = self._surely_joined(live.submap.id)
+        self._lost = {m: loss for m, loss in self._lost.items() if m not in settled}
 
     def start(self, submap: Submap, newest: View, now: FrameStamp | None = None) -> None:
         """Start reverse tracking from a new submap: over the frames without a pose, then on into the lost submaps.
 
         It begins at its keyframe `newest`, also where it is made again later (`now`).
         """
-        onsets = {m: loss.onset for m, loss in self._lost.items()}
-        if onsets:
-            self._circumstances[submap.id] = self._circumstances_of_loss()
+        lost = self._apart_from(submap.id)
+        if lost:
+            self._circumstances[submap.id] = self._circumstances_of_loss(lost)
             numbers = {**self._circumstances[submap.id], **self._buffer.numbers}
             self._record.event(
                 EventKind.RECOVERY_STARTED,
                 now or newest,
                 submap.id,
-                lost=sorted(onsets),
+                lost=sorted(lost),
                 again=now is not None,
                 **numbers,
             )
-        self._submit(submap, newest, self._views_before(newest, submap), onsets, now)
+        self._submit(submap, newest.index, self._views_before(newest, submap, lost), lost, now)
 
     def retry(self, submap: Submap, now: FrameStamp, last_chance: bool = False) -> None:
         """Track in reverse again where something was left to find, once the map has grown or its camera was calibrated.
 
-        A link, while the buffer holds frames that a lost map saw; else poses of buffered frames that have none.
+        A link, while the buffer holds frames that a lost map saw; else poses of buffered frames that have none. Links
+        that are too loose are measured again.
         `last_chance`: no frame comes any more.
         """
         if submap.id in self._under_way:
             return
         due = self._retries.take_if_due(submap, now.index, self._calibration.camera, last_chance)
-        if not (due or self._outgrows(submap.id, last_chance)):
+        loose = self._joined_loosely(submap.id)
+        if not (due or self._outgrows(submap.id, last_chance) or (loose and last_chance)):
             return
-        lost = {k for m in self._lost for k in self._record.atlas.submaps[m].keyframes}
+        lost = {k for m in self._apart_from(submap.id) for k in self._record.atlas.submaps[m].keyframes}
         own = [view for view in self._buffer if view.index in submap.keyframes]
+        first = self._retries.start_of(submap, now.index)
         if own and any(view.index in lost for view in self._buffer):
-            first = self._retries.start_of(submap, now.index)
             self.start(submap, min(own, key=lambda view: (abs(view.index - first), view.index)), now)
         elif way := self._way_to_gaps(submap):
-            self._submit(submap, way[0], way[1:], {}, now)
+            self._submit(submap, way[0].index, way[1:], {}, now)
+        elif loose:
+            self._submit(submap, first, (), {}, now)
 
     def _outgrows(self, submap_id: int, last_chance: bool) -> bool:
         """Whether a submap takes over the frames of a lost one, all of which a walk has posed: told once.
@@ -180,24 +191,26 @@ class Recoveries:
         return outgrows
 
     def _submit(
-        self, submap: Submap, newest: View, views: Iterable[View], onsets: dict[int, int], now: FrameStamp | None
+        self, submap: Submap, newest_id: int, views: Iterable[View], lost: dict[int, Loss], now: FrameStamp | None
     ) -> None:
+        joined, submaps = self._joined_loosely(submap.id), self._record.atlas.submaps
         job = RecoveryJob(
             submap=submap.copy(),
-            newest_id=newest.index,
-            lost={m: sound_copy(self._record.atlas.submaps[m]) for m in onsets},
-            onsets=onsets,
+            newest_id=newest_id,
+            lost={m: sound_copy(submaps[m]) for m in lost},
+            onsets={m: self._lost[m].onset for m in (*lost, *joined)},
             views=tuple(views),
             own=tuple(view for view in self._buffer if view.index in submap.keyframes),
             camera=self._calibration.camera,
             camera_covariance=self._calibration.covariance,
             tries=self._tries.copy(),
             poses=tuple(p for p in self._record.own_poses() if p.submap_id == submap.id),
-            paths={m: self._path_in(m) for m in onsets},
-            notes_rivals=bool(onsets),
+            paths={m: self._path_in(m) for m in lost},
+            notes_rivals=bool(lost),
+            joined={m: sound_copy(submaps[m]) for m in joined},
+            live_since=self._retries.start_of(submap, newest_id),
         )
-        self._retries.start_of(submap, newest.index)
-        n_live = self._retries.n_live(submap, (now or newest).index)
+        n_live = self._retries.n_live(submap, newest_id if now is None else now.index)
         self._under_way[submap.id] = _UnderWay(time.perf_counter(), n_live, again=now is not None)
         self._desk.submit(JobKind.WALK, job)
 
@@ -245,37 +258,61 @@ class Recoveries:
                     self._tries.take_in(lost, job.tries, result.tries)
                 if result.link is not None and result.link.old_id in walk.gone_on:
                     result = replace(result, link=None)
-            if walk.again and not job.onsets and not self._poses_any(result):
-                continue  # the last one for these frames; what it would add to the map is not worth a solution
-            if not isinstance(result, Failure) and (refused := self._refuse_motion(result)) is not None:
+                relinked = [found for found in result.relinked if found.old_id not in walk.gone_on]
+                result = replace(result, relinked=tuple(relinked))
+            if walk.again and not job.lost and not self._poses_any(result):
+                # The last one for these frames; what it would add to the map is not worth a solution.
+                self._tighten(job, result, walk, live, now)
+                continue
+            link = None if isinstance(result, Failure) else result.link
+            if not isinstance(result, Failure) and link and (refused := self._refuse_motion(result, link)) is not None:
                 self._note_events(result)
-                if result.link is not None:
-                    note_refused(self._record, result.link, job.submap.id, refused, now)
-                    self._tries.note_try(result.link.old_id, refused.reason)
+                self._note_refused(link, job, refused, now)
                 self._failed(job, now, refused, time.perf_counter() - walk.began_s)
                 self._retries.leave_open(job.submap.id, walk.n_live, job.camera)  # grown, it knows its velocity better
                 continue
             if not isinstance(result, Failure):
                 with self._record.timer.measure("merging"):
                     self._take_in(job, result, live, now, walk.began_s)
-            link = None if isinstance(result, Failure) else result.link
-            unlinked = bool(job.onsets) and (link is None or link.old_id in self._lost)
+            self._tighten(job, result, walk, live, now)
+            unlinked = bool(job.lost) and (link is None or link.old_id in self._lost)
             if not isinstance(result, Failure) and result.looks_alike:
                 continue
             if unlinked or self._way_to_gaps(self._record.atlas.submaps[job.submap.id]):
                 needs_camera = not isinstance(result, Failure) and result.needs_camera
                 self._retries.leave_open(job.submap.id, walk.n_live, job.camera, needs_camera)
 
-    def _refuse_motion(self, result: RecoveryResult) -> Failure | None:
+    def _tighten(
+        self,
+        job: RecoveryJob,
+        result: RecoveryResult | Failure,
+        walk: _UnderWay,
+        live: VisualOdometry | None,
+        now: FrameStamp,
+    ) -> None:
+        """Replace links that were too loose by what they were measured to be again; those that still are wait on."""
+        if isinstance(result, RecoveryResult):
+            for found in result.relinked:
+                if (refused := self._refuse_motion(result, found)) is not None:
+                    self._note_refused(found, job, refused, now)
+                else:
+                    tighten(self._record, self._connections, job, found, result.submap, now)
+                    self._settle(found.old_id, job.submap.id, live)
+        if self._joined_loosely(job.submap.id):
+            self._retries.leave_open(job.submap.id, walk.n_live, job.camera)
+
+    def _note_refused(self, found: FoundLink, job: RecoveryJob, why: Failure, now: FrameStamp) -> None:
+        note_refused(self._record, found, job.submap.id, why, now)
+        self._tries.note_try(found.old_id, why.reason)
+
+    def _refuse_motion(self, result: RecoveryResult, found: FoundLink) -> Failure | None:
         """Return why a link is not believed by which the camera would have moved as it never does.
 
         Across the gaps that reverse tracking has crossed, and where the new map follows on the old one.
         """
-        if result.link is None:
-            return None
-        link = result.link.estimate
+        link = found.estimate
         path = self._path_of(result)
-        known = self._path_in(result.link.old_id).moved(sim3.inverse(link.S_old_new))
+        known = self._path_in(found.old_id).moved(sim3.inverse(link.S_old_new))
         newest = int(link.agreeing_keyframes[-1])
         old, new = known.take(known.index <= newest), path.take(path.index > newest)
         # The test is made in the unit of the new map, in which the link moves the old one.
@@ -312,22 +349,22 @@ class Recoveries:
             return False
         return any(frame.pose.index not in self._record.poses for frame in result.frames)
 
-    def _views_before(self, newest: View, submap: Submap) -> list[View]:
+    def _views_before(self, newest: View, submap: Submap, lost: Collection[int]) -> list[View]:
         """Return the buffered frames before a keyframe, the latest first: as far back as a lost map has seen any.
 
         Where none has, as far as none is posed in another map.
         """
         views, poses = list(self._buffer.backwards_from(newest.index)), self._record.poses
-        seen = {i for i, pose in poses.items() if pose.submap_id in self._lost}
-        seen.update(k for m in self._lost for k in self._record.atlas.submaps[m].keyframes)
+        seen = {i for i, pose in poses.items() if pose.submap_id in lost}
+        seen.update(k for m in lost for k in self._record.atlas.submaps[m].keyframes)
         of_lost = [n for n, view in enumerate(views) if view.index in seen]
         if of_lost:
             return views[: of_lost[-1] + 1]
         return list(takewhile(lambda v: v.index not in poses or poses[v.index].submap_id == submap.id, views))
 
-    def _circumstances_of_loss(self) -> dict[str, Any]:
+    def _circumstances_of_loss(self, lost: Mapping[int, Loss]) -> dict[str, Any]:
         """Why the newest of the lost maps was lost, and how many frames are buffered of before (k) and since (k_r)."""
-        loss = self._lost[max(self._lost)]
+        loss = lost[max(lost)]
         indices = [view.index for view in self._buffer]
         k = indices.index(loss.first_frame) if loss.first_frame in indices else 0
         return {"cause": loss.cause, "k": k, "k_r": len(indices) - k}
@@ -376,8 +413,8 @@ class Recoveries:
             S_now_then = change_of_frame(unsolved, submap, estimate.agreeing_keyframes.tolist()) @ merged.S_live_grown
             linked = fuse(self._record, self._connections, job, result.link, S_now_then, recovered_frames, now, seconds)
             if linked:
-                self._settle(result.link.old_id, live)
-        if job.onsets:
+                self._settle(result.link.old_id, submap.id, live)
+        if job.lost:
             self._record.event(
                 EventKind.RECOVERY_ENDED,
                 now,
@@ -391,7 +428,7 @@ class Recoveries:
         absorbed = absorb(self._record, recovered_frames, submap.id, self._lost.keys(), now, self._is_ending)
         for gone in absorbed.gone:
             self._lost.pop(gone, None)
-        if job.onsets and absorbed.outgrown_at is not None:
+        if job.lost and absorbed.outgrown_at is not None:
             self._outgrown_at[submap.id] = absorbed.outgrown_at
 
     def _change_of_pixels(self, job: RecoveryJob, submap: Submap) -> Change | None:
@@ -400,9 +437,25 @@ class Recoveries:
             return None
         return partial(rectified_where_possible, camera=self._calibration.camera)
 
-    def _settle(self, old_id: int, live: VisualOdometry | None) -> None:
-        """Let no walk look any more for what is linked: the old submap, and all that is one map with the live one."""
-        settled = {old_id}
+    # --- what is lost
+
+    def _settle(self, old_id: int, new_id: int, live: VisualOdometry | None) -> None:
+        """Let no walk look any more for a submap that is linked, nor for what is one map with the live one."""
+        if old_id in self._surely_joined(new_id):
+            self._lost.pop(old_id, None)
         if live is not None:
-            settled.update(self._record.atlas.component_of(live.submap.id))
-        self._lost = {m: loss for m, loss in self._lost.items() if m not in settled}
+            self.settle(live)
+
+    def _surely_joined(self, submap_id: int) -> list[int]:
+        """Return what is one map with a submap by links that may be relied on."""
+        return next(s for s in self._record.atlas.sure_sets(self._max_scale_sigma) if submap_id in s)
+
+    def _apart_from(self, submap_id: int) -> dict[int, Loss]:
+        """Return the lost submaps that no link joins with a submap."""
+        own = self._record.atlas.component_of(submap_id)
+        return {m: loss for m, loss in self._lost.items() if m not in own}
+
+    def _joined_loosely(self, submap_id: int) -> list[int]:
+        """Return the lost submaps whose link with a submap is too loose to be relied on."""
+        linked = {link.a for link in self._record.atlas.believed if link.b == submap_id}
+        return sorted(linked & self._lost.keys())

@@ -42,6 +42,9 @@ from dualslam.recovery.schedule import way_to_gaps
 
 log = logging.getLogger(__name__)
 
+RELINK = "again"
+"""Instead of an attempt's name: the link is measured again, without reverse tracking."""
+
 Judge = Callable[[Track | Failure], Track | Failure]
 Outcome = TypeVar("Outcome")
 Steps = Generator[WalkNews | None, bool | None, Outcome]
@@ -100,7 +103,8 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Steps[RecoveryRe
     problem = Failure(FailureReason.SOLVER)
     events: list[Event] = []
     looks_alike, needs_camera, tries = False, False, job.tries.copy()
-    for attempt in parts.attempts if job.lost else (parts.posing,):
+    attempts = parts.attempts if job.lost else (parts.posing,) if job.views or not job.joined else ()
+    for attempt in attempts:
         if best is not None and best.out_of_time:
             break
         if (lack := attempt.find_lack()) is not None:
@@ -120,16 +124,35 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Steps[RecoveryRe
             best, way = progress, attempt
         if progress.link is not None or needs_camera or progress.looks_alike:
             break
-    if best is None:
+    if best is None and not job.joined:
         return problem
+    if best is None:
+        best = Progress(job.submap)
     if best.link is None and unsure is not None:
         best, best.link = unsure, unsure.unsure
     if (gap := best.lost_scale_from(parts.max_scale_sigma)) is not None:
         best = yield from _as_far_as(gap, job, parts, way)
     seconds, cpu_s = time.perf_counter() - started, time.process_time() - cpu_started
     frames = tuple(best.frames.values())
-    ending = looks_alike, needs_camera, tries
+    ending = looks_alike, needs_camera, tries, _relink(job, best.submap, parts, tries)
     return RecoveryResult(best.submap, frames, best.link, tuple(events), seconds, cpu_s, *ending)
+
+
+def _relink(job: RecoveryJob, submap: Submap, parts: RecoveryParts, tries: LinkTries) -> tuple[FoundLink, ...]:
+    """Measure again the links with the maps that are joined too loosely, by the keyframes that both hold."""
+    since_start, progress = replace(job, newest_id=job.live_since), Progress(submap)
+    relinked = []
+    for old_id, old in job.joined.items():
+        result = parts.link(old, submap, job.onsets[old_id])
+        for with_doubt in (False, True):
+            found = _confirm(old_id, result, since_start, submap, RELINK, parts, tries, progress, with_doubt)
+            if not isinstance(found, Failure):
+                relinked.append(found)
+            if not isinstance(found, Failure) or found.reason is FailureReason.UNCONFIRMED:
+                break
+            if not with_doubt:
+                tries.note_try(old_id, found.reason)
+    return tuple(relinked)
 
 
 def _unavailable(job: RecoveryJob, attempt: Attempt, lack: Failure) -> Event:

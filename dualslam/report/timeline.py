@@ -29,6 +29,7 @@ _MARKS = {
     "relocalised": ("↺", "mark good", "a place of the map is seen again, and the map goes on"),
     "rolled_over": ("→", "mark quiet", "a full submap hands over to the next"),
     "linked": ("◆", "mark good", "two submaps are linked"),
+    "relinked": ("◆", "mark good", "a link of unsure scale is measured again"),
     "loop_closed": ("◆", "mark good", "a loop is closed"),
     "merged": ("◆", "mark good", "two maps are joined by what both have seen"),
     "interrupted": ("■", "mark bad", "the run was interrupted"),

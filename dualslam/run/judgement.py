@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.atlas.atlas import joined
 from dualslam.core.estimates import MAX_PRIOR_SIGMAS
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
@@ -29,8 +28,6 @@ MIN_COVERAGE = 0.95
 """Share of the frames that can be posed."""
 MAX_SCALE_SIGMA = 0.5
 """Of the logarithm of the scale after a keyframe against that before it: as much, or more, is not handed on."""
-MAX_JOIN_SIGMA = 0.025
-"""Standard deviation of the scale by which maps are joined: twice as much, 5 %, is wrong."""
 MAX_FOCAL_SIGMA = 0.03
 """Standard deviation of the logarithm of the focal length."""
 MIN_FOCAL_CHANGE, MAX_FOCAL_SIGMAS = 0.1, 4.0
@@ -221,16 +218,15 @@ def _measurements(rows: Sequence[FrameRow], measured: Measured) -> list[Reason]:
 
 def _loose_joins(system: System, trajectories: Trajectories) -> list[Reason]:
     """Find frames that are joined to most others by links alone that hardly know their scale."""
-    links, own = system.atlas.believed, trajectories.S_world_submap.keys()
-    parts = joined(own, [k for k in links if k.sigma_scale <= MAX_JOIN_SIGMA and {k.a, k.b} <= own])
+    own = trajectories.S_world_submap.keys()
     main = trajectories.main.index.tolist()
     submap_of = {i: system.poses[system.numbers.number_of(i)].submap_id for i in main}
-    frames = [[i for i in main if submap_of[i] in part] for part in parts]
+    frames = [[i for i in main if submap_of[i] in part] for part in system.sure_sets if own & set(part)]
     beyond = sorted(i for part in sorted(frames, key=len)[:-1] for i in part)
     if not beyond:
         return []
     first, last = beyond[0], beyond[-1]
-    sigma = max(k.sigma_scale for k in links if {k.a, k.b} <= own)
+    sigma = max(k.sigma_scale for k in system.atlas.believed if {k.a, k.b} <= own)
     text = (
         f"Frames {first} to {last} are joined to the others by a scale that is known to {100 * sigma:.1f} % only. "
         "They may be too large or too small by three times as much. A recording that returns there would fix it."

@@ -79,7 +79,8 @@ class System:
         self.saved, self.numbers = saved, FrameNumbers(0 if saved is None else saved.next_id)
         self.blank: set[int] = set()
         self._world = saved.main[0] if saved is not None and saved.main else None
-        self._worlds = Worlds(record.atlas, self._world)
+        self._max_scale_sigma = config.linking.max_live_scale_sigma
+        self._worlds = Worlds(record.atlas, self._max_scale_sigma, self._world)
         earlier = frozenset(record.atlas.submaps)
         self.atlas, self.rows, self.poses = record.atlas, record.rows, record.poses
         self.events, self.timer = record.events, record.timer
@@ -117,6 +118,7 @@ class System:
             self._connections,
             config.recovery,
             self._state.front_ends,
+            self._max_scale_sigma,
         )
         self._calibrations = Calibrations(
             record, self.buffer, components.calibration, components.desk, components.new_graph, self._connections
@@ -165,6 +167,11 @@ class System:
     def world(self) -> int | None:
         """The submap in whose frame the saved map's world is; None without one."""
         return self._world
+
+    @property
+    def sure_sets(self) -> list[list[int]]:
+        """Sets of submaps that are joined by links which know their scale so well that it may be relied on."""
+        return self.atlas.sure_sets(self._max_scale_sigma)
 
     @property
     def live(self) -> VisualOdometry | None:
@@ -451,7 +458,6 @@ class System:
             T_submap_cam = self.atlas.submaps[pose.submap_id].resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
         failure = outcome if isinstance(outcome, Failure) else None
         S_world_submap, world_id = (None, None) if pose is None else self._worlds.of(pose.submap_id)
-        is_doubtful = pose is not None and self.audit.doubts(pose.submap_id)
         return FrameResult(
             self.numbers.index_of(frame.index),
             row.status,
@@ -465,5 +471,10 @@ class System:
             S_world_submap,
             world_id,
             row.method,
-            str(ReasonCode.PHOTOMETRIC) if is_doubtful else "",
+            "" if pose is None else self._doubt_about(pose.submap_id),
         )
+
+    def _doubt_about(self, submap_id: int) -> str:
+        if self.audit.doubts(submap_id):
+            return str(ReasonCode.PHOTOMETRIC)
+        return "" if self._worlds.is_sure(submap_id) else str(ReasonCode.SCALE)

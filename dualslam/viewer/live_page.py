@@ -38,6 +38,7 @@ TOLD = {
     "recovery_started": "tracking in reverse",
     "recovery_failed": "no link found by reverse tracking",
     "linked": "maps joined",
+    "relinked": "scale of a join measured again",
     "merged": "maps joined by a place that both show",
     "loop_closed": "loop closed",
     "link_refused": "link refused",

@@ -50,7 +50,7 @@ def walk(unit: float, off: FloatArray, seed: int) -> tuple[Record, Recoveries, R
     result = RecoveryResult(new, tuple(frames), link, (attempt,), 0.1, 0.1)
     desk = Fake(poll=lambda kind: [Ended(job, result)])
     parts = (desk, None, Fake(camera=CAMERA, covariance=None), None)
-    recoveries = Recoveries(record, FrameBuffer(10.0, 100.0), *parts, RecoveryConfig(), list)  # type: ignore[arg-type]
+    recoveries = Recoveries(record, FrameBuffer(10.0, 100.0), *parts, RecoveryConfig(), list, 0.025)  # type: ignore[arg-type]
     return record, recoveries, result
 
 
@@ -58,9 +58,11 @@ def walk(unit: float, off: FloatArray, seed: int) -> tuple[Record, Recoveries, R
 @pytest.mark.parametrize("seed", range(3))
 def test_a_right_walk_is_believed_and_one_that_is_a_period_off_is_not(unit: float, seed: int) -> None:
     _, recoveries, right = walk(unit, np.zeros(3), seed)
-    assert recoveries._refuse_motion(right) is None
+    assert right.link
+    assert recoveries._refuse_motion(right, right.link) is None
     _, recoveries, wrong = walk(unit, np.array([-1.5, 0.0, 0.0]), seed)
-    assert getattr(recoveries._refuse_motion(wrong), "reason", None) is FailureReason.LEAP
+    assert wrong.link
+    assert getattr(recoveries._refuse_motion(wrong, wrong.link), "reason", None) is FailureReason.LEAP
 
 
 def test_a_link_that_is_refused_for_its_leap_says_so_beside_what_the_walk_tried() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from dualslam.atlas.trajectory import compose
 from dualslam.build import build_system
-from dualslam.core.config.settings import Config
+from dualslam.core.config.settings import Config, LinkingConfig
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, FloatArray, Frame, FrameStatus, View
@@ -219,18 +219,16 @@ def test_the_camera_has_been_refined_meanwhile() -> None:
 
 
 @pytest.mark.slow
-def test_maps_of_a_wrong_camera_are_linked_after_both_have_been_calibrated() -> None:
+def test_maps_of_a_wrong_camera_are_linked_anew_after_both_have_been_calibrated() -> None:
     settings = {
         "calibration": {"first_keyframes": 20, "max_observations": 6000},
         "keyframes": {"max_parallax_deg": 1.0},
         "mapping": {"redundant_ratio": 1.0},
         "camera": {"model_sigma_px": 0.0},
         "recovery": {"attempts": ["live"]},
-        "linking": {"wrong_scale": 0.026},  # so that none is joined with a doubt before
     }
     system, world = miscalibrated(1.03, range(26, 38), settings)
-    for i in range(75):
-        system.step(Frame(i, i / 30, None))
+    doubts = [system.step(Frame(i, i / 30, None)).doubt for i in range(75)]
     system.finish()
     refused = system.events.of_kind(EventKind.LINK_REFUSED)
     assert refused, "by the bend that the camera makes, or by what it does to the scales of the two"
@@ -238,7 +236,14 @@ def test_maps_of_a_wrong_camera_are_linked_after_both_have_been_calibrated() -> 
     (calibrated,) = system.events.of_kind(EventKind.CALIBRATED)
     assert calibrated.data["lost"] == [0]
     (linked,) = system.events.of_kind(EventKind.LINKED)
-    assert linked.frame >= calibrated.frame > refused[0].frame
+    (relinked,) = system.events.of_kind(EventKind.RELINKED)
+    assert refused[0].frame < linked.frame < calibrated.frame <= relinked.frame
+    max_sigma = LinkingConfig().max_live_scale_sigma
+    assert linked.data["sigma_scale"] > max_sigma > relinked.data["sigma_scale"]
+    assert [link.sigma_scale for link in system.atlas.links] == [pytest.approx(relinked.data["sigma_scale"], rel=0.1)]
+    # As long as the link is loose, what is posed beyond it has a doubt.
+    assert doubts == ["scale" if linked.frame <= i < relinked.frame else "" for i in range(75)]
+    assert not system._recoveries.waiting
     for submap in system.atlas.submaps.values():
         np.testing.assert_array_equal(submap.K, system._state.parts.calibration.camera.K)
     main = trajectories_of(system).main
