@@ -202,18 +202,18 @@ class LiveParts:
 
     def new_odometry(self, submap: Submap, graph: SubmapGraph) -> VisualFrontEnd:
         """Make the front end that tracks frames against a submap and extends it."""
-        return self._front_end(submap, graph, 0)
+        return self._front_end(submap, graph)
 
     def new_relocaliser(self, submap: Submap, graph: SubmapGraph) -> VisualFrontEnd:
         """Make one that looks in the whole submap, and not only at what is near in time."""
-        return self._front_end(submap, graph, self.config.recovery.covering_keyframes)
+        return self._front_end(submap, graph, looks_everywhere=True)
 
-    def _front_end(self, submap: Submap, graph: SubmapGraph, n_covering: int) -> VisualFrontEnd:
+    def _front_end(self, submap: Submap, graph: SubmapGraph, looks_everywhere: bool = False) -> VisualFrontEnd:
         config, frontend = self.config, self.frontend
         refinder = Refinder(submap, frontend, self.camera, config.camera.model_sigma_px)
         window, pixels = window_solver(config), self._pixel_search(refinder.images)
         return VisualFrontEnd(
-            frontend, config, submap, graph, self.given, refinder, n_covering, window, self.first_id, pixels
+            frontend, config, submap, graph, self.given, refinder, looks_everywhere, window, self.first_id, pixels
         )
 
     def _pixel_search(self, images: KeyframeImages) -> PixelSearch | None:

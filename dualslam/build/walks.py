@@ -66,8 +66,8 @@ def recovery_parts(
         refinder = Refinder(submap, frontend, lambda: job.camera, config.camera.model_sigma_px)
         for view in sorted(job.own, key=lambda view: view.index, reverse=True):  # those next to the walk stay
             refinder.remember(view)
-        n_covering = 0 if job.lost else config.recovery.covering_keyframes
-        return VisualFrontEnd(frontend, config, submap, graph, camera, refinder, n_covering, window_solver(config))
+        window = window_solver(config)
+        return VisualFrontEnd(frontend, config, submap, graph, camera, refinder, not job.lost, window)
 
     auxiliaries = _auxiliaries(config, n_threads)
 

@@ -10,6 +10,11 @@ from dualslam.core.types import Failure, FailureReason, Track
 if TYPE_CHECKING:
     from dualslam.core.config.settings import HealthConfig
 
+MIN_INLIER_RATIO = 0.35
+"""Share of the matched landmarks that must agree with a pose."""
+MAX_CHI2 = 2.5
+"""Mean squared whitened residual per degree of freedom of those that agree (1 is expected)."""
+
 
 def find_lack_of_support(n_inliers: int, n_matches: int, chi2: float, config: HealthConfig) -> Failure | None:
     """Return what a pose lacks, or None where its matches explain it.
@@ -40,8 +45,8 @@ def support_gates(n_inliers: int, n_matches: int, chi2: float, config: HealthCon
     """Return the comparisons of `find_lack_of_support`, in their order."""
     return (
         Gate("inliers", n_inliers, ">=", config.min_inliers),
-        Gate("share of inliers", n_inliers / max(n_matches, 1), ">=", config.min_inlier_ratio),
-        Gate("chi-square per degree of freedom", chi2, "<=", config.max_chi2),
+        Gate("share of inliers", n_inliers / max(n_matches, 1), ">=", MIN_INLIER_RATIO),
+        Gate("chi-square per degree of freedom", chi2, "<=", MAX_CHI2),
     )
 
 

@@ -24,7 +24,7 @@ from dualslam.map.submap import Submap
 GROWTH = 1.5
 """Each next time comes when it has so many times the keyframes."""
 UPDATE_SIGMA_RATIO = 0.7
-"""A camera may have been changed by an answer less sure than `max_sigma_ratio`. It is changed again, however little, if
+"""A camera may have been changed by an answer less sure than `max_focal_sigma`. It is changed again, however little, if
 the new sigma of the focal length is below this share of that answer's: twice the information. One that was sure stays,
 until another is significantly different."""
 AT_LOSS = 1.05
@@ -256,7 +256,7 @@ class Calibration:
         config, present, found = self._config, self.log_focal_sigma, float(np.sqrt(covariance[0, 0]))
         if present is None:
             return False
-        hardly_sure = present > min(config.max_sigma_ratio * config.log_focal_sigma, SURE_SIGMA)
+        hardly_sure = present > min(config.max_focal_sigma, SURE_SIGMA)
         return hardly_sure and found < UPDATE_SIGMA_RATIO * present
 
     def rectified(self, view: View) -> View:

@@ -38,8 +38,8 @@ FIRM_TIES = 20
 """Landmarks that two keyframes before the group and two after it have seen, from which on nothing is asked: each would
 have to be off by half its depth for the scale to be lost. They are counted in a hundredth of the time."""
 TIE_PARALLAX_DEG = 0.7
-"""Parallax of a landmark that counts as a tie: that of near ones (`mapping.min_parallax_deg`), less what the graph has
-moved since. Far ones may be off by half their depth."""
+"""Parallax of a landmark that counts as a tie: that of near ones (the mapper's `MIN_PARALLAX_DEG`), less what the graph
+has moved since. Far ones may be off by half their depth."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -54,7 +54,7 @@ TOLD_RIGHT = 0.9
 """How likely a source's own data tell of these images: one may have been cropped since."""
 DEGREES_OF_FREEDOM, INFLATION = 3.0, 4.0
 """Of the Student distribution of a pair's cost, as some pairs are wrong altogether; and how much larger than their
-residuals errors are taken to be, as neighbouring points err alike (`CalibrationConfig.inflation`)."""
+residuals errors are taken to be, as neighbouring points err alike (`INFLATION` of self-calibration)."""
 MODEL_SIGMA = 0.03
 """Of the log focal length: what a lens of one number and a principal point in the middle leave."""
 COARSE_ITERATIONS, FINE_ITERATIONS = (30, 60), (50, 200)

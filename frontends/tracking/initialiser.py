@@ -39,6 +39,9 @@ from dualslam.frontends.tracking.near_points import N_PROOF, nearer_than_proven,
 from dualslam.frontends.tracking.resection import resect
 from dualslam.frontends.tracking.two_view_hypotheses import MIN_NOISE2, RelativePoses
 
+MIN_PARALLAX_DEG = 1.0
+"""Angle under which the two cameras must see half as many points as `min_points`, after the rotation is taken out.
+However many more are far away: on a road most are, and the near ones fix the motion."""
 MAX_CHI2 = 2.5
 """Mean squared whitened residual per degree of freedom after the bundle adjustment (1 is expected)."""
 MIN_SUPPORT = 0.6
@@ -250,9 +253,9 @@ class Initialiser:
         n_explained = int((good | (fits & (moved_px < AT_INFINITY_SIGMAS * sigma_b))).sum())
         angle = np.degrees(np.arccos(np.clip(points.cos_parallax[good], -1, 1)))
         # Points without parallax are no points of the map: their depth is anything.
-        good[good] = angle > 0.5 * self._config.min_parallax_deg
+        good[good] = angle > 0.5 * MIN_PARALLAX_DEG
         parallax = float(np.median(angle)) if len(angle) else 0.0
-        n_near = int((angle >= self._config.min_parallax_deg).sum())
+        n_near = int((angle >= MIN_PARALLAX_DEG).sum())
         return _Pair(a, b, matches, T_b_a, points.xyz, good, n_explained, parallax, n_near)
 
     # --- witnesses and bundle adjustment

@@ -13,10 +13,14 @@ from dualslam.map.submap import Submap
 
 MIN_PARALLAX_DEG = 0.5
 """...and the camera has moved enough to see the scene's median depth under this angle (or tracking is weak)."""
+MAX_TRACKED_RATIO = 0.6
+"""A keyframe is due when a smaller share of the last one's landmarks is still tracked."""
+MAX_FRAMES = 30
+"""Frames after which one is due if the camera has moved at all."""
 FULL_PARALLAX_DEG, LEAST = 1.4, 0.6
-"""Parallax from which on `max_tracked_ratio` holds as it is; with less it is smaller in proportion, down to this share.
-At 1 degree half of the scene is too far to be triangulated (`mapping.min_parallax_deg`), and a pixel is a tenth of the
-depth. With 2 degrees and a half `euroc_takeoff` breaks: its bench has left before a keyframe comes."""
+"""Parallax from which on `MAX_TRACKED_RATIO` holds as it is; with less it is smaller in proportion, down to this share.
+At 1 degree half of the scene is too far to be triangulated, and a pixel is a tenth of the depth. With 2 degrees and a
+half `euroc_takeoff` breaks: its bench has left before a keyframe comes."""
 
 N_LIKE = 5
 """Keyframes of earlier runs, those that see most of what a frame sees, that are asked whether one shows the same."""
@@ -91,8 +95,8 @@ def _shows_other(share: float, parallax: float, n_frames: int, config: KeyframeC
     # A turn in place reveals nothing that could be triangulated, until half of what was known is out of view.
     turns = parallax < MIN_PARALLAX_DEG
     worth = 0.5 if turns else min(max(parallax / FULL_PARALLAX_DEG, LEAST), 1.0)
-    left = Gate("share of the last keyframe's landmarks", share, "<", worth * config.max_tracked_ratio)
-    late = Gate("frames since the last keyframe", n_frames, ">=", config.max_frames)
+    left = Gate("share of the last keyframe's landmarks", share, "<", worth * MAX_TRACKED_RATIO)
+    late = Gate("frames since the last keyframe", n_frames, ">=", MAX_FRAMES)
     return [moved, left] if turns else [moved, left, late]
 
 

@@ -24,11 +24,15 @@ MIN_FOUND_RATIO = 0.25
 """A young landmark that tracking finds in fewer of the frames that should see it is culled."""
 MIN_OBSERVATIONS = 3
 """Keyframes that must see a landmark by the time that two more keyframes have come."""
+MIN_PARALLAX_DEG = 1.0
+"""Smallest angle between the two rays of a new landmark, unless it is a far one."""
+MAX_OBSERVATIONS = 250
+"""Known landmarks that a keyframe holds on to, spread over its image: more make the solver slower, not better."""
 TRIANGULATE_AGAINST = 6
 """Older keyframes that a new keyframe is paired with."""
 
 FEW = 0.5
-"""Share of `max_observations` below which a keyframe takes far points as landmarks, too."""
+"""Share of `MAX_OBSERVATIONS` below which a keyframe takes far points as landmarks, too."""
 FAR_SIGMAS = 2.0
 """Parallax of a far point, in standard deviations of its two pixels: its depth is known to half."""
 
@@ -87,7 +91,7 @@ class Mapper:
         feature = np.flatnonzero(track.landmark_ids >= 0)
         n_seen = submap.n_observations(track.landmark_ids[feature])
         uv_px = np.nan_to_num(self._camera.unrectify(view.features.uv_rect_px[feature]))
-        kept = spread_choice(uv_px, n_seen, self._config.max_observations, self._camera.size_px)
+        kept = spread_choice(uv_px, n_seen, MAX_OBSERVATIONS, self._camera.size_px)
         feature = feature[kept]
         submap.add_observations(view.index, feature, track.landmark_ids[feature])
 
@@ -205,9 +209,9 @@ class Mapper:
         until near ones come into view again. A keyframe with landmarks enough does without them: on a road the depths
         of far points err towards near.
         """
-        near_deg = self._config.min_parallax_deg
+        near_deg = MIN_PARALLAX_DEG
         created = [self._triangulate_pair(k, other, candidates, near_deg) for other in neighbours]
-        if np.count_nonzero(self._submap.landmark_of[k] >= 0) < FEW * self._config.max_observations:
+        if np.count_nonzero(self._submap.landmark_of[k] >= 0) < FEW * MAX_OBSERVATIONS:
             far_deg = min(near_deg, self._far_parallax_deg(k))
             created += [self._triangulate_pair(k, other, candidates, far_deg) for other in neighbours]
         return np.concatenate(created) if created else np.zeros(0, np.int64)

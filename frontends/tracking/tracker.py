@@ -26,12 +26,17 @@ from dualslam.frontends.tracking.pixel_search import PixelSearch
 from dualslam.frontends.tracking.resection import estimate_pose
 from dualslam.map.submap import NO_LANDMARK, Submap
 
+SEARCH_RADIUS_PX = 15.0
+"""Search radius about a landmark's predicted pixel, at the finest octave, when the motion model is trusted."""
 LOCAL_RADIUS_PX = 4.0
 """Search radius about the pixels of the local map's landmarks, after a first pose is found."""
 LOCAL_KEYFRAMES = 20
 """Covisible keyframes whose landmarks make the local map."""
 WIDE_KEYFRAMES = 3
 """Recent keyframes that are tried by wide matching and PnP when guided matching fails."""
+COVERING_KEYFRAMES = 20
+"""Beyond these, keyframes that together show the most of the map: in a gap the camera may have looked anywhere. Each
+costs about 2 ms of CPU for a frame that is not found."""
 
 WIDER = 2.5  # second guided search: this many times the first radius
 GUIDE_TOLERANCE, POSE_TOLERANCE = 0.1, 1e-3
@@ -67,7 +72,7 @@ class GivenPose:
 class Tracker:
     """Tracks frames against one submap, one after the other, in whatever direction of time they come.
 
-    `n_covering`: beyond the keyframes nearest in time, wide matching tries so many that show the most of the map.
+    `looks_everywhere`: wide matching also tries the keyframes that show the most of the map.
     `max_gap_scale_sigma`: largest standard deviation (relative) of the scale beyond frames that wide matching has
     skipped, unless the step is small against the depth of the scene; where it is larger the frame counts as lost.
     `pixels`: finds landmarks where guided search finds too few; without it wide matching comes next.
@@ -80,7 +85,7 @@ class Tracker:
         submap: Submap,
         camera: Camera,
         seed: int,
-        n_covering: int = 0,
+        looks_everywhere: bool = False,
         max_gap_scale_sigma: float = 0.025,
         pixels: PixelSearch | None = None,
     ) -> None:
@@ -91,7 +96,7 @@ class Tracker:
         self._submap = submap
         self._camera = camera
         self._seed = seed
-        self._n_covering = n_covering
+        self._looks_everywhere = looks_everywhere
         self._last: Track | None = None
         self._motion = Motion()
         self._local: LocalMap | None = None
@@ -142,7 +147,7 @@ class Tracker:
         grid = FeatureGrid.build(features.uv_rect_px)
         T_predicted = self._motion.predict(self._last, view.timestamp_s)
         found: tuple[FloatArray, IntArray] | Failure = Failure(FailureReason.TOO_FEW_MATCHES)
-        for radius_px in (self._config.search_radius_px, self._config.search_radius_px * WIDER):
+        for radius_px in (SEARCH_RADIUS_PX, SEARCH_RADIUS_PX * WIDER):
             found = self._pose_from_last(view, grid, T_predicted, radius_px)
             if found:
                 break
@@ -324,9 +329,9 @@ class Tracker:
 
     def _wide_keyframes(self, index: int) -> list[int]:
         near = self._submap.keyframes_near(index)[:WIDE_KEYFRAMES]
-        if self._n_covering == 0:
+        if not self._looks_everywhere:
             return near
-        covering = covering_keyframes(self._submap, self._n_covering, self._config.min_inliers)
+        covering = covering_keyframes(self._submap, COVERING_KEYFRAMES, self._config.min_inliers)
         return [*near, *(k for k in covering if k not in near)]
 
     def _refuse_look_alike(self, track: Track) -> Failure | None:

@@ -44,9 +44,9 @@ class VisualFrontEnd:
     """Tracks frames against a submap and extends it by keyframes.
 
     `camera`: as it was given; it says what an image shows. `refinder`: finds landmarks across gaps in the images
-    themselves; without it features alone tie the keyframes there. `n_covering`: see `Tracker`. `window`: poses new
-    keyframes between the graph's updates; without it the graph does. `pixels`: see `Tracker`. `first_id`: number of
-    this run's first frame; keyframes before it are those of the saved map that it goes on in.
+    themselves; without it features alone tie the keyframes there. `looks_everywhere`: see `Tracker`. `window`: poses
+    new keyframes before the map grows about them; without it the graph does. `pixels`: see `Tracker`. `first_id`:
+    number of this run's first frame; keyframes before it are those of the saved map that it goes on in.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class VisualFrontEnd:
         graph: SubmapGraph,
         camera: Camera,
         refinder: Refinder | None = None,
-        n_covering: int = 0,
+        looks_everywhere: bool = False,
         window: WindowSolver | None = None,
         first_id: int = 0,
         pixels: PixelSearch | None = None,
@@ -72,7 +72,7 @@ class VisualFrontEnd:
             submap,
             camera,
             config.seed,
-            n_covering,
+            looks_everywhere,
             config.linking.max_live_scale_sigma,  # all that is mapped beyond inherits it
             pixels,
         )
@@ -80,7 +80,6 @@ class VisualFrontEnd:
         self._refinder = refinder
         self._window = window
         self._first_id = first_id
-        self._since_graph = 0  # keyframes that the graph has not seen yet
         self._careful = True  # the next keyframe is the graph's to pose
         self._after_gap = False
         self._apart: frozenset[int] = frozenset()  # keyframes across the last gap, where few landmarks bridge it
@@ -277,11 +276,11 @@ class VisualFrontEnd:
             detail = f"the map contradicts {n_refused} of {len(matched)} matches of keyframe {track.view.index}"
             return Failure(FailureReason.CHI_SQUARE, detail, {"n_refused": float(n_refused)})
         self._mapper.grow(track, self._apart, posed.noise2)
-        grown = self._graph_step(rebuild)
+        grown = self._solve(rebuild)
         self._meet(track.view.index)
         self._cull_keyframe()
         self._tracker.refresh()
-        failed = posed.rebuilt or (grown is not None and grown.rebuilt and not rebuild)
+        failed = posed.rebuilt or (grown.rebuilt and not rebuild)
         return KeyframeReport(posed, grown, failed)
 
     def _pose(self, track: Track, n_matched: int, pose_is_given: bool) -> GraphEstimate:
@@ -294,15 +293,6 @@ class VisualFrontEnd:
                 return self._taken(posed)
         self._careful = False
         return self._solve()
-
-    def _graph_step(self, rebuild: bool) -> GraphEstimate | None:
-        """Let the graph take in what has come since its last update, where that is due."""
-        self._since_graph += 1
-        young = len(self.submap.keyframes) <= YOUNG_MAP
-        # In the map of an earlier run keyframes are rare: what waits for the next one waits for long.
-        rare = any(k < self._first_id for k in self.submap.keyframes)
-        due = rebuild or young or rare or self._window is None or self._since_graph >= self._config.graph.update_every
-        return self._solve(rebuild) if due else None
 
     def _note_gap(self, track: Track | Failure) -> None:
         """Keyframes beyond frames that found no pose, or one by wide matching alone, are to be tied to those before."""
@@ -337,7 +327,6 @@ class VisualFrontEnd:
         """Bring the graph up to date with the submap, and the submap with its estimate."""
         # Its parts are solved: what is doubtful is how they lie to each other, which takes a few iterations.
         estimate = self.graph.rebuild(self.submap, near_optimum=True) if rebuild else self.graph.update(self.submap)
-        self._since_graph = 0
         return self._taken(estimate)
 
     def _taken(self, estimate: GraphEstimate) -> GraphEstimate:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dualslam.backend import self_calibration
 from dualslam.backend.self_calibration import (
     choose_window,
     estimate_calibration,
@@ -89,10 +90,13 @@ class TestEstimate:
         assert estimate.cost_after < estimate.cost_before
 
     @pytest.mark.parametrize(("f", "counts"), [(1.02, False), (1.12, True)])
-    def test_an_unsure_answer_counts_only_where_the_given_focal_length_is_far_off(self, f: float, counts: bool) -> None:
-        camera, unsure = wrong_camera(f), CalibrationConfig(inflation=9.0)
-        estimate = estimate_calibration(make_submap(camera, turning=True, n=6), camera, unsure)
-        assert unsure.max_sigma_ratio * unsure.log_focal_sigma < estimate.numbers["log_focal_sigma"]
+    def test_an_unsure_answer_counts_only_where_the_given_focal_length_is_far_off(
+        self, f: float, counts: bool, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        camera = wrong_camera(f)
+        monkeypatch.setattr(self_calibration, "INFLATION", 9.0)
+        estimate = estimate_calibration(make_submap(camera, turning=True, n=6), camera, CONFIG)
+        assert CONFIG.max_focal_sigma < estimate.numbers["log_focal_sigma"]
         assert bool(estimate) is counts
 
     def test_another_answer_must_differ_by_more_than_is_unknown_of_both(self) -> None:
@@ -113,14 +117,15 @@ class TestEstimate:
         np.testing.assert_allclose(of_both.correction.vector, surely.correction.vector)
         assert of_both.distance2 == pytest.approx(0.5 * surely.distance2, rel=0.05)
 
-    def test_driving_straight_ahead_says_nothing(self) -> None:
+    def test_driving_straight_ahead_says_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
         camera = wrong_camera()
         submap = make_submap(camera, turning=False)
         estimate = estimate_calibration(submap, camera, CONFIG)
         assert isinstance(estimate, Failure)
         assert estimate.reason is FailureReason.DEGENERATE
         # Without the short cut over the turning the estimate itself has to say so.
-        estimate = estimate_calibration(submap, camera, CalibrationConfig(min_rotation_deg=0))
+        monkeypatch.setattr(self_calibration, "MIN_ROTATION_DEG", 0.0)
+        estimate = estimate_calibration(submap, camera, CONFIG)
         assert isinstance(estimate, Failure) or not estimate.accepted
 
     def test_points_that_only_fit_behind_the_cameras_are_left_out_without_a_word(
@@ -184,13 +189,14 @@ class TestPreferredCamera:
         assert not found.beyond_chance
         assert abs(found.log_focal) < 0.01
 
-    def test_one_need_not_be_sure_of_another(self) -> None:
-        camera, config = wrong_camera(1.06), CalibrationConfig(inflation=9.0)
+    def test_one_need_not_be_sure_of_another(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        camera = wrong_camera(1.06)
+        monkeypatch.setattr(self_calibration, "INFLATION", 9.0)
         submap = make_submap(camera, turning=True, n=6)
-        answer = estimate_calibration(submap, camera, config)
+        answer = estimate_calibration(submap, camera, CONFIG)
         assert isinstance(answer, Failure)
         assert answer.reason is FailureReason.DEGENERATE
-        found = find_preferred_camera(submap, np.arange(6), camera, config)
+        found = find_preferred_camera(submap, np.arange(6), camera, CONFIG)
         assert found
         assert found.log_focal == pytest.approx(-np.log(1.06), abs=0.02)
         assert found.beyond_chance

@@ -112,7 +112,7 @@ def track(n_matches: int = 100, n_inliers: int = 90, chi2: float = 1.0) -> Track
 
 
 class TestHealth:
-    config = HealthConfig(min_inliers=25, min_inlier_ratio=0.4, max_chi2=2.0)
+    config = HealthConfig(min_inliers=25)
 
     def test_a_good_track_is_handed_through(self) -> None:
         good = track()
@@ -122,8 +122,8 @@ class TestHealth:
         ("bad", "reason"),
         [
             (track(30, 24), FailureReason.TOO_FEW_INLIERS),
-            (track(100, 39), FailureReason.LOW_INLIER_RATIO),
-            (track(chi2=2.1), FailureReason.CHI_SQUARE),
+            (track(100, 34), FailureReason.LOW_INLIER_RATIO),
+            (track(chi2=2.6), FailureReason.CHI_SQUARE),
         ],
     )
     def test_a_bad_one_fails_with_its_reason(self, bad: Track, reason: FailureReason) -> None:

@@ -61,9 +61,6 @@ class InitialiserConfig(StrictModel):
     any front end with binary descriptors supports (`orb` with `gms` is the paper's Dual-SLAM+)."""
     min_points: int = Field(50, ge=15)
     """Triangulated points that must survive the first bundle adjustment."""
-    min_parallax_deg: float = Field(1.0, gt=0)
-    """Angle under which the two cameras must see half as many points as `min_points`, after the rotation is taken out.
-    However many more are far away: on a road most are, and the near ones fix the motion."""
     max_direction_sigma_deg: float = Field(1.5, gt=0)
     """Largest standard deviation (from the bundle adjustment's Hessian) of the direction of translation: by the pixels'
     sigmas, or less in proportion, down to two thirds, where residuals are smaller than 0.3 of these."""
@@ -77,8 +74,6 @@ class InitialiserConfig(StrictModel):
 class TrackingConfig(StrictModel):
     """Pose of each frame against the submap."""
 
-    search_radius_px: float = Field(15.0, gt=0)
-    """Search radius about a landmark's predicted pixel, at the finest octave, when the motion model is trusted."""
     min_inliers: int = Field(20, ge=6)
     """Landmarks that must agree with a pose for it to be taken at all."""
     max_lost_s: float = Field(0.75, ge=0)
@@ -90,26 +85,17 @@ class TrackingConfig(StrictModel):
 class KeyframeConfig(StrictModel):
     """When a frame becomes a keyframe."""
 
-    max_tracked_ratio: float = Field(0.6, gt=0, le=1)
-    """A keyframe is due when fewer than this share of the last keyframe's landmarks is still tracked; from 1.4
-    degrees of parallax on; with less a smaller one, half of it where the camera turns in place."""
     max_parallax_deg: float = Field(4.0, gt=0)
     """Parallax at which a keyframe is due whatever is tracked."""
-    max_frames: int = Field(30, ge=1)
-    """Frames after which a keyframe is due if the camera moved at all."""
     weak_landmarks: int = Field(60, ge=10)
     """Tracked landmarks below which tracking is weak and a keyframe is due at once. Where so few near ones hold the
     camera's position, one is due as well when of their hold, one over the depth squared, less than half of what
-    `max_tracked_ratio` asks of their number is left."""
+    is asked of their number is left."""
 
 
 class MappingConfig(StrictModel):
     """New landmarks at a keyframe, and what is culled."""
 
-    min_parallax_deg: float = Field(1.0, gt=0)
-    """Smallest angle between the two rays of a new landmark."""
-    max_observations: int = Field(250, ge=50)
-    """Known landmarks that a keyframe holds on to, spread over its image: more make the solver slower, not better."""
     redundant_ratio: float = Field(0.9, gt=0, le=1)
     """A keyframe of whose landmarks this share is seen by three others at the same or a finer scale is culled."""
 
@@ -119,10 +105,6 @@ class HealthConfig(StrictModel):
 
     min_inliers: int = Field(25, ge=6)
     """Landmarks that must agree with the frame's pose."""
-    min_inlier_ratio: float = Field(0.35, ge=0, le=1)
-    """Share of the matched landmarks that must agree."""
-    max_chi2: float = Field(2.5, gt=0)
-    """Mean squared whitened residual per degree of freedom of the agreeing landmarks (1 is expected)."""
     max_refused: float = Field(0.5, ge=0, le=1)
     """Share of a new keyframe's matches that its graph may refuse: where the map contradicts the majority, the pose
     is wrong, and the keyframe is taken out again before the map grows about it. 1 lets every pose in."""
@@ -206,10 +188,6 @@ class RecoveryConfig(StrictModel):
     frames without a pose, is made again: the map knows depths better then, and more of the scene. It is too when the
     camera has been calibrated since, and, if any number stands here, when the run ends and the map has grown by half.
     One for poses alone that finds none is the last."""
-    covering_keyframes: int = Field(20, ge=0)
-    """Keyframes that a walk which only poses frames, or a search for a lost map, matches widely at most, beyond those
-    nearest in time: the ones that together show the most of the map, since in a gap the
-    camera may have looked anywhere. Each costs about 2 ms of CPU for a frame that is not found."""
     workers: int = Field(0, ge=0, le=16)
     """Processes for long work beside the tracking, which never waits for it (`--workers`): reverse tracking and
     self-calibration. With any there is one more, which solves the live map's graph. 0: inline, in the tracking process,
@@ -249,10 +227,6 @@ class GraphConfig(StrictModel):
     other keyframes see the same points (on a road), it is up to 2.5 times as many."""
     factors_per_landmark: int = Field(6, ge=3)
     """Views of a landmark that become factors, spread over its track; more where a keyframe would be short of them."""
-    update_every: int = Field(1, ge=1, le=10)
-    """Keyframes at which the graph is solved, once a map is past its first: a window of neighbours poses those between,
-    and these, too, before anything is mapped from them. At every second one a run on a road costs 8 % less, but a young
-    map on a road drifts more in scale."""
 
 
 class LinkingConfig(StrictModel):

@@ -12,7 +12,7 @@ from dualslam.backend.local_ba import bundle_adjust_arrays
 from dualslam.core.config.settings import InitialiserConfig
 from dualslam.core.types import Failure, FailureReason, FloatArray, Start, View
 from dualslam.frontends.features.orb import OrbFrontend
-from dualslam.frontends.tracking.initialiser import Initialiser
+from dualslam.frontends.tracking.initialiser import MIN_PARALLAX_DEG, Initialiser
 from dualslam.testing.point_world import CAMERA, SIZE_PX, PointWorld, cloud, path, pose_errors, random_features
 from tests.seeds import first_of
 
@@ -68,7 +68,7 @@ def test_near_points_start_a_map_however_many_are_far() -> None:
     start, refusals = feed(world.views())
     assert start is not None
     assert len(refusals) <= 4
-    assert start.numbers["parallax_deg"] < 0.5 * InitialiserConfig().min_parallax_deg
+    assert start.numbers["parallax_deg"] < 0.5 * MIN_PARALLAX_DEG
     T_true = world.T_world_cam[[view.index for view in start.views]]
     translation, rotation = pose_errors(start.T_first_cam, T_true)
     assert rotation.max() < ROTATION_RAD

@@ -402,7 +402,7 @@ class TestKeyframing:
         live = front_end(world, [0, 4, 8], start_at=8)
         seen = live.submap.landmark_of[8]
         seen = seen[(seen >= 0) & (live.submap.n_observations(seen) >= 3)]
-        config = KeyframeConfig(max_tracked_ratio=0.6, weak_landmarks=10)
+        config = KeyframeConfig(weak_landmarks=10)
         verdicts = {0.25: (True, True), 0.5: (False, True), 0.65: (False, False)}  # with little, and with much
         for share, (with_little, with_much) in verdicts.items():
             held = seen[: round(share * len(seen))]
@@ -434,7 +434,7 @@ class TestKeyframing:
             ids = np.full(max(len(track.landmark_ids), len(held)), NO_LANDMARK)
             ids[: len(held)] = held
             shown = replace(track, landmark_ids=ids)
-            return bool(keyframe_due(shown, live.submap, 8, KeyframeConfig(max_frames=1000)))
+            return bool(keyframe_due(shown, live.submap, 8, KeyframeConfig()))
 
         assert not due(seen)
         assert not due(np.concatenate([near, far[: 3 * len(far) // 4]])), "the far ones hold little"
