@@ -144,6 +144,7 @@ def test_a_torn_video_is_one_sentence_and_no_word_of_its_decoder(tmp_path: Path)
     assert done.stderr.startswith(f"dualslam: {tmp_path / 'torn.mp4'} is no video that OpenCV can open")
 
 
+@pytest.mark.slow
 def test_damaged_images_are_told_by_our_sentences_alone(folder: Path, tmp_path: Path) -> None:
     """A process of its own: decoders write to stderr past Python, and so does numpy of a calibration gone wild."""
     images = sorted((folder / "images").iterdir())[:4]
@@ -175,6 +176,7 @@ def test_a_quiet_run_without_a_map_says_why(
     assert captured.err == f"dualslam: no map; results in {out}\n"
 
 
+@pytest.mark.slow
 def test_letters_that_the_locale_lacks_stop_nothing(tmp_path: Path) -> None:
     """A process of its own, as the locale is the process's. A name that is no ASCII comes in as bytes."""
     out = tmp_path / "мой сон"

@@ -61,7 +61,7 @@ def log_scale(world: World, submap: Submap, ids: IntArray) -> float:
     return float(np.median(np.concatenate(ratios)))
 
 
-@pytest.mark.parametrize("layout", ["street", "room"])
+@pytest.mark.parametrize("layout", ["street", pytest.param("room", marks=pytest.mark.slow)])
 def test_the_sigma_is_that_of_the_error(layout: str) -> None:
     whitened = []
     for seed in range(8):

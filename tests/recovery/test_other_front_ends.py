@@ -53,7 +53,7 @@ def projected(features: Features, length: int) -> np.ndarray:
     return np.asarray(signs @ np.random.default_rng(7).normal(size=(256, length)) / 16)
 
 
-@pytest.fixture(scope="module", params=["sift", pytest.param("patches", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[pytest.param(name, marks=pytest.mark.slow) for name in ("sift", "patches")])
 def recovered(request: pytest.FixtureRequest) -> tuple[System, PointWorld]:
     """A run through a black-out, live features and recovery on the front end of that name."""
     world_of, module = {"sift": (SiftWorld, SiftFrontend), "patches": (PatchWorld, PatchFrontend)}[request.param]

@@ -161,6 +161,7 @@ def largest_error(system: System) -> float:
     return float(pose_errors(main.T_world_cam, ring(N + 12)[main.index])[0].max())
 
 
+@pytest.mark.slow
 def test_a_merge_by_sight_does_not_take_in_what_lies_beyond_a_loss() -> None:
     size = float(np.linalg.norm(np.ptp(ring(N)[:, :3, 3], axis=0)))
     as_one, system = merged_after_a_loss(False), merged_after_a_loss(True)

@@ -57,7 +57,7 @@ def pages(broken_run: RunData, make_run: MakeRun, tmp_path_factory: pytest.TempP
 
 
 @pytest.mark.parametrize("name", ["report", "compare"])
-@pytest.mark.parametrize("width", [390, 1400])
+@pytest.mark.parametrize("width", [390, pytest.param(1400, marks=pytest.mark.slow)])
 def test_a_page_is_drawn_and_fits_the_screen(pages: dict[str, Path], name: str, width: int, tmp_path: Path) -> None:
     shot = tmp_path / "shot.png"
     done = browse(pages[name], tmp_path / "profile", width, f"--screenshot={shot}")

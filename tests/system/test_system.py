@@ -55,6 +55,11 @@ def world() -> PointWorld:
 
 
 @pytest.fixture(scope="module")
+def short(world: PointWorld) -> PointWorld:
+    return PointWorld(world.xyz, world.T_world_cam[:40])
+
+
+@pytest.fixture(scope="module")
 def plain(world: PointWorld) -> System:
     return run(world)
 
@@ -80,13 +85,13 @@ def ended(
 
 
 @pytest.mark.parametrize("interrupted", [False, True])
-def test_each_map_is_refined_once_at_the_end_unless_someone_waits(world: PointWorld, interrupted: bool) -> None:
+def test_each_map_is_refined_once_at_the_end_unless_someone_waits(short: PointWorld, interrupted: bool) -> None:
     refined: list[int] = []
-    ended(world, lambda submap: refined.append(submap.id), interrupted)
+    ended(short, lambda submap: refined.append(submap.id), interrupted)
     assert refined == ([] if interrupted else [0])
 
 
-def test_frames_follow_the_refinement(world: PointWorld) -> None:
+def test_frames_follow_the_refinement(short: PointWorld) -> None:
     """Each keyframe a little farther to the side than the one before: frames between two go the way between theirs."""
 
     def shear(submap: Submap) -> None:
@@ -94,35 +99,35 @@ def test_frames_follow_the_refinement(world: PointWorld) -> None:
             T[:3, 3] += [0.0, 0.0, 0.01 * k]
 
     (index, T), (_, T_as_it_was) = (
-        main_trajectory(ended(world, refine, forget=True)) for refine in (shear, lambda submap: None)
+        main_trajectory(ended(short, refine, forget=True)) for refine in (shear, lambda submap: None)
     )
     moved = T[:, :3, 3] - T_as_it_was[:, :3, 3]
     np.testing.assert_allclose(moved[:, :2], 0.0, atol=0.01)
     np.testing.assert_allclose(moved[:, 2], 0.01 * np.array(index), atol=0.06)
 
 
-def test_frames_are_posed_by_the_landmarks_as_the_refinement_leaves_them(world: PointWorld) -> None:
+def test_frames_are_posed_by_the_landmarks_as_the_refinement_leaves_them(short: PointWorld) -> None:
     """The landmarks move to the side, the keyframes stay: so the frames between them move."""
     aside = np.array([0.05, 0.0, 0.0])
 
     def move(submap: Submap) -> None:
         submap.landmarks["xyz_mu"][:] += aside
 
-    system = ended(world, move)
-    (index, T), (_, T_as_it_was) = (main_trajectory(s) for s in (system, ended(world, lambda submap: None)))
+    system = ended(short, move)
+    (index, T), (_, T_as_it_was) = (main_trajectory(s) for s in (system, ended(short, lambda submap: None)))
     between = np.array([i not in system.atlas.submaps[0].keyframes for i in index])
-    assert between.sum() > 30
+    assert between.sum() > 15
     moved = T[:, :3, 3] - T_as_it_was[:, :3, 3]
     np.testing.assert_allclose(moved[between], np.tile(aside, (between.sum(), 1)), atol=2e-3)
     np.testing.assert_array_equal(moved[~between], 0.0)
 
 
-def test_a_refinement_that_fails_leaves_the_map_as_it_was(world: PointWorld) -> None:
+def test_a_refinement_that_fails_leaves_the_map_as_it_was(short: PointWorld) -> None:
     def fail(submap: Submap) -> None:
         raise SolverError("no")
 
-    indices, T = main_trajectory(ended(world, fail))
-    assert_right(indices, T, world)
+    indices, T = main_trajectory(ended(short, fail))
+    assert_right(indices, T, short)
 
 
 def test_all_frames_are_posed_and_right(plain: System, world: PointWorld) -> None:
@@ -181,9 +186,9 @@ def test_the_same_seed_gives_the_same_trajectory_bit_for_bit(plain: System, worl
     assert [e.as_dict() for e in plain.events] == [e.as_dict() for e in again.events]
 
 
-def test_results_tell_the_pose_of_the_moment(world: PointWorld) -> None:
-    system = system_in(world)
-    for frame in world.frames()[:30]:
+def test_results_tell_the_pose_of_the_moment(short: PointWorld) -> None:
+    system = system_in(short)
+    for frame in short.frames()[:30]:
         result = system.step(frame)
     assert result.T_submap_cam is not None
     assert result.n_inliers > 50
@@ -290,17 +295,6 @@ def test_a_lost_map_that_is_seen_again_before_another_starts_is_gone_on_with() -
     assert system.rows[69].status is FrameStatus.TRACKED
 
 
-@pytest.mark.slow
-def test_it_may_be_lost_again() -> None:
-    once, T = turning_back(25), turning_back(25).T_world_cam
-    world = PointWorld(once.xyz, np.concatenate([T, np.repeat(T[30:31], 12, 0)]))
-    system = run(world, recovery={"enabled": True})
-    assert kinds(system).count(EventKind.FAILED) == 2
-    assert kinds(system).count(EventKind.RELOCALISED) == 1
-    losses = breakages(tuple(system.events))
-    assert [(loss.submap, loss.relocalised, loss.recovered) for loss in losses] == [(0, True, True), (0, False, False)]
-
-
 def test_a_new_map_has_its_chance_after_each_loss(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lost, seen again, and lost once more: only after so many frames anew is it asked which submap shows them."""
     asked, sighted = [], Sightings.sighted
@@ -316,6 +310,9 @@ def test_a_new_map_has_its_chance_after_each_loss(monkeypatch: pytest.MonkeyPatc
     assert second > len(T)
     assert min(asked) == first + 16
     assert max(asked) < len(T)
+    assert kinds(system).count(EventKind.RELOCALISED) == 1
+    losses = breakages(tuple(system.events))
+    assert [(loss.submap, loss.relocalised, loss.recovered) for loss in losses] == [(0, True, True), (0, False, False)]
 
 
 @pytest.mark.slow

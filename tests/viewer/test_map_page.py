@@ -142,7 +142,7 @@ def test_the_report_leads_there(broken_run: RunData, page: str, tmp_path: Path) 
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
-@pytest.mark.parametrize("width", [500, 1400])
+@pytest.mark.parametrize("width", [500, pytest.param(1400, marks=pytest.mark.slow)])
 def test_a_browser_draws_it(page: str, width: int, tmp_path: Path) -> None:
     (tmp_path / "map.html").write_text(page)
     shot = tmp_path / "shot.png"

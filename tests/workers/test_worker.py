@@ -169,6 +169,7 @@ def test_the_end_of_a_run_waits_so_long_and_no_longer(job: RecoveryJob) -> None:
     assert gone(pid)
 
 
+@pytest.mark.slow
 def test_a_system_with_a_worker_ends_in_one_map() -> None:
     world = PointWorld(cloud(), hand_held(70), covered=COVERED)
     settings = {"enabled": True, "workers": 1, "finish_wait_s": PATIENCE_S}

@@ -164,6 +164,7 @@ def test_a_killed_worker_costs_its_recovery_and_nothing_else(workers: int) -> No
     assert system.rows[69].status is FrameStatus.TRACKED
 
 
+@pytest.mark.slow
 def test_the_command_line_takes_a_file_of_corruptions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from dualslam.cli import main
 
