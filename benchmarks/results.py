@@ -1,4 +1,4 @@
-"""Measure what the README and docs/results.md claim, and write the tables there, each with its commit.
+"""Measure what README, docs/index.md and docs/results.md claim, and write the tables there, each with its commit.
 
     python benchmarks/results.py --data DIR [--part sequences] [--part failures] [--part links]
                                  [--seeds 5] [--trials 4] [--worlds 8] [--jobs 2] [--out runs/results] [--write-only]
@@ -30,6 +30,7 @@ FIRST_SEED = 100
 CONDITIONS: dict[str, list[str]] = {"": [], "recovery off": ["--no-recovery"]}
 BLACK = ("kitti_03", "7scenes_1000")
 BLACK_FRAMES = 10
+SHORT = "failures in short"
 
 
 def main() -> None:
@@ -124,18 +125,19 @@ def _git(*arguments: str) -> str:
 
 
 def write(out: Path) -> None:
-    """Put the tables that were measured into README.md and docs/results.md, between their marks."""
+    """Put the tables that were measured into README.md and two pages of docs, between their marks."""
     tables = {"sequences": sequences_table(out), "failures": failures_tables(out), "links": links_table(out)}
-    for page, parts in ((ROOT / "README.md", PARTS[:1]), (ROOT / "docs" / "results.md", PARTS)):
-        text = page.read_text()
+    tables[SHORT] = short_table(tables["failures"])
+    for page, parts in (("README.md", (SHORT,)), ("docs/index.md", (SHORT,)), ("docs/results.md", PARTS)):
+        text = (ROOT / page).read_text()
         for part in parts:
             if table := tables[part]:
-                note = _note_of_commit(out, part)
+                note = _note_of_commit(out, part.split()[0])
                 if not note.exists():
                     sys.exit(f"{note} is missing: nothing says at which commit {part} were measured")
                 commit = note.read_text().strip()
                 text = _filled(text, part, f"Commit `{commit}`, `make results`.\n\n{table}\n")
-        page.write_text(text)
+        (ROOT / page).write_text(text)
 
 
 def _filled(text: str, part: str, content: str) -> str:
@@ -181,6 +183,19 @@ def failures_tables(out: Path) -> str | None:
     sections = re.split(r"(?m)^(?=### )", page.read_text())
     wanted = [s.strip() for s in sections if s.startswith(("### Table II", "### Table III", "### Eq. (1)"))]
     return "\n\n".join(wanted)
+
+
+def short_table(tables: str | None) -> str | None:
+    """Return the failed trials by kind of recording, without recovery and with it, from the failure bench's tables."""
+    rows = re.findall(r"(?m)^\| data: ([\w-]+) \| (base|Dual) \| (\d+) \| (\d+) \|", tables or "")
+    failed = {(data, variant): f"{failures} of {trials}" for data, variant, failures, trials in rows}
+    kinds = dict.fromkeys(data for data, _ in failed)
+    lines = [_line((kind, failed.get((kind, "base"), "-"), failed.get((kind, "Dual"), "-"))) for kind in kinds]
+    return (
+        "\n".join([_line(("recordings", "failed, recovery off", "failed, recovery on")), "|---|---|---|", *lines])
+        if lines
+        else None
+    )
 
 
 def links_table(out: Path) -> str | None:

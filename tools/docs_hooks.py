@@ -1,4 +1,4 @@
-"""What the documentation is built with besides mkdocs: equations as MathML, the configuration, and the notebooks.
+"""Build hooks of the documentation: equations as MathML, configuration, notebooks, and search from the disk.
 
 mkdocs calls the functions named ``on_...`` for each page. Equations are written as on GitHub: ``$...$`` within a
 line, ``$$...$$`` on lines of their own.
@@ -49,6 +49,13 @@ def notebook_page(notebook: dict[str, Any], name: str) -> str:
                 parts.append(f"```text\n{text.rstrip()}\n```")
     parts.insert(1, f"*This page is `notebooks/{name}`, with what it printed and drew.*")
     return "\n\n".join(parts) + "\n"
+
+
+def on_post_build(config: Any, **_: Any) -> None:
+    """Write the search index as a script, too: pages from the disk may not fetch it (`search_from_disk.js`)."""
+    folder = Path(config.site_dir) / "search"
+    index = (folder / "search_index.json").read_text(encoding="utf-8")
+    (folder / "search_index.js").write_text(f"const searchIndex = {index};\n", encoding="utf-8")
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:

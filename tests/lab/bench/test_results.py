@@ -1,4 +1,4 @@
-"""The tables of README and docs/results.md: each with the commit that it was measured at."""
+"""The tables of README and docs: each with the commit that it was measured at."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ ROOT = Path(__file__).parents[3]
 SUMMARY = {"coverage": 0.987, "ate_rmse_m": 0.125, "failures": 2, "recoveries": 1, "relocalised": 0}
 SUMMARY["cpu_ms_per_frame"] = 30
 ROW = "| walk | as it is | 1 | 98.7 (98.7) | 0.125 (0.125) | 2 | 1 | 30 (30) |"
-TABLES = "### Table II: failures\n\n| a |\n|---|\n| 17 |\n\n### Table IV: not asked for\n\n| b |\n"
+ROWS = (
+    "| data: road | base | 15 | 16 | 93.8 |\n| data: road | Dual | 1 | 16 | 6.2 |\n| data: road | Dual+ | 3 | 16 | 19 |"
+)
+TABLES = f"### Table II: failures\n\n| a |\n|---|\n{ROWS}\n\n### Table IV: not asked for\n\n| b |\n"
 
 
 @pytest.fixture
@@ -26,7 +29,7 @@ def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     (tmp_path / "pages" / "docs").mkdir(parents=True)
-    for page in ("README.md", "docs/results.md"):
+    for page in ("README.md", "docs/index.md", "docs/results.md"):
         shutil.copy(ROOT / page, tmp_path / "pages" / page)
     monkeypatch.setattr(module, "ROOT", tmp_path / "pages")
     return module
@@ -51,11 +54,14 @@ def test_each_table_names_the_commit_that_it_was_measured_at(results: ModuleType
     (out / "failures").mkdir()
     (out / "failures" / "tables.md").write_text(TABLES)
     results.write(out)
-    for written in (page, results.ROOT / "README.md"):
-        assert part_of(written, "sequences").startswith("Commit `aaaa`, `make results`.\n\n| sequence |")
-        assert ROW in part_of(written, "sequences")
+    assert part_of(page, "sequences").startswith("Commit `aaaa`, `make results`.\n\n| sequence |")
+    assert ROW in part_of(page, "sequences")
+    for written in (results.ROOT / "README.md", results.ROOT / "docs" / "index.md"):
+        short = part_of(written, "failures in short")
+        assert short.startswith("Commit `bbbb`, `make results`.\n\n| recordings |")
+        assert short.endswith("|---|---|---|\n| road | 15 of 16 | 1 of 16 |\n")
     assert part_of(page, "failures").startswith("Commit `bbbb`, `make results`.\n\n### Table II")
-    assert "| 17 |" in part_of(page, "failures")
+    assert ROWS in part_of(page, "failures")
     assert "not asked for" not in part_of(page, "failures")
     assert part_of(page, "links") == links  # what was not measured stands as it was
 
