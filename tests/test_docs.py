@@ -39,6 +39,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_it_builds_and_asks_for_nothing_outside(site: Path) -> None:
     pages = list(site.rglob("*.html"))
     assert len(pages) > 10
@@ -47,6 +48,7 @@ def test_it_builds_and_asks_for_nothing_outside(site: Path) -> None:
         assert not [url for url in fetched if re.match(r"(https?:)?//", url)]
 
 
+@pytest.mark.slow
 def test_every_field_of_the_configuration_is_explained(site: Path) -> None:
     text = (site / "configuration.html").read_text()
     for path in all_paths(Config):
@@ -54,6 +56,7 @@ def test_every_field_of_the_configuration_is_explained(site: Path) -> None:
         assert (f">{path}</h" if section else f"<code>{path}</code>") in text
 
 
+@pytest.mark.slow
 def test_equations_are_drawn_and_code_is_left_alone(site: Path, hooks: ModuleType) -> None:
     assert (site / "theory.html").read_text().count(
         '<math xmlns="http://www.w3.org/1998/Math/MathML" display="block"'

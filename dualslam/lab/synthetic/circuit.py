@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.spatial import KDTree
 
 from dualslam.core.types import FloatArray
 from dualslam.lab.synthetic.road import Road
@@ -100,14 +101,15 @@ def _lined(seed: int, road: ClosedRoad, word: int) -> tuple[Scene, Road]:
     line = road.centre(np.arange(0, road.length_m, 0.5))
     area = float(np.sum(line[:-1, 0] * line[1:, 1] - line[1:, 0] * line[:-1, 1]))
     built += back_row(rng, road, 1.0 if area > 0 else -1.0)
-    built = [surface for surface in built if _is_clear(surface, line)]
+    near = KDTree(line)
+    built = [surface for surface in built if _is_clear(surface, near)]
     return Scene((*ground(rng, road), *built, *horizon()), background=240, seed=seed), road
 
 
-def _is_clear(surface: Surface, line: FloatArray) -> bool:
+def _is_clear(surface: Surface, line: KDTree) -> bool:
     """Whether a surface leaves the road free."""
     steps = np.linspace(0, 1, 7)
     s, t = np.meshgrid(steps, steps)
     points = surface.origin + s[..., None] * surface.side_s + t[..., None] * surface.side_t
     foot = points[..., [0, 2]].reshape(-1, 2)
-    return bool(np.linalg.norm(foot[:, None] - line, axis=2).min() > CLEAR_M)
+    return bool(np.min(line.query(foot)[0]) > CLEAR_M)

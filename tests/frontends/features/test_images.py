@@ -53,9 +53,9 @@ def test_trajectory_is_right(scene: str, n_frames: int, size: dict[str, int], sh
 
 @pytest.mark.parametrize("kind", [Spoil.BLACKOUT, pytest.param(Spoil.WIPE, marks=pytest.mark.slow)])
 def test_no_map_starts_while_nothing_is_seen(kind: Spoil) -> None:
-    hidden = range(20, 45)
+    hidden = range(15, 28)
     dark = Corruption(kind=kind, start=hidden.start, length=len(hidden))
-    sequence = make_sequence("street", 60, seed=1, events=[dark], **SIZE)
+    sequence = make_sequence("street", 42, seed=1, events=[dark], **SIZE)
     system = run(sequence)
     assert len(system.atlas.submaps) == 2
     (again,) = system.events.of_kind(EventKind.REINITIALISED)
