@@ -120,18 +120,8 @@ class System:
             self._state.front_ends,
             self._max_scale_sigma,
         )
-        self._calibrations = Calibrations(
-            record, self.buffer, components.calibration, components.desk, components.new_graph, self._connections
-        )
-        self._shutter_watch = ShutterWatch(
-            record,
-            self.buffer,
-            components.calibration,
-            components.shutter,
-            components.desk,
-            components.new_graph,
-            self._connections,
-        )
+        self._calibrations = Calibrations(self._state, self._recoveries, self._connections)
+        self._shutter_watch = ShutterWatch(self._state, self._recoveries, self._connections)
         # The steps of a frame.
         sightings = self._revisits.sightings
         extends = saved is not None and not localise and config.places.enabled and config.loops.enabled
@@ -252,7 +242,7 @@ class System:
         self._graphs.collect(frame)
         self._places.collect(frame)
         in_map = state.relocaliser.relocaliser if state.live is None else state.live
-        if self._calibrations.collect(in_map, frame, self._recoveries.waiting):
+        if self._calibrations.collect(in_map, frame):
             if state.live is None:
                 self._starting.begin_again()
             elif state.lost:
@@ -293,7 +283,7 @@ class System:
         self._graphs.finish(last)
         if state.live is not None and last is not None:
             asks = not interrupted and self.saved is None
-            self._calibrations.finish(state.live, last, self._recoveries.waiting, asks)
+            self._calibrations.finish(state.live, last, asks)
         solve = partial(self._graphs.finish, last)
         self._recoveries.finish(state.live, last, interrupted or state.localises, solve)
         if state.live is not None and last is not None:
@@ -379,7 +369,7 @@ class System:
         if self._endings.part_where_scale_is_lost(live, view):
             return
         self._ask_shutter(live, view)
-        self._calibrations.ask_if_due(live, view, self._recoveries.waiting)
+        self._calibrations.ask_if_due(live, view)
         if self._endings.is_full(live.submap):
             self._take_open(live, view)
             self._endings.roll_over(live, view)
@@ -397,7 +387,7 @@ class System:
         """Take in how long its images were read; not while open results for the map have the present pixels."""
         open_ = self._recoveries.is_under_way(live.submap) or self.desk.n_open(JobKind.CALIBRATION, live.submap.id)
         if not open_:
-            self._shutter_watch.collect(live, now, self._recoveries.waiting, wait)
+            self._shutter_watch.collect(live, now, wait)
 
     def _lose(self, live: VisualOdometry, view: View, failure: Failure) -> Track | Failure:
         """Take a frame that was not posed: the map may be relocalised until the next one starts, or it is given up."""
@@ -428,7 +418,7 @@ class System:
         self.buffer.freeze()
         # A map whose end is suspected is no witness.
         if all(frame.failed for frame in self._state.health.suspected()):
-            self._calibrations.ask_at_loss(live, view, self._recoveries.waiting)
+            self._calibrations.ask_at_loss(live, view)
         self._take_open(live, view)
         self._starting.begin_anew([])
         self._starting.foresee()
@@ -437,7 +427,7 @@ class System:
     def _take_open(self, live: VisualOdometry, now: FrameStamp) -> None:
         """Wait, where no clock goes on, for what a map that may end is still to hear of its camera."""
         if not self.pace.in_real_time:
-            self._calibrations.collect(live, now, self._recoveries.waiting, wait=True)
+            self._calibrations.collect(live, now, wait=True)
             self._take_shutter(live, now, wait=True)
 
     def _begin_anew(self) -> None:

@@ -9,30 +9,24 @@ becomes what the snapshot was changed to.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 
 from dualslam.atlas.connections import Connections
-from dualslam.atlas.record import FrameStamp, Record
+from dualslam.atlas.record import FrameStamp
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import se3, sim3
-from dualslam.core.interfaces import SubmapGraph, VisualOdometry
+from dualslam.core.interfaces import VisualOdometry
 from dualslam.core.jobs import Desk, JobKind
-from dualslam.core.types import Failure, FailureReason, View
+from dualslam.core.types import Failure, FailureReason
 from dualslam.map.late_estimate import apply_late
-from dualslam.map.lens import (
-    Calibration,
-    CalibrationAnswer,
-    CalibrationJob,
-    change_camera,
-    rectified_where_possible,
-)
+from dualslam.map.lens import CalibrationAnswer, CalibrationJob, change_camera, rectified_where_possible
 from dualslam.map.submap import Submap
 from dualslam.map.submap_change import change_of_frame
+from dualslam.recovery.manager import Recoveries
+from dualslam.system.state import State
 
 log = logging.getLogger(__name__)
 
@@ -40,64 +34,40 @@ SAME_GAUGE = 1e-6
 """Relative. A snapshot whose gauge the submap still has needs no change of frame; a solution moves it by rounding."""
 
 
-class Views(Protocol):
-    """Buffered views, which change to another camera with the maps."""
-
-    def map_later(self, change: Callable[[View], View], subject: str) -> None:
-        """Change each view, at the latest when somebody looks at it."""
-        ...
-
-
 class Calibrations:
     """Asks live submaps about their camera, and takes the answers in between two frames.
 
     Parameters
     ----------
-    record : Record
-    buffer : Views
-    calibration : Calibration
-    desk : Desk
-        Where the questions are answered.
-    new_graph : callable
+    state : State
+    recoveries : Recoveries
+        Knows the lost submaps, which are to be linked with the live one and must have the same camera.
     connections : Connections
     """
 
-    def __init__(
-        self,
-        record: Record,
-        buffer: Views,
-        calibration: Calibration,
-        desk: Desk,
-        new_graph: Callable[[], SubmapGraph],
-        connections: Connections,
-    ) -> None:
-        self._record = record
-        self._buffer = buffer
-        self._calibration = calibration
-        self._desk = desk
-        self._new_graph = new_graph
-        self._connections = connections
+    def __init__(self, state: State, recoveries: Recoveries, connections: Connections) -> None:
+        self._desk: Desk = state.parts.desk
+        self._record, self._buffer = state.record, state.buffer
+        self._calibration, self._new_graph = state.parts.calibration, state.parts.new_graph
+        self._recoveries, self._connections = recoveries, connections
 
-    def ask_if_due(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int]) -> None:
-        """Ask the live submap about its camera where it is time to.
-
-        `lost`: the submaps that are to be linked with it, and must have the same camera.
-        """
+    def ask_if_due(self, live: VisualOdometry, now: FrameStamp) -> None:
+        """Ask the live submap about its camera where it is time to."""
         if self._calibration.is_due(live.submap):
-            self._ask(live, now, lost)
+            self._ask(live, now)
 
-    def ask_at_loss(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int]) -> None:
+    def ask_at_loss(self, live: VisualOdometry, now: FrameStamp) -> None:
         """Ask the live submap as its track is lost, so that the next map has its camera from the first frame on."""
         if self._calibration.is_due_at_loss(live.submap):
-            self._ask(live, now, lost)
+            self._ask(live, now)
 
-    def finish(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int], ask: bool) -> None:
+    def finish(self, live: VisualOdometry, now: FrameStamp, ask: bool) -> None:
         """Take in what is open at the end of the run; `ask`: a live submap that has said nothing yet is asked.
 
         A wrong camera bends a short map as it does a long one. The map stays as it is: one that a wrong camera has
         broken is not mended by a better one.
         """
-        self.collect(live, now, lost, wait=True)
+        self.collect(live, now, wait=True)
         if not ask or not self._calibration.is_due_at_end(live.submap):
             return
         with self._record.timer.measure("calibration"):
@@ -106,15 +76,16 @@ class Calibrations:
             kept, reason = EventKind.CALIBRATION_KEPT, "asked at the end of the run"
             self._record.event(kept, now, live.submap.id, reason=reason, **found.numbers)
 
-    def _ask(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int]) -> None:
+    def _ask(self, live: VisualOdometry, now: FrameStamp) -> None:
         if self._desk.n_open(JobKind.CALIBRATION, live.submap.id):
             return
+        submaps = self._record.atlas.submaps
         with self._record.timer.measure("calibration"):
-            job = self._calibration.ask(live.submap, {m: self._record.atlas.submaps[m] for m in lost})
+            job = self._calibration.ask(live.submap, {m: submaps[m] for m in self._recoveries.waiting})
             self._desk.submit(JobKind.CALIBRATION, job, of=live.submap.id)
-        self.collect(live, now, lost)
+        self.collect(live, now)
 
-    def collect(self, live: VisualOdometry | None, now: FrameStamp, lost: Collection[int], wait: bool = False) -> bool:
+    def collect(self, live: VisualOdometry | None, now: FrameStamp, wait: bool = False) -> bool:
         """Take in the answers; `live` continues in its submap as it is after that.
 
         It may be the front end that looks for a submap which was lost since it was asked. Returns whether the frames to
@@ -123,7 +94,7 @@ class Calibrations:
         before, desk = self._calibration.camera, self._desk
         for ended in desk.drain(JobKind.CALIBRATION) if wait else desk.poll(JobKind.CALIBRATION):
             with self._record.timer.measure("calibration"):
-                self._take(ended.work, ended.result, live, now, lost)
+                self._take(ended.work, ended.result, live, now)
         return self._calibration.camera is not before
 
     def _take(
@@ -132,10 +103,9 @@ class Calibrations:
         result: CalibrationAnswer | Failure,
         live: VisualOdometry | None,
         now: FrameStamp,
-        lost: Collection[int],
     ) -> None:
         """Let submap, graph, buffer and lost submaps change to the camera that was found, all of them or none."""
-        failure = result if isinstance(result, Failure) else self._take_answer(job, result, live, now, lost)
+        failure = result if isinstance(result, Failure) else self._take_answer(job, result, live, now)
         if isinstance(failure, Failure):
             self._calibration.note(job, failure)
             kept = EventKind.CALIBRATION_KEPT
@@ -150,7 +120,6 @@ class Calibrations:
         answer: CalibrationAnswer,
         live: VisualOdometry | None,
         now: FrameStamp,
-        lost: Collection[int],
     ) -> list[int] | Failure:
         """Return the lost submaps that have changed, too."""
         if live is None or live.submap.id != job.submap.id:
@@ -168,7 +137,7 @@ class Calibrations:
         live.adopt(graph, before)
         self._buffer.map_later(self._calibration.rectified, "camera")
         self._connections.follow(before, live.submap, now)
-        changed = [m for m in sorted(lost) if self._change_lost(m, job, answer, now)]
+        changed = [m for m in self._recoveries.waiting if self._change_lost(m, job, answer, now)]
         rectified = partial(rectified_where_possible, camera=answer.camera)
         for m in (live.submap.id, *changed):
             self._record.change_pixels(m, lambda _: rectified)

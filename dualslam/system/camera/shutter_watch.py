@@ -9,25 +9,24 @@ walk moves the scale behind such a turn by 4 %, which nothing else shows.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from functools import partial
-from typing import Protocol
 
 from dualslam.atlas.connections import Connections
-from dualslam.atlas.record import FrameStamp, Record
+from dualslam.atlas.record import FrameStamp
 from dualslam.core.camera.base import Camera
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import ReadoutEstimate
 from dualslam.core.events import EventKind
-from dualslam.core.interfaces import Shutter, SubmapGraph, VisualOdometry
-from dualslam.core.jobs import Desk, JobKind
-from dualslam.core.types import Failure, FloatArray, View
+from dualslam.core.interfaces import Shutter, VisualOdometry
+from dualslam.core.jobs import JobKind
+from dualslam.core.types import Failure, FloatArray
 from dualslam.map.frame_observations import Change
-from dualslam.map.lens import Calibration
 from dualslam.map.submap import Submap
-from dualslam.system.camera.background import Views
+from dualslam.recovery.frame_buffer import FrameBuffer
+from dualslam.recovery.manager import Recoveries
 from dualslam.system.camera.turns import turn_rates
+from dualslam.system.state import State
 
 log = logging.getLogger(__name__)
 
@@ -45,55 +44,21 @@ MAX_SIGMA_S = 0.004
 rendered street, which hardly turns: -0.020 s with 0.008 claimed). There it does not matter either."""
 
 
-class ReadViews(Views, Protocol):
-    """Buffered views, which change to another shutter with the maps."""
-
-    @property
-    def indices(self) -> list[int]:
-        """Return whose they are, the oldest first."""
-        ...
-
-    def newest(self, n: int) -> list[View]:
-        """Return so many of the newest views, from the oldest to the newest."""
-        ...
-
-    def change_all(self, change: Callable[[Iterable[View]], Iterable[View]]) -> None:
-        """Put what `change` makes of the views, oldest first, into their places."""
-        ...
-
-
 class ShutterWatch:
     """Asks live submaps how long their images were read, and takes the answer in between two frames.
 
     Parameters
     ----------
-    record : Record
-    buffer : ReadViews
-    calibration : Calibration
-    shutter : Shutter
-    desk : Desk
-        Where the questions are answered.
-    new_graph : callable
+    state : State
+    recoveries : Recoveries
+        Knows the lost submaps, which are to be linked with the live one and must have the same pixels.
     connections : Connections
     """
 
-    def __init__(
-        self,
-        record: Record,
-        buffer: ReadViews,
-        calibration: Calibration,
-        shutter: Shutter,
-        desk: Desk,
-        new_graph: Callable[[], SubmapGraph],
-        connections: Connections,
-    ) -> None:
-        self._record = record
-        self._buffer = buffer
-        self._calibration = calibration
-        self._shutter = shutter
-        self._desk = desk
-        self._new_graph = new_graph
-        self._connections = connections
+    def __init__(self, state: State, recoveries: Recoveries, connections: Connections) -> None:
+        self._record, self._buffer, self._desk = state.record, state.buffer, state.parts.desk
+        self._calibration, self._shutter = state.parts.calibration, state.parts.shutter
+        self._new_graph, self._recoveries, self._connections = state.parts.new_graph, recoveries, connections
         self._due_at: dict[int, float] = {}  # by submap, keyframes
         self._asked: dict[int, tuple[object, float, Camera]] = {}  # by submap: what, and of which pixels
 
@@ -113,22 +78,16 @@ class ShutterWatch:
                     self._asked[submap.id] = question, self._shutter.readout_s, self._calibration.camera
                     self._desk.submit(JobKind.READOUT, question, of=submap.id)
 
-    def collect(self, live: VisualOdometry, now: FrameStamp, lost: Collection[int], wait: bool = False) -> None:
-        """Take in what the live submap has answered.
-
-        `lost`: the submaps that are to be linked with it, and must have the same pixels. `wait`: for a limited time,
-        for what is open.
-        """
+    def collect(self, live: VisualOdometry, now: FrameStamp, wait: bool = False) -> None:
+        """Take in what the live submap has answered; `wait`: for a limited time, for what is open."""
         for ended in self._desk.drain(JobKind.READOUT) if wait else self._desk.poll(JobKind.READOUT):
             asked = self._asked.get(live.submap.id)
             # An answer of another map, or of other pixels, is no answer.
             if asked == (ended.work, self._shutter.readout_s, self._calibration.camera):
                 with self._record.timer.measure("shutter"):
-                    self._take_answer(ended.result, live, now, lost)
+                    self._take_answer(ended.result, live, now)
 
-    def _take_answer(
-        self, answer: ReadoutEstimate | Failure, live: VisualOdometry, now: FrameStamp, lost: Collection[int]
-    ) -> None:
+    def _take_answer(self, answer: ReadoutEstimate | Failure, live: VisualOdometry, now: FrameStamp) -> None:
         submap = live.submap
         if isinstance(answer, Failure) or not _is_sure(answer):
             return
@@ -137,7 +96,7 @@ class ShutterWatch:
             return
         self._due_at[submap.id] = SOON * len(submap.keyframes)
         submaps = self._record.atlas.submaps
-        changed = [m for m in sorted(lost) if self._change(submaps[m], answer.more_s, now)]
+        changed = [m for m in self._recoveries.waiting if self._change(submaps[m], answer.more_s, now)]
         self._take(readout_s)
         sigma_s = INFLATION * answer.sigma_s
         self._record.event(EventKind.SHUTTER_FOUND, now, submap.id, readout_s=readout_s, sigma_s=sigma_s, lost=changed)
@@ -180,7 +139,7 @@ class ShutterWatch:
         correct_views(self._buffer, self._shutter, camera)
 
 
-def correct_views(buffer: ReadViews, shutter: Shutter, camera: Camera) -> None:
+def correct_views(buffer: FrameBuffer, shutter: Shutter, camera: Camera) -> None:
     """Let the buffered views be read in the time that the shutter has now."""
     correction = shutter.correction(buffer.indices, camera)
     if correction is None:
