@@ -1,7 +1,7 @@
-"""What can be chosen, and the numbers that go with each choice. Imports neither torch nor kornia.
+"""The kornia front end's options and their default numbers. Imports neither torch nor kornia.
 
-Numbers of `dog` and `harris` were measured (docs/frontends.md), those of the networks are their authors', with the
-reason; every one can be set in the config.
+Numbers of `dog` and `harris` were measured (docs/notes/2026-11-21-front-ends-compared.md). Those of the networks are
+their authors', with the reason. Every one can be set in the config.
 """
 
 from __future__ import annotations
