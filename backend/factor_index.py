@@ -34,6 +34,8 @@ SMALL_MAP = 20
 """Keyframes up to which all that a graph can bear are factors: in a small map every observation counts, and none costs
 much. At the next keyframe the choice is made anew."""
 ALL = 1 << 30
+FACTORS_PER_LANDMARK = 6
+"""Views of a landmark that become factors, spread over its track; more where a keyframe would be short of them."""
 BUDGET, MOST_RATIO = 3000, 2.5
 """Factors of all keyframes that see what the newest ones see, about: with fewer such keyframes each has more of them,
 up to so many times `GraphConfig.factors_per_keyframe`."""
@@ -214,7 +216,7 @@ class FactorIndex:
 
     def _choose(self, submap: Submap, admitted: BoolArray, factors: BoolArray, a_part: bool) -> BoolArray:
         """Return which of the admitted rows are to be factors."""
-        obs, config = submap.observations, self._config
+        obs = submap.observations
         keyframes = np.array(list(submap.keyframes), np.int64)
         self._per_keyframe = self._factors_per_keyframe(submap, admitted, keyframes) if a_part else ALL
         if 2 * self._per_keyframe <= self._chosen_with:
@@ -228,7 +230,7 @@ class FactorIndex:
             keyframes,
             len(submap.landmarks),
             self._per_keyframe,
-            config.factors_per_landmark if self._per_keyframe < ALL else ALL,
+            FACTORS_PER_LANDMARK if self._per_keyframe < ALL else ALL,
             2 if young else MIN_VIEWS,
         )
 

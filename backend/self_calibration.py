@@ -37,6 +37,8 @@ from dualslam.core.geometry import so3
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.map.submap import Submap
 
+MAX_KEYFRAMES = 60
+"""Keyframes of the window, neighbours in time; of all such windows the one with most turning."""
 MIN_ROTATION_DEG = 15.0
 """Turning, summed over the window, below which nothing is tried: the focal length could not be known."""
 INFLATION = 4.0
@@ -97,7 +99,7 @@ def estimate_calibration(
         A failure where the window holds too little, or the solver failed; an estimate is to be used only where it
         is `accepted`.
     """
-    problem = _ask(submap, choose_window(submap, config.max_keyframes), camera, config, seed)
+    problem = _ask(submap, choose_window(submap, MAX_KEYFRAMES), camera, config, seed)
     if isinstance(problem, Failure):
         return problem
     return estimate_correction(problem, camera.width, correction_of(camera), config, robust_k, present_covariance)

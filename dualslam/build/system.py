@@ -21,6 +21,7 @@ from dualslam.build.parts import (
 from dualslam.build.walks import recovery_parts
 from dualslam.build.workers import (
     MAP_KINDS,
+    WALK_LIMIT_S,
     WORKER_BUDGET,
     features_beside,
     inline_handlers,
@@ -142,7 +143,7 @@ def build_system(
     else:
         executor = worker_desk(config, camera, faults, watch)
     schedule = schedule or (After() if workers else AT_ONCE)
-    budget_s = WORKER_BUDGET * config.recovery.time_limit_s
+    budget_s = WORKER_BUDGET * WALK_LIMIT_S
     desk = ScheduledDesk(executor, schedule, config.recovery.finish_wait_s, budget_s)
     open_one = partial(open_graph, new_graph=new_graph)
     graphs = BesideGraphs(desk, window_solver(config), open_one) if workers else None

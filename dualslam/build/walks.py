@@ -87,7 +87,7 @@ def recovery_parts(
         max_scale_sigma=config.linking.max_live_scale_sigma,
         propagate=lambda link, new, newest_id, bend: propagate_to_live_end(link, new, newest_id, config.linking, bend),
         check_camera=lambda submap, link, job: check_camera(
-            submap, link, job.newest_id, partial(_preferred_camera, job, config), config.linking, config.calibration
+            submap, link, job.newest_id, partial(_preferred_camera, job, config), config.linking
         ),
         judge=lambda track: judge_track(track, config.health),
         config=config.recovery,

@@ -30,6 +30,8 @@ from dualslam.workers.start_beside import StartServer
 
 WORKER_BUDGET = 0.75
 """Share of the time after which a worker counts as hung that its walks may take: what they have by then is not lost."""
+WALK_LIMIT_S = 120.0
+"""After which a worker counts as hung, and its recovery as failed. A walk over a full buffer of 10 s takes a tenth."""
 GRAPH_LIMIT_S = 30.0
 """After which the process that has the graphs counts as hung: a batch over a full submap takes a second."""
 FEATURES_LIMIT_S = 10.0
@@ -127,7 +129,7 @@ def worker_desk(config: Config, camera: Camera, faults: FaultScript, watch: Walk
         ),
         partial(walk_handlers, config, camera, n_threads),
         recovery.workers,
-        recovery.time_limit_s,
+        WALK_LIMIT_S,
         niceness=WALK_NICENESS,
     )
     live_map = Lane(

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dualslam.core.config.calibration_config import CalibrationConfig
 from dualslam.core.config.settings import LinkingConfig
 from dualslam.core.estimates import PreferredCamera
 from dualslam.core.geometry import so3
@@ -28,6 +27,8 @@ from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking.estimate import LinkEstimate
 from dualslam.map.submap import Submap
 
+MAX_KEYFRAMES = 60
+"""Of a larger map so many keyframes are asked, at even spaces."""
 MIN_PLACE = 5
 """Keyframes whose positions tell the scale of a place."""
 
@@ -80,7 +81,6 @@ def check_camera(
     live_since: int,
     find: Callable[[Submap, IntArray], PreferredCamera | None],
     config: LinkingConfig,
-    calibration: CalibrationConfig,
 ) -> Bend | Failure:
     """Return the bend that the camera may have made in a new map, none where its pixels say nothing of it.
 
@@ -95,8 +95,6 @@ def check_camera(
     find : callable
         Asks keyframes of the submap about the camera.
     config : LinkingConfig
-    calibration : CalibrationConfig
-        Keyframes of a map that has more than its window holds are asked at even spaces.
 
     Returns
     -------
@@ -108,8 +106,8 @@ def check_camera(
     ids = np.array(sorted(submap.keyframes), np.int64)
     here, there = _places(ids, link.agreeing_keyframes, live_since)
     ids = ids[(ids >= min(here[0], there[0])) & (ids <= max(here[-1], there[-1]))]
-    if len(ids) > calibration.max_keyframes:
-        ids = ids[np.linspace(0, len(ids) - 1, calibration.max_keyframes).astype(np.int64)]
+    if len(ids) > MAX_KEYFRAMES:
+        ids = ids[np.linspace(0, len(ids) - 1, MAX_KEYFRAMES).astype(np.int64)]
     found = find(submap, ids)
     if found is None:
         return NO_BEND

@@ -39,11 +39,18 @@ from dualslam.frontends.tracking.near_points import N_PROOF, nearer_than_proven,
 from dualslam.frontends.tracking.resection import resect
 from dualslam.frontends.tracking.two_view_hypotheses import MIN_NOISE2, RelativePoses
 
+MIN_POINTS = 50
+"""Triangulated points that must survive the first bundle adjustment."""
+MIN_MATCHES = round(1.2 * MIN_POINTS)
+"""Matches between the two views below which no model is tried: a sixth of them may be wrong."""
 MIN_PARALLAX_DEG = 1.0
-"""Angle under which the two cameras must see half as many points as `min_points`, after the rotation is taken out.
+"""Angle under which the two cameras must see half as many points as `MIN_POINTS`, after the rotation is taken out.
 However many more are far away: on a road most are, and the near ones fix the motion."""
 MAX_CHI2 = 2.5
 """Mean squared whitened residual per degree of freedom after the bundle adjustment (1 is expected)."""
+MAX_DIRECTION_SIGMA_DEG = 1.5
+"""Largest standard deviation (from the bundle adjustment's Hessian) of the direction of translation: by the pixels'
+sigmas, or less in proportion, down to two thirds, where residuals are smaller than 0.3 of these."""
 MIN_SUPPORT = 0.6
 """Share of the points that the frames between the two views must confirm by their own pixels."""
 MAX_VIEWS = 120
@@ -108,7 +115,6 @@ class Initialiser:
             nearest_search(frontend)  # a front end without it is told so before the first frame
         self._adjuster = adjuster
         self._config = config
-        self._loose_direction_sigma_deg = DIRECTION_MARGIN * config.max_direction_sigma_deg
         self._K = K
         self._size_px = size_px
         self._seed = seed
@@ -128,8 +134,8 @@ class Initialiser:
         self.collect(view)
         lenience = float(np.clip(waited_s / PATIENCE_S, 1.0, MAX_LENIENCE))
         best = Failure(FailureReason.TOO_FEW_MATCHES, "one view")
-        if len(view.features) < self._config.min_matches:
-            gate = Gate("features", len(view.features), ">=", self._config.min_matches)
+        if len(view.features) < MIN_MATCHES:
+            gate = Gate("features", len(view.features), ">=", MIN_MATCHES)
             return Failure(FailureReason.NO_TEXTURE, f"{len(view.features)} features in the image", gates=(gate,))
         farthest = sum(lag < len(self._views) for lag in LAGS) - 1
         for _ in range(1 if briefly else MAX_PAIRS):
@@ -159,15 +165,15 @@ class Initialiser:
         """
         a, b = self._views[first], self._views[last]
         matches = self._match(a.features, b.features)
-        if len(matches) < self._config.min_matches:
-            gate = Gate("matches", len(matches), ">=", self._config.min_matches)
-            detail = f"{len(matches)} matches, {self._config.min_matches} needed"
+        if len(matches) < MIN_MATCHES:
+            gate = Gate("matches", len(matches), ">=", MIN_MATCHES)
+            detail = f"{len(matches)} matches, {MIN_MATCHES} needed"
             return Failure(FailureReason.TOO_FEW_MATCHES, detail, gates=(gate,))
         pair = self._best_pose(a, b, matches)
         start = self._verify(pair, [a, *self._witnesses(first, last), b]) if isinstance(pair, _Pair) else pair
         if isinstance(start, Start):
             direction = start.numbers["direction_sigma_deg"]
-            most_deg = lenience * self._config.max_direction_sigma_deg
+            most_deg = lenience * MAX_DIRECTION_SIGMA_DEG
             if not direction < most_deg:
                 start = _direction_unknown(direction, most_deg, start.numbers)
         if isinstance(start, Failure) and start.reason is FailureReason.LOW_PARALLAX:
@@ -187,9 +193,9 @@ class Initialiser:
         uv_a, uv_b = a.features.uv_rect_px[fa], b.features.uv_rect_px[fb]
         sigma = np.maximum(a.features.sigma_px[fa], b.features.sigma_px[fb])
         poses = RelativePoses(uv_a, uv_b, sigma, self._K, self._size_px, self._seed)
-        if poses.n_moved < int(NEAR * self._config.min_points):
+        if poses.n_moved < int(NEAR * MIN_POINTS):
             detail = f"a turn explains all but {poses.n_moved} of {len(matches)} matches"
-            gate = Gate("matches that no turn explains", poses.n_moved, ">=", int(NEAR * self._config.min_points))
+            gate = Gate("matches that no turn explains", poses.n_moved, ">=", int(NEAR * MIN_POINTS))
             return Failure(FailureReason.LOW_PARALLAX, detail, gates=(gate,))
         pairs = [self._evaluate(a, b, matches, T_b_a) for T_b_a in poses.of_turns()]
         if (hopeless := self._hopeless(pairs, len(matches))) is not None:
@@ -203,8 +209,8 @@ class Initialiser:
         best = max(contenders, key=lambda p: int(p.good.sum()))
         n_good = int(best.good.sum())
         numbers = {"n_matches": float(len(matches)), "n_points": float(n_good), "parallax_deg": best.parallax_deg}
-        enough = Gate("points", n_good, ">=", self._config.min_points)
-        near = Gate("near points", best.n_near, ">=", NEAR * self._config.min_points)
+        enough = Gate("points", n_good, ">=", MIN_POINTS)
+        near = Gate("near points", best.n_near, ">=", NEAR * MIN_POINTS)
         if not enough.passed:
             detail = f"{n_good} points of {len(matches)} matches"
             return Failure(FailureReason.TOO_FEW_INLIERS, detail, numbers, gates=(enough,))
@@ -213,8 +219,8 @@ class Initialiser:
             return Failure(FailureReason.LOW_PARALLAX, detail, numbers, gates=(enough, near))
         if any(direction_angle_deg(best.T_b_a, other.T_b_a) > SAME_DEG for other in contenders):
             return Failure(FailureReason.AMBIGUOUS_MODEL, "two poses explain the views alike", numbers)
-        if (direction := self._direction_sigma_deg(best)) > self._loose_direction_sigma_deg:
-            return _direction_unknown(direction, self._loose_direction_sigma_deg, numbers)
+        if (direction := self._direction_sigma_deg(best)) > DIRECTION_MARGIN * MAX_DIRECTION_SIGMA_DEG:
+            return _direction_unknown(direction, DIRECTION_MARGIN * MAX_DIRECTION_SIGMA_DEG, numbers)
         return best
 
     def _hopeless(self, pairs: list[_Pair], n_matches: int) -> Failure | None:
@@ -228,10 +234,11 @@ class Initialiser:
         # The best pose, whichever it is, is far from one of two that are twice as far apart.
         if any(direction_angle_deg(p.T_b_a, q.T_b_a) > 2 * SAME_DEG for p, q in combinations(sure, 2)):
             return Failure(FailureReason.AMBIGUOUS_MODEL, "two poses explain the views alike")
+        loosest_deg = DIRECTION_MARGIN * MAX_DIRECTION_SIGMA_DEG
         for pair in sure:
-            has_points = pair.good.sum() >= self._config.min_points
-            if has_points and (direction := self._direction_sigma_deg(pair)) > self._loose_direction_sigma_deg:
-                return _direction_unknown(direction, self._loose_direction_sigma_deg, {})
+            has_points = pair.good.sum() >= MIN_POINTS
+            if has_points and (direction := self._direction_sigma_deg(pair)) > loosest_deg:
+                return _direction_unknown(direction, loosest_deg, {})
         return None
 
     def _direction_sigma_deg(self, pair: _Pair) -> float:
@@ -264,7 +271,7 @@ class Initialiser:
         """Views spread evenly between the two."""
         between = np.linspace(first, last, N_WITNESSES + 2)[1:-1]
         positions = sorted({round(p) for p in between} - {first, last})
-        return [self._views[p] for p in positions if len(self._views[p].features) >= self._config.min_points]
+        return [self._views[p] for p in positions if len(self._views[p].features) >= MIN_POINTS]
 
     def _verify(self, pair: _Pair, views: list[View]) -> Start | Failure:
         good = np.flatnonzero(pair.good)
@@ -302,7 +309,7 @@ class Initialiser:
         it agreed with them.
         """
         matches = self._frontend.match_wide(first.features.take(feature), witness.features)
-        if len(matches) < self._config.min_points // 2:
+        if len(matches) < MIN_POINTS // 2:
             return Failure(FailureReason.TOO_FEW_MATCHES, f"{len(matches)} of {len(xyz)} points found")
         point, seen = matches.index[:, 0], matches.index[:, 1]
         uv_px, sigma_px = witness.features.uv_rect_px[seen], witness.features.sigma_px[seen]
@@ -342,7 +349,7 @@ class Initialiser:
         in_front = np.all(se3.act(se3.inverse(result.T_submap_kf), result.xyz_mu)[..., 2] > 0, axis=0)
         keep = _agreeing(problem, inlier) & in_front & result.adjusted
         numbers["n_points"] = float(keep.sum())
-        survivors = Gate("points after adjustment", int(keep.sum()), ">=", self._config.min_points)
+        survivors = Gate("points after adjustment", int(keep.sum()), ">=", MIN_POINTS)
         share = Gate("share of points after adjustment", float(keep.mean()), ">=", MIN_SUPPORT)
         if not (survivors.passed and share.passed):
             detail = f"{keep.sum()} of {len(xyz)} points survive adjustment"

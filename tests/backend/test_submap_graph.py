@@ -20,7 +20,7 @@ OPTIMUM_MU, OPTIMUM_RAD = 5e-3, 5e-3
 deviation of the last pose, and nowhere more than one standard deviation of the same pose."""
 
 
-EVERY_FACTOR = {"factors_per_keyframe": 10_000, "factors_per_landmark": 1_000}
+EVERY_FACTOR = {"factors_per_keyframe": 10_000}
 """Nothing is left out: what these tests ask of the solver is then what the observations say."""
 
 

@@ -63,7 +63,7 @@ def test_a_bend_is_by_what_one_end_turns_and_grows(log_scale: float, turn_deg: f
 
 def test_the_right_camera_bends_nothing(link: LinkEstimate) -> None:
     submap = make_submap(TRUE, turning=True, n=N)
-    bend = check_camera(submap, link, LIVE_SINCE, asking(TRUE), CONFIG, CALIBRATION)
+    bend = check_camera(submap, link, LIVE_SINCE, asking(TRUE), CONFIG)
     assert isinstance(bend, Bend)
     assert abs(bend.log_scale) < 0.005
 
@@ -71,7 +71,7 @@ def test_the_right_camera_bends_nothing(link: LinkEstimate) -> None:
 def test_a_map_that_says_nothing_of_its_camera_has_no_bend(link: LinkEstimate) -> None:
     camera = wrong_camera(1.06)
     submap = make_submap(camera, turning=False, n=N)
-    assert check_camera(submap, link, LIVE_SINCE, asking(camera), CONFIG, CALIBRATION) == NO_BEND
+    assert check_camera(submap, link, LIVE_SINCE, asking(camera), CONFIG) == NO_BEND
 
 
 def test_a_camera_that_bends_the_map_is_a_reason_for_no_link(link: LinkEstimate) -> None:
@@ -83,7 +83,7 @@ def test_a_camera_that_bends_the_map_is_a_reason_for_no_link(link: LinkEstimate)
     poses = [m.keyframe_poses(ids) for m in (submap, true)]
     truth = measure_bend(*poses, OVERLAP, np.arange(LIVE_SINCE, N))
     assert abs(truth.log_scale) > CONFIG.max_live_scale_sigma, "else the scene shows nothing"
-    refused = check_camera(submap, link, LIVE_SINCE, asking(camera), CONFIG, CALIBRATION)
+    refused = check_camera(submap, link, LIVE_SINCE, asking(camera), CONFIG)
     assert isinstance(refused, Failure)
     assert refused.reason is FailureReason.CAMERA
     assert refused.numbers["bend_scale"] == pytest.approx(truth.log_scale, rel=0.2)
@@ -100,7 +100,7 @@ def test_what_counts_is_the_bend_and_not_the_contradiction(
     submap = make_submap(TRUE, turning=True, n=N)
     for beyond_chance, reason in ((True, FailureReason.CAMERA), (False, FailureReason.SCALE)):
         find = partial(found, log_scale=log_scale, turn_deg=turn_deg, beyond_chance=beyond_chance)
-        verdict = check_camera(submap, link, LIVE_SINCE, find, CONFIG, CALIBRATION)
+        verdict = check_camera(submap, link, LIVE_SINCE, find, CONFIG)
         assert isinstance(verdict, Bend) is passes
         doubt = verdict.doubt if isinstance(verdict, Bend) else verdict
         assert (doubt is None) is (abs(log_scale) < CONFIG.max_live_scale_sigma and turn_deg < 1.0)
@@ -111,11 +111,14 @@ def test_it_counts_beside_what_else_is_unknown(link: LinkEstimate) -> None:
     submap = make_submap(TRUE, turning=True, n=N)
     find = partial(found, log_scale=0.02, turn_deg=0.0)
     unsure = replace(link, sigma_scale=0.02)
-    bends = [check_camera(submap, each, LIVE_SINCE, find, CONFIG, CALIBRATION) for each in (link, unsure)]
+    bends = [check_camera(submap, each, LIVE_SINCE, find, CONFIG) for each in (link, unsure)]
     assert [isinstance(bend, Bend) and bend.doubt is not None for bend in bends] == [False, True]
 
 
-def test_of_a_large_map_a_window_is_asked_that_reaches_both_ends(link: LinkEstimate) -> None:
+def test_of_a_large_map_a_window_is_asked_that_reaches_both_ends(
+    link: LinkEstimate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dualslam.linking.camera_bend.MAX_KEYFRAMES", 12)
     asked: list[IntArray] = []
 
     def find(submap: Submap, ids: IntArray) -> PreferredCamera | None:
@@ -123,11 +126,11 @@ def test_of_a_large_map_a_window_is_asked_that_reaches_both_ends(link: LinkEstim
         return None
 
     submap = make_submap(TRUE, turning=True, n=N)
-    check_camera(submap, link, LIVE_SINCE, find, CONFIG, CalibrationConfig(max_keyframes=12))
+    check_camera(submap, link, LIVE_SINCE, find, CONFIG)
     assert len(asked[0]) == 12
     assert (asked[0][0], asked[0][-1]) == (0, N - 1)
     # Next to a live end of one keyframe those before it tell its scale.
-    assert isinstance(check_camera(submap, link, N - 1, find, CONFIG, CALIBRATION), Bend)
+    assert isinstance(check_camera(submap, link, N - 1, find, CONFIG), Bend)
 
 
 def test_a_link_carries_it_in_its_covariance() -> None:
@@ -169,6 +172,6 @@ def test_a_camera_within_one_sigma_bends_nothing(link: LinkEstimate) -> None:
         def find(submap: Submap, ids: IntArray, distance2: float = distance2) -> PreferredCamera:
             return replace(found(submap, ids, 0.04, 0.0, beyond_chance=False), distance2=distance2)
 
-        bend = check_camera(submap, link, LIVE_SINCE, find, CONFIG, CALIBRATION)
+        bend = check_camera(submap, link, LIVE_SINCE, find, CONFIG)
         assert isinstance(bend, Bend)
         assert (bend.doubt is None) is passes

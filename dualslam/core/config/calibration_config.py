@@ -14,8 +14,6 @@ class CalibrationConfig(StrictModel):
     """Whether to do it at all."""
     first_keyframes: int = Field(30, ge=10)
     """Keyframes at which a submap is asked for the first time."""
-    max_keyframes: int = Field(60, ge=10)
-    """Keyframes of the window, neighbours in time; of all such windows the one with most turning."""
     max_observations: int = Field(15000, ge=1000)
     """Observations that go into the estimate: they bound its time (about 1 s)."""
     log_focal_sigma: float = Field(0.05, ge=1e-6)

@@ -59,16 +59,6 @@ class InitialiserConfig(StrictModel):
     matching: Literal["ratio", "gms"] = "ratio"
     """How the two views are matched: by the front end's own wide matching, or by grid-based motion statistics, which
     any front end with binary descriptors supports (`orb` with `gms` is the paper's Dual-SLAM+)."""
-    min_points: int = Field(50, ge=15)
-    """Triangulated points that must survive the first bundle adjustment."""
-    max_direction_sigma_deg: float = Field(1.5, gt=0)
-    """Largest standard deviation (from the bundle adjustment's Hessian) of the direction of translation: by the pixels'
-    sigmas, or less in proportion, down to two thirds, where residuals are smaller than 0.3 of these."""
-
-    @property
-    def min_matches(self) -> int:
-        """Matches between the two views below which no model is tried: a sixth of them may be wrong."""
-        return round(1.2 * self.min_points)
 
 
 class TrackingConfig(StrictModel):
@@ -192,9 +182,6 @@ class RecoveryConfig(StrictModel):
     """Processes for long work beside the tracking, which never waits for it (`--workers`): reverse tracking and
     self-calibration. With any there is one more, which solves the live map's graph. 0: inline, in the tracking process,
     which waits."""
-    time_limit_s: float = Field(120.0, gt=0)
-    """Time after which a worker counts as hung, and its recovery as failed. A walk over a full buffer of 10 s takes
-    about a tenth of it on a free core."""
     finish_wait_s: float = Field(30.0, ge=0)
     """How long the end of the run waits for walks that are still under way."""
 
@@ -225,8 +212,6 @@ class GraphConfig(StrictModel):
     """Observations of a keyframe that become factors of the graph, about, chosen from those that it could bear: spread
     over the image, long tracks first. Points of the others follow the poses. An update's cost grows with it; where few
     other keyframes see the same points (on a road), it is up to 2.5 times as many."""
-    factors_per_landmark: int = Field(6, ge=3)
-    """Views of a landmark that become factors, spread over its track; more where a keyframe would be short of them."""
 
 
 class LinkingConfig(StrictModel):

@@ -12,18 +12,21 @@ from dualslam.backend.local_ba import bundle_adjust_arrays
 from dualslam.core.config.settings import InitialiserConfig
 from dualslam.core.types import Failure, FailureReason, FloatArray, Start, View
 from dualslam.frontends.features.orb import OrbFrontend
-from dualslam.frontends.tracking.initialiser import MIN_PARALLAX_DEG, Initialiser
+from dualslam.frontends.tracking.initialiser import MAX_DIRECTION_SIGMA_DEG, MIN_PARALLAX_DEG, Initialiser
 from dualslam.testing.point_world import CAMERA, SIZE_PX, PointWorld, cloud, path, pose_errors, random_features
 from tests.seeds import first_of
 
 ROTATION_RAD = 0.01
-TRANSLATION = 3 * np.radians(InitialiserConfig().max_direction_sigma_deg)
+TRANSLATION = 3 * np.radians(MAX_DIRECTION_SIGMA_DEG)
 """Of the baseline: three of the standard deviations that the direction may have."""
 
 
-def initialiser(**settings: float) -> Initialiser:
-    config = InitialiserConfig(**settings)
-    return Initialiser(OrbFrontend(), bundle_adjust_arrays, config, CAMERA.K, SIZE_PX, 0)
+def initialiser() -> Initialiser:
+    return Initialiser(OrbFrontend(), bundle_adjust_arrays, InitialiserConfig(), CAMERA.K, SIZE_PX, 0)
+
+
+def bound_direction(monkeypatch: pytest.MonkeyPatch, max_sigma_deg: float) -> None:
+    monkeypatch.setattr("dualslam.frontends.tracking.initialiser.MAX_DIRECTION_SIGMA_DEG", max_sigma_deg)
 
 
 def feed(views: list[View]) -> tuple[Start | None, list[Failure]]:
@@ -195,7 +198,7 @@ def test_a_map_starts_with_a_third_of_its_points_proven(n_seen: int, starts: boo
         assert "prove" in start.detail
 
 
-def test_direction_is_known_as_well_as_is_said() -> None:
+def test_direction_is_known_as_well_as_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     errors, sigmas = [], []
     for seed in range(8):
         world = PointWorld(cloud(seed=seed), path(9, np.array([0.06, 0, 0.02]), np.zeros(3)), noise_px=1.0, seed=seed)
@@ -210,7 +213,8 @@ def test_direction_is_known_as_well_as_is_said() -> None:
         sigmas.append(start.numbers["direction_sigma_deg"])
     # The sigma is that of the worse of two axes.
     assert 0.3 < np.sqrt(np.mean(np.square(errors))) / np.mean(sigmas) < 1.6
-    strict = initialiser(max_direction_sigma_deg=0.5 * min(sigmas))
+    bound_direction(monkeypatch, 0.5 * min(sigmas))
+    strict = initialiser()
     for view in world.views():
         strict.collect(view)
     refusal = strict.try_pair(0, 8)
@@ -219,14 +223,16 @@ def test_direction_is_known_as_well_as_is_said() -> None:
 
 
 @pytest.mark.parametrize(("worse", "starts"), [(1.2, True), (1.5, False)])
-def test_after_a_long_wait_a_direction_may_be_known_a_third_less_well(worse: float, starts: bool) -> None:
+def test_after_a_long_wait_a_direction_may_be_known_a_third_less_well(
+    worse: float, starts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     world = PointWorld(cloud(), path(9, np.array([0.06, 0, 0.02]), np.zeros(3)), noise_px=1.0)
     *earlier, newest = world.views()
     usual = _fed(initialiser(), earlier).add(newest)
     assert isinstance(usual, Start)
-    bound = usual.numbers["direction_sigma_deg"] / worse
+    bound_direction(monkeypatch, usual.numbers["direction_sigma_deg"] / worse)
     for waited_s, expected in ((0.0, False), (9.0, False), (15.0, starts), (100.0, starts)):
-        found = _fed(initialiser(max_direction_sigma_deg=bound), earlier).add(newest, waited_s)
+        found = _fed(initialiser(), earlier).add(newest, waited_s)
         assert bool(found) is expected
         assert found or "direction of translation" in found.detail
 
