@@ -28,56 +28,44 @@ NEARLY_AS_MUCH = 0.5
 
 @dataclass(frozen=True, slots=True)
 class JoinGate:
-    """One condition of a join.
+    """One condition of a join: comparisons all of which must hold, and what a refusal says.
 
     Attributes
     ----------
-    name : str
-        As in the event log.
-    value, threshold : float
-        What was measured, and its limit.
-    passed : bool
+    compared : tuple of Gate
+        By their names in the event log.
     reason : FailureReason
         Of a refusal.
     detail : str
         What a refusal says.
-    sigma : float
-        Standard deviation of the value; 0 where it is one itself, or a count.
     sure : bool
         Whether the join may be relied on, as far as this gate goes.
     logged : dict
         What else was measured, for the event log alone.
-    sign : str
-        The comparison that passes.
     """
 
-    name: str
-    value: float
-    threshold: float
-    passed: bool
+    compared: tuple[Gate, ...]
     reason: FailureReason
     detail: str
-    sigma: float = 0.0
     sure: bool = True
     logged: dict[str, float] = field(default_factory=dict)
-    sign: str = "<="
 
     @classmethod
     def at_most(
         cls, name: str, value: float, limit: float, reason: FailureReason, detail: str, sure: float | None = None
     ) -> JoinGate:
         """Return a gate that a value passes up to a limit; it is sure up to `sure`."""
-        return cls(name, value, limit, value <= limit, reason, detail, sure=value <= (limit if sure is None else sure))
+        return cls((Gate(name, value, "<=", limit),), reason, detail, value <= (limit if sure is None else sure))
 
     @classmethod
     def at_least(cls, name: str, value: float, limit: float, reason: FailureReason, detail: str) -> JoinGate:
         """Return a gate that a value passes from a limit on."""
-        return cls(name, value, limit, value >= limit, reason, detail, sign=">=")
+        return cls((Gate(name, value, ">=", limit),), reason, detail)
 
     @property
-    def comparison(self) -> Gate:
-        """What ``decisions.jsonl`` holds of it."""
-        return Gate(self.name, self.value, self.sign, self.threshold)
+    def passed(self) -> bool:
+        """Whether all comparisons hold."""
+        return all(gate.passed for gate in self.compared)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,12 +102,13 @@ class LinkEvidence:
     @property
     def comparisons(self) -> tuple[Gate, ...]:
         """What ``decisions.jsonl`` holds of the gates."""
-        return tuple(gate.comparison for gate in self.gates)
+        return tuple(gate for asked in self.gates for gate in asked.compared)
 
     @property
     def numbers(self) -> dict[str, float]:
         """What was measured, for the event log."""
-        return {name: n for gate in self.gates for name, n in ({gate.name: gate.value} | gate.logged).items()}
+        compared = {gate.name: gate.value for gate in self.comparisons}
+        return compared | {name: n for gate in self.gates for name, n in gate.logged.items()}
 
     def refusal(self, numbers: dict[str, float] | None = None) -> Failure | None:
         """Return why the join is not made; `numbers`: for the event log, besides."""
@@ -197,21 +186,13 @@ def parting_gate(log_scale: float, sigma_old: float, sigma_new: float, n_parted:
         Keyframes there.
     """
     sigma = math.hypot(sigma_old, sigma_new)
-    is_possible = abs(log_scale) <= GATE_SIGMAS * sigma
-    by_old = math.isfinite(sigma_new) and sigma_old > GATE_SIGMAS * sigma_new
+    possible = Gate("log_scale", abs(log_scale), "<=", GATE_SIGMAS * sigma)
+    by_old = Gate("held_old", sigma_old, ">", GATE_SIGMAS * sigma_new)  # not where both are infinite
     detail = f"the maps part at {n_parted} newer keyframes, and either may be the bent one"
-    if not is_possible:
+    if not possible.passed:
         detail = f"the maps part by {log_scale:+.0%} in scale at {n_parted} newer keyframes, and neither is torn"
-    return JoinGate(
-        "log_scale",
-        log_scale,
-        GATE_SIGMAS * sigma,
-        is_possible and by_old,
-        FailureReason.AGREEMENT,
-        detail,
-        sigma,
-        logged={"held_old": sigma_old, "held_new": sigma_new, "parted": float(n_parted)},
-    )
+    logged = {"held_new": sigma_new, "parted": float(n_parted)}
+    return JoinGate((possible, by_old), FailureReason.AGREEMENT, detail, logged=logged)
 
 
 def drift_gate(share_of_way: float, turn_deg: float, log_scale: float) -> JoinGate:
@@ -227,30 +208,23 @@ def drift_gate(share_of_way: float, turn_deg: float, log_scale: float) -> JoinGa
         Between the two, as well.
     """
     limit = min(MAX_DRIFT, MAX_SLIP + math.radians(turn_deg) + math.expm1(abs(log_scale)))
-    return JoinGate(
-        "drift",
-        share_of_way,
-        limit,
-        share_of_way <= limit and turn_deg <= MAX_DRIFT_DEG and abs(log_scale) <= MAX_DRIFT_LOG_SCALE,
-        FailureReason.CONTRADICTION,
-        f"the map would have drifted by {share_of_way:.0%} of the way, {turn_deg:.0f} deg"
-        f" and {math.expm1(log_scale):+.0%} in scale",
-        logged={"drift_rot_deg": turn_deg, "drift_log_scale": log_scale},
+    compared = (
+        Gate("drift", share_of_way, "<=", limit),
+        Gate("drift_rot_deg", turn_deg, "<=", MAX_DRIFT_DEG),
+        Gate("drift_log_scale", abs(log_scale), "<=", MAX_DRIFT_LOG_SCALE),
     )
+    detail = (
+        f"the map would have drifted by {share_of_way:.0%} of the way, {turn_deg:.0f} deg"
+        f" and {math.expm1(log_scale):+.0%} in scale"
+    )
+    return JoinGate(compared, FailureReason.CONTRADICTION, detail)
 
 
 def ambiguity_gate(support: int, first_support: int) -> JoinGate:
     """Return the gate of a second similarity, by the landmarks that it and the first one explain."""
-    limit = NEARLY_AS_MUCH * first_support
-    return JoinGate(
-        "second_support",
-        support,
-        limit,
-        support < limit,
-        FailureReason.AMBIGUOUS_MODEL,
-        f"a second pose explains {support} landmarks, the first {first_support}",
-        logged={"first_support": float(first_support)},
-    )
+    compared = (Gate("second_support", support, "<", NEARLY_AS_MUCH * first_support),)
+    detail = f"a second pose explains {support} landmarks, the first {first_support}"
+    return JoinGate(compared, FailureReason.AMBIGUOUS_MODEL, detail, logged={"first_support": float(first_support)})
 
 
 def judge_motion(motions: Iterable[Motion]) -> LinkEvidence:
@@ -261,13 +235,7 @@ def judge_motion(motions: Iterable[Motion]) -> LinkEvidence:
 def motion_gate(motion: Motion) -> JoinGate:
     """Return the gate of one motion: off by no more than the run itself explains."""
     times = motion.off_mu / max(motion.usual_mu, 1e-12)
-    return JoinGate(
-        "leap_off",
-        motion.off_mu,
-        motion.allowed_mu,
-        not motion.is_refused,
-        FailureReason.LEAP,
-        f"the camera is {times:.0f} times further from where its velocities lead than elsewhere",
-        motion.usual_mu,
-        logged={"leap_usual": motion.usual_mu, "leap_asked": float(motion.n_asked)},
-    )
+    detail = f"the camera is {times:.0f} times further from where its velocities lead than elsewhere"
+    compared = (Gate("leap_off", motion.off_mu, "<=", motion.allowed_mu),)
+    logged = {"leap_usual": motion.usual_mu, "leap_asked": float(motion.n_asked)}
+    return JoinGate(compared, FailureReason.LEAP, detail, logged=logged)

@@ -11,6 +11,7 @@ stop can stop all the same. In the end the test allows everything.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -79,13 +80,15 @@ class Motion:
 
     @property
     def allowed_mu(self) -> float:
-        """Return how far off the prediction may be."""
+        """Return how far off the prediction may be: any way, where it could be asked at too few places."""
+        if self.n_asked < MIN_ASKED:
+            return math.inf
         return max(ALLOWED * self.usual_mu, self.change_mu) + self.slack_mu
 
     @property
     def is_refused(self) -> bool:
         """Whether the camera cannot have moved so, as far as the run can tell."""
-        return self.n_asked >= MIN_ASKED and self.off_mu > self.allowed_mu
+        return self.off_mu > self.allowed_mu
 
 
 def measure_motion(path: Path, last_before: int, known: Path, slack_mu: float = 0.0) -> Motion | None:

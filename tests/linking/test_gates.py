@@ -1,5 +1,7 @@
 """The parts that judge a similarity: runs along time, discontinuities, and each gate by itself."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -10,7 +12,15 @@ from dualslam.core.types import FailureReason, FloatArray
 from dualslam.linking import propose_correspondences, verify
 from dualslam.linking.deformation import measure_deformation
 from dualslam.linking.gates import PAIR_CHI2, PIXEL_CHI2
-from dualslam.linking.join_test import LinkEvidence
+from dualslam.linking.join_test import (
+    JoinGate,
+    LinkEvidence,
+    ambiguity_gate,
+    drift_gate,
+    motion_gate,
+    parting_gate,
+)
+from dualslam.linking.motion import MIN_ASKED, Motion
 from dualslam.linking.pairs import PairModel
 from dualslam.linking.timeline import ask_keyframes, find_discontinuities, leading_run
 from dualslam.testing.adversaries import ONSET_ID, corrupted_tail
@@ -137,6 +147,32 @@ def test_a_scale_that_is_known_to_five_percent_joins_with_a_doubt(sigma: float, 
     evidence = judged(model, case, to_centre @ C @ to_centre.T)
     assert (evidence.is_accepted, evidence.is_sure) == (accepted, sure)
     assert (evidence.refusal() is None, evidence.doubt() is None) == (accepted, sure)
+
+
+NEARER = Motion(off_mu=1.0, usual_mu=1.0, n_asked=MIN_ASKED)
+
+
+@pytest.mark.parametrize(
+    ("gate", "refused_by"),
+    [
+        (parting_gate(-0.1, 0.1, 0.01, 5), set()),
+        (parting_gate(-0.5, 0.1, 0.01, 5), {"log_scale"}),
+        (parting_gate(0.1, 0.1, 0.09, 5), {"held_old"}),
+        (parting_gate(0.1, np.inf, np.inf, 5), {"held_old"}),
+        (drift_gate(0.05, 10.0, -0.2), set()),
+        (drift_gate(0.4, 0.2, 0.003), {"drift"}),
+        (drift_gate(0.1, 90.0, -np.log(4.0)), {"drift_rot_deg", "drift_log_scale"}),
+        (ambiguity_gate(29, 60), set()),
+        (ambiguity_gate(30, 60), {"second_support"}),
+        (motion_gate(NEARER), set()),
+        (motion_gate(replace(NEARER, off_mu=9.0)), {"leap_off"}),
+        (motion_gate(replace(NEARER, off_mu=9.0, n_asked=MIN_ASKED - 1)), set()),
+    ],
+)
+def test_a_join_is_refused_by_the_comparisons_that_decisions_show(gate: JoinGate, refused_by: set[str]) -> None:
+    evidence = LinkEvidence((gate,))
+    assert {each.name for each in evidence.comparisons if not each.passed} == refused_by
+    assert (evidence.refusal() is not None) == bool(refused_by)
 
 
 def judged(model: PairModel, case: Case, covariance: FloatArray) -> LinkEvidence:

@@ -108,7 +108,7 @@ def events_of(attempts: list[str], **settings: Any) -> list[Event]:
 
 
 def refused_scale(sigma: float, detail: str, reason: FailureReason, config: LinkingConfig) -> JoinGate:
-    return JoinGate("sigma_scale", sigma, 0.0, False, reason, detail)
+    return JoinGate.at_most("sigma_scale", sigma, 0.0, reason, detail)
 
 
 class TestOrder:
