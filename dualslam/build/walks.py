@@ -6,8 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, partial
 
-import numpy as np
-
 from dualslam.backend.self_calibration import find_preferred_camera
 from dualslam.build.checks import auxiliary_config, naming_attempt
 from dualslam.build.parts import bundle_adjuster, graph_maker, window_solver
@@ -16,7 +14,6 @@ from dualslam.core.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.estimates import PreferredCamera
 from dualslam.core.interfaces import Frontend, SubmapGraph
-from dualslam.core.support import judge_track
 from dualslam.core.types import Failure, FailureReason, IntArray, View
 from dualslam.frontends.features.image_features import ImageFeatures
 from dualslam.frontends.gap.auxiliary_features import Auxiliary, BufferedFeatures, OwnFeatures
@@ -25,7 +22,7 @@ from dualslam.frontends.gap.refinding import Refinder
 from dualslam.frontends.gap.route import Route, find_lack
 from dualslam.frontends.registry import FOR_WALKS, create_frontend, find_missing
 from dualslam.frontends.tracking.visual import VisualFrontEnd
-from dualslam.linking import DescriptorMatcher, check_camera, estimate_link, propagate_to_live_end
+from dualslam.linking import DescriptorMatcher
 from dualslam.linking.gates import DESCRIPTOR_RADIUS_PX
 from dualslam.map.submap import Submap
 from dualslam.recovery.job import RecoveryJob
@@ -33,14 +30,6 @@ from dualslam.recovery.reverse_tracking import Attempt, RecoveryParts
 
 FEATURE_THREADS = 2
 """That find other front ends' features beside reverse tracking, where the tracking waits for it."""
-
-
-def _preferred_camera(
-    job: RecoveryJob, config: Config, submap: Submap, keyframe_ids: IntArray
-) -> PreferredCamera | None:
-    """Ask keyframes of a map that a walk has grown about the camera that it was walked with."""
-    settings = (config.calibration, config.graph.robust_k, config.seed)
-    return find_preferred_camera(submap, keyframe_ids, job.camera, *settings, job.camera_covariance)
 
 
 def recovery_parts(
@@ -76,21 +65,17 @@ def recovery_parts(
         if images is not None and view.image is not None and find_lack(view, config.tracking.min_inliers) is None:
             images.of(view.image)
 
-    matcher = DescriptorMatcher(frontend.distance, frontend.max_distance, DESCRIPTOR_RADIUS_PX)
+    def find_camera(job: RecoveryJob, submap: Submap, keyframe_ids: IntArray) -> PreferredCamera | None:
+        settings = (config.calibration, config.graph.robust_k, config.seed)
+        return find_preferred_camera(submap, keyframe_ids, job.camera, *settings, job.camera_covariance)
+
     return RecoveryParts(
         attempts=_attempts(config, frontend, live, camera, auxiliaries),
         posing=Attempt("live", live),
         new_graph=new_graph or graph_maker(config),
-        link=lambda old, new, onset: estimate_link(
-            old, new, config.linking, np.random.default_rng(config.seed), onset, matcher
-        ),
-        max_scale_sigma=config.linking.max_live_scale_sigma,
-        propagate=lambda link, new, newest_id, bend: propagate_to_live_end(link, new, newest_id, config.linking, bend),
-        check_camera=lambda submap, link, job: check_camera(
-            submap, link, job.newest_id, partial(_preferred_camera, job, config), config.linking
-        ),
-        judge=lambda track: judge_track(track, config.health),
-        config=config.recovery,
+        matcher=DescriptorMatcher(frontend.distance, frontend.max_distance, DESCRIPTOR_RADIUS_PX),
+        find_camera=find_camera,
+        config=config,
         foresee=foresee,
     )
 

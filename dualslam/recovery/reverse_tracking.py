@@ -14,22 +14,31 @@ import logging
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 
 from dualslam.atlas.trajectory import FramePose, Path
-from dualslam.core.config.settings import RecoveryConfig
+from dualslam.core.config.settings import Config
 from dualslam.core.decisions import Gate
 from dualslam.core.errors import SolverError
-from dualslam.core.estimates import KeyframeReport
+from dualslam.core.estimates import KeyframeReport, PreferredCamera
 from dualslam.core.events import Event, EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.jobs import Limit, result_of
-from dualslam.core.types import Failure, FailureReason, Rival, Track, View
+from dualslam.core.support import judge_track
+from dualslam.core.types import Failure, FailureReason, IntArray, Rival, Track, View
 from dualslam.core.walk_news import WalkNews, WalkTrace
-from dualslam.linking import NO_BEND, Bend, LinkEstimate, LinkRefusal
+from dualslam.linking import (
+    DescriptorMatcher,
+    LinkEstimate,
+    LinkRefusal,
+    check_camera,
+    estimate_link,
+    propagate_to_live_end,
+)
 from dualslam.linking.link_tries import LinkTries
 from dualslam.linking.motion import WINDOW_FRAMES
 from dualslam.linking.rivals import choose_by_velocity
@@ -37,7 +46,7 @@ from dualslam.map.frame_observations import FrameObservations
 from dualslam.map.submap import Submap
 from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, RecoveryResult, refusal_data
 from dualslam.recovery.progress import Progress
-from dualslam.recovery.relinker import Linker, LinkTry, Relinker
+from dualslam.recovery.relinker import LinkTry, Relinker
 from dualslam.recovery.schedule import way_to_gaps
 
 log = logging.getLogger(__name__)
@@ -68,20 +77,27 @@ class RecoveryParts:
     """The parts of a recovery, built by the composition root of the process in which it runs.
 
     `posing`: the way back where there is no lost map, but frames without a pose.
-    `max_scale_sigma`: of a link, at the live end.
+    `find_camera`: asks keyframes of a map that a walk has grown about the camera.
     `foresee`: finds beforehand what a walk over a gap may ask for in a frame.
     """
 
     attempts: tuple[Attempt, ...]
     posing: Attempt
     new_graph: Callable[[], SubmapGraph]
-    link: Linker
-    max_scale_sigma: float
-    propagate: Callable[[LinkEstimate, Submap, int, Bend], LinkEstimate | Failure]
-    check_camera: Callable[[Submap, LinkEstimate, RecoveryJob], Bend | Failure]
-    judge: Judge
-    config: RecoveryConfig
+    matcher: DescriptorMatcher
+    find_camera: Callable[[RecoveryJob, Submap, IntArray], PreferredCamera | None]
+    config: Config
     foresee: Callable[[View], None] = lambda view: None
+
+    def link(self, old: Submap, new: Submap, onset: int | None) -> LinkEstimate | Failure:
+        """Try to link a submap with an older one, which is suspected to be corrupted from a frame on."""
+        rng = np.random.default_rng(self.config.seed)
+        return estimate_link(old, new, self.config.linking, rng, onset, self.matcher)
+
+    @property
+    def max_scale_sigma(self) -> float:
+        """Largest standard deviation of a link's scale at the live end."""
+        return self.config.linking.max_live_scale_sigma
 
 
 def run_recovery(
@@ -214,11 +230,12 @@ def _make_attempt(
     reverse_tracker.keep(relinker.keyframe_ids)  # redundant or not: linking stands on keyframes that both maps hold
     progress = Progress(submap)
     # Frames before a start are worth a look each, however many show nothing; no map waits for the end of that walk.
-    max_gap_frames = parts.config.max_gap_frames if job.lost else len(job.views)
+    max_gap_frames = parts.config.recovery.max_gap_frames if job.lost else len(job.views)
     views = job.views if job.lost else _there_and_back(job.views, progress)
     unsure_of: int | None = None  # the lost map with which a link would be, but for a loose scale
     trace = WalkTrace(submap.id, attempt.name, job.newest_id, submap.T_submap_kf[job.newest_id][:3, 3])
-    for step in track_in_reverse(reverse_tracker, views, parts.judge, relinker.keyframe_ids, max_gap_frames):
+    judge = partial(judge_track, config=parts.config.health)
+    for step in track_in_reverse(reverse_tracker, views, judge, relinker.keyframe_ids, max_gap_frames):
         trace.note(step.view, step.track)
         progress.out_of_time = bool((yield trace.news()))
         if progress.out_of_time:
@@ -296,15 +313,16 @@ def _confirm(
     found = _accepted(result, with_doubt)
     if isinstance(found, Failure):
         return found
-    link = _accepted(parts.propagate(found, submap, job.newest_id, NO_BEND), with_doubt)
+    config = parts.config.linking
+    link = _accepted(propagate_to_live_end(found, submap, job.newest_id, config), with_doubt)
     if isinstance(link, Failure):
         return link
-    bend = parts.check_camera(submap, link, job)
+    bend = check_camera(submap, link, job.newest_id, partial(parts.find_camera, job), config)
     if isinstance(bend, Failure):
         return bend
     if bend.doubt is not None and not with_doubt:
         return LinkRefusal(bend.doubt.reason, bend.doubt.detail, bend.doubt.numbers, unsure=link)
-    link = _accepted(parts.propagate(found, submap, job.newest_id, bend), with_doubt)
+    link = _accepted(propagate_to_live_end(found, submap, job.newest_id, config, bend), with_doubt)
     if isinstance(link, Failure):
         return link
     again = None if with_doubt else tries.judge(old_id, link.sigma_scale, parts.max_scale_sigma)
