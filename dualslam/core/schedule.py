@@ -293,11 +293,6 @@ def _described(request: Request) -> str:
     return f"{request.kind}{'' if request.submap is None else f' of submap {request.submap}'} at {request.frame}"
 
 
-def never(*kinds: JobKind) -> After:
-    """Return the schedule by default, but for kinds whose answers come at the end of the run alone."""
-    return After({**DELAYS, **dict.fromkeys(kinds, math.inf)})
-
-
 def header_of(policy: Policy, in_real_time: bool, **given: Any) -> dict[str, Any]:
     """Return the first line of a schedule: its version, what was stated, and what else is `given` of the run."""
     delays = None
