@@ -96,8 +96,7 @@ def estimate_calibration(
     Returns
     -------
     CalibrationEstimate or Failure
-        A failure where the window holds too little, or the solver failed; an estimate is to be used only where it
-        is `accepted`.
+        A failure if the window holds too little, or the solver failed. Use an estimate only if it is `accepted`.
     """
     problem = _ask(submap, choose_window(submap, MAX_KEYFRAMES), camera, config, seed)
     if isinstance(problem, Failure):

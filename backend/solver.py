@@ -70,7 +70,7 @@ class IncrementalSolver:
         thresholds.insert((chr(0), np.full(3, POINT_THRESHOLD_MU)))  # plain-int keys have the character 0
         params = gtsam.ISAM2Params()
         params.setRelinearizeThreshold(thresholds)
-        params.relinearizeSkip = 1 << 30  # whoever updates says when
+        params.relinearizeSkip = 1 << 30  # the caller says when
         params.enablePartialRelinearizationCheck = False
         self._isam = gtsam.ISAM2(params)
         self.statistics = UpdateStatistics(0, 0)

@@ -82,8 +82,8 @@ class ISam2SubmapGraph:
     Notes
     -----
     Reading was measured at 400 keyframes and 10,000 landmarks (CPU time, best case): the variables of 20 keyframes by
-    their keys 0.25 ms, all of them 3.5 ms (half the solver's walk, half the copy into numpy), the fit of 5,000
-    observations 1.2 ms. `update` therefore reads `READ_WINDOW` keyframes and the landmarks that they see, and
+    their keys 0.25 ms, all of them 3.5 ms, the fit of 5,000 observations 1.2 ms. Half of the 3.5 ms is the solver's,
+    half the copy into numpy. `update` therefore reads `READ_WINDOW` keyframes and the landmarks that they see, and
     everything each `READ_ALL_EVERY`-th time. No array of the submap is older than that.
     """
 

@@ -36,7 +36,7 @@ class Link:
     a, b : int
         Submap ids; equal for a loop within a submap.
     S_a_b : (4, 4) float64
-        ``[[s R, t], [0, 1]]``: ``p_a = S_a_b @ p_b``, in the submaps' frames as they are now.
+        ``[[s R, t], [0, 1]]``: ``p_a = S_a_b @ p_b``, in the submaps' current frames.
     covariance : (7, 7) float64
         Of the right perturbation ``S_a_b @ exp(xi)``: rotation, translation, log-scale, in the frame and unit of b.
     kind : LinkKind

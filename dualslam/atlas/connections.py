@@ -63,7 +63,7 @@ class Connections:
         self._desk = desk
         self._problems = AtlasProblems(record, solver, desk)
         self._mover = Mover(record, solver, self._problems.covariances, new_graph, front_ends, forget_graph)
-        self._asked: AskedSolution | None = None  # what is being solved beside the tracking
+        self._asked: AskedSolution | None = None  # what is being solved in the background
         self._due: set[int] = set()  # submaps whose linked sets are to be solved next
         self._is_due_foreseen = False
         self._changes: dict[int, int] = {}  # by submap: how many times others than its graph have changed it

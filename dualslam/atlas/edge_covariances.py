@@ -74,7 +74,7 @@ class EdgeCovariances:
     compute : callable
         Gives them from a submap's factors, here and now.
     desk : Desk
-        Where they are computed that `foresee` asks for.
+        Computes those that are requested beforehand.
     """
 
     def __init__(self, compute: Covariances, desk: Desk) -> None:

@@ -36,7 +36,7 @@ class AtlasProblems:
         self._record = record
         self.covariances = EdgeCovariances(solver.edge_covariances, desk)
         self.views = NodeViews()
-        self._newest: dict[int, int] = {}  # by submap: its newest keyframe when it was foreseen what is to be solved
+        self._newest: dict[int, int] = {}  # by submap: its newest keyframe at the last request
 
     def foresee(self, touched: set[int], new: Sequence[Link]) -> None:
         """Compute in the background what the solution with connections to come needs of the submaps."""

@@ -118,7 +118,7 @@ def find_focal(
 ) -> FocalSearch | Failure:
     """Search for the focal length of a camera that has no calibration, by frames from its beginning.
 
-    `told`: what the source's own data tell, if they do.
+    `told`: the focal length in the source's own data, if any.
 
     Raises
     ------

@@ -85,7 +85,7 @@ def build_system(
     localise : bool
         Find poses in the saved map, and add nothing to it.
     new_graph : callable, optional
-        Makes the factor graph of a submap, each time anew, in the place of `ISam2SubmapGraph`; in one process alone.
+        Makes the factor graph of a submap, each time anew, instead of `ISam2SubmapGraph`; in one process alone.
     schedule : Policy, optional
         When answers of background work are used (`dualslam/core/schedule.py`): `After` so many frames, or as
         `Recorded` by another run. By default at once without workers, else after `DELAYS`, and in real time as they
@@ -127,7 +127,7 @@ def build_system(
     reader = FrameReader(frontend, live.camera, config.camera.model_sigma_px, shutter, scene)
 
     workers = config.recovery.workers
-    # Built here in any case: a mistake in the config is told at once, not by a worker.
+    # Built here in any case: a mistake in the config is reported at once, not by a worker.
     parts = recovery_parts(config, camera, frontend=frontend, new_graph=new_graph)
     places = place_parts(config, frontend, camera)
     watch = WalkWatch()
@@ -180,10 +180,10 @@ def build_system(
 
 @dataclass(frozen=True, slots=True)
 class LiveParts:
-    """What the system makes anew with each start and each submap: the stations of a frame's walk after its features.
+    """The parts that are made anew with each start and each submap.
 
-    `FrameReader` finds a frame's features; `Initialiser` starts a map from them; `VisualFrontEnd` poses the frames that
-    follow, and extends the map by keyframes; a `SubmapGraph` solves it.
+    `FrameReader` finds a frame's features. `Initialiser` starts a map from them. `VisualFrontEnd` poses the frames that
+    follow, and extends the map by keyframes. A `SubmapGraph` solves it.
     """
 
     config: Config

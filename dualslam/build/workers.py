@@ -113,7 +113,7 @@ def feature_handlers(config: FrontendConfig) -> Handlers:
 def worker_desk(config: Config, camera: Camera, faults: FaultScript, watch: WalkWatch) -> WorkerDesk:
     """Build the desk whose work is done in processes, which are started at once."""
     recovery = config.recovery
-    # Live frames come first: threads for the walk only where a core is left beside the tracking and the workers.
+    # Live frames come first: reverse tracking gets threads only if tracking and workers leave a core.
     n_threads = min(FEATURE_THREADS, spare_cores(1 + recovery.workers))
     walks = Lane(
         "walks",

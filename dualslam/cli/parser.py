@@ -27,15 +27,15 @@ MAX_PORT = 65535
 SHORTEST_M, LONGEST_M = 1e-6, 1e9
 """Of a known length: a mistyped exponent, and nothing that a camera could see, lies outside."""
 SOURCE_HELP = (
-    "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours); a ROS bag or MCAP; a folder of images or a video "
-    "file, whose camera is searched for without --camera or --fov; with one of these a webcam's number, or the address "
-    "of a stream (rtsp://..., http://...); or an embedded world: synthetic:street, room, circuit, eight, terrace, "
+    "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours); a ROS bag or MCAP. A folder of images or a video: "
+    "its camera is estimated without --camera or --fov. With one of these: a webcam's number, or the address "
+    "of a stream (rtsp://..., http://...). A rendered world: synthetic:street, room, circuit, eight, terrace, "
     "corridors, posters, board, parked, takeoff, standstill, hover, with options as in "
     "synthetic:street,frames=300,seed=1,events=FILE"
 )
 EXIT_STATUSES = (
-    "Exit status: 0 done; 1 no frame has a pose, or something failed that was not asked for; 2 bad usage or bad input; "
-    "130 interrupted (what a run has found by then is written)."
+    "Exit status: 0 done. 1: no frame has a pose, or an unexpected error. 2: bad usage or bad input. "
+    "130: interrupted; all results so far are written."
 )
 
 
@@ -197,7 +197,7 @@ def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
         "--workers",
         metavar="N",
         type=_count,
-        help="processes for long work beside the tracking, and one for its graph; --realtime: 1, and one for features",
+        help="processes for long background work, and one for its graph; --realtime: 1, and one for features",
     )
 
 
@@ -360,7 +360,7 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
 
 def _add_configuration(parser: argparse.ArgumentParser) -> None:
     group = _add_fields(parser)
-    group.add_argument("--no-recovery", action="store_true", help="do not try to link what a failure has parted")
+    group.add_argument("--no-recovery", action="store_true", help="do not link the maps before and after a failure")
 
 
 def _add_fields(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:

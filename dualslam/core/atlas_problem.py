@@ -119,8 +119,8 @@ class AtlasSolution:
     believed : (E,) bool
         False for doubtful edges that were rejected.
     chi2 : (E,) float64
-        Of connections against all others that are believed (7 degrees of freedom); NaN where nothing else ties the
-        ends, for what is no connection, and for all but the newest of many that are not doubtful.
+        Of connections against all others that are believed (7 degrees of freedom). NaN if nothing else ties the ends,
+        for edges that are no connection, and for all but the newest of many that are not doubtful.
     cost_before, cost_after : float
         Half the sum of squared whitened residuals of the believed edges.
     drift : float

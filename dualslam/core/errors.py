@@ -17,8 +17,7 @@ class ConfigError(DualSlamError):
     problem : str
         What is wrong.
     field : tuple of str or int
-        Path to the field, which the message then begins with; empty where it is of no single one, or where `problem`
-        says it.
+        Path to the field, with which the message then begins. Empty if it concerns several, or if `problem` names it.
     """
 
     def __init__(self, problem: str, field: tuple[str | int, ...] = ()) -> None:

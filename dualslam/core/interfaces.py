@@ -84,8 +84,8 @@ class Frontend(Protocol):
     def distance(self, a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
         """Distance of paired descriptors (N, D), (N, D) -> (N,) float.
 
-        Zero for equal ones, symmetric, and of a scale on which a ratio of best to second best says something (a norm of
-        the difference, a count of differing bits).
+        Symmetric, and zero for equal ones. A ratio of best to second best must have a meaning (a norm of the
+        difference, a count of differing bits).
         """
         ...
 
@@ -328,7 +328,7 @@ class Shutter(Protocol):
     def take(
         self, readout_s: float, rates_rad_s: Mapping[int, FloatArray], latest: Iterable[View], K: FloatArray
     ) -> None:
-        """Go on with the readout time that a map has told."""
+        """Continue with the readout time estimated from a map."""
         ...
 
 

@@ -1,10 +1,10 @@
-"""Work beside the tracking: one mechanism for all that the next frame does not need.
+"""Background work: one mechanism for all that the next frame does not need.
 
-A job is a snapshot of arrays that nobody else changes, and its kind says what is made of it. What comes back is a
-change, which the part that asked for it merges, between two frames, into a map that has grown meanwhile. An executor
-does the work: `InlineDesk` at once, in the process that tracks, `WorkerDesk` (`dualslam/workers/desk.py`) in others.
-The schedule (`dualslam/core/schedule.py`) says when the results are used: the same one gives the same run to the
-bit. A job may fail: then its outcome is a `Failure`, and nothing else has changed.
+A job is a snapshot of arrays that nobody else changes, and its kind says what is made of it. The result is a change.
+The part that asked for it merges it, between two frames, into a map that has grown meanwhile. An executor does the
+work: `InlineDesk` at once, in the process that tracks, `WorkerDesk` (`dualslam/workers/desk.py`) in others. The
+schedule (`dualslam/core/schedule.py`) says when the results are used: the same one gives the same run to the bit. A job
+may fail: then its outcome is a `Failure`, and nothing else has changed.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Handlers = Mapping[JobKind, Handler]
 
 @dataclass(slots=True)
 class Limit:
-    """When a job that works in steps is told that its time is over; by default never.
+    """The limit after which a job that works in steps must stop; by default none.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Limit:
     after_steps : int or None
         Steps: the same on every machine.
     steps : int or None
-        After which it was told.
+        After which it was stopped.
     """
 
     after_s: float | None = None
@@ -105,7 +105,7 @@ class Ended:
     wall_s : float
         From when it was submitted, the time in the queue included; 0 inline.
     stopped_after : int or None
-        Steps, where it was told that its time was over.
+        Steps after which it was stopped early.
     """
 
     work: Any

@@ -42,10 +42,10 @@ DELAYS: Mapping[JobKind, float] = {
 }
 """Frames after which an answer is used by default: twice the median CPU time of a job in frames of 30 Hz, and one more.
 
-Twice, since a worker has about half a core where tracking and features take the rest of two; one more, since answers
-come in where a frame begins. Medians of the jobs above 10 ms, in frames: start search 0.8, graph 0.8 (166 jobs),
-scale watch 0.7, readout 2.3, calibration 15, loop search 4.4, reverse tracking 8.2 (7 jobs, up to 35), edge covariances
-6 (docs/adr/0020-work-beside-tracking.md), atlas below 0.3. Measured on 110 to 180 frames each of `kitti_03` and
+Twice, since a worker has about half a core where tracking and features take the rest of two. One more, since answers
+come in where a frame begins. Medians of the jobs above 10 ms, in frames: start search 0.8, graph 0.8 (166 jobs), scale
+watch 0.7, readout 2.3, calibration 15, loop search 4.4, reverse tracking 8.2 (7 jobs, up to 35), edge covariances 6
+(docs/adr/0020-work-beside-tracking.md), atlas below 0.3. Measured on 110 to 180 frames each of `kitti_03` and
 `7scenes_1000` with black frames, `hololens_000` and `tum_fr1_rpy`: CPU time, which does not depend on what else runs.
 """
 
@@ -90,7 +90,7 @@ class AnswerRecord:
     detail : str
         Of the failure.
     steps : int or None
-        Of the job, after which it was told to stop, as its time was over.
+        Of the job, after which it was stopped, as its time was over.
     drained : bool
         Whether it was used because the run, or its map, ended there, and not when the frame began.
     """
@@ -278,7 +278,7 @@ class Recorded:
         return After({JobKind(kind): math.inf if frames is None else frames for kind, frames in delays.items()})
 
     def limit_of(self, request: Request) -> Limit:
-        """Return after how many steps the job was told to stop."""
+        """Return after how many steps the job was stopped."""
         record = self.record_of(request)
         return Limit() if record is None else Limit(after_steps=record.steps)
 

@@ -1,8 +1,12 @@
 """The small frozen values that the stages of the system hand to each other.
 
-Conventions (all of dualslam): ``T_a_b`` takes coordinates in b to coordinates in a; poses are (4, 4) float64, camera to
-submap unless the name says otherwise; the camera looks along +z with x right and y down; pixels are (u, v) with (0, 0)
-at the centre of the top-left pixel; a submap's lengths are in its own monocular unit (``_mu``).
+Conventions of all of dualslam:
+
+- ``T_a_b`` takes coordinates in b to coordinates in a.
+- Poses are (4, 4) float64, camera to submap unless the name says otherwise.
+- The camera looks along +z, with x right and y down.
+- Pixels are (u, v), with (0, 0) at the centre of the top-left pixel.
+- A submap's lengths are in its own monocular unit (``_mu``).
 """
 
 from __future__ import annotations
@@ -68,7 +72,7 @@ class Frame:
     Raises
     ------
     InputError
-        If it is no such thing: what is wrong is told before anything is done with it.
+        If it is none: it is refused before anything is done with it.
     """
 
     index: int
@@ -109,7 +113,7 @@ class Features:
     Attributes
     ----------
     uv_px : (N, 2) float64
-        Where the front end found them in the image; where it was read row by row, as if at the time of its middle row.
+        Their positions in the image. Those of a rolling shutter are corrected to the time of its middle row.
     uv_rect_px : (N, 2) float64
         The same, with lens distortion removed: pixels of the camera's pinhole equivalent. All geometry uses these.
     sigma_px : (N,) float64

@@ -1,7 +1,7 @@
-"""What the container of a video (QuickTime, MP4) says: the focal length of its camera, and how much of it is played.
+"""Metadata in a video's container (QuickTime, MP4): focal length of the camera, and length of the part that is played.
 
-A QuickTime file is a tree of boxes: size, four letters, content. Apple's cameras, and programs that write as they do,
-keep names (`keys`) and values (`ilst`) in a box `meta` of the film or of a track. Others note no focal length.
+A QuickTime file is a tree of boxes: size, four letters, content. Apple's cameras keep names (`keys`) and values
+(`ilst`) in a box `meta` of the film or of a track, as do some programs. Others note no focal length.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ SIGNED, UNSIGNED = (21, 65, 66, 67, 74), (22, 75, 76, 77, 78)
 
 
 def equivalent_focal_mm(path: Path) -> float | None:
-    """Return the focal length that a camera of 36 x 24 mm would need for the same view; None where none is told.
+    """Return the focal length that a camera of 36 x 24 mm would need for the same view, or None.
 
-    Whatever is no such container, or is broken before it tells, tells none. A value that cannot be read is passed over:
+    None if the file is no such container, or is broken before the value. A value that cannot be read is passed over:
     the film and each track may have one.
     """
     try:

@@ -25,8 +25,8 @@ SAME_SHAPE = 0.02
 def focal_over_longer_side(path: Path) -> float | None:
     """Return a photograph's focal length in pixels, over the longer side of its image.
 
-    By the pitch of the sensor's pixels where it is told, else by the focal length that a 35 mm camera would need.
-    None where neither is told, the file is no photograph, or it was cropped since.
+    By the pitch of the sensor's pixels if known, else by the equivalent focal length of a 35 mm camera. None if neither
+    is known, the file is no photograph, or it was cropped since.
     """
     try:
         with Image.open(path) as image:

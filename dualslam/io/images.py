@@ -162,7 +162,7 @@ def _bytes_of(path: Path) -> bytes | None:
     try:
         return path.read_bytes()
     except OSError:
-        return None  # told where the frame is read
+        return None  # reported where the frame is read
 
 
 class _FileReader:
@@ -234,7 +234,7 @@ class _ZipReader:
         try:
             return self._zip.read(self._names[index])
         except _TORN:
-            return None  # told where the frame is read
+            return None  # reported where the frame is read
 
     def close(self) -> None:
         self._zip.close()

@@ -30,7 +30,7 @@ METADATA = "map.json"
 MAP_FORMAT = 2
 """Of what `save_map` writes; 1, without connections that can be bent, is read as well."""
 SUBMAP_FORMAT = 3
-"""Of a submap's arrays; 2, in which nothing was condemned, is read as well."""
+"""Of a submap's arrays. 2, which marks nothing invalid, is read as well."""
 _FEATURE_FIELDS = tuple(f.name for f in fields(Features))
 
 

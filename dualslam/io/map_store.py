@@ -240,7 +240,7 @@ def _links(arrays: Arrays, metadata: Mapping[str, Any]) -> list[Link]:
 
 
 def _not_exact(link: Link, atlas: Atlas) -> Link:
-    """Return a rollover's link that an earlier version took as exact as stiff as it is now."""
+    """Return a rollover's link with the current stiffness. An earlier version took it as exact."""
     if link.kind is not LinkKind.ROLLOVER or link.covariance.any():
         return link
     return replace(link, covariance=rollover_covariance(atlas.submaps[link.b], link.attached(atlas)[1]))

@@ -30,7 +30,7 @@ def write_scale(run: Path, metres_per_unit: float, sigma_rel: float | None, word
 
 
 def read_scale(run: Path) -> float | None:
-    """Return the metres per unit of a run's map; None where nobody has told.
+    """Return the metres per unit of a run's map, or None if unknown.
 
     Raises
     ------

@@ -13,8 +13,8 @@ T = TypeVar("T")
 def read_ahead(items: Iterator[T], depth: int = 8, *, drop_oldest: bool = False) -> Generator[T, None, None]:
     """Yield `items`, produced on another thread.
 
-    The thread starts with the first item asked for. It ends when the items do, when they raise (the exception comes
-    out here, after the items before it) or when this generator is closed, as a ``break`` in the consumer's loop does.
+    The thread starts with the first item asked for. It ends when the items do, or when this generator is closed, as by
+    a ``break`` in the consumer's loop. If the items raise, the exception comes out here, after the items before it.
 
     Parameters
     ----------

@@ -66,7 +66,7 @@ class ReducedImages:
         return _ReducedReader(self._images.reader(grey), self._factor)
 
     def told_focal(self) -> ToldFocal | None:
-        """Return what is told of the large images: a share of their side."""
+        """Return the focal length known of the large images: a share of their side."""
         return self._images.told_focal()
 
 

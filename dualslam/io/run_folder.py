@@ -82,7 +82,7 @@ _RESULTS = (
     MAP_PAGE,
     REPORT,
 )
-"""In the order in which a person is told of them."""
+"""In the order in which they are listed for a person."""
 _NOT_OF_EVERY_RUN = frozenset({f"{SUBMAPS}/", GROUND_TRUTH, MASK, MAP_PAGE, DECISIONS})
 _SUBMAP_NAME = re.compile(r"\d+\.txt")
 SAMPLE_NAME = re.compile(r"\d+\.jpg")
@@ -316,8 +316,8 @@ def check_vacant(path: Path, *, overwrite: bool) -> None:
     Raises
     ------
     OutputError
-        If there is an earlier run (or files of its names) and `overwrite` is not set; if there are files of its names
-        and no run has written them, such as the ``groundtruth.txt`` of a sequence; or if it is a file.
+        If there is an earlier run (or files of its names) and `overwrite` is not set. If it holds files of these names
+        that no run has written, such as the ``groundtruth.txt`` of a sequence. If it is a file.
     """
     try:
         present = _run_files(path)

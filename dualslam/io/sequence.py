@@ -112,9 +112,9 @@ class Selection:
 class RecordedSequence:
     """Frames of a recording, in either direction of time, read ahead on a thread of its own.
 
-    Iterating again reads again. A frame whose image cannot be read, or is of another size than the camera's, has
-    ``image=None`` and says why in `error`; reading goes on. The log has the first of these frames, and their number
-    where the reading ends.
+    Iterating again reads again. An image that cannot be read, or differs in size from the camera's, gives a frame with
+    ``image=None`` and an `error`. Reading goes on. The log has the first of these frames, and their number where the
+    reading ends.
 
     Attributes
     ----------

@@ -43,7 +43,7 @@ class CorruptionKind(StrEnum):
 
 
 class Cause(StrEnum):
-    """Where a disturbance comes from: results are told apart by it."""
+    """Origin of a disturbance. Results are grouped by it."""
 
     NATURAL = "natural"
     """Nothing was added: what the sequence itself does."""
@@ -97,9 +97,12 @@ class Corruption(StrictModel):
     """One disturbance of the frames ``start <= index < start + length``, indices counted in the source."""
 
     kind: CorruptionKind
-    """wipe, occlusion, blur, motion_blur, blackout, exposure, noise, freeze, drop, stride, few_features, wrong_pose,
-    solver_error, kill_worker, focal, resolution, no_distortion, clock_unit, clock_jitter, clock_repeat, cab, bonnet,
-    bars, logo or clock; in the script of a rendered world also shutter and rotation."""
+    """One of these, by what it disturbs.
+
+    Image: wipe, occlusion, blur, motion_blur, blackout, exposure, noise, freeze. Frames: drop, stride.
+    Internals: few_features, wrong_pose, solver_error, kill_worker. Camera: focal, resolution, no_distortion.
+    Times: clock_unit, clock_jitter, clock_repeat. What stands still: cab, bonnet, bars, logo, clock.
+    A rendered world's script also has shutter and rotation."""
     start: int = Field(0, ge=0)
     """First frame, counted in the source whatever the stride."""
     length: int | None = Field(None, ge=1)

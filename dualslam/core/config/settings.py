@@ -41,24 +41,23 @@ class CameraConfig(StrictModel):
     """Error of the camera model itself at a pixel (one sigma), beside the noise of the features: chequerboard
     calibrations and rectified data sets are off by half a pixel to a pixel towards the rim of the image."""
     readout_s: float | None = Field(None, ge=-0.1, le=0.1)
-    """Time between reading the first and the last row of an image: 0 for a global shutter, about 0.03 for webcams and
-    the first Kinect, negative where images were turned upside down since, so that the last row was read first. None:
-    the frames in which there is no map are asked for it, and where one that rolls is likely, no map starts from a fast
-    turn until it is known."""
+    """Time between reading the first and the last row of an image. 0 for a global shutter, about 0.03 for webcams and
+    the first Kinect, negative for images turned upside down, whose last row was read first. None: it is estimated from
+    frames without a map. If the shutter probably rolls, no map starts from a fast turn until then."""
     find_still_pixels: bool = True
     """Find pixels that stand still in the image while the rest moves (a bonnet, black bars, a logo), and leave them
     out. No map starts while the camera itself stands still."""
     mask: str | None = None
-    """Image whose black pixels show no scene, of the frames' size; or a folder with one for each frame, named as the
-    frames, or in their order."""
+    """Image of the frames' size whose black pixels show no scene. Or a folder with one for each frame, named as the
+    frames or in their order."""
 
 
 class InitialiserConfig(StrictModel):
     """How a submap starts: two views, a first bundle adjustment, and a check after it."""
 
     matching: Literal["ratio", "gms"] = "ratio"
-    """How the two views are matched: by the front end's own wide matching, or by grid-based motion statistics, which
-    any front end with binary descriptors supports (`orb` with `gms` is the paper's Dual-SLAM+)."""
+    """How the two views are matched: by the front end's own wide matching, or by grid-based motion statistics. Any
+    front end with binary descriptors supports these (`orb` with `gms` is the paper's Dual-SLAM+)."""
 
 
 class TrackingConfig(StrictModel):
@@ -67,9 +66,9 @@ class TrackingConfig(StrictModel):
     min_inliers: int = Field(20, ge=6)
     """Landmarks that must agree with a pose for it to be taken at all."""
     max_lost_s: float = Field(0.75, ge=0)
-    """Seconds, by the frames' times, from the first frame that is not posed, after which the submap is given up; below
-    5 Hz, as many frames as 5 Hz gives in them. Until then wide matching may find it again, unless the next one starts
-    first: its start is looked for meanwhile."""
+    """Seconds after which a lost submap is given up, counted from the first frame without a pose by the frames' times.
+    Below 5 Hz, as many frames as 5 Hz gives in them. Until then wide matching may find it again, and the next one may
+    start."""
 
 
 class KeyframeConfig(StrictModel):
@@ -78,9 +77,9 @@ class KeyframeConfig(StrictModel):
     max_parallax_deg: float = Field(4.0, gt=0)
     """Parallax at which a keyframe is due whatever is tracked."""
     weak_landmarks: int = Field(60, ge=10)
-    """Tracked landmarks below which tracking is weak and a keyframe is due at once. Where so few near ones hold the
-    camera's position, one is due as well when of their hold, one over the depth squared, less than half of what
-    is asked of their number is left."""
+    """Tracked landmarks below which tracking is weak and a keyframe is due at once. Near landmarks hold the camera's
+    position, by one over the depth squared each. If only few near ones do, a keyframe is also due when less than half
+    of the hold required of their number is left."""
 
 
 class MappingConfig(StrictModel):
@@ -115,12 +114,12 @@ class AttemptConfig(StrictModel):
     """
 
     frontend: str = "live"
-    """`live`: the live features, guided by the motion model in reverse. Or a front end by its name: features of its
-    own, found in the buffered images, pose the frames by PnP from one to the next, and skip those that cannot be used.
+    """`live`: the live features, guided by the motion model in reverse. Or a front end by its name: its own features,
+    found in the buffered images, pose the frames by PnP from one to the next. Frames that cannot be used are skipped.
     Landmarks, and what is compared when linking, are made of the live features in either case."""
     tracking: Literal["own", "live"] = "own"
-    """Whether that front end poses every frame, so that the attempt does not depend on the live features, or only the
-    first frames beyond gaps and what follows until the live features can take over, which is several times as fast."""
+    """`own`: that front end poses every frame, so the attempt does not depend on the live features. `live`: it poses
+    only the first frames beyond gaps, until the live features can take over. That is several times as fast."""
     n_features: int = Field(2000, ge=50, le=20000)
     """Keypoints per image of that front end."""
     options: dict[str, Any] = Field(default_factory=dict)
@@ -159,7 +158,7 @@ class RecoveryConfig(StrictModel):
     """Reverse tracking that joins a new submap to the one that was lost."""
 
     enabled: bool = True
-    """Off: a lost track ends the submap, and the next one stays apart from it."""
+    """Off: a lost track ends the submap, and the next one is not linked to it."""
     max_gap_frames: int = Field(30, ge=0)
     """Frames in a row that reverse tracking may skip, because none of its keyframes can be matched in them. A walk that
     links no map, but poses the frames before a start, goes on to the end of the buffer."""
@@ -169,17 +168,16 @@ class RecoveryConfig(StrictModel):
     """In this order, each from the same snapshot of the new map, until one leads to a link. A list of words will do,
     such as `[gap, live, sift]`; an attempt with settings is written `{frontend: sift, n_features: 3000}`."""
     relocalise_after: int | None = Field(15, ge=0)
-    """Frames that show something without a start, after which a lost map is looked for, and continued where it is seen
-    again; null: never. A map that starts sooner is better linked, by all that reverse tracking finds: most start within
-    2 to 5 frames, unless the camera turns in place, and then it may come back to what the lost map shows before any can
-    start."""
+    """Frames with content but without a start, after which the lost map is searched for and, if revisited, continued.
+    null: never. A new map that starts sooner is better linked by reverse tracking, and most start within 2 to 5 frames.
+    Where the camera turns in place none can start, but it may come back to the lost map."""
     retry_keyframes: tuple[Annotated[int, Field(ge=1)], ...] = (5, 15)
-    """Keyframes of the new map, from its start on, at which reverse tracking that has found no link, or left buffered
-    frames without a pose, is made again: the map knows depths better then, and more of the scene. It is too when the
-    camera has been calibrated since, and, if any number stands here, when the run ends and the map has grown by half.
-    One for poses alone that finds none is the last."""
+    """Keyframes of the new map at which reverse tracking is repeated if it has found no link, or left buffered frames
+    without a pose. The map then knows depths better, and more of the scene. It is also repeated after a calibration
+    and, if any number stands here, at the end of the run if the map has grown by half. One for poses alone that finds
+    none is the last."""
     workers: int = Field(0, ge=0, le=16)
-    """Processes for long work beside the tracking, which never waits for it (`--workers`): reverse tracking and
+    """Processes for long background work, for which tracking never waits (`--workers`): reverse tracking and
     self-calibration. With any there is one more, which solves the live map's graph. 0: inline, in the tracking process,
     which waits."""
     finish_wait_s: float = Field(30.0, ge=0)
@@ -204,8 +202,8 @@ class GraphConfig(StrictModel):
     """Huber threshold in sigmas: 1.345 keeps 95 % efficiency under Gaussian noise, 0.8 does where residuals are at
     0.6 of their sigmas, and 88 % where the sigmas are right."""
     max_keyframes: int = Field(150, ge=20, le=1000)
-    """Keyframes at which a submap rolls over into the next: an update's cost grows with the map (on a road 65 ms on
-    average with this cap, 140 ms without), and the solver's Cholesky rejects chains of more than about 1,000."""
+    """Keyframes at which a submap rolls over into the next. An update's cost grows with the map: on a road 65 ms on
+    average with this cap, 140 ms without. The solver's Cholesky rejects chains of more than about 1,000."""
     rollover_keyframes: int = Field(12, ge=3, le=19)
     """Keyframes that a submap shares with the one that it rolls over into."""
     factors_per_keyframe: int = Field(60, ge=20)
@@ -255,8 +253,8 @@ class LinkingConfig(StrictModel):
 
     @property
     def max_live_scale_sigma(self) -> float:
-        """Largest standard deviation of the scale at the new map's live end, with what reverse tracking has lost of it
-        on the way from there to the overlap; and beyond a gap over which wide matching has skipped while tracking.
+        """Largest standard deviation of the scale at the new map's live end, including the loss by reverse tracking
+        from there to the overlap. Also the limit beyond a gap that tracking has crossed by wide matching.
         """
         return self.wrong_scale / 2
 
@@ -304,11 +302,11 @@ class PlacesConfig(StrictModel):
 
 
 class LoopsConfig(StrictModel):
-    """Loops and merges of maps by what is seen again."""
+    """Loops and merges of maps at revisited places."""
 
     enabled: bool = True
     """Whether the live map is linked where it shows what any map, itself among them, has shown before. Without
-    recovery (`recovery.enabled`) a lost map of the same run stays apart all the same."""
+    recovery (`recovery.enabled`) a lost map of the same run is never merged."""
 
 
 class Config(StrictModel):

@@ -1,8 +1,8 @@
 """Projection by a pinhole camera with its Jacobians, and the robust refinement of a pose against known points.
 
 Perturbations of a pose are left ones: ``T_cam_w <- exp(xi) @ T_cam_w``, xi = (rotation, translation) in the camera
-frame. ``T_w_cam`` is then multiplied by ``exp(-xi)`` on its right. So a covariance of xi is at once the covariance of
-``T_w_cam`` in the camera's own frame, which is GTSAM's covariance of a ``Pose3``.
+frame. ``T_w_cam`` is then multiplied by ``exp(-xi)`` on its right. So a covariance of xi is also that of ``T_w_cam`` in
+the camera's own frame: GTSAM's covariance of a ``Pose3``.
 """
 
 from __future__ import annotations

@@ -100,8 +100,8 @@ class HomographyPoses:
 def decompose_homography(H_b_a: FloatArray, K: FloatArray) -> HomographyPoses:
     """Return the poses and planes that a homography of pixels allows. Ma, section 5.3.3.
 
-    The sign of `H_b_a` is chosen so that its determinant is positive, as it is when both cameras are on the same side
-    of the plane. Two of the four poses are ruled out by the positive depth of the points.
+    The sign of `H_b_a` makes its determinant positive, as it is when both cameras are on the same side of the plane.
+    Two of the four poses are ruled out by the positive depth of the points.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ class ExportedMap:
     """The main map: V views, P points, R observations.
 
     A keyframe that two submaps share appears once, in the submap that its frame's pose belongs to. What a by-pass has
-    condemned is left out.
+    marked invalid is left out.
 
     Attributes
     ----------
