@@ -52,13 +52,12 @@ class Endings:
         sightings: Sightings,
         earlier: Set[int],
     ) -> None:
-        config = state.config
         self._state = state
         self._recoveries = recoveries
         self._connections = connections
         self._sightings = sightings
         self._earlier = earlier
-        self._scale_watch = ScaleWatch(config.linking, state.parts.desk) if config.audit.enabled else None
+        self._scale_watch = ScaleWatch(state.config.linking, state.parts.desk)
 
     def archive(self, live: VisualOdometry, why: str) -> None:
         """Archive the live submap; what only a live one could use is no longer computed."""
@@ -114,7 +113,7 @@ class Endings:
 
         Reverse tracking from the new one may link the two. Not while reverse tracking is about to change the map.
         """
-        if self._scale_watch is None or self._recoveries.is_under_way(live.submap):
+        if self._recoveries.is_under_way(live.submap):
             return False
         record = self._state.record
         with record.timer.measure("audit"):
@@ -184,7 +183,7 @@ class Endings:
     def part_what_lost_its_scale(self, last: FrameStamp) -> None:
         """Part this run's archived maps where no link holds what lies beyond a loss of scale, at the end of the run."""
         state, record = self._state, self._state.record
-        if self._scale_watch is None or state.localises:
+        if state.localises:
             return
         with record.timer.measure("audit"):
             for m in sorted(record.atlas.submaps.keys() - self._earlier):

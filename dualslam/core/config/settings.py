@@ -280,13 +280,6 @@ class LinkingConfig(StrictModel):
         return self.wrong_scale
 
 
-class AuditConfig(StrictModel):
-    """Whether a map is checked while it grows and when the run ends."""
-
-    enabled: bool = True
-    """Whether a map is split at keyframes across which its scale is lost."""
-
-
 class AtlasConfig(StrictModel):
     """The graph over all submaps."""
 
@@ -326,7 +319,6 @@ class Config(StrictModel):
     recovery: RecoveryConfig = RecoveryConfig()
     graph: GraphConfig = GraphConfig()
     linking: LinkingConfig = LinkingConfig()
-    audit: AuditConfig = AuditConfig()
     atlas: AtlasConfig = AtlasConfig()
     places: PlacesConfig = PlacesConfig()
     loops: LoopsConfig = LoopsConfig()
