@@ -1,4 +1,4 @@
-"""What iSAM2 keeps inside, as plain arrays: its Bayes tree, and how much of it an update touched."""
+"""iSAM2's Bayes tree as plain arrays, and how much of it an update touched."""
 
 from __future__ import annotations
 

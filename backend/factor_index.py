@@ -1,4 +1,4 @@
-"""What of a submap is in its factor graph, and what should change: pure numpy, no solver."""
+"""Index of a submap's factors, present and due: pure numpy, no solver."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a submap's graph holds beside projections: the gauge, relative poses, and holds where ties are too few."""
+"""Factors beside projections: the gauge, relative poses, and holds where ties are too few."""
 
 from __future__ import annotations
 

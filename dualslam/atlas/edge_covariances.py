@@ -1,4 +1,4 @@
-"""What a submap says of the similarities between its keyframes, remembered, and computed in the background."""
+"""Covariances of a submap's inner similarities, cached, and computed in the background."""
 
 from __future__ import annotations
 

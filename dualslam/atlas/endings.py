@@ -1,4 +1,4 @@
-"""What the end of a submap leaves: its last estimate, an event, and frames that change to the submap after it."""
+"""Ending of a submap: its last estimate, an event, and frames that change to the next submap."""
 
 from __future__ import annotations
 

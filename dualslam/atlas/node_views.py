@@ -1,4 +1,4 @@
-"""What a submap's nodes see: which of them are tied, and how deep the scene is. Remembered while it stays as it was.
+"""Views of a submap's nodes: which of them are tied, and how deep the scene is. Cached until it changes.
 
 Most submaps of a long run are full: between two solutions of the atlas none of this changes in them.
 """

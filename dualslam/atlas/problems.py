@@ -1,4 +1,4 @@
-"""What of the atlas is to be solved, as problems of whole linked sets, and what these need computed before."""
+"""Problems of the atlas: whole linked sets to be solved, and the covariances that they need."""
 
 from __future__ import annotations
 

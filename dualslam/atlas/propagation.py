@@ -1,4 +1,4 @@
-"""What follows a submap that has moved: its frames that are no keyframes, its culled keyframes, its links."""
+"""Propagation of a moved submap: to its other frames, its culled keyframes, its links."""
 
 from __future__ import annotations
 

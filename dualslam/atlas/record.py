@@ -1,4 +1,4 @@
-"""What a run has found out so far: the one book that tracking and recovery both write in, between two frames."""
+"""A run's record, written by tracking and recovery between two frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a solution of the atlas says and does, before it is done and after."""
+"""Events and numbers of an atlas solution."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run leaves behind of a map that it continues: what is dead there, and what has become of it.
+"""Removal of dead rows and culled keyframes from a map that a run continues.
 
 While a run lasts, rows of landmarks only grow, dead observations are up to half of theirs
 (`dualslam/map/dead_rows.py`), and culled keyframes stay as anchors. A map that is used many times would carry those of

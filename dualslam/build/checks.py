@@ -1,4 +1,4 @@
-"""What can be refused in a config before anything is built."""
+"""Checks of a config before anything is built."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What reverse tracking is made of: the live front end, and the attempts by others."""
+"""Construction of reverse tracking: the live front end, and the attempts by others."""
 
 from __future__ import annotations
 

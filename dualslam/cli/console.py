@@ -1,4 +1,4 @@
-"""What a person sees of a run: progress while it goes on, one line when it is over, a table of where the time went."""
+"""Terminal output of a run: progress, the last line, and a table of where the time went."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is refused before anything heavy is imported: a mistyped field or path is answered at once."""
+"""Checks before anything heavy is imported: a mistyped field or path is answered at once."""
 
 from __future__ import annotations
 

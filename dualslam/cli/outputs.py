@@ -1,4 +1,4 @@
-"""What a command is about to write."""
+"""Checks of the files that a command is about to write."""
 
 from __future__ import annotations
 

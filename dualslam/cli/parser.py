@@ -1,4 +1,4 @@
-"""What can be typed: commands, options and their help. Nothing heavy is imported until a command executes."""
+"""Commands, options and their help. Nothing heavy is imported until a command executes."""
 
 from __future__ import annotations
 

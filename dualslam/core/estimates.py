@@ -1,4 +1,4 @@
-"""What the interfaces hand over: estimates of a graph, a camera and a shutter, and what a keyframe did to the map."""
+"""Values of the interfaces: estimates of a graph, camera and shutter, and a keyframe's effect on the map."""
 
 from __future__ import annotations
 
@@ -120,8 +120,8 @@ class PreferredCamera:
         Whether the pixels contradict the camera.
     keyframe_ids : (K,) int64
     T_now, T_preferred : (K, 4, 4)
-        Their poses by the same pixels alone, under the current camera and under the preferred one; each in a frame and
-        unit of its own.
+        Their poses by the same pixels alone, under the current camera and the preferred one; each in a frame and unit
+        of its own.
     """
 
     log_focal: float

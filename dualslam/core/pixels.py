@@ -1,4 +1,4 @@
-"""What a pixel matcher is given, and what it returns."""
+"""Input and output of a pixel matcher."""
 
 from __future__ import annotations
 

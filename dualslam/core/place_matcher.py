@@ -1,4 +1,4 @@
-"""What the verification of places needs of a front end."""
+"""Front-end interface for the verification of places."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a photograph says of the camera that took it: the focal length in its EXIF data."""
+"""Focal length in a photograph's EXIF data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is wrong with images as such: a raw colour mosaic, darkness, a brightness that jumps from frame to frame."""
+"""Faults of images: a raw colour mosaic, darkness, a brightness that jumps from frame to frame."""
 
 from __future__ import annotations
 

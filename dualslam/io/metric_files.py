@@ -1,4 +1,4 @@
-"""What measurements add to a run folder: the metric trajectory (TUM, GPX, GeoJSON), covariances, the joint graph."""
+"""Metric files of a run folder: trajectory (TUM, GPX, GeoJSON), covariances, the joint graph."""
 
 from __future__ import annotations
 

@@ -66,8 +66,8 @@ def open_sequence(
     Parameters
     ----------
     source : path, address, or number of a webcam
-        A folder of a known layout (ours, KITTI odometry, TUM RGB-D, TUM-Mono, EuRoC), a folder of images, or a video
-        file. ``0``, ``1``, ... for a webcam, or the address of a stream (``rtsp://``, ``http://``).
+        A video, a folder of images, or one of a known layout (ours, KITTI odometry, TUM RGB-D, TUM-Mono, EuRoC). ``0``,
+        ``1``, ... for a webcam, or the address of a stream (``rtsp://``, ``http://``).
     camera_file : path, optional
         Calibration to use instead of the source's own (see `dualslam.io.camera_files`).
     fov_degrees : float, optional

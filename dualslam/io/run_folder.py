@@ -1,4 +1,4 @@
-"""What a run leaves behind: one folder, written so that a crash or an interrupt at any moment loses nothing."""
+"""Run folder: written so that a crash or an interrupt at any moment loses nothing."""
 
 from __future__ import annotations
 

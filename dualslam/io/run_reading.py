@@ -1,4 +1,4 @@
-"""What a run has left behind, read again: its frames, events, numbers, and small pictures."""
+"""Reader of a run folder: frames, events, numbers, and small pictures."""
 
 from __future__ import annotations
 

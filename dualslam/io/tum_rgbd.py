@@ -61,8 +61,8 @@ def _camera(folder: Path) -> Camera:
     found = re.search(r"(?:fr|freiburg)_?([123])", name.lower())
     if found is None:
         raise InputError(
-            f"{folder}: the camera of a TUM RGB-D sequence is known by fr1, fr2 or fr3 in its folder's name, "
-            "which has none of them; give a camera file."
+            f"{folder}: the camera of a TUM RGB-D sequence follows from fr1, fr2 or fr3 in its folder's name. "
+            "This name has none; give a camera file."
         )
     numbers = INTRINSICS[int(found.group(1))]
     return radtan_camera(numbers[:4], numbers[4:], (640, 480), f"fr{found.group(1)}")

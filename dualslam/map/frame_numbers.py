@@ -71,7 +71,7 @@ class FrameNumbers:
         if self._last is not None and number <= self._last:
             raise InputError(
                 f"frame {frame.index} comes after frame {self.index_of(self._last)}: the index of each frame must lie "
-                "beyond the last one's, in one direction, as frames are told apart by it."
+                "beyond the last one's, in one direction, because it identifies the frame."
             )
         self._last = number
         return replace(frame, index=self.number(int(frame.index)))

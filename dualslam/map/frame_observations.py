@@ -1,4 +1,4 @@
-"""What a frame saw of its submap when it was posed: by the same landmarks it can be posed anew."""
+"""Observations of a frame when it was posed: with the same landmarks it can be posed again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What became of each frame: the row that stays and grows, and the result that a step hands out."""
+"""Records of frames: the row that stays and grows, and the result that a step returns."""
 
 from __future__ import annotations
 

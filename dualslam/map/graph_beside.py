@@ -3,9 +3,9 @@
 `BesideGraph` is the `SubmapGraph` that the tracking sees. Its updates adjust the newest keyframes (`WindowSolver`), and
 note that the graph proper has something to learn. Between two frames `BesideGraphs` sends the changes of the arrays
 (`dualslam/map/submap_delta.py`) to the process, one job at a time. A graph that is behind so takes several keyframes at
-once. It puts the result into the current submap: known keyframes and landmarks take their values, what has come since
-follows (`dualslam/map/late_estimate.py`). A process that dies costs its graph: the next job brings the whole submap to
-a fresh one. A graph that fails leaves the submap to its window, and is made anew with the next keyframe.
+once. It puts the result into the current submap: known keyframes and landmarks take their values, and newer ones
+follow. A process that dies costs its graph: the next job brings the whole submap to a fresh one. A graph that fails
+leaves the submap to its window, and is made anew with the next keyframe.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class BesideGraph:
     window : callable
         Adjusts the newest keyframes of a submap.
     register : callable
-        Told, whenever there is something to send, of which submap.
+        Called with the submap, whenever there is something to send.
     in_real_time : callable
         Whether frames come by a clock.
     open_graph : callable

@@ -13,8 +13,8 @@ from dualslam.map.submap import NO_LANDMARK, Submap
 def next_submap(full: Submap, submap_id: int, n_shared: int, newest_id: int | None = None) -> Submap:
     """Start a submap from the newest keyframes of a full one, in the same coordinates.
 
-    If the newest keyframe does not see what those inserted before it see (the map was full when it was found again),
-    from those that do.
+    The newest keyframe may not see what earlier ones see, if the map was full when it was relocalised. Then those that
+    do are taken.
 
     Parameters
     ----------

@@ -35,9 +35,9 @@ class Submap:
     landmark_of : dict of int to (N,) int64
         For each feature of a keyframe its landmark, or `NO_LANDMARK`.
     landmarks : Table
-        ``xyz_mu`` (3), ``alive``, ``descriptor``, ``normal`` (3, mean unit vector from landmark to cameras),
-        ``distance_mu`` (at the reference view), ``scale`` (patch scale there), ``first_kf``, ``replaced_by``,
-        ``n_visible``, ``n_found`` (how often tracking should have seen it, and did), ``condemned``.
+         ``xyz_mu`` (3), ``alive``, ``descriptor``, ``first_kf``, ``replaced_by``, ``condemned``.
+        ``normal`` (3): mean unit vector from landmark to cameras. ``distance_mu``, ``scale``: distance and patch scale
+        at the reference view. ``n_visible``, ``n_found``: how often tracking should have seen it, and did.
     observations : Table
         ``kf``, ``feature``, ``landmark``, ``alive``.
     n_dropped : int
@@ -49,8 +49,8 @@ class Submap:
     gauge : tuple of int
         The two keyframes of the first baseline: the first pose is fixed, their distance fixes the scale.
     condemned : set of int
-        Keyframes that are not to be relied on: by-passed by another map, or of a tail that was corrupted. Landmarks
-        that no other keyframe sees have ``condemned`` set.
+        Keyframes marked invalid: by-passed by another map, or of a corrupted tail. Landmarks that no other keyframe
+        sees have ``condemned`` set.
     """
 
     def __init__(self, submap_id: int, K: FloatArray, descriptor: NDArray[np.generic]) -> None:

@@ -1,4 +1,4 @@
-"""What changed in a submap since its replica was brought up to date: how a graph in another process follows the arrays.
+"""Changes of a submap since its replica was updated: how a graph in another process follows the arrays.
 
 A replica holds what a graph needs of a submap: poses, points, pixels with their sigmas, observations, gauge. Keyframes
 and rows that were added go there once, and of the rest only what died or moved: tens of kilobytes a keyframe, where the
@@ -126,7 +126,7 @@ class SubmapMirror:
         self._landmark_alive = np.zeros(0, bool)
         self._K: FloatArray | None = None
         self._n_dropped = 0
-        self._kept_rows: IntArray | None = None  # what the replica is to be told
+        self._kept_rows: IntArray | None = None  # what is to be sent to the replica
 
     @property
     def knows_replica(self) -> bool:

@@ -1,8 +1,10 @@
-"""Places that are seen again: recognised by descriptors, verified by pixels, linked once others say the same.
+"""Revisited places: recognised by descriptors, verified by pixels, linked once other keyframes agree.
 
-In reading order: `recogniser` (what recognises, as others see it), `faiss_index` (votes of landmarks), `verification`
-(is it the same place?), `second_pose` (would another pose explain it as well?), `revisits` (when is it asked, believed,
-linked?).
+In reading order:
+
+- `recogniser`: what a recogniser offers. `faiss_index`: the one that counts votes of landmarks.
+- `verification`: is it the same place? `second_pose`: would another pose explain it as well?
+- `revisits`: when to ask, believe and link.
 """
 
 from dualslam.places.faiss_index import FaissRecogniser

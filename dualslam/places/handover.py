@@ -1,7 +1,7 @@
-"""A live map that comes to what a joined map of an earlier run shows: the run goes on in that one.
+"""Continue a run in the joined map of an earlier run, once the live map reaches its place.
 
-Without it each run would map the place once more, from the seam between two submaps on, and a map that is used many
-times would grow by a submap with each use.
+Without it each run would map the place once more, from the seam between two submaps on. A map would grow by a submap
+with each use.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ class Handover:
         K : (3, 3)
             Intrinsics of the frame.
         in_parts : bool
-            At each call ask the index, or pose the frame by one of up to three keyframes that it has named; the
-            keyframe waits meanwhile. For real time, where all at once takes longer than a frame (36 ms in the
-            middle, up to 70, in a map of 7-Scenes); whoever calls lets the index know of the submaps.
+            Each call asks the index, or poses the frame by one of up to three keyframes that it has named. The keyframe
+            waits meanwhile. For real time, where all at once takes longer than a frame (median 36 ms, up to 70, in a
+            map of 7-Scenes). The caller adds the submaps to the index.
         """
         self._forget_another(live)
         if self._sighting is None and self._search is not None:
@@ -115,8 +115,8 @@ class Handover:
     def follow_alone(self, view: View, live: VisualOdometry) -> Relocalised | None:
         """Show a frame that the live map could not pose to the submap that seems to have the place.
 
-        It had the place by a frame that both posed alike, and by each frame since: the map that ends here was about
-        to go over to it.
+        It had the place by a frame that both posed alike, and by each frame since: the map that ends here was about to
+        switch to it.
         """
         self._forget_another(live)
         if self._sighting is None:

@@ -1,4 +1,4 @@
-"""What recognises places, as the rest of the system sees it."""
+"""Interface of place recognition."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class PlaceRecogniser(Protocol):
         features : Features
             Of the image.
         submaps : mapping of int to Submap
-            Those that were taken in, as they are now: culled and merged landmarks are followed there.
+            The current submaps of the index: culled and merged landmarks are followed there.
         may_be : callable
             Whether a keyframe (submap id, keyframe id) may be returned; called for keyframes with votes only.
         at_most : int

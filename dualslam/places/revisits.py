@@ -70,7 +70,7 @@ class _Closing:
 
 
 class Revisits:
-    """Searches for places, keyframe by keyframe, and links those that are seen again.
+    """Searches for places, keyframe by keyframe, and links those that are revisited.
 
     Parameters
     ----------

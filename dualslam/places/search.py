@@ -1,4 +1,4 @@
-"""The search for a place seen before, as a job beside the tracking: a snapshot goes out, verified places come back.
+"""Search for a revisited place as a background job: a snapshot goes out, verified places come back.
 
 Asking the index is cheap and stays where the map grows. Verification matches images against each other, and takes as
 long as several frames.
@@ -57,7 +57,7 @@ def poses_of(match: PlaceMatch, submaps: Mapping[int, Submap]) -> tuple[FloatArr
 def follow_maps(
     match: PlaceMatch, then: tuple[FloatArray, FloatArray], submaps: Mapping[int, Submap]
 ) -> PlaceMatch | None:
-    """Return a match between submaps as they are now, which have been solved again since it was made.
+    """Return a match between the current submaps, which have been solved again since it was made.
 
     None where one of its keyframes is no more. `then`: their poses when the match was made.
     """

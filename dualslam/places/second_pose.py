@@ -1,7 +1,7 @@
-"""Does a second similarity explain nearly as much? Then the scene repeats itself, and no match can say which is right.
+"""Test for a second similarity that explains nearly as much: then the scene repeats itself, and no match decides.
 
 Matching with a test of the second best throws out just those matches that would show a repetition. Here every landmark
-is paired with all that look like it; what the first similarity explains is taken out, and the rest is asked for
+is paired with all similar ones. Pairs that the first similarity explains are removed, and the rest is searched for
 another one.
 """
 
@@ -21,7 +21,8 @@ from dualslam.core.types import BoolArray, Failure, FloatArray, IntArray
 SAME_SHARE = 0.1
 """Distance, of the size of what they move, within which two similarities are one: twice the 5 % of a wrong link."""
 N_ALIKE = 4
-"""Landmarks of the other map that one landmark is paired with: the number of copies of a thing that are told apart."""
+"""Landmarks of the other map that one landmark is paired with: the number of copies of a thing that can be
+distinguished."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

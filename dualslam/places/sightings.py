@@ -118,7 +118,7 @@ class Sightings:
         return n
 
     def avoid(self, submap_id: int) -> None:
-        """Relocalise no more frames in a submap that was lost as a look-alike: a wrong pose may pass by chance."""
+        """Relocalise no more frames in a submap lost to repeated structure: a wrong pose may pass by chance."""
         self._avoided.add(submap_id)
 
     def end(self) -> None:

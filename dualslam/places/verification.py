@@ -1,11 +1,14 @@
-"""Is this the same place? Pixels decide: what both sides matched, what should be seen and is not, what else would fit.
+"""Verification of a place by pixels: what both sides match, what should be seen and is not, what else would fit.
 
-A candidate of the recogniser and the keyframe that asks each bring the keyframes that see the same landmarks. (1) Wide
-matching between the two groups pairs landmarks; (2) a similarity of these 3D-3D pairs by RANSAC and refinement;
-(3) a search, guided by it, for everything that either side should show in the other's images, which scores the
-similarity by what is *not* found as well; (4) the similarity again, of all pairs, with its covariance, and the gates:
-keyframes on either side, spread over the image, sigmas; (5) the test whether a second similarity fits as well.
-Drift is not considered: it can neither refute what the pixels prove, nor prove what they do not.
+The recogniser's candidate and the query keyframe each bring the keyframes that see the same landmarks. The steps:
+
+1. Wide matching between the two groups pairs landmarks.
+2. RANSAC and refinement give a similarity of these 3D-3D pairs.
+3. A guided search looks for everything that either side should show in the other's images. Misses count, too.
+4. All pairs give the similarity again, with its covariance. The gates test keyframes on either side, their spread over
+   the image, and sigmas.
+5. A second similarity must not fit as well.
+ is not considered: it can neither refute what the pixels prove, nor prove what they do not.
 """
 
 from __future__ import annotations
@@ -56,8 +59,8 @@ NEAR_FIRST = 4.0
 """Pairs within twice the gate's distance of the first similarity are its own, not evidence of another: a thing that was
 mapped twice lies a little beside itself."""
 MIN_FOUND = 0.3
-"""Share of what should be seen that must be found, in the middle part of the image, relative to the share that the
-place's own keyframes show of it. Images that show something else come to 0.01 to 0.04 (25 pairs each of `kitti_03` and
+"""Share of the expected landmarks that must be found, in the middle part of the image. It is relative to the share that
+the place's own keyframes show. Images that show something else come to 0.01 to 0.04 (25 pairs each of `kitti_03` and
 `hololens_000`); the same place from elsewhere to 0.4 and more."""
 
 
@@ -302,7 +305,7 @@ class PlaceVerifier:
         )
 
     def _second_pose(self, place: Side, query: Side, S: FloatArray, rng: Generator) -> SecondSimilarity | None:
-        """Look for another similarity among all that looks alike, in the place and in the keyframe that asks."""
+        """Look for another similarity among all similar landmarks, in the place and in the query keyframe."""
         ids = query.submap.landmark_of[query.keyframes[0]]
         asked = np.unique(ids[ids >= 0])
         theirs, ours = query.submap.landmarks["descriptor"], place.submap.landmarks["descriptor"]

@@ -1,4 +1,4 @@
-"""What a person looks at after a run: one self-contained page for it, and one for several runs side by side.
+"""Reports for a person: one self-contained page for a run, and one for several runs side by side.
 
 In reading order: `run_data` (a run folder, read), `page` (the page, section by section), `top_view`, `timeline`,
 `failures`, `places`, `charts` (its figures). `compare` (several runs), `explanation` (decisions about a frame),

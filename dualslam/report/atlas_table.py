@@ -17,7 +17,7 @@ def atlas_section(run: RunData) -> Markup | None:
         return None
     words = (
         "Each connection between submaps is a factor of one graph, solved when it comes. What is rejected stays in the "
-        "map, without a say. A submap is bent by the part of a move that is not a change of its place; in its own unit."
+        "map and is ignored. A submap is bent by the part of a move that is not a change of its place; in its own unit."
     )
     return join([tag("p", words), cards(_HEADS, rows)])
 

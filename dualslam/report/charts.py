@@ -88,7 +88,7 @@ def beside_table(run: RunData) -> Markup:
         )
         for kind, queue in beside.items()
     ]
-    caption = "Work beside the tracking, in processes of its own: the longest counts from when a job was submitted."
+    caption = "Background work, in processes of its own. The longest time counts from when a job was submitted."
     return table(heads, rows, "plain stages", caption)
 
 

@@ -155,7 +155,9 @@ def _told(run: RunData, story: FailureStory) -> str:
         told.append(f"There were signs of trouble since frame {suspected}: the map is not trusted from there on.")
     if story.relocalised is not None:
         gap = abs(run.row_of.get(story.relocalised["frame"], 0) - run.row_of.get(story.lost_since, 0))
-        again = f"It was seen again at frame {story.relocalised['frame']}, {count(gap, 'frame')} after the loss, before"
+        again = (
+            f"It was relocalised at frame {story.relocalised['frame']}, {count(gap, 'frame')} after the loss, before"
+        )
         return " ".join([*told, again, "another map had started, and continued."])
     if story.restart is None:
         return " ".join([*told, "No map was started after it, until the run ended."])
@@ -196,7 +198,7 @@ def _outcome(story: FailureStory) -> str:
     reasons = Counter(str(e.get("reason", "?")).replace("_", " ") for e in refused)
     common = ", ".join(f"{reason} ({n})" if len(reasons) > 1 else reason for reason, n in reasons.most_common(3))
     tried = f"All {len(refused)} links that were tried were" if len(refused) > 1 else "The one link that was tried was"
-    return f"{tried} refused: {common}. The two maps stay apart.{broken}"
+    return f"{tried} refused: {common}. The two maps are not joined.{broken}"
 
 
 def _link_words(link: Mapping[str, Any]) -> str:
@@ -223,7 +225,7 @@ def _close_up(run: RunData, scene: PlacedRun | None, story: FailureStory) -> Mar
     drawing = close_up(run, scene, (first, last + AROUND), [row_of[k] for k in keyframes])
     if drawing is None:
         return join(None)
-    marks = "; ◆ keyframes that the link rests on" if keyframes else ""
+    marks = "; ◆ keyframes that support the link" if keyframes else ""
     words = "The path around the loss, from above: thick where frames were recovered, dotted where none has a pose"
     return tag("figure", drawing, tag("figcaption", f"{words}{marks}."), cls="close-up")
 

@@ -26,7 +26,7 @@ _MARKS = {
     "initialised": ("○", "mark", "a map begins"),
     "reinitialised": ("○", "mark", "a new map begins"),
     "gap_relocalised": ("↺", "mark quiet", "found again"),
-    "relocalised": ("↺", "mark good", "a place of the map is seen again, and the map goes on"),
+    "relocalised": ("↺", "mark good", "a place of the map is revisited, and the map continues"),
     "rolled_over": ("→", "mark quiet", "a full submap hands over to the next"),
     "linked": ("◆", "mark good", "two submaps are linked"),
     "relinked": ("◆", "mark good", "a link of unsure scale is measured again"),

@@ -96,7 +96,7 @@ def _drawing(
         if placed.submap is not None and len(placed.row) and window is None:
             words.append(canvas.label(placed.xyz[len(placed.row) // 2] @ axes.T, f"submap {placed.submap}", "name"))
         at = placed.xyz[np.isin(placed.row, marked)]
-        words += [canvas.label(uv, "◆", "agreeing", "keyframe that the link rests on") for uv in at @ axes.T]
+        words += [canvas.label(uv, "◆", "agreeing", "keyframe that supports the link") for uv in at @ axes.T]
     words += _ends(scene, canvas, axes) if window is None else []
     words += _breakages(run, scene, canvas, axes)
     words.append(canvas.scale_bar(scene.unit, np.concatenate(drawn) @ axes.T))

@@ -1,4 +1,4 @@
-"""What a run trusts: lost scales, answers that were not believed, and the map's own uncertainty."""
+"""Doubts about a run: lost scales, rejected answers, and the map's own uncertainty."""
 
 from __future__ import annotations
 

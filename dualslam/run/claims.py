@@ -1,4 +1,4 @@
-"""What a map claims of its own accuracy, keyframe by keyframe: the columns ``sigma_*`` of ``frames.csv``.
+"""A map's claimed accuracy, keyframe by keyframe: the columns ``sigma_*`` of ``frames.csv``.
 
 Both are read from the map as it is at the end of a run, whichever way a keyframe came into it: tracked, in reverse too,
 or posed again later. A frame claims what the keyframe does that it hangs on.

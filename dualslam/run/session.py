@@ -192,8 +192,8 @@ def run_to_folder(
     ------
     ConfigError, InputError, OutputError
     Exception
-        Whatever the system, `on_frame` or, after its first frame, the sequence raised, once what was found until then
-        is written; a note on it says where.
+        Any exception of the system, of `on_frame` or, after its first frame, of the sequence. It is raised once the
+        results are written, and a note on it says where.
     KeyboardInterrupt
         If results were being written; a note on it says which are there.
     """

@@ -33,8 +33,8 @@ class Components:
     graphs in another process and back, if they are solved there. `refine_at_end`: has the last word on each submap.
     `patches`: compares frames with the images of older keyframes. `open_graph`: makes a graph of a submap in this
     process, solved. `open_features`: starts one more process, and returns a function that has the features of a frame
-    found there. `foresee`: computes in the background what reverse tracking may ask for in a frame; none where nothing
-    runs in the background.
+    found there. `foresee`: precomputes in the background the features that reverse tracking may need. None without
+    background processes.
     """
 
     view_of: Callable[[Frame], View | Failure]

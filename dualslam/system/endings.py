@@ -128,7 +128,7 @@ class Endings:
         try:
             graph.rebuild(submap)
         except SolverError as error:
-            log.warning("submap %d is not parted where it has lost its scale: %s", old.id, error)
+            log.warning("submap %d is not split where it has lost its scale: %s", old.id, error)
             return False
         record.event(
             EventKind.FAILED,

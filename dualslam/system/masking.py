@@ -1,4 +1,4 @@
-"""What stands still in the image: the frames, and the map, from before it was found are rid of it."""
+"""Removal of pixels that stand still from frames and map, back to before they were found."""
 
 from __future__ import annotations
 

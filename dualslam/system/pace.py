@@ -1,10 +1,10 @@
 """Whether the system keeps up with its camera, and what it leaves out where it does not.
 
-Two things can be behind: the tracking, when frames are processed after their time, and the back end, when more
-keyframes wait for its graph than it catches up on by taking many at once. In either case keyframes are what there is to
-save: each costs the tracking its insertion and the back end its solution. One that is due but not urgent is put off
-until both have caught up. While there is no map, a start is looked for beside the frames (`workers/start_beside.py`),
-or, without processes, by one pair of frames at a time: a start that comes late costs more than frames that are dropped.
+Two things can be behind. The tracking is if frames are processed after their time. The back end is if more keyframes
+wait for its graph than it can catch up on. In either case keyframes are what there is to save: each costs the tracking
+its insertion and the back end its solution. One that is due but not urgent is put off until both have caught up. While
+there is no map, a start is looked for beside the frames (`workers/start_beside.py`), or, without processes, by one pair
+of frames at a time: a start that comes late costs more than frames that are dropped.
 
 Only real time has a pace. Without it nothing here ever changes what a run does.
 """
@@ -22,8 +22,8 @@ FAR_BEHIND_KEYFRAMES = 30
 full submap takes. Below that its lag ends by itself, since five keyframes at once cost a graph half of five one by one.
 In a fast turn, where the lag arises, a missing keyframe loses the track."""
 MAX_PUT_OFF = 5
-"""Frames by which a keyframe is put off at most. At 30 Hz that is a sixth of a second: long enough to work off the
-delay of a keyframe and a relinearisation, too short for the view to change by more than a few degrees."""
+"""Frames by which a keyframe is put off at most. At 30 Hz that is a sixth of a second. It suffices to work off the
+delay of a keyframe and a relinearisation, and the view changes by a few degrees at most."""
 URGENT_TIMES = 2
 """A frame that tracks fewer than so many times the landmarks of a weak track needs new ones now, or is lost."""
 

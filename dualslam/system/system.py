@@ -198,8 +198,8 @@ class System:
         Returns
         -------
         callable or None
-            Waits for a frame's features, on a thread of the caller's, and returns the frame with them, to be given to
-            `step`. None where all is done in one process.
+            Waits for a frame's features, on a thread of the caller's, and returns the frame with them, for `step`. None
+            where all is done in one process.
         """
         return None if self._state.parts.open_features is None else self._state.parts.open_features()
 

@@ -1,4 +1,4 @@
-"""What a live view draws of a run: submaps, links, the camera and the status of each frame, as arrays in one world.
+"""Scene of the live view: submaps, links, camera and frame statuses, as arrays in one world.
 
 Linked sets of submaps stand in one frame. An unlinked one stands beside them, in a unit of its own, until a link takes
 it in. Knows no viewer.

@@ -41,7 +41,7 @@ class SubmapArrays:
         Keyframes, ascending.
     T_submap_kf : (K, 4, 4) float32
     condemned : (K,) bool
-        Keyframes that are not to be relied on.
+        Keyframes marked invalid.
     landmarks_xyz : (L, 3) float32
     """
 

@@ -27,8 +27,8 @@ def has_display() -> bool:
 def open_viewer(recording: bytes) -> None:
     """Show the content of an ``.rrd`` file, and wait until the window is closed.
 
-    The viewer sends usage data, and asks for newer versions, unless its settings forbid it. It gets settings of its own
-    that forbid the one, so that the user's stay unchanged, and a way out that leads nowhere for the other.
+    The viewer sends usage data, and asks for newer versions, unless its settings forbid it. Its own settings forbid the
+    former, so that the user's stay unchanged. A proxy that leads nowhere stops the latter.
 
     Raises
     ------

@@ -1,12 +1,12 @@
-"""Work beside the tracking in processes of their own: warm, fed with jobs, asked for results without ever waiting.
+"""Background work in processes of its own: warm, fed with jobs, and polled for results without waiting.
 
 A process, because GTSAM holds the interpreter's lock while it solves. A worker that dies, or takes longer than its
 time, costs the job that it was busy with: the job ends as a `Failure`, and a fresh worker takes the place.
 
-Workers stand in lanes. One is for what the live map asks for all the time, so that no reverse tracking of 20 s stands
-before its graph; one is for walks and whatever else may take long. Where cores are short, the system's scheduler gives
-way to the tracking first, then to the live map's lane (`Lane.niceness`). A lane's queue is bounded, and its most urgent
-kind goes first.
+Workers stand in lanes. One is for the live map's constant requests, so that no reverse tracking of 20 s stands before
+its graph. One is for reverse tracking and other long jobs. Where cores are short, the system's scheduler gives way to
+the tracking first, then to the live map's lane (`Lane.niceness`). A lane's queue is bounded, and its most urgent kind
+goes first.
 
 Workers are spawned, so a script of one's own that asks for them must be importable: what it runs stands under
 ``if __name__ == "__main__":``.
@@ -155,7 +155,7 @@ class WorkerDesk:
         Called with each job that a process begins (kind and work), and the process's id: where the failure lab takes
         hold.
     on_news : callable, optional
-        Called, where a job's result is asked for, with what its process has told of it meanwhile.
+        Called with the job's progress reports, when its result is asked for.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class WorkerDesk:
         queue = self._by_kind[kind]
         while not (ended := self._ended.pop(kind, [])):
             if not queue.busy:
-                return Ended(work, Failure(FailureReason.WORKER, "the processes were told to end"))
+                return Ended(work, Failure(FailureReason.WORKER, "the processes have been stopped"))
             self._look(queue, wait=True)
         return ended[0]
 

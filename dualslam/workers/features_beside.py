@@ -40,7 +40,7 @@ class FeaturesBeside:
         try:
             found = self._desk.ask(JobKind.FEATURES, self._painted(frame).image).result
         except ConfigError as error:
-            log.warning("no more features are found beside the tracking: %s", error)
+            log.warning("no more features are found in the background: %s", error)
             self._gave_up = True
             return frame
         if isinstance(found, Failure):

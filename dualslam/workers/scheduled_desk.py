@@ -45,7 +45,7 @@ class ScheduledDesk:
     finish_wait_s : float
         How long the end of a run in real time, or of one that was interrupted, waits for what is under way.
     budget_s : float, optional
-        Time after which a job that can stop early is told to, in real time.
+        Time after which a job that can stop early must, in real time.
 
     Attributes
     ----------

@@ -78,7 +78,7 @@ class StartBeside:
     ----------
     desk : Desk
     starter : MapStarter
-        Searches here and now where there is no hurry.
+        Searches here and now when the system is on time.
     K : (3, 3) float64
         Intrinsics of the frames.
     """

@@ -1,14 +1,14 @@
 """Objects of numpy arrays through a pipe: large arrays go past the pickle, and what was sent before is not sent again.
 
 Pickling holds the interpreter's lock, and so does each turn at a pipe: a thread that carries a job of a thousand arrays
-must come to its turn a thousand times beside the one that tracks. So the structure alone is pickled, the memory of
-large arrays is written from where it lies, and many pieces go with one call of the system, which holds no lock.
+must come to its turn a thousand times beside the one that tracks. So only the structure is pickled. The memory of large
+arrays is written from its place. Many pieces go with one system call, which holds no lock.
 
 Features and images never change, and most of a job is made of those that the one before held already: the frames in the
-buffer, the keyframes of a map. Each goes through a `Channel` once. The worker keeps it as long as the process that
-tracks does, and what comes back names it only, so that a result is what has changed. An object stays the same object in
-the worker, job after job: what was found in an image is known when it comes again. The other way nothing is kept: what
-a worker has made is whole in its result.
+buffer, the keyframes of a map. Each goes through a `Channel` once. The worker keeps it as long as the tracking process
+does. The result only names it, and so holds the changes alone. An object stays the same object in the worker, job after
+job: what was found in an image is known when it comes again. The other way nothing is kept: what a worker has made is
+whole in its result.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Channel:
     def send_in_passing(self, thing: Any) -> bool:
         """Send what is small, if the other end has kept up, and else let it be lost: this never waits.
 
-        A pipe counts as free while most of its buffer is; that is some ten times what is told in passing.
+        A pipe counts as free while most of its buffer is; that is some ten times the size of such a message.
 
         Raises
         ------

@@ -27,12 +27,12 @@ STOP_S = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """What came back of a job: its result, and what it cost."""
+    """Result and cost of a job."""
 
     result: Any | Failure
     cpu_s: float = 0.0
     peak_rss_mb: float = 0.0
-    stopped_after: int | None = None  # steps, where it was told that its time was over
+    stopped_after: int | None = None  # steps, if it was stopped early
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +80,7 @@ class Worker:
         self._jobs.put((kind, work, limit))
 
     def news(self) -> Any:
-        """Return what the job in hand has told since the last call, the newest of it; None where nothing."""
+        """Return the newest report of the current job since the last call, or None."""
         news, self._news = self._news, None
         return news
 
@@ -115,7 +115,7 @@ class Worker:
         self._carrier.join()
 
     def _carry(self) -> None:
-        """Carry jobs to the process and results back, until told to stop or the process is gone."""
+        """Carry jobs to the process and results back, until it is stopped or the process is gone."""
         with self._connection:
             channel = Channel(self._connection, gives=True)
             try:

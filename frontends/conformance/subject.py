@@ -1,4 +1,4 @@
-"""What the checks are given, and how they complain."""
+"""Subject of the conformance checks, and their complaints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every front end does first with an image."""
+"""Preparation of an image for any front end."""
 
 from __future__ import annotations
 

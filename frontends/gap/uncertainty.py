@@ -1,4 +1,4 @@
-"""What a pose is worth that was found across a gap: its covariance, and how well it holds the scale.
+"""Uncertainty of a pose found across a gap: its covariance, and how well it holds the scale.
 
 A frame beyond a gap sees points whose depths are known from the other side, to some extent. All that is mapped beyond
 the gap inherits the scale at which it sees them. What that is worth is not read from residuals, but from the Hessian:

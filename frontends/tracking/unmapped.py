@@ -1,8 +1,8 @@
-"""What an image shows and the map lacks: whether the camera has moved past it, and a keyframe would map it.
+"""Unmapped image content, and whether the camera has moved past it so that a keyframe would map it.
 
-Parallax is told by what is known. Beside a far wall a bench that comes into view, on which nothing is mapped yet, moves
-by a quarter of the image while the wall hardly does, and has gone, or has come too close, when the wall asks for a
-keyframe.
+Known content gives the parallax. A bench that comes into view beside a far wall has nothing mapped on it yet. It moves
+by a quarter of the image while the wall hardly does. When the wall asks for a keyframe, the bench has gone or is too
+close.
 """
 
 from __future__ import annotations

@@ -214,7 +214,7 @@ def test_a_map_that_a_later_one_took_over_is_told_without_a_link(broken_run: Run
     text = outline(with_events(broken_run, event)).text
     assert "✓ taken over by a later map" in text
     assert "submap 1 posed all its 20 frames: no link is needed." in text
-    assert "The two maps stay apart" not in text
+    assert "The two maps are not joined" not in text
 
 
 def test_a_map_that_was_seen_again_is_told_without_a_restart(broken_run: RunData) -> None:
@@ -225,7 +225,7 @@ def test_a_map_that_was_seen_again_is_told_without_a_restart(broken_run: RunData
     events = [*broken_run.events[: failed + 1], event, *broken_run.events[failed + 1 :]]
     text = outline(replace(broken_run, events=events)).text
     assert "✓ seen again" in text
-    assert f"seen again at frame {again}" in text
+    assert f"relocalised at frame {again}" in text
     assert f"{again} seen again" in text, "the picture's words"
     assert "was started at frame" not in text
 

@@ -1,4 +1,4 @@
-"""What every camera model has: raw pixels, rays and rectified pixels, a form for files, and a check of its numbers.
+"""Base of camera models: raw pixels, rays and rectified pixels, a form for files, and a check of the numbers.
 
 A model hides its lens: the rest of the system sees rectified pixels of a pinhole with intrinsics `K`. Pixel (0, 0) is
 the centre of the top-left pixel. The camera looks along +z, x right, y down.

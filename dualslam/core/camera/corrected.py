@@ -21,8 +21,8 @@ from dualslam.core.types import FloatArray
 class LensCorrection:
     """How a camera differs from the calibration that was given.
 
-    In the rectified pixels of the given camera, a ray (x, y, 1) is seen at ``K diag(e^a, e^a, 1) (x_d, y_d, 1)``, plus
-    (du, dv). Here ``(x_d, y_d) = (x, y) (1 + k1 r^2 + k2 r^4)``.
+    A ray (x, y, 1) is seen, in the given camera's rectified pixels, at ``K diag(e^a, e^a, 1) (x_d, y_d, 1)`` plus (du,
+    dv). Here ``(x_d, y_d) = (x, y) (1 + k1 r^2 + k2 r^4)``.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What a search for an unknown camera has found."""
+"""Result of a search for an unknown camera."""
 
 from __future__ import annotations
 

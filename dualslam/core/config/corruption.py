@@ -1,4 +1,4 @@
-"""What the failure lab does to a run on purpose: image corruptions and faults inside the system, as config values."""
+"""Deliberate failures as config values: image corruptions and faults inside the system."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is wrong with a configuration, in one sentence that names the field and the nearest known one."""
+"""Messages for a wrong configuration: one sentence with the field and the nearest known one."""
 
 from __future__ import annotations
 

@@ -173,9 +173,9 @@ class RecoveryConfig(StrictModel):
     Where the camera turns in place none can start, but it may come back to the lost map."""
     retry_keyframes: tuple[Annotated[int, Field(ge=1)], ...] = (5, 15)
     """Keyframes of the new map at which reverse tracking is repeated if it has found no link, or left buffered frames
-    without a pose. The map then knows depths better, and more of the scene. It is also repeated after a calibration
-    and, if any number stands here, at the end of the run if the map has grown by half. One for poses alone that finds
-    none is the last."""
+    without a pose. The map then knows depths better, and more of the scene. It is also repeated after a calibration. If
+    any number stands here, it is repeated at the end of the run, once the map has grown by half. One for poses alone
+    that finds none is the last."""
     workers: int = Field(0, ge=0, le=16)
     """Processes for long background work, for which tracking never waits (`--workers`): reverse tracking and
     self-calibration. With any there is one more, which solves the live map's graph. 0: inline, in the tracking process,

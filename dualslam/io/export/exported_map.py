@@ -1,4 +1,4 @@
-"""What all exports start from: the main map of a run as flat arrays, in one frame and one unit."""
+"""Common input of all exports: the main map of a run as flat arrays, in one frame and one unit."""
 
 from __future__ import annotations
 

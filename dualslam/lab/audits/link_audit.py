@@ -137,7 +137,7 @@ def audit_links(
     truth : mapping of int to (4, 4)
         True ``T_world_cam`` by frame index, for the frames that have it.
     reach : int
-        Truth comes from the frames of either map among the link's keyframes, and so many before and after them (in
+        Truth comes from the frames of either map among the link's keyframes. `reach` more count before and after (in
         counts of the source's index). Where those do not tell whether the scale is wrong (slow motion tells little of
         it), twice or four times as many and so on: the fewest that do, or else those that tell most. The same at the
         live end.

@@ -118,7 +118,7 @@ def plan_trials(spec: BenchSpec, describe: Callable[[SequenceSpec], SourceInfo])
     sequences = [s for s in spec.sequences if s.half in (None, spec.half)]
     info = {s.name: describe(s.model_copy(update={"source": _source(s, spec.half, 0)})) for s in sequences}
     for variant in spec.variants:
-        _config(spec, variant, 0, [])  # a wrong field is told before any long work
+        _config(spec, variant, 0, [])  # a wrong field is reported before any long work
     return [
         _trial(spec, sequence, info[sequence.name], condition, variant, number)
         for number in range(max(spec.trials, *(c.trials or 0 for c in spec.conditions)))

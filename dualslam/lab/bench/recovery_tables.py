@@ -1,4 +1,4 @@
-"""What recovery was asked to do and did: Table III of the paper, and Eq. (1) against what was observed."""
+"""Tables of recovery: Table III of the paper, and Eq. (1) against the observed rates."""
 
 from __future__ import annotations
 
@@ -72,9 +72,9 @@ def recovery_table(spec: BenchSpec, records: Sequence[TrialRecord]) -> ResultTab
             *("attempt", "made", "succeeded", "success %", "low %", "high %", "mean s", "median s", "longest s"),
         ),
         rows,
-        "An attempt is made where all before it failed, so that its success is conditional on that; those of a walk "
-        "that is made again later are retries, and counted apart. Wilson's 95 % intervals. Seconds are wall time of "
-        "the recoveries that succeeded, on the machine of the bench.",
+        "An attempt is made if all before it failed, so its success is conditional on that. Attempts of a repeated "
+        "reverse tracking are retries, counted separately. Wilson's 95 % intervals. Seconds are wall time of the "
+        "recoveries that succeeded, on the machine of the bench.",
     )
 
 

@@ -1,4 +1,4 @@
-"""What a bench is made of, as strict YAML."""
+"""Specification of a bench, as strict YAML."""
 
 from __future__ import annotations
 

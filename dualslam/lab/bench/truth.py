@@ -1,4 +1,4 @@
-"""What the truth says of a run: posed frames, trajectory error, broken stretches, false joins."""
+"""A run against ground truth: posed frames, trajectory error, broken stretches, false joins."""
 
 from __future__ import annotations
 

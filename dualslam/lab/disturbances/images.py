@@ -1,4 +1,4 @@
-"""What corruptions do to an image: the same frame and seed give the same pixels, whatever was asked for before."""
+"""Image corruptions: the same frame and seed give the same pixels, in any order."""
 
 from __future__ import annotations
 

@@ -72,8 +72,8 @@ class TrajectoryScore:
     ate_pct_of_path : float or None
         The same (RMSE), of the length of the true path.
     path_m, spread_m : float or None
-        Length of the true path over the compared poses; RMS distance of the true positions from their mean, which is
-        the error of a camera that never moved.
+        Length of the true path over the compared poses. RMS distance of the true positions from their mean: the error
+        of a camera that never moved.
     scale : float or None
         Scale that the alignment found, estimate to truth (1 for SE(3)).
     scale_drift : float or None

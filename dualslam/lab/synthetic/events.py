@@ -1,4 +1,4 @@
-"""What the script of a rendered world does to its frames: the light, the lens, the shutter, the way of the camera."""
+"""Scripted events of a rendered world: light, lens, shutter, and the camera's path."""
 
 from __future__ import annotations
 

@@ -15,8 +15,8 @@ from dualslam.lab.synthetic.sequence import SyntheticSequence
 def render_to_folder(sequence: SyntheticSequence, out: str | Path, image_format: str = "png") -> Path:
     """Render all frames of a sequence into a new folder.
 
-    It holds ``images/NNNNNN.png`` (named by frame index, dropped frames are missing), ``times.txt`` (seconds, one line
-    a frame) and ``calib.txt`` (``fx fy cx cy width height``). ``groundtruth_tum.txt`` has ``t tx ty tz qx qy qz qw``,
+    It holds ``images/NNNNNN.png``, named by frame index, without dropped frames. ``times.txt`` has seconds, one line a
+    frame. ``calib.txt`` has ``fx fy cx cy width height``. ``groundtruth_tum.txt`` has ``t tx ty tz qx qy qz qw``,
     camera to world, one line a frame. ``SOURCE.md`` says how to render it again.
 
     Parameters

@@ -38,7 +38,7 @@ _REFRESH_AT = (24, 80, 200, 500)
 class _Candidates:
     """Surfaces that may be in view, nearest first.
 
-    ``index`` (N,) in the scene; ``planes`` (N, 3, 3) the affine forms of s/z, t/z, 1/z over (u, v, 1), with s and t in
+    ``index`` (N,) in the scene. ``planes`` (N, 3, 3): the affine forms of s/z, t/z, 1/z over (u, v, 1). s and t are in
     [0, 1] on the surface. ``bounds`` (N, 4) first and past-the-last pixel: u0, v0, u1, v1; ``nearest`` (N,) the largest
     1/z.
     """

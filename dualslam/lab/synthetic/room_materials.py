@@ -1,4 +1,4 @@
-"""What the room's surfaces look like: each function paints a kind of surface on a `Painter`, new each time."""
+"""Materials of the room's surfaces: each function paints one kind on a `Painter`, new each time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the street's surfaces look like: each function paints a kind of surface on a `Painter`, new each time."""
+"""Materials of the street's surfaces: each function paints one kind on a `Painter`, new each time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a synthetic world is made of: textured rectangles, their pictures made on first sight, and the scene they form.
+"""Surfaces of a synthetic world: textured rectangles, pictures made on first sight, and the scene they form.
 
 World frame of all scenes: metres, x right, y down, z forward, the ground (or floor) at y = 0; heights are negative y.
 """

@@ -1,9 +1,8 @@
 """Questions about the camera, asked in the background, and their answers' effect on a map that has grown meanwhile.
 
 The snapshot that was asked comes back changed to another camera: other pixels, poses and points. All keyframes of the
-live submap take the new camera, and those of the snapshot their new poses, too. Later ones follow them
-(`dualslam/map/late_estimate.py`). Then the graph is made anew. Inline nothing has come since, and the live submap
-becomes what the snapshot was changed to.
+live submap take the new camera, and those of the snapshot their new poses, too. Later ones follow
+them. Then the graph is rebuilt. Inline nothing has come since, and the live submap becomes the changed snapshot.
 """
 
 from __future__ import annotations

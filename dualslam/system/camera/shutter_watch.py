@@ -40,8 +40,8 @@ MIN_SIGMAS = 3.0
 to 1.2 (KITTI, EuRoC), rolling ones at 5 and more."""
 
 MAX_SIGMA_S = 0.004
-"""Inflated: where the camera turns too slowly to fix a readout time to that, other errors of the pixels pass for one (a
-rendered street, which hardly turns: -0.020 s with 0.008 claimed). There it does not matter either."""
+"""Inflated. If the camera turns too slowly to fix a readout time to this, other errors of the pixels pass for one. A
+rendered street, which hardly turns, gave -0.020 s with 0.008 claimed. There it does not matter either."""
 
 
 class ShutterWatch:
