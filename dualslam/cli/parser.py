@@ -98,6 +98,7 @@ def _build_parser() -> _Parser:
     _add_export(commands)
     _add_scale(commands)
     _add_measure(commands)
+    _add_merge(commands)
     _add_render(commands)
     _add_config(commands)
     _add_demo(commands)
@@ -299,6 +300,22 @@ def _add_measure(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser, _ = _command(commands, "measure", "Put the map of a run into the frame of measurements, in metres.")
     parser.add_argument("run", metavar="RUN", type=_path, help="a run folder")
     _add_measurements(parser, required=True)
+
+
+def _add_merge(commands: argparse._SubParsersAction[_Parser]) -> None:
+    parser, _ = _command(commands, "merge", "Join the maps of two runs that saw the same places.")
+    parser.add_argument("run_a", metavar="RUN_A", type=_path, help="a run folder")
+    parser.add_argument("run_b", metavar="RUN_B", type=_path, help="a run folder; it may be of another camera")
+    _add_output(parser)
+    _add_measurements(parser)
+    parser.add_argument(
+        "--measurements-b",
+        metavar="FILE",
+        type=_path,
+        action="append",
+        default=[],
+        help="as --measurements, on the clock of RUN_B; repeatable",
+    )
 
 
 class _Distance(argparse.Action):

@@ -33,6 +33,8 @@ from dualslam.map.frame_records import FrameRow as FrameRow  # a row of frames.c
 log = logging.getLogger(__name__)
 
 TRAJECTORY = "trajectory.txt"
+TRAJECTORIES_MERGED = ("trajectory_a.txt", "trajectory_b.txt")
+"""Of a merged run: the frames of either run, on its own clock."""
 TRAJECTORY_KITTI = "trajectory_kitti.txt"
 TRAJECTORY_KITTI_FRAMES = "trajectory_kitti_frames.txt"
 FRAMES = "frames.csv"
@@ -66,6 +68,7 @@ _FILES = (
     GROUND_TRUTH,
     MASK,
     *METRIC_FILES,
+    *TRAJECTORIES_MERGED,
 )
 _RESULTS = (
     CONFIG,

@@ -6,7 +6,7 @@ do not. What is believed becomes a link, and the atlas does the rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
 from dualslam.atlas.atlas import Link, LinkKind
@@ -123,10 +123,12 @@ class Revisits:
         enabled = self._config.places.enabled and self._config.loops.enabled
         return self.sightings.take_in(live, at_most) if enabled else 0
 
-    def note_keyframe(self, live: VisualOdometry, at_most: int | None = None) -> None:
-        """Search for a place that the live map's newest keyframe shows again; `collect` returns the answer.
+    def note_keyframe(
+        self, live: VisualOdometry, at_most: int | None = None, among: Collection[int] | None = None
+    ) -> None:
+        """Search for a place that the live map's reference keyframe shows again; `collect` returns the answer.
 
-        `at_most`: see `take_in`.
+        `at_most`: see `take_in`. `among`: the submaps to search, those of another run; by default all.
         """
         if not (self._config.places.enabled and self._config.loops.enabled):
             return
@@ -138,10 +140,14 @@ class Revisits:
         if busy or (self._provisional is None and self._n_asked % ASK_EVERY):
             return
         submap, keyframe_id = live.submap, live.reference_id
-        self.take_in(submap, at_most)
         submaps = self._record.atlas.submaps
+        if among is None:
+            self.take_in(submap, at_most)
+        else:
+            for m in among:
+                self._recogniser.take_in(submaps[m])
         features = submap.keyframes[keyframe_id].features
-        candidates = tuple(self._recogniser.query(features, submaps, self._may_be(submap, keyframe_id)))
+        candidates = tuple(self._recogniser.query(features, submaps, self._may_be(submap, keyframe_id, among)))
         named = {submap.id, *(candidate.submap_id for candidate in candidates)} if candidates else set()
         search = PlaceSearch(submap.id, keyframe_id, candidates, {m: submaps[m].copy() for m in sorted(named)})
         self._desk.submit(JobKind.LOOP, search, of=submap.id)
@@ -218,18 +224,18 @@ class Revisits:
                 return None
         return best
 
-    def _may_be(self, submap: Submap, keyframe_id: int) -> Callable[[int, int], bool]:
+    def _may_be(self, submap: Submap, keyframe_id: int, among: Collection[int] | None) -> Callable[[int, int], bool]:
         """Return which keyframes would be a revisit: not those that are tracked, or were a moment ago."""
         ids = submap.landmark_of[keyframe_id]
         seen_now = set(submap.covisible(ids[ids >= 0])[0].tolist())
         arrived = sorted({k for m in self._record.atlas.submaps.values() for k in m.keyframes})
         at = arrived.index(keyframe_id)
-        recent = {*arrived[max(at - RECENT, 0) : at + RECENT + 1], *seen_now}
+        recent = {*arrived[max(at - RECENT, 0) : at + RECENT + 1], *seen_now} if among is None else set()
         joined = set(self._record.atlas.component_of(submap.id))
         rests = self._n_asked < self._rests_until
 
         def may_be(m: int, k: int) -> bool:
-            if k in recent or (rests if m in joined else not self._merges):
+            if k in recent or (among is not None and m not in among) or (rests if m in joined else not self._merges):
                 return False
             return m == submap.id or k not in submap.keyframes
 

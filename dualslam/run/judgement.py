@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,6 +45,7 @@ def judge_run(
     rows: Sequence[FrameRow],
     crashed: bool = False,
     measured: Measured | None = None,
+    besides: Iterable[Reason] = (),
 ) -> Verdict:
     """Judge a run that has ended.
 
@@ -58,10 +59,12 @@ def judge_run(
     crashed : bool
     measured : Measured, optional
         The run in the frame of measurements from outside.
+    besides : iterable of Reason
+        What is known against it already.
     """
     if not rows:
         return Verdict(Level.DOUBTFUL)
-    reasons, scores = [*_coverage(system, rows), *_clock(rows)], {}
+    reasons, scores = [*besides, *_coverage(system, rows), *_clock(rows)], {}
     if crashed:
         text = "The run crashed: what it had found until then was kept. Report the error, and run again."
         reasons.append(_about_all(rows, ReasonCode.CRASHED, Level.USABLE, text))

@@ -105,16 +105,19 @@ class Measured:
 
 
 def read_rows(
-    paths: Sequence[Path], sigma: float | None, clock_offset_s: float, frame_times_s: FloatArray | None
+    paths: Sequence[Path],
+    sigma: float | None,
+    clock_offset_s: float,
+    frame_times_s: FloatArray | None,
+    origin: tuple[float, float, float] | None = None,
 ) -> list[RowSource]:
-    """Read files of measurements; positions by latitude and longitude have the first one's origin.
+    """Read files of measurements; positions by latitude and longitude have the origin given, or the first one's.
 
     Raises
     ------
     InputError
     """
     found: list[RowSource] = []
-    origin = None
     for path in paths:
         found.append(read_measurements(path, sigma, clock_offset_s, frame_times_s, origin))
         origin = origin or found[-1].origin

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -48,6 +48,7 @@ from dualslam.run.measuring import Measured, measure, write_measured
 from dualslam.run.no_map import StartRefusals
 from dualslam.run.results import Trajectories, frame_rows, summarise, trajectories_of, truth_of_frames
 from dualslam.run.runner import RunReport, run_sequence
+from dualslam.system.audit.verdict import Reason
 from dualslam.system.system import System
 from dualslam.viewer.map_page import map_page
 from dualslam.workers.desk import WorkerDesk
@@ -304,6 +305,9 @@ def save_system(
     *,
     overwrite: bool = False,
     measurements: Iterable[MeasurementSource] = (),
+    given: Mapping[str, Any] | None = None,
+    colours: Colours | None = None,
+    reasons: Iterable[Reason] = (),
 ) -> None:
     """Write the run folder of a finished system that a program fed by itself.
 
@@ -317,6 +321,12 @@ def save_system(
     out : path
     overwrite : bool
     measurements : iterable of MeasurementSource
+    given : mapping, optional
+        What the summary says of the run's origin besides, or instead.
+    colours : mapping of int to (N, 3) uint8, optional
+        Of each submap's landmarks.
+    reasons : iterable of Reason
+        What is known against the run besides.
 
     Raises
     ------
@@ -329,8 +339,10 @@ def save_system(
     with RunFolder(out, overwrite=overwrite) as folder:
         folder.write_config(dump_config(config))
         _write_new_events(system, folder)
-        given = _given(sequence, False) | {"saved_map": None, "localise": False, "no_map": None}
-        summary, _ = _write_results(system, report, config, sequence, folder, given, list(measurements))
+        origin = _given(sequence, False) | {"saved_map": None, "localise": False, "no_map": None} | dict(given or {})
+        summary, _ = _write_results(system, report, config, sequence, folder, origin, list(measurements), reasons)
+        if colours:
+            save_colours(folder.map_path, colours)
         _write_pages(folder)
     if refused := summary.get("measurements", {}).get("refused"):
         raise InputError(f"{refused} The run without measurements is in {out}.")
@@ -443,6 +455,7 @@ def _write_results(
     folder: RunFolder,
     given: dict[str, Any],
     sources: list[MeasurementSource],
+    reasons: Iterable[Reason] = (),
 ) -> tuple[dict[str, Any], Trajectories]:
     """Write all that comes at the end of a run; return the summary, which begins with `given`, and the trajectories."""
     trajectories = trajectories_of(system)
@@ -450,7 +463,7 @@ def _write_results(
     if measured is not None and measured.undone:
         trajectories = trajectories_of(system)
     rows = frame_rows(system, trajectories.main, report.dropped, report.latencies_ms)
-    verdict = judge_run(system, trajectories, rows, crashed=report.bug is not None, measured=measured)
+    verdict = judge_run(system, trajectories, rows, crashed=report.bug is not None, measured=measured, besides=reasons)
     rows = [replace(row, doubt=verdict.doubt_about(row.index)) for row in rows]
     truth: Trajectory | None = getattr(sequence, "ground_truth", None)
     summary = (

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable
+
 from dualslam.atlas.record import FrameStamp
 from dualslam.atlas.trajectory import FramePose
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import VisualOdometry
-from dualslam.core.types import FrameMethod, Track, View
+from dualslam.core.types import FrameMethod, FrameStatus, Track, View
+from dualslam.map.frame_records import FrameRow
 from dualslam.places.handover import Handover
 from dualslam.places.revisits import Revisits
 from dualslam.places.sightings import Relocalised
@@ -84,6 +87,26 @@ class PlaceKeeping:
         with self._state.record.timer.measure("places"):
             self._revisits.note_keyframe(live, TAKEN_IN_A_FRAME if self._state.pace.in_real_time else None)
         self._link(view)
+
+    def join(self, submap_ids: Iterable[int], among: Collection[int]) -> FrameStamp | None:
+        """Link archived submaps with others, of another run, where keyframes show the same places.
+
+        Returns the last keyframe that was asked about.
+        """
+        state, now = self._state, None
+        for m in submap_ids:
+            submap = state.record.atlas.submaps[m]
+            asking = state.parts.new_relocaliser(submap, state.parts.new_graph())
+            for k in sorted(submap.keyframes.keys() - submap.condemned):
+                now = FrameRow(k, submap.keyframes[k].timestamp_s, FrameStatus.TRACKED)
+                asking.start_at(k)
+                with state.record.timer.measure("places"):
+                    self._revisits.take_solution(asking, now)
+                    self._revisits.note_keyframe(asking, among=among)
+                    self._revisits.collect(asking, now)
+            if now is not None:
+                self._revisits.finish(asking, now)
+        return now
 
     # --- a place that an earlier run has mapped
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import partial
 
@@ -268,6 +268,18 @@ class System:
             if len(view.features) < state.config.tracking.min_inliers:
                 self.blank.add(frame.index)
         return self._result(frame, outcome, started)
+
+    def join(self, submap_ids: Collection[int]) -> None:
+        """Link submaps of another run, which the atlas holds besides the saved map's, with these; end the run.
+
+        No frame is taken before or after. `rows` are the caller's to fill in afterwards: no camera has
+        moved from the frames of one run to those of the other.
+        """
+        last = self._places.join(submap_ids, sorted(self.atlas.submaps.keys() - set(submap_ids)))
+        if last is not None:
+            self._connections.settle(last)
+        self.numbers.end()
+        self.desk.close()
 
     def finish(self, interrupted: bool = False) -> None:
         """End the run: wait, for a limited time, for reverse tracking that is under way; archive the live submap.
