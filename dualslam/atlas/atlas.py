@@ -48,6 +48,8 @@ class Link:
         Whether it may be rejected where others contradict it.
     rejected : bool
         The atlas does not believe it: it joins nothing, but is asked again at each solution.
+    is_sure : bool
+        Whether its scale may be relied on: if not, what lies beyond it has a doubt.
     """
 
     a: int
@@ -60,6 +62,7 @@ class Link:
     keyframe_b: int = -1
     doubtful: bool = True
     rejected: bool = False
+    is_sure: bool = True
 
     @classmethod
     def of_rollover(cls, full: Submap, following: Submap) -> Link:
@@ -160,9 +163,9 @@ class Atlas:
         """Return the linked sets of submaps, each ascending, in order of their first submap."""
         return joined(self.submaps, self.believed)
 
-    def sure_sets(self, max_scale_sigma: float) -> list[list[int]]:
-        """Return the sets of submaps that are linked by connections which know their scale so well."""
-        return joined(self.submaps, [link for link in self.believed if link.sigma_scale <= max_scale_sigma])
+    def sure_sets(self) -> list[list[int]]:
+        """Return the sets of submaps that are linked by connections whose scale may be relied on."""
+        return joined(self.submaps, [link for link in self.believed if link.is_sure])
 
     def component_of(self, submap_id: int) -> list[int]:
         """Return the linked set of a submap, ascending."""

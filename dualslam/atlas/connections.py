@@ -104,14 +104,15 @@ class Connections:
         return report
 
     def tighten(self, link: Link, now: FrameStamp) -> bool:
-        """Replace the connection of the same kind between two submaps, if `link` knows the scale better; say whether.
+        """Replace the unsure connection of the same kind between two submaps, if `link` is surer; say whether.
 
         What it moves follows with the next solution.
         """
         links = self._atlas.links
         ends = link.a, link.b, link.kind
-        row = next((i for i, known in enumerate(links) if (known.a, known.b, known.kind) == ends), None)
-        if row is None or link.sigma_scale >= links[row].sigma_scale:
+        unsure = (i for i, known in enumerate(links) if (known.a, known.b, known.kind) == ends and not known.is_sure)
+        row = next(unsure, None)
+        if row is None or not (link.is_sure or link.sigma_scale < links[row].sigma_scale):
             return False
         links[row] = link
         self._count_change([link.a, link.b])  # a solution under way has the former one in it

@@ -13,15 +13,12 @@ class Worlds:
     Parameters
     ----------
     atlas : Atlas
-    max_scale_sigma : float
-        Of a link that may be relied on.
     saved : int or None
         The submap whose frame is the world of the saved map that a run continues.
     """
 
-    def __init__(self, atlas: Atlas, max_scale_sigma: float, saved: int | None = None) -> None:
+    def __init__(self, atlas: Atlas, saved: int | None = None) -> None:
         self._atlas = atlas
-        self._max_scale_sigma = max_scale_sigma
         self._saved = saved
         self._made_from: list[object] = []
         self._found: dict[int, tuple[FloatArray, int]] = {}
@@ -41,7 +38,7 @@ class Worlds:
         return self._found[submap_id]
 
     def is_sure(self, submap_id: int) -> bool:
-        """Whether links that know their scale well join a submap with the one whose unit its world has."""
+        """Whether links whose scale may be relied on join a submap with the one whose unit its world has."""
         self._compose()
         return submap_id in self._sure
 
@@ -51,7 +48,7 @@ class Worlds:
         same = len(state) == len(self._made_from) and all(map(lambda a, b: a is b, state, self._made_from))
         if not same:
             self._made_from, self._found, self._sure = state, {}, set()
-            sure_sets = atlas.sure_sets(self._max_scale_sigma)
+            sure_sets = atlas.sure_sets()
             for component in atlas.components():
                 S_first = atlas.S_world_submap(component)
                 world = self._saved if self._saved in S_first else None

@@ -22,6 +22,7 @@ LINK_ROWS: Rows = {
     "keyframes_ab": ("i", (2,)),
     "doubtful": ("b", ()),
     "rejected": ("b", ()),
+    "is_sure": ("b", ()),
 }
 PLACED_ROWS: Rows = {"placed": ("i", ()), "S_world_submap": ("f", (4, 4))}
 WARP_ROWS: Rows = {"warp": ("i", (2,)), "warp_S": ("f", (4, 4))}

@@ -34,6 +34,8 @@ from dualslam.map.submap import Submap
 
 LINKS, FRAMES, SUBMAP, SOLUTION = "links", "frames", "submap_", "solution"
 _OTHER = (LINKS, FRAMES, SOLUTION)
+_EARLIER_SURE = 0.025
+"""Standard deviation of the scale up to which versions that did not save `is_sure` relied on a link."""
 _DAMAGE = (KeyError, ValueError, IndexError, TypeError, OverflowError)
 
 
@@ -105,6 +107,7 @@ def save_atlas(folder: str | Path, atlas: Atlas, poses: dict[int, FramePose], ca
         "keyframes_ab": np.array([(link.keyframe_a, link.keyframe_b) for link in links], np.int64).reshape(-1, 2),
         "doubtful": np.array([link.doubtful for link in links], bool),
         "rejected": np.array([link.rejected for link in links], bool),
+        "is_sure": np.array([link.is_sure for link in links], bool),
     }
     groups.small[SOLUTION] = _solution_arrays(atlas)
     ordered = list(poses.values())
@@ -232,10 +235,11 @@ def _links(arrays: Arrays, metadata: Mapping[str, Any]) -> list[Link]:
     ends = arrays["keyframes_ab"].tolist() if "keyframes_ab" in arrays else [(-1, -1)] * len(ab)
     doubtful = arrays["doubtful"].tolist() if "doubtful" in arrays else [k is not LinkKind.ROLLOVER for k in kinds]
     rejected = arrays["rejected"].tolist() if "rejected" in arrays else [False] * len(ab)
-    rows = zip(ab, S_a_b, covariance, kinds, metadata["link_keyframes"], ends, doubtful, rejected, strict=True)
+    is_sure = arrays["is_sure"].tolist() if "is_sure" in arrays else [C[6, 6] <= _EARLIER_SURE**2 for C in covariance]
+    rows = zip(ab, S_a_b, covariance, kinds, metadata["link_keyframes"], ends, doubtful, rejected, is_sure, strict=True)
     links = []
-    for (a, b), S, C, kind, shared, (k_a, k_b), may_doubt, refused in rows:
-        links.append(Link(a, b, S, C, kind, tuple(map(int, shared)), k_a, k_b, may_doubt, refused))
+    for (a, b), S, C, kind, shared, (k_a, k_b), may_doubt, refused, sure in rows:
+        links.append(Link(a, b, S, C, kind, tuple(map(int, shared)), k_a, k_b, may_doubt, refused, sure))
     return links
 
 

@@ -68,7 +68,8 @@ def _current(record: Record, old: Submap, new_id: int, found: FoundLink, S_now_t
     S_old_now_then = change_of_frame(old, record.atlas.submaps[old.id], keyframe_ids)
     S_old_new = S_old_now_then @ link.S_old_new @ sim3.inverse(S_now_then)
     Ad = sim3.adjoint(S_now_then)
-    return Link(old.id, new_id, S_old_new, Ad @ link.covariance @ Ad.T, LinkKind.RECOVERY, tuple(keyframe_ids))
+    C, stands_on = Ad @ link.covariance @ Ad.T, tuple(keyframe_ids)
+    return Link(old.id, new_id, S_old_new, C, LinkKind.RECOVERY, stands_on, is_sure=found.is_sure)
 
 
 def _note_link(

@@ -85,15 +85,18 @@ class RecoveredFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundLink:
-    """The link that an attempt ended with."""
+    """The link that an attempt ended with; `is_sure`: whether it may be relied on, by all its gates."""
 
     old_id: int
     estimate: LinkEstimate
     attempt: str
+    is_sure: bool = True
 
     def is_surer_than(self, other: FoundLink | None) -> bool:
-        """Whether its scale is known better; any link is surer than none."""
-        return other is None or self.estimate.sigma_scale < other.estimate.sigma_scale
+        """Whether it may be relied on and the other not, or its scale is known better; any is surer than none."""
+        if other is None or self.is_sure != other.is_sure:
+            return other is None or self.is_sure
+        return self.estimate.sigma_scale < other.estimate.sigma_scale
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -75,9 +75,6 @@ class Recoveries:
     config : RecoveryConfig
     front_ends : callable
         Gives those that go on, or may go on, in a submap of the atlas.
-    max_scale_sigma : float
-        Of a link that may be relied on. A map that is joined more loosely still counts as lost. That ends when the link
-        is tightened, or the newer map is lost as well.
     """
 
     def __init__(
@@ -90,7 +87,6 @@ class Recoveries:
         connections: Connections,
         config: RecoveryConfig,
         front_ends: Callable[[], Iterable[VisualOdometry]],
-        max_scale_sigma: float,
     ) -> None:
         self._record = record
         self._buffer = buffer
@@ -100,8 +96,7 @@ class Recoveries:
         self._connections = connections
         self._config = config
         self._front_ends = front_ends
-        self._max_scale_sigma = max_scale_sigma
-        self._lost: dict[int, Loss] = {}  # submaps that are not linked yet, or too loosely
+        self._lost: dict[int, Loss] = {}  # not linked yet, or too loosely, until the newer map is lost as well
         self._under_way: dict[int, _UnderWay] = {}  # by the new submap's id
         self._circumstances: dict[int, dict[str, Any]] = {}  # of the walk, by the new submap's id
         self._retries = RetrySchedule(config.retry_keyframes)
@@ -448,7 +443,7 @@ class Recoveries:
 
     def _surely_joined(self, submap_id: int) -> list[int]:
         """Return what is one map with a submap by links that may be relied on."""
-        return next(s for s in self._record.atlas.sure_sets(self._max_scale_sigma) if submap_id in s)
+        return next(s for s in self._record.atlas.sure_sets() if submap_id in s)
 
     def _apart_from(self, submap_id: int) -> dict[int, Loss]:
         """Return the lost submaps that no link joins with a submap."""

@@ -159,15 +159,9 @@ def _relink(job: RecoveryJob, submap: Submap, parts: RecoveryParts, tries: LinkT
     since_start, progress = replace(job, newest_id=job.live_since), Progress(submap)
     relinked = []
     for old_id, old in job.joined.items():
-        result = parts.link(old, submap, job.onsets[old_id])
-        for with_doubt in (False, True):
-            found = _confirm(old_id, result, since_start, submap, RELINK, parts, tries, progress, with_doubt)
-            if not isinstance(found, Failure):
-                relinked.append(found)
-            if not isinstance(found, Failure) or found.reason is FailureReason.UNCONFIRMED:
-                break
-            if not with_doubt:
-                tries.note_try(old_id, found.reason)
+        found = _confirm_with_doubt(old_id, old, since_start, submap, RELINK, parts, tries, progress)
+        if not isinstance(found, Failure):
+            relinked.append(found)
     return tuple(relinked)
 
 
@@ -276,8 +270,8 @@ def _make_attempt(
     progress.needs_old_map |= bool(job.lost) and relinker.is_hopeless
     if progress.link is None and unsure_of is not None:
         # The map has grown since that try.
-        result = parts.link(job.lost[unsure_of], submap, job.onsets[unsure_of])
-        found = _confirm(unsure_of, result, job, submap, attempt.name, parts, tries, progress, with_doubt=True)
+        old = job.lost[unsure_of]
+        found = _confirm_with_doubt(unsure_of, old, job, submap, attempt.name, parts, tries, progress)
         progress.unsure = None if isinstance(found, Failure) else found
     if job.lost:
         event = _event_of(job, progress, attempt.name, time.perf_counter() - started)
@@ -293,6 +287,25 @@ def _there_and_back(views: tuple[View, ...], progress: Progress) -> Iterator[Vie
     """
     yield from views
     yield from way_to_gaps(views[::-1], progress.frames, progress.submap.keyframes)
+
+
+def _confirm_with_doubt(
+    old_id: int,
+    old: Submap,
+    job: RecoveryJob,
+    submap: Submap,
+    attempt: str,
+    parts: RecoveryParts,
+    tries: LinkTries,
+    progress: Progress,
+) -> FoundLink | Failure:
+    """Return the link with a map, measured again over the whole overlap; it may be one that is not to be relied on."""
+    result = parts.link(old, submap, job.onsets[old_id])
+    found = _confirm(old_id, result, job, submap, attempt, parts, tries, progress)
+    if not isinstance(found, Failure):
+        return found
+    tries.note_try(old_id, found.reason)
+    return _confirm(old_id, result, job, submap, attempt, parts, tries, progress, with_doubt=True)
 
 
 def _confirm(
@@ -332,7 +345,7 @@ def _confirm(
     if refused is not None:
         return refused
     told = {"tries": tries.refused[old_id] + 1.0, "rivals": float(len(progress.rivals))}
-    return FoundLink(old_id, replace(link, numbers=link.numbers | told), attempt)
+    return FoundLink(old_id, replace(link, numbers=link.numbers | told), attempt, is_sure=not with_doubt)
 
 
 def _accepted(result: LinkEstimate | Failure, with_doubt: bool) -> LinkEstimate | Failure:

@@ -224,12 +224,12 @@ def _loose_joins(system: System, trajectories: Trajectories) -> list[Reason]:
     own = trajectories.S_world_submap.keys()
     main = trajectories.main.index.tolist()
     submap_of = {i: system.poses[system.numbers.number_of(i)].submap_id for i in main}
-    frames = [[i for i in main if submap_of[i] in part] for part in system.sure_sets if own & set(part)]
+    frames = [[i for i in main if submap_of[i] in part] for part in system.atlas.sure_sets() if own & set(part)]
     beyond = sorted(i for part in sorted(frames, key=len)[:-1] for i in part)
     if not beyond:
         return []
     first, last = beyond[0], beyond[-1]
-    sigma = max(k.sigma_scale for k in system.atlas.believed if {k.a, k.b} <= own)
+    sigma = max(k.sigma_scale for k in system.atlas.believed if {k.a, k.b} <= own and not k.is_sure)
     text = (
         f"Frames {first} to {last} are joined to the others by a scale that is known to {100 * sigma:.1f} % only. "
         "They may be too large or too small by three times as much. A recording that returns there would fix it."

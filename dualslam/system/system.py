@@ -79,8 +79,7 @@ class System:
         self.saved, self.numbers = saved, FrameNumbers(0 if saved is None else saved.next_id)
         self.blank: set[int] = set()
         self._world = saved.main[0] if saved is not None and saved.main else None
-        self._max_scale_sigma = config.linking.max_live_scale_sigma
-        self._worlds = Worlds(record.atlas, self._max_scale_sigma, self._world)
+        self._worlds = Worlds(record.atlas, self._world)
         earlier = frozenset(record.atlas.submaps)
         self.atlas, self.rows, self.poses = record.atlas, record.rows, record.poses
         self.events, self.timer = record.events, record.timer
@@ -118,7 +117,6 @@ class System:
             self._connections,
             config.recovery,
             self._state.front_ends,
-            self._max_scale_sigma,
         )
         self._calibrations = Calibrations(self._state, self._recoveries, self._connections)
         self._shutter_watch = ShutterWatch(self._state, self._recoveries, self._connections)
@@ -157,11 +155,6 @@ class System:
     def world(self) -> int | None:
         """The submap in whose frame the saved map's world is; None without one."""
         return self._world
-
-    @property
-    def sure_sets(self) -> list[list[int]]:
-        """Sets of submaps that are joined by links which know their scale so well that it may be relied on."""
-        return self.atlas.sure_sets(self._max_scale_sigma)
 
     @property
     def live(self) -> VisualOdometry | None:

@@ -61,7 +61,7 @@ def test_the_world_of_a_saved_map_stays_its_own_and_what_has_not_changed_is_not_
     for m in range(3):
         atlas.add(Submap(m, np.eye(3), np.zeros(32, np.uint8)))
     S = sim3.exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0, 0.5]))
-    worlds = Worlds(atlas, 0.025, saved=1)
+    worlds = Worlds(atlas, saved=1)
     assert [worlds.of(m)[1] for m in range(3)] == [0, 1, 2]
     atlas.link(Link(0, 1, S, np.eye(7), LinkKind.MERGE))
     assert [worlds.of(m)[1] for m in range(3)] == [1, 1, 2]
@@ -74,11 +74,10 @@ def test_beyond_a_link_that_hardly_knows_its_scale_a_map_is_not_sure_until_the_l
     atlas = Atlas()
     for m in range(3):
         atlas.add(Submap(m, np.eye(3), np.zeros(32, np.uint8)))
-    worlds = Worlds(atlas, 0.025, saved=1)
+    worlds = Worlds(atlas, saved=1)
     assert all(worlds.is_sure(m) for m in range(3))  # each in its own unit
-    known = [Link(a, b, np.eye(4), s**2 * np.eye(7), LinkKind.RECOVERY) for a, b, s in ((0, 1, 0.04), (1, 2, 0.02))]
-    for link in known:
-        atlas.link(link)
+    for a, b, is_sure in ((0, 1, False), (1, 2, True)):
+        atlas.link(Link(a, b, np.eye(4), np.eye(7), LinkKind.RECOVERY, is_sure=is_sure))
     assert [worlds.is_sure(m) for m in range(3)] == [False, True, True]  # the world is that of submap 1
-    atlas.links[0] = replace(known[0], covariance=0.01**2 * np.eye(7))
+    atlas.links[0] = replace(atlas.links[0], is_sure=True)
     assert all(worlds.is_sure(m) for m in range(3))

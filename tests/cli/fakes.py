@@ -9,7 +9,7 @@ import numpy as np
 from dualslam.atlas.atlas import Atlas
 from dualslam.atlas.trajectory import FramePose
 from dualslam.core.camera.base import Camera
-from dualslam.core.config.settings import Config, LinkingConfig
+from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind, EventLog
 from dualslam.core.jobs import InlineDesk
 from dualslam.core.stage_timer import StageTimer
@@ -67,10 +67,6 @@ class FakeSystem:
         self.was_interrupted = False
         self._truth, self._lost, self._before_step = truth, lost, before_step
         self._submap: Submap | None = None
-
-    @property
-    def sure_sets(self) -> list[list[int]]:
-        return self.atlas.sure_sets(LinkingConfig().max_live_scale_sigma)
 
     def step(self, frame: Frame) -> FrameResult:
         self._before_step(frame)

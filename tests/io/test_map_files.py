@@ -253,10 +253,12 @@ def test_a_saved_map_that_was_edited_is_refused_in_one_sentence(
     other = Submap(5, np.eye(3), np.zeros(32, np.uint8))
     other.add_keyframe(Keyframe(30, 3.0, features(np.random.default_rng(0), 4)), np.eye(4))
     atlas.add(other)
-    atlas.link(Link(4, 5, np.eye(4), np.eye(7), LinkKind.RECOVERY, (12,)))
+    atlas.link(Link(4, 5, np.eye(4), np.eye(7), LinkKind.RECOVERY, (12,), is_sure=False))
     pose = FramePose(11, 1.1, 4, 10, np.eye(4))
     save_atlas(tmp_path / "map", atlas, {11: pose}, PinholeCamera(640, 480, 500.0, 500.0, 320.0, 240.0))
-    assert load_atlas(tmp_path).poses.keys() == {11}
+    stored = load_atlas(tmp_path)
+    assert stored.poses.keys() == {11}
+    assert [link.is_sure for link in stored.atlas.links] == [False]
     damage(tmp_path / "map")
     with pytest.raises(InputError, match=words) as refused:
         load_atlas(tmp_path)

@@ -50,7 +50,7 @@ def walk(unit: float, off: FloatArray, seed: int) -> tuple[Record, Recoveries, R
     result = RecoveryResult(new, tuple(frames), link, (attempt,), 0.1, 0.1)
     desk = Fake(poll=lambda kind: [Ended(job, result)])
     parts = (desk, None, Fake(camera=CAMERA, covariance=None), None)
-    recoveries = Recoveries(record, FrameBuffer(10.0, 100.0), *parts, RecoveryConfig(), list, 0.025)  # type: ignore[arg-type]
+    recoveries = Recoveries(record, FrameBuffer(10.0, 100.0), *parts, RecoveryConfig(), list)  # type: ignore[arg-type]
     return record, recoveries, result
 
 

@@ -220,6 +220,7 @@ class TestOrder:
         (link,) = system.atlas.believed
         assert linked.data["sigma_scale"] == pytest.approx(link.sigma_scale, rel=0.01)
         assert link.sigma_scale < LinkingConfig().wrong_scale
+        assert not link.is_sure
 
     def test_all_may_fail(self) -> None:
         events = events_of(["live", "sift"], max_gap_frames=3)

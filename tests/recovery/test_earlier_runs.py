@@ -104,7 +104,7 @@ def test_reverse_tracking_is_told_the_ways_of_this_run_alone() -> None:
     buffer.append(view)
     jobs: list[RecoveryJob] = []
     parts = (Fake(submit=lambda kind, job: jobs.append(job)), None, Fake(camera=CAMERA, covariance=None), None)
-    recoveries = Recoveries(record, buffer, *parts, RecoveryConfig(), list, 0.025)  # type: ignore[arg-type]
+    recoveries = Recoveries(record, buffer, *parts, RecoveryConfig(), list)  # type: ignore[arg-type]
     recoveries.declare_lost(0, FIRST + 28, "inliers", FIRST + 30)
     recoveries.start(live, view)
     (job,) = jobs

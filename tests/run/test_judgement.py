@@ -184,12 +184,12 @@ def test_a_scale_that_is_not_handed_on_makes_a_run_usable() -> None:
     assert (reason.first_frame, reason.last_frame) == (80, 89)
 
 
-@pytest.mark.parametrize(("sigma", "level"), [(0.02, Level.GOOD), (0.04, Level.USABLE)])
-def test_a_join_that_hardly_knows_its_scale_makes_the_smaller_part_doubtful(sigma: float, level: Level) -> None:
+@pytest.mark.parametrize(("is_sure", "level"), [(True, Level.GOOD), (False, Level.USABLE)])
+def test_a_join_of_unsure_scale_makes_the_smaller_part_doubtful(is_sure: bool, level: Level) -> None:
     system = run(ahead(), lost=(60,))
     old, new = sorted(system.atlas.submaps)
-    C = np.diag([1e-8] * 6 + [sigma**2])
-    system.atlas.link(Link(old, new, np.eye(4), C, LinkKind.RECOVERY, keyframe_a=0, keyframe_b=61))
+    unsure = Link(old, new, np.eye(4), 1e-3 * np.eye(7), LinkKind.RECOVERY, (), 0, 61, is_sure=is_sure)
+    system.atlas.link(unsure)
     verdict = judged(system)
     assert verdict.level is level
     assert verdict.doubt_about(59) == ("" if level is Level.GOOD else "scale")
