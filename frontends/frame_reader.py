@@ -48,7 +48,7 @@ class FrameReader:
         # 1. Which pixels show the scene.
         self._scene.look(frame)
         cover = self._scene.cover_of(frame)
-        # 2. Features of these (in real time found beside the tracking), and 3. the lens taken out of their pixels.
+        # 2. Features of these (in real time found in the background), and 3. the lens taken out of their pixels.
         view = view_of(frame, self._frontend, camera, self._model_sigma_px, cover)
         # 4. The rows' times taken out, where the shutter is known to roll.
         return view if isinstance(view, Failure) else self._shutter.shutter_corrected(view, camera)

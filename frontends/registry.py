@@ -119,8 +119,7 @@ def create_frontend(config: FrontendConfig, needs: Iterable[str] = FOR_MAPS) -> 
     Raises
     ------
     ConfigError
-        The name is unknown, what it points to cannot be imported, or an option is wrong; or what is built lacks one of
-        `needs`.
+        The name is unknown, its target cannot be imported, an option is wrong, or the result lacks one of `needs`.
     """
     factory: FrontendFactory = _factory(config.name)
     frontend = factory.from_options(config.n_features, config.options)
@@ -149,7 +148,7 @@ def find_missing(name: str) -> str | None:
 
 
 def check_frontend(config: FrontendConfig) -> Frontend | None:
-    """Refuse what `create_frontend` would, as far as can be told without what an extra installs, and without weights.
+    """Refuse what `create_frontend` would, as far as possible without an extra's packages and without weights.
 
     Returns
     -------

@@ -19,8 +19,8 @@ GATE_95 = 1.96
 """Of a Gaussian, 95 % lie within so many sigmas."""
 SIGMA_RATIO = (1 / 6, 1.3)
 """The residuals' 95 % over that of the sigmas claimed. Above, gates at 95 % would lose more than one right match in
-eight. Far below is honest: a clean print is the best case, and real views differ by more than their homography; ORB's
-and SIFT's, measured on real images, are three times what they are here. A factor of six is a wrong unit or octave."""
+eight. Far below is honest: a clean print is the best case, and real views differ by more than their homography. ORB's
+and SIFT's ratios on real images are three times those here. A factor of six is a wrong unit or octave."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,8 +20,8 @@ from dualslam.frontends.direct.warp import Pyramid, sample
 HALF_PX = 6
 """Half the side of a patch, in pixels of the coarser image."""
 MIN_CORRELATION = 0.8
-"""With it, 82 to 98 % of what is found is within 1.5 px of the truth (a rendered street at up to four times the
-distance, a room; places predicted up to 3 px off); the rest is for the pose to sort out."""
+"""With it, 82 to 98 % of the finds are within 1.5 px of the truth. Measured on a room and a rendered street at up to
+four times the distance, with predictions up to 3 px off. The pose must reject the rest."""
 MAX_RIVAL = 0.9
 """Correlation of the best place that is not beside the peak, relative to the peak's."""
 BESIDE_PX = 2

@@ -96,9 +96,9 @@ def select_spread(xy: IntArray, response: FloatArray, n_wanted: int) -> IntArray
     cell_px = max(1.0, float(np.sqrt(width * height / n_wanted)))
     column, row = ((each / cell_px).astype(np.int64) for each in (u, v))
     cell = row * int(width / cell_px + 1) + column
-    # FAST scores are whole numbers below 256, so one integer key sorts by two things at once, and with the row in its
-    # last bits, which makes it unique, any sort does: numpy's quickest is ten times as fast as its stable one. Ties go
-    # to the earlier corner, and the choice depends on nothing but the image.
+    # FAST scores are whole numbers below 256, so one integer key sorts by two things at once. The row in its last bits
+    # makes it unique, so any sort does: numpy's quickest is ten times as fast as its stable one. Ties go to the earlier
+    # corner, and the choice depends on nothing but the image.
     rows = np.arange(len(xy))
     weakness = 256 - response.astype(np.int64)
     by_cell = np.sort(((cell * 512 + weakness) << _ROW_BITS) | rows) & _ROW_MASK
@@ -160,9 +160,9 @@ def find_peaks(patches: NDArray[np.uint8]) -> Peaks:
 def refine_corners(peaks: Peaks) -> tuple[FloatArray, BoolArray]:
     """Sub-pixel offset from the centre of each patch to the extremum of a difference of Gaussians beside it.
 
-    A FAST corner is a whole pixel, and which pixel of the blob it picks depends on noise; the extremum is a smooth
-    function of the image. On KITTI and 7-Scenes pairs it brings the median epipolar residual from 0.31 to 0.13 pixels
-    of the level (Harris, minimal eigenvalue and Foerstner gain almost nothing: they peak somewhere else).
+    A FAST corner is a whole pixel, and noise decides which pixel of the blob it is. The extremum is a smooth function
+    of the image. On KITTI and 7-Scenes pairs it brings the median epipolar residual from 0.31 to 0.13 pixels of the
+    level (Harris, minimal eigenvalue and Foerstner gain almost nothing: they peak somewhere else).
 
     Returns
     -------

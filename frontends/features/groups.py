@@ -64,10 +64,10 @@ def best_pairs(
         The two members of each pair.
     cost : (P,) float64
     rival : (P,) int64
-        Class of the second member; only candidates of the same class as the best one count as its rivals in the ratio
-        test (a corner seen in two octaves must not compete with itself).
+        Class of the second member. The ratio test compares the best one with candidates of its class alone: a corner
+        seen in two octaves must not compete with itself.
     ratio : float
-        The best cost must not exceed this share of its best rival's; 1 switches the test off.
+        The best cost must not exceed this share of the second best; 1 switches the test off.
 
     Returns
     -------

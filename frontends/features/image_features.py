@@ -1,9 +1,8 @@
 """Another front end's features of buffered images, each found once, and beforehand where they can be prefetched.
 
-Attempts at a recovery walk the same frames one after the other, and so does a recovery that is tried again: finding
-SIFT features anew each time was more than half of what walks cost that come to nothing. And of what a walk over a gap
-costs that comes to a link, half was waiting for features, while the images that it would come to next were known:
-their features are found beside what it does with those before.
+Attempts at a recovery visit the same frames one after the other, and so does a repeated recovery. Finding SIFT features
+anew each time was more than half of the cost without a link. With a link over a gap, half of the cost was waiting for
+features. The next images are known, so their features are found in the background.
 """
 
 from __future__ import annotations

@@ -185,8 +185,8 @@ def match_epipolar(
 ) -> Matches:
     """Match features of two keyframes of known relative pose, along epipolar lines, one to one.
 
-    A pair is a candidate where the feature of b lies on the epipolar line of the feature of a within the 95 % gate of
-    both features' noise, and the octaves are close. Of the candidates, pairs that are best for each other are kept.
+    A pair is a candidate if the feature of b lies on the epipolar line of that of a, and the octaves are close. The
+    tolerance is the 95 % gate of both features' noise. Of the candidates, pairs that are best for each other are kept.
 
     Parameters
     ----------

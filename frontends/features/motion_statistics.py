@@ -1,8 +1,8 @@
 """Grid-based motion statistics (Bian et al., CVPR 2017): a match is right where its neighbours move the same way.
 
-Both images are cut into cells. Right matches of one cell end in one cell, and those of the cells about it in the cells
-about that one; wrong ones end anywhere. So the matches between two 3 x 3 blocks of cells are counted, and a pair of
-cells stands where there are more than chance would give (eq. 9: more than alpha standard deviations, alpha = 6).
+Both images are cut into cells. Right matches of one cell end in one cell, and those of its neighbours in the neighbours
+of that cell. Wrong ones end anywhere. So the matches between two 3 x 3 blocks of cells are counted. A pair of cells is
+accepted if there are more than chance would give (eq. 9: more than alpha standard deviations, alpha = 6).
 """
 
 from __future__ import annotations

@@ -8,11 +8,11 @@ an extremum, 1.96 sigma covers 95 % of the matches at sigma = 0.20-0.22 (KITTI) 
 is nominal), elsewhere at 0.56-0.65. With 0.45 and 0.65, 98 % (KITTI) and 94-96 % (7-Scenes) lie within 1.96 sigma. The
 tails are heavier than Gaussian: the core alone has a sigma four times smaller on KITTI.
 
-Soft images. Where an image is blurred, it is noise that makes FAST's corners, and noise that places those on its soft
-edges. Of the corners found in two frames of rendered streets under a blur of 5 px, with a noise of 2 grey levels, half
-were 2 to 3 pixels of their octave off, at a sigma of 0.45, and matched all the same, by what lies around: a map of such
-holds what its motion model says. What tells them is the contrast, and how the extremum of the sub-pixel step curves
-where it curves least, both relative to the noise (median error in pixels of the octave):
+Soft images. In a blurred image noise makes FAST's corners, and places those on its soft edges. Two frames of rendered
+streets had a blur of 5 px and a noise of 2 grey levels. Half of the corners were 2 to 3 pixels of their octave off, at
+a sigma of 0.45, and matched by their surroundings all the same. A map of such corners only repeats its motion model.
+Two measures separate them: the contrast, and the least curvature at the extremum of the sub-pixel step. Both are
+relative to the noise (median error in pixels of the octave):
 
     ======================  =======  =======  ======  =======  =======  =============
     contrast                below 4  4 to 6   6 to 8  8 to 12  over 12  sharp streets
@@ -21,8 +21,8 @@ where it curves least, both relative to the noise (median error in pixels of the
     above                   -        -        -       -        0.2-0.5  0.3-0.8
     ======================  =======  =======  ======  =======  =======  =============
 
-Noise alone makes corners of a contrast of up to 4: less than 5 is no corner. One that noise has placed, along an edge
-of a sharp image, has a sigma of 1.5; where the image is so soft that they are many, they are none.
+Noise alone makes corners of a contrast of up to 4: less than 5 is no corner. One that noise has placed along an edge of
+a sharp image has a sigma of 1.5. In an image so soft that they are many, they do not count.
 
 Descriptor distances, in bits of 256 (20 pairs: KITTI 1 and 3 frames apart, 7-Scenes 5 and 25; the wrong ones over all):
 
@@ -77,7 +77,7 @@ MARGIN_PX = PATCH_RADIUS_PX + 1
 NOISE_CONTRAST = 5.0
 """Contrast of a corner, relative to the noise, that noise does not make (module docstring)."""
 SHARP_SHARE = 2 / 3
-"""Share of its corners that a sharp image places: 76 % at least in the frames of four recordings (median 94 to 96 %),
+"""Share of its corners that a sharp image places. At least 76 % in the frames of four recordings (median 94 to 96 %).
 53 % in KITTI's under a blur of 4 px, a tenth in those of rendered streets under one of 5 px."""
 Corners = tuple[IntArray, FloatArray]
 """Of one level: pixels (N, 2) and FAST scores (N,)."""
@@ -163,8 +163,8 @@ class OrbFrontend(OptionedFrontend):
         angle = self._angles(patches)
         offset, found = refine_corners(peaks)
         descriptors = self._descriptors(levels, chosen, angle)
-        # INTER_LINEAR keeps the outer edges of the image in place, so it is pixel edges that scale, not centres; the
-        # ratio is of the true sizes, which are rounded.
+        # INTER_LINEAR keeps the outer edges of the image in place, so pixel edges scale, not centres. The ratio is of
+        # the true sizes, which are rounded.
         ratio = np.array([[image.shape[1] / level.shape[1], image.shape[0] / level.shape[0]] for level in levels])
         uv = (np.concatenate(chosen) + offset + 0.5) * ratio[octave] - 0.5
         scale = self.scale_factor ** octave.astype(np.float64)

@@ -3,9 +3,9 @@
 The numbers below were measured on 20 pairs of KITTI 03 (1 and 3 frames apart) and 7-Scenes (5 and 25), 1500 features,
 epipolar geometry fitted to the matches themselves (PoseLib).
 
-Noise. 1.96 sigma cover 95 % of the matches at sigma = 0.14-0.24 px at the finest level and 0.7-1.2 px at a scale of 8
-(KITTI; on 7-Scenes, whose camera is nominal, 0.5-1.1 px and 0.7-1.0 px): a part that grows with the scale and a part
-that does not, 0.15 px each at the finest level.
+Noise. On KITTI 1.96 sigma cover 95 % of the matches at sigma = 0.14-0.24 px at the finest level and 0.7-1.2 px at a
+scale of 8. On 7-Scenes, whose camera is nominal, it is 0.5-1.1 px and 0.7-1.0 px. One part grows with the scale and one
+does not: 0.15 px each at the finest level.
 
 Descriptor distances, of unit vectors (the wrong ones over all):
 

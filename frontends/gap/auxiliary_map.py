@@ -1,7 +1,7 @@
 """Tracks of a front end that is not the live one, through frames whose poses in a submap are known.
 
-It holds no landmarks of the submap and none of its descriptors: pixels of its own features, matched by themselves, and
-for each frame where it stands relative to a keyframe of the submap, so that its points move with the submap's graph.
+It holds no landmarks of the submap and none of its descriptors. It holds pixels of its own features, matched by
+themselves. Each frame's pose is relative to a keyframe of the submap, so that its points move with the submap's graph.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class AuxiliaryMap:
         return self._features[index]
 
     def T_cam_submap(self, index: int) -> FloatArray:
-        """Return where a frame stands by the submap's poses of now."""
+        """Return where a frame stands by the submap's current poses."""
         return se3.inverse(self._submap.resolve_anchor(*self._place[index]))
 
     def add(self, index: int, features: Features, matches: Mapping[int, Matches]) -> None:

@@ -1,9 +1,9 @@
 """Whether two frames beyond a gap, each posed by itself, confirm each other.
 
-Matches between them agree with their poses or not, within the noise of their pixels and what the poses may be wrong by.
-That moves all matches together: it is allowed for wherever they lie at once, by the bound of Scheffe for six parameters
-(a pose's derivative times any error within its 99 % ellipsoid). The two poses are taken to be wrong independently,
-though both hang by the same points on the gap's other side: of a right pair rather too little is asked than too much.
+Matches between them agree with their poses or not, within the noise of their pixels and the errors of the poses. An
+error of a pose moves all matches together. Scheffe's bound for six parameters allows for it: a pose's derivative times
+any error within its 99 % ellipsoid. The two poses are taken to be wrong independently, though both hang by the same
+points on the gap's other side: of a right pair rather too little is asked than too much.
 """
 
 from __future__ import annotations
@@ -87,9 +87,9 @@ def confirmed_share(first: BeyondGap, second: BeyondGap, matches: IntArray, K: F
 def are_no_copies(
     first: BeyondGap, second: BeyondGap, matches: IntArray, rivals: Iterable[Rival], K: FloatArray
 ) -> BoolArray:
-    """Return which matches of two frames are of one thing: of what repeats itself a copy may look more alike.
+    """Return which matches of two frames are of one thing: in repeated structure a copy may look more similar.
 
-    Those nearer to where the poses show what lies at the median depth than half way to where a rival does.
+    A match counts if it is nearer to the poses' prediction than half way to that of another pose, at the median depth.
 
     Parameters
     ----------

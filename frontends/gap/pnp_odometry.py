@@ -1,13 +1,13 @@
 """Poses by front ends of their own, frame to frame (paper, section III-B); keyframes and landmarks of the live one.
 
-Features of another front end, found in the buffered images, are matched from frame to frame; their points, triangulated
+Features of another front end, found in the buffered images, are matched from frame to frame. Their points, triangulated
 from the frames before, give each frame's pose by PnP. Under that pose the live front end looks for the submap's
 landmarks, and what it finds there makes the frame a keyframe like any other: landmarks are reconstructed from live
 features, and the factor graph solves for the pose anew. What other attempts took for the pose plays no part.
 
-Or the live front end walks by itself as far as it can (`tracks_live`), which is ten times as fast, and only the frames
-where it fails are posed so: by its own features first, matched wide, which are there already, and where these give no
-pose that is believed by those of another front end. To find these takes longer than all else that a walk does.
+Or the live front end tracks by itself as far as it can (`tracks_live`), which is ten times as fast. Only the frames
+where it fails are posed so. Its own features are matched wide first, since they exist already. If these give no
+accepted pose, features of another front end follow. Finding these takes longer than all the rest.
 
 Where the next frame cannot be posed so (blur, black-out, frames that are missing) the odometry crosses the gap
 (`frontends/gap/pose_finder.py`).
@@ -184,7 +184,7 @@ class PnpOdometry:
         """Come to a frame that is a keyframe of the submap already."""
         T_cam_submap = se3.inverse(self.submap.T_submap_kf[view.index])
         self._note(view, view.index, T_cam_submap)
-        self._end_gap()  # not by a pose that had rivals
+        self._end_gap()  # not by an ambiguous pose
         n = int((self.submap.landmark_of[view.index] >= 0).sum())
         return self._live.track_at(view, GivenPose(T_cam_submap, n, n, 1.0, np.zeros((6, 6)), wide=False))
 

@@ -1,8 +1,8 @@
 """Poses of frames by one front end's features: from frame to frame, and across a gap.
 
-Its features are matched by themselves; their points, triangulated from the frames before, give a frame's pose by PnP.
-Across a gap a frame is matched with several frames before it, and its pose is believed only once a second frame beyond
-the gap, posed by itself, sees the same points where they should be, and no other pose explains nearly as much.
+Its features are matched by themselves. Their points, triangulated from the frames before, give a frame's pose by PnP.
+Across a gap a frame is matched with several frames before it. Its pose is accepted once a second frame beyond the gap,
+posed by itself, sees the same points where they should be. No other pose may explain nearly as much.
 """
 
 from __future__ import annotations
@@ -92,11 +92,11 @@ class PoseFinder:
         As it was given.
     is_short_cut : bool
         There are other features, better ones: what these leave in doubt beyond a gap is for those to decide. Binary
-        descriptors know a thing again only where they see it from about the same side. Past rows of parked cars, each
-        of which repeats the one before, 16 to 46 points of 186 to 294 were all that showed of the right pose, and in
-        scenes that do not repeat themselves no second pose has the 12 that it takes to be one (8 at most).
+        descriptors know a thing again only where they see it from about the same side. Past rows of parked cars, each a
+        copy of the one before, the right pose had only 16 to 46 points of 186 to 294. In scenes without repetition no
+        second pose has the required 12 (8 at most).
     notes_rivals : bool
-        A pose beyond a gap that has rivals is gone by, and who goes on has to tell them apart; else it is refused.
+        Whether an ambiguous pose beyond a gap is used, and left to the caller to decide. Otherwise it is refused.
     expected : mapping of int to (4, 4)
         ``T_cam_submap`` of frames beyond the gap, where it is known which of several like places they show.
     """
@@ -150,7 +150,7 @@ class PoseFinder:
         return tuple(self._rivals)
 
     def T_cam_submap(self, index: int) -> FloatArray:
-        """Return where a frame stands by the submap's poses of now."""
+        """Return where a frame stands by the submap's current poses."""
         return self._map.T_cam_submap(index)
 
     def note(self, view: View, reference_id: int, T_cam_submap: FloatArray) -> None:
@@ -300,10 +300,9 @@ class PoseFinder:
         """Let the submap's landmarks decide where the auxiliary front end's matches alone do not, if the camera has
         hardly moved.
 
-        A camera in the hand turns fast and moves little: few of the auxiliary front end's points have parallax enough
-        to keep the scale, but the landmarks that it still sees have, and a step that is small against their depth
-        changes nothing in that. (Across a long one, landmarks of two or three views would carry their errors over as
-        scale.)
+        A camera in the hand turns fast and moves little. Few of the auxiliary front end's points have enough parallax
+        to keep the scale, but the landmarks in view have. A step that is small against their depth does not change
+        that. (Across a long one, landmarks of two or three views would carry their errors over as scale.)
         """
         track = judge_track(self._live.track_near(view, found.T_cam_submap), self._config.health)
         if isinstance(track, Failure):
@@ -360,8 +359,8 @@ class PoseFinder:
     def _holds_scale(self, view: View, wide: GapPose) -> bool:
         """Whether the landmarks that are found again in the image hold the scale where the wide matches leave it open.
 
-        They are what carries it on beyond the gap. Where they turn out to be too few, the walk comes to no link and
-        other features make it again; after the last ones there is no other try.
+        They carry it on beyond the gap. If they are too few, reverse tracking finds no link and is repeated with other
+        features. After the last ones there is no other try.
         """
         if not self._is_short_cut:
             return False

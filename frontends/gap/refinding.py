@@ -1,9 +1,9 @@
 """Landmarks of one side of a gap, found again on the other side in the images themselves.
 
-Beyond frames that could not be used (or after tracking has matched wide again) the map's scale hangs by the landmarks
-that are seen on both sides, and the detector finds few of the same points at half or twice the distance. With the pose
-now known about, each landmark's place and size there are too: the keyframes beyond the gap are searched for what the
-last keyframes before it saw, by its patch of the image, and what is found becomes a feature of theirs like any other.
+Beyond unusable frames, or after wide matching, the map's scale depends on landmarks that are seen on both sides. The
+detector finds few of the same points at half or twice the distance. The pose is now known roughly, and so are each
+landmark's place and size. The keyframes beyond the gap are searched for the landmarks of the last keyframes before it,
+by their image patches. Each find becomes a feature like any other.
 
 The pose of a gap relocalisation comes from few matches over a long way. There a landmark is looked for once its place
 is known to within what is searched, by the pose's covariance and its own: in a smaller search than that, what looks
@@ -51,8 +51,8 @@ small, to 20 % 5 to 13 %. A hundred of them beyond a gap would not average that 
 MAX_ZOOM = 4.0
 """Beyond, a patch covers another part of the scene than its landmark stands for."""
 SIGMA_PX = 0.45
-"""Noise of a place, in pixels of the coarser image: half of what is found on a rendered street, at half the distance or
-twice, is nearer than 0.25 to 0.5 px of where it is in truth."""
+"""Noise of a place, in pixels of the coarser image. On a rendered street, at half the distance or twice, half of the
+finds are within 0.25 to 0.5 px of the truth."""
 MAJORITY = 0.5
 """Of the patches that are found must agree with one pose: below, it is chance that has found them."""
 

@@ -1,16 +1,15 @@
 """The pose of a frame beyond a gap, from wide matches with several frames whose poses are known.
 
-Two ways lead to a first pose. Where the known frames have seen enough parallax, their points and a 3-point solver. And
-where they have not (a map that has just begun knows the depth of what lies ahead to a tenth, and a camera that drives
-on through a gap sees it at half the distance), the essential matrix between the gap's two sides, and one number for the
-length of the gap relocalisation, which each track that a second known frame sees tells by itself. Both are then refined
-with the points, the known poses held, and the one that more tracks agree with stays.
+Two ways lead to a first pose. If the known frames have enough parallax, a 3-point solver uses their points. Otherwise
+the essential matrix between the gap's two sides gives the direction. Each track that a second known frame sees gives
+the length. That helps a map that has just begun: it knows depths to a tenth, and beyond a gap the camera sees things at
+half the distance. Both poses are then refined with the points, the known poses held. The one with more agreeing tracks
+stays.
 
-The refinement hears only tracks that two known frames see, where there are enough of these. What one of them sees may
-lie anywhere on a line: a few false matches at the image's edge, on a road that looks alike everywhere, bend a pose by a
-degree until they agree with it, and nothing shows.
+The refinement uses tracks seen in at least two known frames, if enough exist. A track seen in one may lie anywhere on a
+line. A few such false matches on a road can bend a pose by a degree until they agree with it, unnoticed.
 
-What the gap relocalisation's length is worth is told by `gap_uncertainty`.
+See `gap_uncertainty` for the uncertainty of the translation.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Does a second pose beyond a gap explain nearly as much as the first? Then the scene repeats itself: none is known.
+"""Test for a second pose beyond a gap that explains nearly as much as the first: then the scene repeats itself.
 
-A match is made where the best candidate is clearly better than the second, which throws out just those that would show
-a repetition; among the few that are left a wrong pose, one period off, may have all. So every point is paired with all
-features that look like it; what the first pose explains is taken out, and the rest is asked for another pose. (The
-same test for two maps: `dualslam/places/second_pose.py`.)
+A ratio test keeps a match only if the best candidate is clearly better than the second. That removes just those that
+would show a repetition. A wrong pose, one period off, may have all of the few that are left. So every point is paired
+with all similar features. The pairs that the first pose explains are removed, and the rest is searched for another
+pose. (The same test for two maps: `dualslam/places/second_pose.py`.)
 
-What a pose explains is counted among the points that it has in view. A pose near the one of before the gap has nearly
-all of them, and of those that a camera which has moved on by a period still sees, it would win by number alone.
+What a pose explains is counted among the points that it has in view. A pose near the last one before the gap has nearly
+all of them in view. By number alone it would win over that of a camera that has moved on by a period.
 """
 
 from __future__ import annotations
