@@ -1,4 +1,4 @@
-"""What a pose across a gap must pass: it holds the scale, and no other pose explains nearly as much."""
+"""Tests of a pose across a gap: it holds the scale, and no other pose explains nearly as much."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
 """The focal length and the lens of a camera of which nothing is known, from the first seconds of its video.
 
-Pairs of frames are each asked how well they are explained by every camera of a grid: a focal length, and one number for
-the lens (the division model of Fitzgibbon, 2001). For each camera the relative pose is estimated (RANSAC and refinement
-of PoseLib) and the robust cost of the epipolar constraint is kept. A pair that cannot tell (a straight drive, a plane,
-a turn on the spot) has a flat cost and says nothing, where a solver for its focal length would return some number; the
-sum over the pairs has its best place where the camera is. Self-calibration goes on from there.
+Each pair of frames is compared with every camera of a grid: a focal length, and one number for the lens (the division
+model of Fitzgibbon, 2001). For each camera the relative pose is estimated (RANSAC and refinement of PoseLib) and the
+robust cost of the epipolar constraint is kept. An uninformative pair (a straight drive, a plane, a turn on the spot)
+has a flat cost and no effect. A solver for its focal length would return some number. The sum over the pairs is lowest
+at the right camera. Self-calibration goes on from there.
 
 The lens has to be asked for with the focal length: without it, a wide lens (EuRoC's) is taken for a camera of twice the
 focal length.
@@ -53,8 +53,8 @@ cameras 0.45 to 0.6."""
 TOLD_RIGHT = 0.9
 """How likely a source's own data tell of these images: one may have been cropped since."""
 DEGREES_OF_FREEDOM, INFLATION = 3.0, 4.0
-"""Of the Student distribution of a pair's cost, as some pairs are wrong altogether; and how much larger than their
-residuals errors are taken to be, as neighbouring points err alike (`INFLATION` of self-calibration)."""
+"""Of the Student distribution of a pair's cost, as some pairs are entirely wrong. The inflation scales errors above
+their residuals, as neighbouring points err alike (`INFLATION` of self-calibration)."""
 MODEL_SIGMA = 0.03
 """Of the log focal length: what a lens of one number and a principal point in the middle leave."""
 COARSE_ITERATIONS, FINE_ITERATIONS = (30, 60), (50, 200)
@@ -79,12 +79,12 @@ def search_focal(
         Width and height.
     seed : int
     told : ToldFocal, optional
-        What the source's own data tell.
+        The focal length in the source's own data.
 
     Returns
     -------
     FocalSearch or Failure
-        Fewer than `MIN_PAIRS` pairs moved enough, and nothing was told: `LOW_PARALLAX`.
+        Fewer than `MIN_PAIRS` pairs moved enough, and the source's data have no focal length: `LOW_PARALLAX`.
     """
     pairs = list(_find_pairs(frontend, features, size_px, seed))
     told_px = None if told is None else told.over_side * max(size_px)
@@ -116,7 +116,7 @@ def search_focal(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pair:
-    """Matched pixels (N, 2) from the middle of the image, their sigma, and the radius at which the lens is told."""
+    """Matched pixels (N, 2) from the middle of the image, their sigma, and the radius at which the lens is given."""
 
     uv_a: FloatArray
     uv_b: FloatArray
@@ -244,7 +244,7 @@ def _K(focal: float) -> FloatArray:
 def _log_prior(log_focal: FloatArray, lens: FloatArray, told: ToldFocal | None) -> FloatArray:
     """Return the logarithm of the prior of cameras, of the shape that both make together.
 
-    `told`: by the source's own data, which are right about it as a rule.
+    `told`: the focal length in the source's own data, which is right as a rule.
     """
     of_focal = _log_normal(log_focal, *LOG_FOCAL_PRIOR)
     if told is not None:

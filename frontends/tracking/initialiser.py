@@ -1,8 +1,10 @@
 """How a submap starts: two views with parallax, a first bundle adjustment, and a check that refuses doubtful starts.
 
-A wrong start costs more than a late one: it is refused unless (1) the two views determine the direction of translation
-to within a stated sigma, (2) no other pose explains them nearly as well, and (3) the frames between them, which had no
-part in the estimate, agree with the points by their own pixels.
+A wrong start costs more than a late one. It must pass three tests:
+
+1. The two views determine the direction of translation to within a stated sigma.
+2. No other pose explains them nearly as well.
+3. The frames between them agree with the points by their own pixels. They had no part in the estimate.
 """
 
 from __future__ import annotations
@@ -57,8 +59,8 @@ MAX_VIEWS = 120
 """How many recent frames are kept as possible first views."""
 PATIENCE_S, MAX_LENIENCE = 10.0, 4 / 3
 """Seconds without a start after which its direction may be known less well, and how many times less at most: no map
-costs more then. Of a camera that hardly leaves its place for 24 s (`tum_fr1_rpy`) the best pairs of all know theirs to
-1.3 to 1.9 degrees; some runs found none below 1.5, and ended without a map."""
+costs more then. For a camera that hardly leaves its place for 24 s (`tum_fr1_rpy`) the best pairs know it to 1.3 to 1.9
+degrees. Some runs found none below 1.5, and ended without a map."""
 
 LAGS = (2, 4, 8, 16, 32, START_REACH)  # frames back that are tried as the first view
 MAX_PAIRS = 2  # tried with each view, in turn: what two views farther apart lack, the next two lack most often as well
@@ -112,7 +114,7 @@ class Initialiser:
     ) -> None:
         self._frontend = frontend
         if config.matching == "gms":
-            nearest_search(frontend)  # a front end without it is told so before the first frame
+            nearest_search(frontend)  # a front end without it is refused before the first frame
         self._adjuster = adjuster
         self._config = config
         self._K = K
@@ -128,8 +130,8 @@ class Initialiser:
     def add(self, view: View, waited_s: float = 0.0, briefly: bool = False) -> Start | Failure:
         """Take a view in and try to start from it and an earlier one: with the next two in turn, `briefly` with one.
 
-        In turn come all that have enough in common with it, the farthest back first; where one shows too little
-        parallax those nearer show no more, and the turn begins anew, one farther back if there is one.
+        All views that have enough in common with it are tried in turn, the farthest back first. If one shows too little
+        parallax, nearer ones show no more. The turn then begins anew, one farther back if there is one.
         """
         self.collect(view)
         lenience = float(np.clip(waited_s / PATIENCE_S, 1.0, MAX_LENIENCE))
@@ -360,8 +362,8 @@ class Initialiser:
         inlier &= result.chi2 < CHI2_99[2] * float(np.clip(chi2, MIN_NOISE2, 1.0))
         n_views = np.bincount(problem.point[inlier], minlength=len(xyz))
         proven = keep & _agreeing(problem, inlier) & (n_views >= N_PROOF)
-        # Of a pattern that repeats itself, a third view of five fits by chance. Right before the camera, where it would
-        # weigh most, a point is taken on the word of all of them, unless others that all have seen are as near.
+        # Of a pattern that repeats itself, a third view of five fits by chance. Right before the camera a point weighs
+        # most. There all views must have seen it, unless others that all have seen are as near.
         proven &= ~nearer_than_proven(result.xyz_mu[:, 2], proven & (n_views == len(views)))
         numbers["n_proven"] = float(proven.sum())
         least = float(max(PROVEN * keep.sum(), MIN_CONSENSUS))

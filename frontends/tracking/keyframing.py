@@ -64,8 +64,8 @@ def keyframe_due(track: Track, submap: Submap, reference_id: int, config: Keyfra
 def keyframe_like(track: Track, submap: Submap, first_id: int, config: KeyframeConfig) -> int | None:
     """Return the keyframe of an earlier run that makes one of this frame superfluous, if there is one.
 
-    What it sees is in view from much the same place; whether it is found there, or looks otherwise today, is no
-    question of where keyframes are, as long as enough of the map is.
+    That keyframe sees the same from much the same place. Whether the frame's own content is found there, or has
+    changed, does not matter as long as enough of the map is.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a new keyframe does to the map: observations, culling, duplicates merged, new landmarks triangulated."""
+"""Effect of a new keyframe on the map: observations, culling, merged duplicates, new landmarks."""
 
 from __future__ import annotations
 
@@ -96,12 +96,12 @@ class Mapper:
         submap.add_observations(view.index, feature, track.landmark_ids[feature])
 
     def grow(self, track: Track, apart: Set[int] = frozenset(), noise2: float = 1.0) -> None:
-        """Grow the map about the keyframe that a tracked frame has become, from the poses as they are now.
+        """Grow the map about the keyframe that a tracked frame has become, from the current poses.
 
         `apart`: keyframes across a gap, with which nothing new is triangulated. What few landmarks tie to each other
         has epipolar lines that are off, on which half of what is found is wrong (rendered streets: 65 of 130), each of
-        it by a depth that confirms the poses. `noise2`: variance of the map's whitened residuals. What fits worse than
-        these is let in neither as a new landmark nor as another view of one; noisier pixels open no gate to landmarks.
+        it by a depth that confirms the poses. `noise2`: variance of the map's whitened residuals. Observations that fit
+        worse are admitted neither as a new landmark nor as another view of one. Noisier pixels do not widen the gate.
         """
         view = track.view
         self._gate_chi2 = CHI2_95[2] * min(noise2, 1.0)

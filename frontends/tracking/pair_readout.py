@@ -26,7 +26,7 @@ TYPICAL = 4
 """Place of the readout time, 0.02 s, that must be ruled out for a shutter to count as global."""
 MIN_SHIFT_PX = 3.0
 """A view turns fast where so long a readout would shift its first and last rows by so much: several times what lens
-models get wrong. Only there can a readout be told from that, and only there does it matter."""
+models get wrong. Only there can a readout be separated from these, and only there does it matter."""
 LAG, SPACING = 3, 3
 """Frames between the views of a pair, far enough for the turn to change; and between pairs, which do not overlap."""
 SUSPICION = 1 / 9
@@ -35,8 +35,8 @@ MAX_PAIRS = 60
 """Pairs after which a readout time is taken, however unsure: waiting costs more then."""
 ENOUGH_PAIRS, ENOUGH_CURVATURE = 150, 50.0
 """Pairs after which the time that is known is good enough; or the second difference of chi-square at it, by steps: a
-sigma of 0.004 s with errors four times what they seem. On the first 200 frames of a hand-held turn the times that
-were first known lay between 0.012 and 0.035 s, by which frames were paired; the whole says 0.026."""
+sigma of 0.004 s with errors four times what they seem. On the first 200 frames of a hand-held turn the first estimates
+lay between 0.012 and 0.035 s, depending on the pairs. All pairs together give 0.026."""
 MIN_MATCHES = 60
 STEP_TOLERANCE = 1e-4
 """At which a refinement ends, radians: a twentieth of a pixel. Chi-squares, of hundreds, are 0.02 off at most."""
@@ -124,12 +124,12 @@ class ReadoutEstimator:
     def _misfits(
         self, a: Features, rate_a: FloatArray, b: Features, rate_b: FloatArray, camera: Camera
     ) -> tuple[FloatArray, float]:
-        """Return the robust chi-square of the best relative pose of two views for each readout time (T,), and for a
-        typical one with the rows read the other way round.
+        """Return the robust chi-square of the best relative pose of two views for each readout time (T,). The second
+        result is for a typical time with the rows read the other way round.
 
-        Poses come from RANSAC with the shortest and with the longest time, and from there each time's is refined from
-        that of the time before it, upwards and downwards: RANSAC's own scatter would drown what the times differ by,
-        and from far off a refinement stays in another minimum than its neighbours' (a step of 18 between two times).
+        RANSAC gives the poses for the shortest and the longest time. From there each pose is refined from that of the
+        neighbouring time, upwards and downwards. RANSAC's own scatter would hide the differences between times. A
+        refinement from far off stays in another minimum than its neighbours' (a step of 18 between two times).
         """
         sigma_px = np.sqrt(0.5 * (a.sigma_px**2 + b.sigma_px**2))
         lens = poselib_camera(camera.K, camera.size_px)

@@ -1,7 +1,7 @@
 """Rolling shutter: rows are read one after the other, so that a turning camera sees each from another direction.
 
-Where every pixel would have been found at the time of the middle row follows from how the camera turns, which matches
-to the frame before tell, and from the readout time, which is the camera's own.
+Pixels are corrected to the time of the middle row. That needs the rate of turn, from matches to the frame before, and
+the camera's readout time.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class TurnMeter:
     Attributes
     ----------
     between_rad_s : (3,) float64 or None
-        Between the two last views; None where it could not be told.
+        Between the two last views; None if unknown.
     """
 
     def __init__(self, frontend: Frontend) -> None:
@@ -55,9 +55,8 @@ class TurnMeter:
         self.between_rad_s: FloatArray | None = None
 
     def rate_rad_s(self, view: View, K: FloatArray) -> FloatArray:
-        """Take the next view in; return its turn (3,), rad/s, in its own axes: zero where it cannot be told.
-
-        Matches tell the turn half-way between two frames; half a frame more is carried on from the two last turns.
+        """Take the next view in; return its turn (3,), rad/s, in its own axes: zero if unknown. Matches give the turn
+        half-way between two frames; half a frame more is extrapolated from the two last turns.
         """
         last, before, gap_s = self._last, self.between_rad_s, self._gap_s
         sees = _largest(view.features)
@@ -176,7 +175,7 @@ class RollingShutter:
     def take(
         self, readout_s: float, rates_rad_s: Mapping[int, FloatArray], latest: Iterable[View], K: FloatArray
     ) -> None:
-        """Go on with the readout time that a map has told.
+        """Continue with the readout time estimated from a map.
 
         `rates_rad_s`: how the camera turns at frames so far, for `all_corrected`; `latest`: the last ones, in order.
         """

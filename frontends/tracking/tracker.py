@@ -74,8 +74,8 @@ class Tracker:
 
     `looks_everywhere`: wide matching also tries the keyframes that show the most of the map.
     `max_gap_scale_sigma`: largest standard deviation (relative) of the scale beyond frames that wide matching has
-    skipped, unless the step is small against the depth of the scene; where it is larger the frame counts as lost.
-    `pixels`: finds landmarks where guided search finds too few; without it wide matching comes next.
+    skipped. Above it the frame counts as lost, unless the step is small against the depth of the scene. `pixels`: finds
+    landmarks where guided search finds too few; without it wide matching comes next.
     """
 
     def __init__(

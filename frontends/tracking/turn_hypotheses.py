@@ -1,8 +1,8 @@
 """Relative poses whose rotation the far part of a scene shows by itself.
 
-A near plane can hide what is far from a search over all matches: a pose that takes the turn for parallax has points in
-front of the camera where the true one, for what is far, has none, and wins the count. Here the rotation comes first,
-from a layer of matches that move as one turn does, and the translation from the others.
+A near plane can hide the far scene from a search over all matches. A pose that takes the turn for parallax puts far
+points in front of the camera, where the true one has none. So it wins the count. Here the rotation comes first, from a
+layer of matches that move as one turn does, and the translation from the others.
 """
 
 from __future__ import annotations

@@ -85,8 +85,8 @@ class RelativePoses:
         """Return the four T_b_a of a homography, where it explains most of what the essential matrix' pose does.
 
         Before a plane, the essential matrix is anyone's guess: a homography explains as much with less freedom. Only
-        the matches that the essential matrix explains are asked, as wrong ones meet a line by chance, a point hardly
-        ever, and before a plane that repeats itself there are many.
+        the matches that the essential matrix explains are used. Wrong ones meet a line by chance, a point hardly ever.
+        Before a plane that repeats itself there are many.
         """
         uv_a, uv_b, variance = self._uv_a, self._uv_b, self._sigma_px**2
         gate_px = 3.0 * float(np.median(self._sigma_px))

@@ -1,7 +1,7 @@
 """The visual front end: frames in, keyframes of one submap out, in either direction of time.
 
-The same object tracks live frames, and tracks in reverse from a new submap's first keyframe, to the frames before it
-and through a buffer to an older submap: the only difference is the order in which it is given the frames.
+The same object tracks live frames and tracks in reverse. Reverse tracking starts at a new submap's first keyframe and
+goes through the buffer to an older submap. The only difference is the order of the frames.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class VisualFrontEnd:
     `camera`: as it was given; it says what an image shows. `refinder`: finds landmarks across gaps in the images
     themselves; without it features alone tie the keyframes there. `looks_everywhere`: see `Tracker`. `window`: poses
     new keyframes before the map grows about them; without it the graph does. `pixels`: see `Tracker`. `first_id`:
-    number of this run's first frame; keyframes before it are those of the saved map that it goes on in.
+    number of this run's first frame; keyframes before it are those of the saved map that it continues.
     """
 
     def __init__(
