@@ -7,9 +7,9 @@ In reading order:
 - `timeline`: what the keyframes say one by one, in order of time,
 - `deformation`: how the maps are bent beyond a similarity,
 - `join_test`: the gates of all joins, and `verify`: what they ask of a link,
-- `live_end` and `camera_bend`: whether the new map bears the link to where it is needed,
+- `live_end` propagates the link's covariance to the current frame, `camera_bend` detects bending by a wrong camera,
 - `pairs`: the matches as measurements, `scale_observability`: how firmly a map holds its scale,
-- `motion`, `rivals` and `link_tries`: the camera's motion across gaps and seams, other poses, earlier tries.
+- `motion`: the camera's motion across gaps and seams. `link_tries`: earlier tries.
 """
 
 from dualslam.linking.camera_bend import NO_BEND, Bend, check_camera

@@ -1,15 +1,14 @@
 """Whether a wrong camera bends the new map between the overlap, where a link is measured, and its live end.
 
 A wrong camera bends a map wherever it turns: it may agree with another map of that camera on all that both have seen,
-and say nothing of the scale beyond. How sure the pixels contradict the camera does not decide. Matches that err alike
-look like a wrong camera, beyond what their noise explains, where what they ask for changes little in the map's shape;
-and a short map may hardly know its camera, and be bent. So what counts is by how much the map would be another one
-under the camera that its pixels ask for, both by the same observations: what else holds a map together would count as
-the camera's doing.
+and say nothing of the scale beyond. How sure the pixels contradict the camera does not decide. Matches with common
+errors look like a wrong camera beyond their noise, although the map's shape hardly changes with it. A short map may
+hardly know its camera, and be bent. So the test compares the map with the one under the preferred camera. Both are
+solved from the same observations alone: other ties would count as an effect of the camera.
 
 Of that, chance has its share: pixels of an exact camera ask for another one, too. A correction at a squared distance of
-d2 makes, in whatever direction, a change of at most sqrt(d2) of that change's standard deviations (Cauchy-Schwarz), so
-that of the change's square at least the part 1 / d2 is what chance makes on average. The rest counts.
+d2 makes a change of at most sqrt(d2) of that change's standard deviations, in any direction (Cauchy-Schwarz). So chance
+makes at least the part 1 / d2 of the change's square on average. The rest counts.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ class Bend:
     Attributes
     ----------
     log_scale : float
-        Logarithm of its scale there, over that of now.
+        Logarithm of its scale there over the current one.
     rotation_rad : float
     doubt : Failure or None
         Why a link is not to be relied on with it.
@@ -99,9 +98,9 @@ def check_camera(
     Returns
     -------
     Bend or Failure
-        A failure where the link would not be known well enough with it to join the maps, or a bend with a `doubt` where
-        it would not be well enough to be relied on. Of the camera where that is contradicted beyond chance, else of the
-        scale, which more keyframes may tell.
+        A failure if the link with this bend is too unsure to join the maps. A bend with a `doubt` if it joins them, but
+        is too unsure to rely on. The reason is the camera if it is contradicted beyond chance. Otherwise it is the
+        scale, which more keyframes may decide.
     """
     ids = np.array(sorted(submap.keyframes), np.int64)
     here, there = _places(ids, link.agreeing_keyframes, live_since)
@@ -146,7 +145,7 @@ def _log_spread(T: FloatArray, rows: IntArray) -> float:
 
 
 def _mean_turn(T_now: FloatArray, T_other: FloatArray) -> FloatArray:
-    """Return the rotation that takes the keyframes of now to where they would be, on average."""
+    """Return the mean rotation from the current keyframes to where they would be."""
     turns = T_other[:, :3, :3] @ T_now[:, :3, :3].swapaxes(1, 2)
     middle = turns[len(turns) // 2]
     mean = np.mean([so3.log(middle.T @ turn) for turn in turns], axis=0)

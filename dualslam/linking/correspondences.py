@@ -48,9 +48,9 @@ class Correspondences:
     shared_pixel : (M,) bool
         Whether both maps use the same keypoint of the same frame somewhere. The two points then share part of their
         noise. With C their cross-covariance the residual's covariance is ``P_old + A P_new A' - C A' - A C'``;
-        the same pixel moves both points the same way, so what is subtracted is positive, and to leave it out is to
-        inflate: distances come out small, sigmas large. (Leaving it in would let pairs with all pixels in common, which
-        are no independent evidence, outweigh all others.)
+        the same pixel moves both points the same way, so C is positive, and omitting it inflates the covariance.
+        Distances come out small, sigmas large. (With C, pairs with all pixels in common would outweigh all others,
+        though they are no independent evidence.)
     keyframes : (K,) int64
         Shared keyframes with views, ascending: in order of time.
     view_pair, view_keyframe : (V,) int64
@@ -117,8 +117,8 @@ def propose_correspondences(
 ) -> Correspondences:
     """Match landmarks of two submaps through their shared keyframes.
 
-    In each shared keyframe two landmarks are proposed as one where both maps use the same keypoint of the same image
-    (identity), else where their keypoints are near and their descriptors are each other's nearest. Proposals of several
+    In each shared keyframe two landmarks are proposed as one if both maps use the same keypoint of the same image
+    (identity). Otherwise their keypoints must be near, and their descriptors each other's nearest. Proposals of several
     keyframes for the same pair are its views; a landmark with several proposals keeps the one with the most keyframes
     (identity first). Pairs whose points are not fixed by their views are left out.
 

@@ -74,9 +74,9 @@ def _change_of_scale(model: PairModel, S_old_new: FloatArray, part: BoolArray) -
 def _change_of_path(model: PairModel, S_old_new: FloatArray, keyframes: BoolArray) -> tuple[float, float]:
     """Compare the scale of the cameras' path with that of the landmarks: in a sound map these two agree.
 
-    A centre is known to about one pixel's worth at the landmarks' distance, over the root of their number, and several
-    times worse along the optical axis. It matters where landmarks are seen in the healthy part but were placed by what
-    the corrupted one saw of them: they then agree with each other in a wrong scale, and only the path is right.
+    A centre is known to about one pixel at the landmarks' distance, over the root of their number. Along the optical
+    axis it is several times worse. It matters where landmarks are seen in the healthy part but were placed by what the
+    corrupted one saw of them: they then agree with each other in a wrong scale, and only the path is right.
     """
     centres = model.T_old_kf[keyframes, :3, 3]
     moved = sim3.act(S_old_new, model.T_new_kf[keyframes, :3, 3])

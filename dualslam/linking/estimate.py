@@ -3,9 +3,9 @@
 Source: Huang et al., "Dual-SLAM", section II (Map Fusion): ``X' = s R X + T`` by RANSAC with Horn's algorithm over
 3D-3D matches restricted to equal keyframes. The consensus along time, the reprojections and the gates are ours.
 
-The refinement weighs the pairs by their points' covariances. These are the pixels of both maps, propagated: so the
-reprojections both ways, which are the same pixels again, judge the result (per keyframe and over all) and are not added
-to the refinement, where they would count twice.
+The refinement weighs the pairs by their points' covariances. These are the pixels of both maps, propagated: the
+reprojections both ways are the same pixels again. So they judge the result, per keyframe and over all. In the
+refinement they would count twice.
 """
 
 from __future__ import annotations
@@ -301,8 +301,8 @@ def _oldest_consensus(
 ) -> _Consensus | Failure:
     """Find the similarity of the oldest trusted keyframes: where two fit, the older one holds.
 
-    It is estimated on all trusted keyframes; if the oldest of them do not agree with it, or newer ones do not, it is
-    estimated again on fewer, always with the oldest among them, until all that it was estimated on agree.
+    It is estimated on all trusted keyframes. While some of them disagree, it is estimated again on fewer, always with
+    the oldest among them, until all agree.
     """
     ids = model.pairs.keyframes
     rows = np.flatnonzero(trusted)

@@ -20,8 +20,8 @@ MAX_MISFITS = 1
 DESCRIPTOR_RADIUS_PX = 3.0
 """Distance in the same image within which two keypoints can be the same point: the detector's own scatter."""
 MIN_TIES = 10
-"""Landmarks that keyframes on both sides of a place in the old map must see in agreement with their pixels; with fewer
-the old map is broken there, and what is newer counts as suspected."""
+"""Landmarks that keyframes on both sides of a place in the old map must see in agreement with their pixels. With fewer
+the old map is broken there, and its newer part counts as suspected."""
 TIE_WINDOW = 5
 """Keyframes on either side that are searched for ties."""
 LOOK_BACK = 10

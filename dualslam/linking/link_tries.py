@@ -59,8 +59,8 @@ class LinkTries:
     def judge(self, old_id: int, sigma_scale: float, max_sigma: float) -> Failure | None:
         """Return why a link that has passed is to be tried again, if it is.
 
-        After tries that were refused it must pass twice in a row, be it in two walks, or the bound which allows for
-        them at once.
+        After refused tries it must pass twice in a row, in one walk or two. Or it must pass at once the tighter bound
+        that allows for them.
         """
         n_refused = self.refused[old_id]
         if n_refused == 0 or old_id in self._held or sigma_scale <= tightened(max_sigma, n_refused + 1):

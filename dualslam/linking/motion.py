@@ -5,8 +5,8 @@ How far such predictions are off is measured in the run itself: the same questio
 the camera was tracked without interruption. So no unit is needed, and a hand is judged as a hand, a car as a car.
 
 A gap may be longer than the history that could be asked. The error then grows as that of a velocity that changes at
-random, and the camera may have stood still for the time that could not be asked: a robot that has never been seen to
-stop can stop all the same. In the end the test allows everything.
+random. The camera may also have stood still for the rest of the time: a robot that has never been seen to stop can stop
+all the same. In the end the test allows everything.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ class Motion:
     usual_mu : float
         The usual error of such predictions over the same time.
     change_mu : float
-        Error that the change of velocity across the gap explains, whenever it came between the middles of the two
-        windows in which the velocities were measured.
+        Error that the change of velocity across the gap explains. The change may have come at any moment between the
+        middles of the two windows that measured the velocities.
     slack_mu : float
         What the join of two maps leaves open there.
     n_asked : int
@@ -123,8 +123,8 @@ def seam_motions(old: Path, new: Path, slack: Slack = lambda i, j: 0.0) -> Itera
     """Measure the camera's motion wherever one of two maps follows on the other.
 
     The usual error is the old map's, or the new one's where the old one is too short. The end of the old map may be
-    corrupted: a seam that is refused is measured once more without the old map's last frames, and left out where these
-    are all that speak against it.
+    corrupted: a refused seam is measured once more without the old map's last frames. It is left out if only these
+    contradict it.
 
     Parameters
     ----------

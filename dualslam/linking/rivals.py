@@ -1,8 +1,7 @@
-"""Which of several poses beyond a gap, all of which the images allow, is one that the camera can have come to.
+"""Choice among several poses beyond a gap that the images all allow: the one that the camera can have reached.
 
-What repeats itself leaves poses for many places, a period apart. The velocities before and after the gap, each known in
-its own map, tell how far off each of them is, as in any motion test (`linking/motion.py`). One of them
-is believed only where they leave no doubt.
+Repeated structure allows many poses, a period apart. The velocities before and after the gap, each known in its own
+map, predict the motion, as in any motion test (`linking/motion.py`). A pose is accepted only if they leave no doubt.
 """
 
 from __future__ import annotations
@@ -22,14 +21,14 @@ from dualslam.linking.motion import Motion, gaps_of, measure_motion
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Choice:
-    """What the velocities say of the poses that a walk took beyond gaps, and of their rivals.
+    """The decision by velocities among the poses of a walk beyond gaps and their alternatives.
 
     Attributes
     ----------
     refusal : Failure or None
-        Why the walk is not to be believed, if it is not.
+        Why the walk is refused, if it is.
     better : tuple of Rival
-        What it has to go by instead, if that is known: of several frames, all at one place.
+        The poses to use instead, if known: of several frames, all at one place.
     is_measured : bool
         Whether the walk was far enough beyond the gap.
     """
@@ -40,12 +39,12 @@ class Choice:
 
 
 def choose_by_velocity(walked: Path, known: Path, rivals: Sequence[Rival]) -> Choice:
-    """Tell the poses that a walk took beyond gaps from their rivals.
+    """Choose by velocity between the poses of a walk beyond gaps and their alternatives.
 
     The velocity before the gap is the lost map's: the walk may have found its place only a while beyond the gap, and a
-    long leap tells less. Of a frame's poses one is believed where it is allowed as a leap and all others are refused;
-    and so would be any other that is not found, if it lies as far off as these lie from each other. All frames must
-    tell the same.
+    long gap decides less. Of a frame's poses one is accepted if the motion test allows it and refuses all others. The
+    test must also refuse a further pose that was not found, as far off as these lie from each other. All frames must
+    agree.
 
     Parameters
     ----------
@@ -86,7 +85,7 @@ def _nothing_told(own: Motion) -> Choice:
 
 
 def _measure(walked: Path, known: Path, rivals: Sequence[Rival]) -> tuple[list[Motion], FloatArray] | None:
-    """Measure the motion across the gap behind a frame: under the walk's pose, and under each rival of that frame.
+    """Measure the motion across the gap behind a frame: under the walk's pose, and under each other pose of that frame.
 
     Returns these motions, and the place of the last frame before the gap by each (N, 3); None without a velocity on
     both sides.

@@ -1,10 +1,10 @@
 """How firmly a map holds its scale from one place to another.
 
 A link is measured where two maps overlap; what it is made for lies elsewhere, at the new map's live end. Between the
-two places the scale is handed on from landmark to landmark, and where few are shared, or all are seen under one angle,
-little of it arrives. How much is known of it stands in the normal equations of the map: all poses and points between
-the places are unknown together, and what is asked is the ratio of the scales at which the cameras of either place see
-their points. That ratio does not depend on the gauge.
+two places the scale is handed on from landmark to landmark. If few are shared, or all are seen under one angle, little
+of it arrives. How much is known of it stands in the normal equations of the map: all poses and points between the
+places are unknown together. The result is the ratio of the scales at which the cameras of either place see their
+points. That ratio does not depend on the gauge.
 """
 
 from __future__ import annotations

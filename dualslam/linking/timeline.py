@@ -1,4 +1,4 @@
-"""What the shared keyframes say about a similarity one by one, in order of time.
+"""A similarity tested by the shared keyframes one by one, in order of time.
 
 The newest part of the old map may be corrupted: rigid in itself, so that it fits the new map by a clean similarity that
 is wrong. What gives it away lies along time: the place where the old map is torn, or where the similarity changes.
@@ -88,9 +88,9 @@ def find_discontinuities(submap: Submap, oldest: int, newest: int) -> IntArray:
     """Return the ids of the keyframes before which a map is torn, ascending: its parts there are not held together.
 
     A wrong pose either ends the tracks, or leaves their observations wrong on one side of it. So a place between two
-    keyframes is torn if too few landmarks are seen on both sides in agreement with their pixels, or if most
-    observations of those that are followed across it (twice on either side: a single camera cannot tell a change of
-    scale about itself) disagree.
+    keyframes is torn if too few landmarks are seen on both sides in agreement with their pixels. It is also torn if
+    most observations of landmarks followed across it disagree. These are seen twice on either side, since a single
+    camera cannot detect a change of scale about itself.
 
     Parameters
     ----------

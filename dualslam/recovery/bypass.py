@@ -114,7 +114,7 @@ def drop_corrupted(record: Record, old_id: int, since: int) -> int:
 def condemn_tail(
     record: Record, recovered_frames: Collection[RecoveredFrame], old_id: int, handover: int, since: int
 ) -> int:
-    """Mark the keyframes of a linked old map that are not to be relied on any more; return how many.
+    """Mark the keyframes of a linked old map that are no longer reliable; return how many.
 
     Those beyond the handover that the new map has posed, and all of the corrupted tail, from `since` on.
     """

@@ -3,11 +3,11 @@
 K = k + k_r frames: the last k while all is well, and all that came since while the live submap is lost. Memory has a
 hard bound, which k frames and a short loss stay far below. A long loss (a lens that stays covered) reaches it, and then
 the frames of the loss give way, not those before it: a recovery needs the k frames before the loss, which the old map
-saw, and the newest, with which the new map starts; what it cannot use of the stretch between, it skips. In order:
+saw, and the newest, with which the new map starts. It skips unusable frames between. In order:
 
 1. images are packed (`GreyImage.pack`), the oldest first: nothing is lost but time;
-2. images of the stretch are dropped, each time the one whose neighbours stay closest together, so that what is left
-   thins out evenly and a walk through it takes ever longer, but even, steps;
+2. images of the stretch are dropped, each time the one whose neighbours stay closest together. The rest thins out
+   evenly, and reverse tracking takes longer, but even, steps;
 3. then whole frames of the stretch, in the same way;
 4. where the bound does not even hold the rest, the oldest images, and at last the oldest frames.
 """
@@ -113,8 +113,7 @@ class FrameBuffer:
     def map_later(self, change: Callable[[View], View], subject: str) -> None:
         """Do the same in slices (`settle`), and what is left as soon as somebody looks.
 
-        `change` makes the same of a view whether or not it has changed it before; it takes the place of one of the same
-        `subject` that has not come to its end yet, and comes after one of another.
+        `change` must be idempotent. It replaces an unfinished one of the same `subject`, and follows one of another.
         """
         if subject != self._subject:
             self.settle()

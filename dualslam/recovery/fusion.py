@@ -96,9 +96,9 @@ def _note_link(
 def gauge_at_overlap(submap: Submap, keyframe_ids: IntArray) -> tuple[int, int]:
     """Return the two keyframes that are to hold a submap's gauge from now on: the widest baseline of the overlap.
 
-    A link is measured at its overlap. While the map grows at its other end its scale is still solved for, and if the
-    gauge lay there, the overlap would drift away under the link. Where the overlap spans less than the gauge in use (a
-    turn in place), that one stays.
+    A link is measured at its overlap. While the map grows at its other end, its scale is still solved for. If the gauge
+    lay there, the overlap would drift away under the link. Where the overlap spans less than the gauge in use (a turn
+    in place), that one stays.
     """
     ids = [int(k) for k in keyframe_ids if int(k) in submap.keyframes]
     if len(ids) < 2:
@@ -114,7 +114,7 @@ def gauge_at_overlap(submap: Submap, keyframe_ids: IntArray) -> tuple[int, int]:
 def _hand_over(
     record: Record, job: RecoveryJob, found: FoundLink, recovered_frames: list[RecoveredFrame], now: FrameStamp
 ) -> None:
-    """Give the frames of the old map's end the poses of the new one, and condemn what is not to be relied on."""
+    """Give the frames of the old map's end the poses of the new one, and mark unreliable keyframes invalid."""
     link, new_id = found.estimate, job.submap.id
     newest = int(link.agreeing_keyframes[-1])
     onset = job.onsets[found.old_id]

@@ -45,9 +45,9 @@ class RecoveryJob:
     paths : dict of int to Path
         For each lost submap the camera's path in it.
     notes_rivals : bool
-        Whether a pose beyond a gap that has rivals is gone by; the velocities must tell them apart.
+        Whether an ambiguous pose beyond a gap is used. The velocities must then decide.
     expected : dict of int to (4, 4)
-        ``T_cam_submap`` of frames beyond a gap, where the velocities have told.
+        ``T_cam_submap`` of frames beyond a gap, decided by the velocities.
     joined : dict of int to Submap
         Copies of lost submaps that are joined with it by a scale too loose to be relied on: these links are measured
         again, by the keyframes that both hold.

@@ -175,7 +175,7 @@ class Recoveries:
             self._submit(submap, first, (), {}, now)
 
     def _outgrows(self, submap_id: int, last_chance: bool) -> bool:
-        """Whether a submap takes over the frames of a lost one, all of which a walk has posed: told once.
+        """Whether a submap takes over the frames of a lost one, all of which a walk has posed. True only once.
 
         It does once it holds more, or at the end of the run.
         """
@@ -221,7 +221,7 @@ class Recoveries:
         return way_to_gaps(tuple(views), poses.keys(), submap.keyframes.keys())
 
     def collect(self, live: VisualOdometry | None, now: FrameStamp) -> None:
-        """Merge the walks that have ended. `live` goes on in its submap as it is after that."""
+        """Merge the walks that have ended. `live` continues in the merged submap."""
         self._take(self._desk.poll(JobKind.WALK), live, now)
 
     def finish(

@@ -1,10 +1,10 @@
-"""What reverse tracking added to a snapshot of a submap, put into that submap as it has become meanwhile.
+"""Merging of reverse tracking's additions to a snapshot into the submap as it has become meanwhile.
 
 Three states of one submap: the snapshot (`base`), the snapshot with what the walk added (`grown`), and the submap that
 went on (`live`): it may have grown at its other end, been solved again, changed its camera, or been archived. Landmark
-ids only grow, so that all which is older than the snapshot has the same ids in all three. Rows of observations do so
-from the snapshot to what has grown from it; in the live submap they may be numbered anew since, and are found by what
-they are: a keyframe, its feature, a landmark. What the walk added are observations; its poses and points are initial
+ids only grow, so that all which is older than the snapshot has the same ids in all three. Rows of observations keep
+theirs from the snapshot to the grown one. In the live submap they may have new numbers, and are identified by three
+things: a keyframe, its feature, a landmark. What the walk added are observations; its poses and points are initial
 values for the next solution, no more.
 """
 

@@ -1,4 +1,4 @@
-"""When reverse tracking tries to link its submap with the lost ones, and when it has tried enough."""
+"""Link attempts of reverse tracking: when to try its submap against the lost maps, and when to stop."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ class Relinker:
     Attributes
     ----------
     has_seen_enough : bool
-        Whether the next keyframes change nothing: the walk has met so many of a lost submap's healthy part, or so many
-        beyond a place where its own map is torn that all which could hold it together there is seen.
+        Whether the next keyframes change nothing: the walk has met enough of a lost submap's healthy part. Or it has
+        met enough keyframes beyond a tear of its own map to test everything that could hold it together.
     """
 
     def __init__(
@@ -76,12 +76,12 @@ class Relinker:
 
     @property
     def holds_all(self) -> bool:
-        """Whether the growing submap holds all keyframes of the lost ones."""
+        """Whether the growing submap holds all keyframes of the lost submaps."""
         return self.keyframe_ids <= self._submap.keyframes.keys()
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether the growing submap holds all keyframes of the lost ones, and these are too few for any link."""
+        """Whether the growing submap holds all keyframes of the lost submaps, and these are too few for any link."""
         return self.holds_all and all(len(old.keyframes) < MIN_SHARED_KEYFRAMES for old in self._old)
 
     def attempts(self, keyframe_id: int) -> Iterator[LinkTry]:

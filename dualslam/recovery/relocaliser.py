@@ -56,7 +56,7 @@ class Relocaliser:
         return self._n_unseen > self._after
 
     def sighted(self, view: View) -> VisualOdometry | None:
-        """Return the front end that may go on in its map with this frame: where the one before has shown it."""
+        """Return the front end that may continue in its map with this frame, if the one before was found there."""
         if self._frontend is None:
             return None
         if self._sighted:

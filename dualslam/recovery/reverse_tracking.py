@@ -3,7 +3,7 @@
 The walk is a visual front end, given the buffered frames latest first. It sees images and features only, never the
 old map's poses or landmarks: a link must not confirm itself. What it takes from the old map is which frames were
 keyframes, so that both maps hold the same ones. Several attempts, each with poses from another front end, start from
-the same snapshot one after the other until one leads to a link; what one of them got wrong does not reach the next.
+the same snapshot until one leads to a link. An attempt's errors do not reach the next.
 
 It is a job on a snapshot that nobody else changes: it can run in a process of its own, and be merged when it is ready.
 """
@@ -78,7 +78,7 @@ class RecoveryParts:
 
     `posing`: the way back where there is no lost map, but frames without a pose.
     `find_camera`: asks keyframes of a map that a walk has grown about the camera.
-    `foresee`: finds beforehand what a walk over a gap may ask for in a frame.
+    `foresee`: precomputes the features that crossing a gap may need in a frame.
     """
 
     attempts: tuple[Attempt, ...]
@@ -174,8 +174,8 @@ def _unavailable(job: RecoveryJob, attempt: Attempt, lack: Failure) -> Event:
 def _as_far_as(gap: int, job: RecoveryJob, parts: RecoveryParts, attempt: Attempt) -> Steps[Progress]:
     """Walk again, no farther than to the frame before a gap.
 
-    Later walks go by the keyframes that an earlier one has left. From beyond a gap they would be tied to a crossing
-    that a young map has made, and the grown one can make it more firmly.
+    Later walks go by the keyframes that an earlier one has left. From beyond a gap they would be tied to the crossing
+    of a young map. The grown one can cross more firmly.
     """
     near = replace(job, views=tuple(view for view in job.views if view.index >= gap))
     kept = yield from _make_attempt(near, parts, attempt, job.tries.copy())
@@ -185,9 +185,8 @@ def _as_far_as(gap: int, job: RecoveryJob, parts: RecoveryParts, attempt: Attemp
 def _make_told_apart(
     job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, tries: LinkTries
 ) -> Steps[Progress | Failure]:
-    """Make one attempt; where a pose beyond a gap has rivals, again by the one that the velocities tell to be right.
-
-    Where they tell none, again as far as the gap: what lies beyond it is not to be believed.
+    """Make one attempt. If a pose beyond a gap is ambiguous, repeat it under the one that the velocities choose. If
+    they choose none, repeat it only as far as the gap.
     """
     progress = yield from _make_attempt(job, parts, attempt, walked := tries.copy())
     events: list[Event] = []

@@ -1,9 +1,9 @@
-"""What a link holds of a map is no more than what has the scale of the place where it stands.
+"""Splitting of linked maps at a lost scale: a link holds only the part with the scale of its place.
 
 A map that has lost its scale and goes on may be joined to another by its later, healthy part: by sight, or by reverse
 tracking. What lies beyond the loss hangs on the joined map by nothing, and yet it would be posed in it, ten times too
 large. So each map that is linked is asked once more, at the end of the run, when all that it has seen is in it: from
-its outermost links outward, as far as it hands its scale on. What lies beyond is parted off, a submap of its own.
+its outermost links outward, as far as it hands its scale on. The rest is split off as a submap of its own.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class _Loss:
 
 
 def part_what_lost_its_scale(record: Record, submap_id: int, config: LinkingConfig, now: FrameStamp) -> None:
-    """Part off what lies beyond a loss of scale, seen from the places of a map where links stand.
+    """Split off the part of a map beyond a loss of scale, seen from its links.
 
     A map without a link is left as it is: nothing says which of its parts is the right one. So is what lies between
     two links: each end has a scale that is known.

@@ -1,10 +1,10 @@
 """Whether a live map still hands its scale on: where it does not, what comes after is another map.
 
-A camera that turns faster than it sees leaves few landmarks that both sides of the turn have seen, and where their
-depths are hardly known the scale behind the turn is another one; yet every frame finds its inliers, and nothing looks
-wrong. The map's own normal equations tell (`linking/scale_observability.py`), once some keyframes behind the turn have
-seen the same: a verdict at once would cut a map at each turn on the spot, from which the camera comes back. They are
-solved at the desk: beside the tracking where there are workers, and the verdict comes with a later keyframe.
+A fast turn leaves few landmarks that both sides of it have seen. If their depths are hardly known, the scale behind the
+turn is another one. Yet every frame finds its inliers, and nothing looks wrong. The map's own normal equations show it
+(`linking/scale_observability.py`), once some keyframes behind the turn have seen the same: a verdict at once would cut
+a map at each turn on the spot, from which the camera comes back. They are solved at the desk: with workers in the
+background, and the verdict comes with a later keyframe.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ is true comes to what is claimed on plain stretches (`benchmarks/covariances.py`
 BEHIND = 2 * GROUP
 """Keyframes after a group before it is tested."""
 SURE = 0.9
-"""Probability of a wrong scale at which a map is parted. At even odds half of the maps that are parted would have been
-whole: six runs of `hololens_000` lose 2 % of their frames by that, and the error of the rest falls by a fifth."""
+"""Probability of a wrong scale at which a map is split. At even odds half of the split maps would have been whole: six
+runs of `hololens_000` lose 2 % of their frames by that, and the error of the rest falls by a fifth."""
 FIRM_TIES = 20
 """Landmarks that two keyframes before the group and two after it have seen, from which on nothing is asked: each would
 have to be off by half its depth for the scale to be lost. They are counted in a hundredth of the time."""
@@ -147,7 +147,7 @@ class ScaleWatch:
         ids = np.array(sorted(submap.keyframes), np.int64)
         begin, end = np.searchsorted(ids, [group[0], group[-1] + 1]).tolist()
         if end == len(ids):
-            return None  # the map was parted meanwhile: nothing is left behind the group
+            return None  # the map was split meanwhile: nothing is left behind the group
         if count_ties(submap, ids, begin, end, n_views=2) >= FIRM_TIES:
             return None  # reverse tracking, or a loop, has tied them meanwhile
         seam = min(range(begin, end + 1), key=lambda place: count_ties(submap, ids, place, place))

@@ -69,7 +69,7 @@ class RetrySchedule:
 def as_far_as_it_leads(
     views: Iterable[View], poses: Mapping[int, FramePose], submap: Submap, linked: Collection[int]
 ) -> Iterator[View]:
-    """Yield the views, latest first, up to where only a leap over another map's frames would lead on.
+    """Yield the views, latest first, up to where only frames of another map follow.
 
     What another map has posed, and all that is older, is not this one's to pose. Not so where the two are linked, as
     far as this one has keyframes there as well.
