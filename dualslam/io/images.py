@@ -161,7 +161,7 @@ class ImageFiles:
 def _bytes_of(path: Path) -> bytes | None:
     try:
         return path.read_bytes()
-    except OSError:
+    except (OSError, ValueError):  # a name of a damaged list may be none (NUL)
         return None  # reported where the frame is read
 
 
@@ -178,6 +178,8 @@ class _FileReader:
             raise UnreadableImageError(f"{path} does not exist.") from None
         except OSError as e:
             raise UnreadableImageError(f"{path} cannot be read: {e.strerror or e}.") from e
+        except ValueError as e:
+            raise UnreadableImageError(f"{str(path)!r} is no name of a file: {e}.") from e
         return decode(data, str(path), self._grey, self._bits)
 
     def close(self) -> None:

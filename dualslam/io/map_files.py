@@ -67,7 +67,9 @@ def load_arrays(
             return {name: archive[name] for name in (archive.files if names is None else [*names, *there])}
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; check the path.") from None
-    except (OSError, ValueError, zipfile.BadZipFile, zlib.error, EOFError, KeyError, TypeError, AttributeError) as e:
+    except (
+        OSError, ValueError, zipfile.BadZipFile, zlib.error, EOFError, KeyError, TypeError, AttributeError, RuntimeError
+    ) as e:  # fmt: skip
         # Where numpy sees no archive of its own it speaks of pickles, and of how to load one unsafely.
         problem = "it is no archive of arrays" if isinstance(e, ValueError) and "pickle" in str(e) else _reason(e)
         raise InputError(f"{path} is no map file, or is damaged: {problem}. Give another map, or make it again.") from e

@@ -24,10 +24,10 @@ def number_of(image: np.ndarray) -> int:
     return round((float(np.mean(image)) - 20) / 10)
 
 
-def write_images(folder: Path, names: list[str]) -> None:
+def write_images(folder: Path, names: list[str], width: int = WIDTH, height: int = HEIGHT) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for i, name in enumerate(names):
-        assert cv2.imwrite(str(folder / name), image_of(i))
+        assert cv2.imwrite(str(folder / name), image_of(i, width, height))
 
 
 def tum_lines(times: list[float]) -> str:
