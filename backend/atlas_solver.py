@@ -30,7 +30,7 @@ focal length of 700 and a few hundred matches. Below, the factor would also be b
 SETTLED_COST = 1e-9
 """A graph with no more than this to gain stands already: a tree, whose nodes were composed along its edges."""
 MAX_PASSES = 4
-"""What is believed decides what the others are asked; it settled in two rounds in every trial."""
+"""Rounds of rejection: accepted edges change the tests of the others. Two sufficed in every trial."""
 MAX_ITERATIONS = 100
 ODOMETRY = ("within", "rollover")
 """Kinds of edges that say how a camera went, and not where it has been before."""
@@ -110,7 +110,7 @@ class GtsamAtlasSolver:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Choice:
-    """What is believed, the chi-square of what was asked, and what it costs: residuals, and a price per rejection."""
+    """Accepted edges, the chi-square of the tested ones, and the cost: residuals, and a price per rejection."""
 
     believed: BoolArray
     chi2: FloatArray

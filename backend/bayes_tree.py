@@ -15,7 +15,7 @@ _EDGE = re.compile(r"^(\d+)->(\d+)$")
 
 @dataclass(frozen=True, slots=True)
 class UpdateStatistics:
-    """What one step of the incremental solver did.
+    """Effect of one step of the incremental solver.
 
     Attributes
     ----------

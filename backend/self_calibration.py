@@ -205,7 +205,7 @@ def estimate_correction(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Answer:
-    """What a problem says about its camera, as if pixels erred by `INFLATION` times as much.
+    """A problem's information on its camera, as if pixels erred by `INFLATION` times as much.
 
     Attributes
     ----------

@@ -54,7 +54,7 @@ class Sim3Edge:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sim3Prior:
-    """What is known of one node beforehand; `covariance` as in `Sim3Edge`, None fixes the node."""
+    """Prior of one node; `covariance` as in `Sim3Edge`, None fixes the node."""
 
     S_world_node: FloatArray
     covariance: FloatArray | None = None

@@ -38,7 +38,7 @@ POINT_THRESHOLD_MU = 0.02
 N_LAST = 30
 """So many of the newest poses are eliminated last."""
 GTSAM_ERRORS = (RuntimeError, ValueError, IndexError)
-"""What GTSAM's C++ exceptions arrive as."""
+"""Python types of GTSAM's C++ exceptions."""
 
 
 class SolverFailure(Exception):  # noqa: N818 - caught inside backend, never leaves it
@@ -164,7 +164,7 @@ class IncrementalSolver:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BatchOptimum:
-    """What `optimise_batch` found: poses (K, 4, 4) and points (L, 3) of ascending ids, and costs."""
+    """Result of `optimise_batch`: poses (K, 4, 4) and points (L, 3) of ascending ids, and costs."""
 
     T_submap_kf: FloatArray
     xyz_mu: FloatArray

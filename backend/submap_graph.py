@@ -66,7 +66,7 @@ class _Changes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Optimum:
-    """What a batch solution makes of a submap: poses by keyframe, and all points (those not in it as they were)."""
+    """Batch solution of a submap: poses by keyframe, and all points (those not in it unchanged)."""
 
     poses: Mapping[int, FloatArray]
     xyz_mu: FloatArray

@@ -22,7 +22,7 @@ HOLD_ROTATION_RAD, HOLD_TRANSLATION_MU = 0.01, 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TieChanges:
-    """What leaves the graph and what comes, in this order: the gauge where it is new, holds, relative poses.
+    """Removed and added factors, in this order: a new gauge, holds, relative poses.
 
     Attributes
     ----------

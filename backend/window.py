@@ -36,7 +36,7 @@ NEWEST_CHI2_CAP = 625.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """What is adjusted. Observations are sorted by point.
+    """A window to be adjusted. Observations are sorted by point.
 
     Attributes
     ----------

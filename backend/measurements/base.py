@@ -18,7 +18,7 @@ Residual = tuple[FloatArray, FloatArray]
 
 
 class Gauge(StrEnum):
-    """What a measurement can fix of the similarity from the map to its own frame."""
+    """Parts of the similarity, from the map to its own frame, that a measurement can fix."""
 
     TRANSLATION = "translation"
     ROTATION = "rotation"

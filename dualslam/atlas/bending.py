@@ -22,7 +22,7 @@ bend outlast a new solution of the submap."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Move:
-    """What a solution does to one submap.
+    """Effect of a solution on one submap.
 
     Attributes
     ----------

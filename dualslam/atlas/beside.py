@@ -54,7 +54,7 @@ def atlas_handlers(solver: AtlasSolver) -> Handlers:
 
 @dataclass(slots=True, eq=False)
 class AskedSolution:
-    """What was asked, and of which state of the atlas.
+    """A request, and the state of the atlas that it is about.
 
     Attributes
     ----------

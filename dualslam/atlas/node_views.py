@@ -22,7 +22,7 @@ MIN_SHARED, MAX_ACROSS = 30, 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeView:
-    """What was found out about a submap's nodes, and the state of the submap for which it holds.
+    """Cached views of a submap's nodes, and the state of the submap for which they hold.
 
     Attributes
     ----------

@@ -26,7 +26,7 @@ they are, to the bit."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AtlasReport:
-    """What a solution of the atlas did.
+    """Effect of an atlas solution.
 
     Attributes
     ----------

@@ -56,7 +56,7 @@ def atlas_solver(config: Config) -> GtsamAtlasSolver:
 
 @dataclass(frozen=True, slots=True)
 class MetricParts:
-    """What puts a map into the frame of measurements.
+    """The parts that put a map into the frame of measurements.
 
     Attributes
     ----------

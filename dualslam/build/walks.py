@@ -81,7 +81,7 @@ def recovery_parts(
 
 
 class _ImagesOf:
-    """What another front end finds in the buffered images. The front end is built when it is first needed."""
+    """Another front end's features of buffered images. The front end is built when it is first needed."""
 
     def __init__(self, wanted: FrontendConfig, n_threads: int) -> None:
         self._wanted = wanted

@@ -37,7 +37,7 @@ GRAPH_LIMIT_S = 30.0
 FEATURES_LIMIT_S = 10.0
 """After which the process that finds features counts as hung: networks take a second or two on a large image."""
 MAP_KINDS = (JobKind.START, JobKind.GRAPH)
-"""What the worker for the live map does, in order; it keeps a state from job to job."""
+"""Jobs of the live map's worker, in order. It keeps a state from job to job."""
 GRAPH_NICENESS, WALK_NICENESS = 3, 8
 """Of the process that has the graphs, and of those for long work: half and a sixth of the share of what tracks,
 where cores are short."""
@@ -58,7 +58,7 @@ def place_handlers(verifier: PlaceVerifier) -> Handlers:
 
 
 READOUT_HANDLERS: Handlers = {JobKind.READOUT: answer_readout}
-"""What tells how long images were read."""
+"""Jobs that estimate the readout time."""
 
 
 def inline_handlers(

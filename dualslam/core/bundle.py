@@ -37,7 +37,7 @@ class BundleProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameRows:
-    """What frames that are no keyframes see of a submap.
+    """Observations of a submap by frames that are no keyframes.
 
     Attributes
     ----------

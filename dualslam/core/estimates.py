@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphEstimate:
-    """What a solved graph hands back to its submap: refined variables, and how well the newest factors fit.
+    """Result of a solved graph for its submap: refined variables, and how well the newest factors fit.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ MAX_PRIOR_SIGMAS = 6.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationEstimate:
-    """What a submap's observations say about the camera that took them.
+    """A camera as estimated from a submap's observations.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class PreferredCamera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeReport:
-    """What a keyframe did to the map and how its graph took it.
+    """Effect of a keyframe on the map and its graph.
 
     Attributes
     ----------

@@ -96,7 +96,7 @@ class Frontend(Protocol):
 
 @runtime_checkable
 class NearestSearch(Protocol):
-    """What a front end with quickly compared descriptors offers besides: the raw material of motion statistics."""
+    """Extra interface of a front end with quickly compared descriptors: the input of motion statistics."""
 
     def nearest(self, a: Features, b: Features) -> IntArray:
         """Row in b of the feature nearest to each of a, (N,), by descriptor alone and without any test.

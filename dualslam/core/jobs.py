@@ -23,7 +23,7 @@ Result = TypeVar("Result")
 
 
 class JobKind(StrEnum):
-    """What is made of a snapshot, the most urgent first."""
+    """Kinds of jobs, the most urgent first."""
 
     FEATURES = "features"
     START = "start search"

@@ -32,7 +32,7 @@ class MeasurementRow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowSource:
-    """What a file of measurements holds.
+    """Contents of a file of measurements.
 
     Attributes
     ----------

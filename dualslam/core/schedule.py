@@ -271,7 +271,7 @@ class Recorded:
 
     @property
     def _stated(self) -> After:
-        """What the record itself went by without a clock, and what follows where the repetition comes apart."""
+        """The recorded run's schedule, if it had no clock. It also serves after a departure from the record."""
         delays = self.header.get("delays")
         if delays is None:
             return After()

@@ -28,7 +28,7 @@ BoolArray = NDArray[np.bool_]
 
 
 class FrameStatus(StrEnum):
-    """What became of one input frame: the `status` column of ``frames.csv``."""
+    """Status of one input frame: the `status` column of ``frames.csv``."""
 
     INITIALISING = "initialising"
     TRACKED = "tracked"
@@ -297,7 +297,7 @@ class Rival:
 
     @property
     def T_rival_walked(self) -> FloatArray:
-        """What moves all that lies beyond the gap from where it is by the one to where it is by the other."""
+        """Transform of everything beyond the gap, from its place under the one pose to that under the other."""
         return np.asarray(np.linalg.inv(self.T_cam_rival) @ self.T_cam_walked, np.float64)
 
 

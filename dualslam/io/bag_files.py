@@ -44,7 +44,7 @@ class Place:
 
 @dataclass(slots=True, weakref_slot=True)
 class Bag:
-    """What a bag holds.
+    """Contents of a bag.
 
     Attributes
     ----------

@@ -38,7 +38,7 @@ TO_RGB: dict[str, int | None] = {
     **{f"bayer_gbrg{bits}": cv2.COLOR_BayerGR2RGB for bits in (8, 16)},
     **{f"bayer_grbg{bits}": cv2.COLOR_BayerGB2RGB for bits in (8, 16)},
 }
-"""What OpenCV does to an image of one of ROS's encodings."""
+"""OpenCV's conversion of an image of one of ROS's encodings."""
 
 
 def recognises(folder: Path) -> bool:

@@ -39,7 +39,7 @@ BEFORE_FOCAL = {
     EucmCamera.model: ("alpha", "beta"),
     DoubleSphereCamera.model: ("xi", "alpha"),
 }
-"""What stands before fx, fy, cx, cy in Kalibr's list of intrinsics."""
+"""Parameters before fx, fy, cx, cy in Kalibr's list of intrinsics."""
 ANY, NONE = "", "none"
 _SAID: dict[str, str] = {
     ANY: "pinhole simplepinhole linearpinhole perspective rectified",
@@ -59,7 +59,7 @@ _SAID: dict[str, str] = {
     DoubleSphereCamera.model: "doublesphere ds",
 }
 LENSES = {word: lens for lens, words in _SAID.items() for word in words.split()} | {"": ANY}
-"""What a model's name, in small letters without signs, says of the lens."""
+"""Lens of each model name, in small letters without signs."""
 KNOWN = (
     "pinhole, radial-tangential (plumb_bob), kannala_brandt (equidistant, fisheye), fov, division, omni (MEI), eucm, "
     "double_sphere (ds)"

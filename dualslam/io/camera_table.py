@@ -48,7 +48,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "k": ("k", "distortion"),
     **{name: (name,) for name in ("k1", "k2", "k3", "k4", "p1", "p2", "xi", "alpha", "beta")},
 }  # fmt: skip
-"""What is read, by its keys in small letters without signs; where two are there, they must agree."""
+"""Parameters and their keys, in small letters without signs. If two are present, they must agree."""
 SECTIONS = frozenset({
     "projectionparameters", "mirrorparameters", "distortionparameters", "intrinsics", "intrinsic", "distortion", "lens",
     "resolution", "intrinsicparameters", "coefficients", "distortioncoefficients", "narrowstereo", "image",

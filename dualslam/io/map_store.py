@@ -41,7 +41,7 @@ _DAMAGE = (KeyError, ValueError, IndexError, TypeError, OverflowError)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredMap:
-    """What `save_atlas` wrote: the submaps with their links, and where each frame stands.
+    """A map written by `save_atlas`: the submaps with their links, and where each frame stands.
 
     Attributes
     ----------

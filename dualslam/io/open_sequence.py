@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 class SourceFormat(Protocol):
-    """What a module of this package offers to be a folder format."""
+    """Interface of a module that reads a folder format."""
 
     def recognises(self, folder: Path) -> bool:
         """Tell whether a folder is of this format, without reading much."""

@@ -29,7 +29,7 @@ MAX_ROUNDING_PX = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """What a format's reader finds: everything about a recorded sequence, no image read yet.
+    """Result of a format's reader: everything about a recorded sequence, no image read yet.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Recording:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Given:
-    """What the caller brings himself, so that a source need not have it.
+    """Data that the caller supplies instead of the source.
 
     Attributes
     ----------

@@ -169,7 +169,7 @@ def estimate_link(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Overlap:
-    """What both maps know of the frames that they share. `onset`: keyframes from there on are not trusted."""
+    """Both maps' data of their shared frames. `onset`: keyframes from there on are not trusted."""
 
     old: Submap
     new: Submap

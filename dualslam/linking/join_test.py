@@ -101,12 +101,12 @@ class LinkEvidence:
 
     @property
     def comparisons(self) -> tuple[Gate, ...]:
-        """What ``decisions.jsonl`` holds of the gates."""
+        """The gates as written to ``decisions.jsonl``."""
         return tuple(gate for asked in self.gates for gate in asked.compared)
 
     @property
     def numbers(self) -> dict[str, float]:
-        """What was measured, for the event log."""
+        """The measured values, for the event log."""
         compared = {gate.name: gate.value for gate in self.comparisons}
         return compared | {name: n for gate in self.gates for name, n in gate.logged.items()}
 

@@ -19,7 +19,7 @@ def tightened(max_sigma: float, n_tries: int) -> float:
 
 
 class LinkTries:
-    """What earlier tries at linking each lost map came to, over all walks and attempts.
+    """Results of earlier tries at linking each lost map, over all walks and attempts.
 
     Attributes
     ----------

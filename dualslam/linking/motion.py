@@ -47,7 +47,7 @@ JOIN_SIGMAS = 3.0
 """Standard deviations by which the similarity that joins two maps may be off."""
 
 Slack = Callable[[int, int], float]
-"""What a join leaves open at the seam between two frames, in the unit of the map."""
+"""Uncertainty of a join at the seam between two frames, in the unit of the map."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ FRAMES_IN_EVENTS = (
     "suspected_since",
     "torn",
 )
-"""What belongs to events, or to a part of one, and is frames: one or a list. One below 0 is none, but a mark."""
+"""Fields of events, or of a part of one, that hold frames: one or a list. A number below 0 is a mark."""
 
 
 class FrameNumbers:

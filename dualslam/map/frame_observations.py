@@ -19,7 +19,7 @@ Change = Callable[[Features], Features]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameObservations:
-    """What a frame saw of a submap. In single precision: a run keeps thousands.
+    """A frame's observations of a submap. In single precision: a run keeps thousands.
 
     Attributes
     ----------

@@ -12,7 +12,7 @@ from dualslam.core.types import Failure, FloatArray, FrameMethod, FrameStatus
 
 @dataclass(slots=True)
 class FrameRow:
-    """What became of one frame so far: a row of ``frames.csv``. Reverse tracking may still pose it later.
+    """Record of one frame so far: a row of ``frames.csv``. Reverse tracking may still pose it later.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class FrameRow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameResult:
-    """What one step found out about its frame.
+    """Result of one step about its frame.
 
     Attributes
     ----------

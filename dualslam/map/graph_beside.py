@@ -37,7 +37,7 @@ MAX_GRAPHS = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphJob:
-    """What a graph in another process is to take in. It can be pickled.
+    """Job of a graph in another process. It can be pickled.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class GraphJob:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphAnswer:
-    """What a graph holds after a job.
+    """State of a graph after a job.
 
     Attributes
     ----------
@@ -198,7 +198,7 @@ class BesideGraph:
 
     @property
     def statistics(self) -> Any:
-        """What the solver reports; see `opened`."""
+        """The solver's statistics; see `opened`."""
         return self.opened().statistics
 
     def bayes_tree(self) -> Any:

@@ -65,7 +65,7 @@ class CalibrationJob:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationAnswer:
-    """What a submap has said of its camera, and what becomes of the maps.
+    """A submap's estimate of its camera, and the effect on the maps.
 
     Attributes
     ----------

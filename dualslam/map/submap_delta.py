@@ -203,7 +203,7 @@ def _died(before: NDArray[np.bool_], now: NDArray[np.bool_]) -> NDArray[np.bool_
 
 
 def _slim(keyframe: Keyframe) -> Keyframe:
-    """What a graph needs of a keyframe: pixels and their sigmas."""
+    """A keyframe's data for a graph: pixels and their sigmas."""
     f, none = keyframe.features, np.zeros(0)
     slim = Features(f.uv_rect_px, f.uv_rect_px, f.sigma_px, none, np.zeros(0, np.int64), none, NO_DESCRIPTORS)
     return replace(keyframe, features=slim)

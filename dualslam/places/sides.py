@@ -53,7 +53,7 @@ class Pairs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Looks:
-    """What was looked for: each side's landmarks in the images of the other; the resulting pairs."""
+    """Result of a two-way search: each side's landmarks in the images of the other, and the resulting pairs."""
 
     in_query: list[Sighting]
     pairs: list[tuple[IntArray, IntArray]]

@@ -31,7 +31,7 @@ SAME_TURN_RAD = float(np.radians(6.0))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceParts:
-    """What places are recognised and verified by; made by the composition root."""
+    """Recogniser and verifier of places, made by the composition root."""
 
     recogniser: PlaceRecogniser
     verifier: PlaceVerifier

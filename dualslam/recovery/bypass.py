@@ -23,7 +23,7 @@ from dualslam.recovery.merge import Merged
 
 @dataclass(frozen=True, slots=True)
 class Absorption:
-    """What becomes of the lost maps of which a walk has posed every frame.
+    """Effect on the lost maps of which a walk has posed every frame.
 
     Attributes
     ----------

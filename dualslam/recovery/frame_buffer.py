@@ -76,7 +76,7 @@ class FrameBuffer:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """What it holds, for the event log."""
+        """Its contents, for the event log."""
         images = sum(view.image is not None for view in self._views)
         return {"frames": len(self._views), "images": images, "buffer_mb": self.nbytes / MB}
 

@@ -1,4 +1,4 @@
-"""What reverse tracking is given, and what it returns: data that can be pickled."""
+"""Input and output of reverse tracking: data that can be pickled."""
 
 from __future__ import annotations
 

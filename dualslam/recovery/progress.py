@@ -39,7 +39,7 @@ class Progress:
 
     @property
     def verdict(self) -> str:
-        """What it came to, in a few words."""
+        """The result in a few words."""
         if self.link is not None:
             return "linked"
         ended = "out of time" if self.out_of_time else self.why_unusable if self.n_unusable else "the buffer ends"

@@ -59,7 +59,7 @@ class PosedRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunData:
-    """What a run left behind.
+    """Data of a finished run.
 
     Attributes
     ----------

@@ -39,7 +39,7 @@ ERROR_LOG, TRIAL = "error.log", "trial.json"
 
 
 class _Recorded(Protocol):
-    """What a sequence with ground truth knows of its frames."""
+    """Ground truth of a sequence's frames."""
 
     @property
     def source_indices(self) -> IntArray: ...

@@ -33,7 +33,7 @@ after a blurred stretch see sharply what the blurred ones have placed."""
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """What a map says of one keyframe; NaN where it cannot tell.
+    """A map's claims about one keyframe; NaN if unknown.
 
     Attributes
     ----------

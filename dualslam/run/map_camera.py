@@ -41,7 +41,7 @@ HUBER = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """What a frame saw of a submap: its pose, points, pixels from the principal point, over f; sigma, over f."""
+    """A frame's observations of a submap: its pose, points, pixels from the principal point, over f; sigma, over f."""
 
     T_cam_submap: FloatArray
     xyz: FloatArray

@@ -26,7 +26,7 @@ SWITCH_S = 5e-4
 
 
 class Steppable(Protocol):
-    """What the harness needs of a system."""
+    """Interface of a system for the harness."""
 
     def step(self, frame: Frame) -> FrameResult:
         """Take one frame."""
@@ -39,7 +39,7 @@ class Steppable(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """What a run cost and how it ended. The map itself stays in the system.
+    """Cost and end of a run. The map itself stays in the system.
 
     Attributes
     ----------

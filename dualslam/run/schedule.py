@@ -12,9 +12,9 @@ MAX_LATE_S = 1 / 15
 """So late a frame may be while the next one waits: two frames of a camera at 30 Hz. A keyframe mostly takes that much
 more than other frames, and is caught up on after it. At 10 Hz a frame that the next one has overtaken is later."""
 CATCH_UP_S = 1.0
-"""Who has not been in time for so long does not catch up: the newest frame is then the one to look at."""
+"""Time without a punctual frame after which a system does not catch up: late frames are then dropped."""
 LATE_S = 2e-3
-"""What a sleeping process wakes up too late by is no lateness of ours."""
+"""A sleeping process may wake up so late. It does not count as lateness of the system."""
 
 
 class Schedule:

@@ -349,7 +349,7 @@ def save_system(
 
 
 class _Fed:
-    """What stands for the sequence where a program has fed a system."""
+    """Stands for the sequence if a program has fed a system."""
 
     name, rate_hz = "python", 0.0
 

@@ -24,7 +24,7 @@ from dualslam.lab.synthetic import SyntheticSequence, make_sequence, parse_event
 
 SYNTHETIC = "synthetic:"
 WORLD_NUMBERS = {"frames": 300, "seed": 0, "width": 640, "height": 480, "visit": 0, "backwards": 0}
-"""What a synthetic source states in numbers, and what it takes where it does not."""
+"""Numeric options of a synthetic source, and their defaults."""
 RENDER_AHEAD_FRAMES = 4
 N_COMPARED = 9
 SAME_IMAGE = 0.97

@@ -30,7 +30,7 @@ URGENT_TIMES = 2
 
 @dataclass(slots=True)
 class PaceStatistics:
-    """What was left out.
+    """Counts of the work left out.
 
     Attributes
     ----------

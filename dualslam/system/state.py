@@ -20,7 +20,7 @@ from dualslam.system.pace import Pace
 
 @dataclass(slots=True)
 class State:
-    """What the steps of a frame share.
+    """State that the steps of a frame share.
 
     Attributes
     ----------

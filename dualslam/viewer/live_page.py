@@ -103,7 +103,7 @@ def _free_port() -> int:
 
 
 class Page:
-    """What stands on the page.
+    """Contents of the page.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ IN_PLACE_S, LINE_S = 0.5, 15.0
 
 
 class RunState:
-    """What a run is doing, as who watches it learns.
+    """Current activity of a run, for a viewer.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class RunState:
 
     @property
     def words(self) -> str:
-        """What is being done: posing frames, tracking in reverse, ending."""
+        """Activity: posing frames, tracking in reverse, ending."""
         said = []
         if self.n_done == self.n_frames:
             said.append(FINISHING)

@@ -138,7 +138,7 @@ def share_out(n_available: Sequence[int], weights: FloatArray, n_wanted: int) ->
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Peaks:
-    """What a difference of Gaussians does beside the corners: the sub-pixel step and the doubts about it ask the same.
+    """Differences of Gaussians around the corners, shared by the sub-pixel step and its doubts.
 
     Attributes
     ----------

@@ -141,7 +141,7 @@ class PoseFinder:
 
     @property
     def doubt(self) -> Failure | None:
-        """What was found to look alike beyond the gap at hand: it is not crossed by these features any more."""
+        """Repeated structure found beyond the current gap. These features do not cross it any more."""
         return self._doubt
 
     @property

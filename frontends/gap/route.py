@@ -16,7 +16,7 @@ N_PREFETCHED = 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Route:
-    """What a walk sets out from, and what it will come to.
+    """Start of a walk, and the frames on its way.
 
     Attributes
     ----------

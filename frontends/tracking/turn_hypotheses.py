@@ -23,7 +23,7 @@ MIN_FAR, MIN_FAR_SHARE = 20, 0.1
 
 
 class TurnHypotheses:
-    """What turns and translations make of the matches of two views.
+    """Matches of two views under turns and translations.
 
     Parameters
     ----------

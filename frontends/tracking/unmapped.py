@@ -23,7 +23,7 @@ CELLS_ACROSS, MIN_IN_CELL = 8, 5  # the image's cells, and how many features mak
 def passes_unmapped(
     track: Track, submap: Submap, keyframe_id: int, frontend: Frontend, parallax_deg: float, n: int
 ) -> bool:
-    """Whether what is not mapped, neither here nor in a keyframe, has moved between the two by more than a turn does.
+    """Whether unmapped content has moved between frame and keyframe by more than a turn does.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ class ToldFocal:
 
 @dataclass(frozen=True, slots=True)
 class FocalSearch:
-    """What was found.
+    """Result of the search.
 
     Attributes
     ----------

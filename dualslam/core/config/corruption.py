@@ -11,7 +11,7 @@ from dualslam.core.config.strict_model import StrictModel
 
 
 class CorruptionKind(StrEnum):
-    """What is done; in brackets the meaning of `Corruption.strength`."""
+    """Kinds of corruption; in brackets the meaning of `Corruption.strength`."""
 
     WIPE = "wipe"  # fog, or a blank wall before the lens: texture fades to flat shade (fraction)
     OCCLUSION = "occlusion"  # something textured moves through the image (fraction of the image that it hides)
@@ -49,7 +49,7 @@ class Cause(StrEnum):
     """Nothing was added: what the sequence itself does."""
     IMAGE = "image"
     INPUT = "input"
-    """What comes with the images is wrong: the calibration or the clock."""
+    """Wrong data beside the images: the calibration or the clock."""
     INTERNAL = "internal"
 
 

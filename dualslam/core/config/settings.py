@@ -35,7 +35,7 @@ class PixelsConfig(StrictModel):
 
 
 class CameraConfig(StrictModel):
-    """What is known of the camera beyond its calibration file."""
+    """Camera properties beyond its calibration file."""
 
     model_sigma_px: float = Field(0.8, ge=0, le=100)
     """Error of the camera model itself at a pixel (one sigma), beside the noise of the features: chequerboard
@@ -135,7 +135,7 @@ class AttemptConfig(StrictModel):
 
     @property
     def name(self) -> str:
-        """What events call it."""
+        """Its name in events."""
         return self.frontend if self.tracking == "own" else f"gap ({self.frontend})"
 
     @model_validator(mode="before")
@@ -324,4 +324,4 @@ class Config(StrictModel):
     loops: LoopsConfig = LoopsConfig()
     calibration: CalibrationConfig = CalibrationConfig()
     corruptions: tuple[Corruption, ...] = ()
-    """What the failure lab does to the run on purpose, for example [{kind: blackout, start: 100, length: 10}]."""
+    """Deliberate failures of the run, for example [{kind: blackout, start: 100, length: 10}]."""

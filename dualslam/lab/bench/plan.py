@@ -24,7 +24,7 @@ from dualslam.lab.bench.spec import BenchSpec, ConditionSpec, Half, SequenceSpec
 # the smallest gaps, and the square roots of 2 and 3 are in no simple ratio to it.
 _SPREAD = (0.6180339887498949, 0.41421356237309515, 0.7320508075688772)
 _SALT = {Half.DEVELOPMENT: (), Half.REPORTING: (0x5245504F,)}
-"""What a half adds to every seed. Trials from before there were halves are development trials."""
+"""Offset of each half's seeds. Trials without a half are development trials."""
 
 _FIRST_WORLD = {Half.DEVELOPMENT: 1000, Half.REPORTING: 20_000}
 """Seed of the first trial's world, where each trial has its own."""
@@ -32,7 +32,7 @@ _FIRST_WORLD = {Half.DEVELOPMENT: 1000, Half.REPORTING: 20_000}
 
 @dataclass(frozen=True, slots=True)
 class SourceInfo:
-    """What a plan needs to know of a source.
+    """Facts about a source that a plan needs.
 
     Attributes
     ----------

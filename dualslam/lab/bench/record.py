@@ -303,7 +303,7 @@ def is_wrong(link: LinkError, thresholds: Thresholds) -> bool:
 
 
 class Fault(StrEnum):
-    """What keeps a run from being right."""
+    """Faults that keep a run from being right."""
 
     CRASHED = "crashed"
     REFUSED = "refused"

@@ -33,7 +33,7 @@ class SequenceSpec(StrictModel):
     """A sequence, and which part of it a trial takes."""
 
     name: str = Field(pattern=_NAME)
-    """What it is called in the tables, and its folder of trials."""
+    """Its name in the tables, and of its folder of trials."""
     source: str
     """As for `dualslam run`; a path is sought in the folder of `--data`. ``{seed}`` becomes a seed of the trial's own,
     below 20000 in the development half and above it in the reporting half."""
@@ -70,7 +70,7 @@ class VariantSpec(StrictModel):
     """A way to run: a name and what it sets in the configuration."""
 
     name: str = Field(pattern=_NAME)
-    """What it is called in the tables."""
+    """Its name in the tables."""
     set: dict[str, Any] = Field(default_factory=dict)
     """Config fields by their path, such as {recovery.enabled: false}, over those of the bench."""
 
@@ -112,7 +112,7 @@ class PlacedCorruption(StrictModel):
 
     @property
     def dose_unit(self) -> str:
-        """What differs from trial to trial, ``strength`` or ``seconds``; empty where both are fixed."""
+        """The field that varies from trial to trial, ``strength`` or ``seconds``; empty if both are fixed."""
         return next((name for name in ("strength", "seconds") if isinstance(getattr(self, name), tuple)), "")
 
     def dose(self, share: float) -> float | None:
@@ -133,10 +133,10 @@ def _within(value: float | Range | None, share: float) -> float | None:
 
 
 class ConditionSpec(StrictModel):
-    """What is done to the sequence in a trial."""
+    """Disturbance of the sequence in a trial."""
 
     name: str = Field(pattern=_NAME)
-    """What it is called in the tables."""
+    """Its name in the tables."""
     corruptions: tuple[PlacedCorruption, ...] = ()
     """None: the sequence as it is."""
     sequences: tuple[str, ...] | None = None
@@ -192,15 +192,15 @@ class BenchSpec(StrictModel):
     """A bench: every sequence in every condition with every variant, so many trials each."""
 
     name: str = Field(pattern=_NAME)
-    """What the bench is called."""
+    """Name of the bench."""
     sequences: tuple[SequenceSpec, ...] = Field(min_length=1)
-    """What is run on."""
+    """Sequences of the bench."""
     variants: tuple[VariantSpec, ...] = Field(min_length=1)
-    """What is compared; all of them run the same trials."""
+    """Variants to compare. All run the same trials."""
     reference: str = ""
     """The variant that failures are reduced against; empty: the first."""
     conditions: tuple[ConditionSpec, ...] = Field((ConditionSpec(name="natural"),), min_length=1)
-    """What is done to the sequences."""
+    """Disturbances of the sequences."""
     trials: int = Field(10, ge=1)
     """Of each sequence and condition. They differ in start frame, in where corruptions strike, and in seeds."""
     seed: int = Field(0, ge=0)

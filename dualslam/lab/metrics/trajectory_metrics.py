@@ -36,11 +36,11 @@ _MIN_MOTION = 0.05
 
 
 class EvaluationSequence(Protocol):
-    """What is needed of a sequence: its name, when its frames were, and where the camera was."""
+    """Interface of a sequence: its name, the times of its frames, and the true poses."""
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Its name."""
         ...
 
     @property

@@ -16,13 +16,13 @@ class Level(StrEnum):
     GOOD = "good"
     """A reason of this level is a remark: it does not speak against the trajectory."""
     USABLE = "usable"
-    """What is posed can be used; something is missing, or less sure than usual."""
+    """The posed frames can be used; something is missing, or less sure than usual."""
     DOUBTFUL = "doubtful"
     """Part of what is posed is probably wrong."""
 
 
 class ReasonCode(StrEnum):
-    """What speaks against a run, the gravest first."""
+    """Reasons against a run, the gravest first."""
 
     NO_MAP = "no_map"
     JUMP = "jump"

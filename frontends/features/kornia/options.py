@@ -86,7 +86,7 @@ class KorniaOptions(StrictModel):
 
     @property
     def noise(self) -> Noise:
-        """What the user set, and the descriptor's own numbers for the rest."""
+        """The user's settings, and the descriptor's own numbers for the rest."""
         default = NOISE[self.detector if self.is_network else "sift"]
         return Noise(
             self.sigma_px or default.sigma_px,
