@@ -122,7 +122,7 @@ def assert_right(system: System, world: PointWorld) -> None:
     assert rotation.max() < ROTATION_RAD
 
 
-@pytest.mark.parametrize("polls", [1, 6])
+@pytest.mark.parametrize("polls", [pytest.param(1, marks=pytest.mark.slow), 6])
 def test_a_graph_that_answers_late_is_as_good_as_one_in_time(world: PointWorld, polls: int) -> None:
     system = run(beside(world, polls, **DENSE), world)
     assert isinstance(system.live and system.live.graph, BesideGraph)

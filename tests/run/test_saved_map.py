@@ -29,9 +29,8 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.mark.parametrize(
-    "localise", [pytest.param(False, id="extended", marks=pytest.mark.slow), pytest.param(True, id="localised")]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("localise", [False, True], ids=["extended", "localised"])
 def test_a_run_on_a_saved_map_ends_with_all_its_pages(first: Path, localise: bool, tmp_path: Path) -> None:
     out = tmp_path / "run"
     options = ["--start", "30", "--map", str(first), *(["--localise"] if localise else [])]

@@ -259,7 +259,9 @@ def test_a_page_is_served_to_this_machine_alone(view: LiveView, told: Run) -> No
     assert view.url.startswith("http://127.0.0.1:")
 
 
-@pytest.mark.parametrize("sign", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "hung"])
+@pytest.mark.parametrize(
+    "sign", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)], ids=["killed", "hung"]
+)
 def test_a_viewer_that_is_killed_or_hangs_holds_nothing_up(view: LiveView, told: Run, sign: signal.Signals) -> None:
     assert view._idle.wait(10)
     step(view, told)
@@ -332,6 +334,7 @@ def test_without_the_extra_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None
         LiveView()
 
 
+@pytest.mark.slow
 def test_the_view_of_a_whole_run(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The trajectory is what it is without a view, and viser is not imported by the run's process."""
     loaded_before = "viser" in sys.modules  # by another test of this process

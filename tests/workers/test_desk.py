@@ -200,7 +200,10 @@ def stop(desk: WorkerDesk) -> None:
     os.kill(desk.pids[0] or 0, signal.SIGSTOP)
 
 
-@pytest.mark.parametrize(("harm", "reason"), [(kill, FailureReason.WORKER), (stop, FailureReason.TIMEOUT)])
+@pytest.mark.parametrize(
+    ("harm", "reason"),
+    [(kill, FailureReason.WORKER), pytest.param(stop, FailureReason.TIMEOUT, marks=pytest.mark.slow)],
+)
 def test_a_worker_that_dies_or_hangs_costs_its_job(harm: Callable[[WorkerDesk], None], reason: FailureReason) -> None:
     with working(lane(GRAPH, time_limit_s=5.0)) as desk:
         harm(desk)

@@ -67,7 +67,7 @@ def in_time() -> System:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("polls", [3, 15])
+@pytest.mark.parametrize("polls", [3, pytest.param(15, marks=pytest.mark.slow)])
 def test_a_late_answer_is_as_good_as_one_in_time(in_time: System, polls: int) -> None:
     late = run(polls)
     asked, found = (system.events.of_kind(EventKind.CALIBRATED)[0] for system in (in_time, late))
@@ -84,7 +84,7 @@ def test_a_late_answer_is_as_good_as_one_in_time(in_time: System, polls: int) ->
         assert np.sqrt((measured**2).mean()) < 1.3 * np.sqrt((expected**2).mean()) + 1e-3
 
 
-@pytest.mark.parametrize("polls", [0, 3])
+@pytest.mark.parametrize("polls", [pytest.param(0, marks=pytest.mark.slow), 3])
 def test_what_frames_have_seen_changes_with_the_camera(in_time: System, polls: int) -> None:
     """Those from before the change, too, have the pixels that the map has now."""
     system = in_time if polls == 0 else run(polls)
