@@ -15,7 +15,7 @@ from dualslam.map.split import next_submap
 from dualslam.map.submap import Submap
 from dualslam.testing.point_world import CAMERA, SIZE_PX, make_features
 
-N_KEYFRAMES = 5000
+N_KEYFRAMES = 2000
 N_SHARED = 12
 SOLVE_EVERY = 3
 PER_KEYFRAME = 3
@@ -135,7 +135,7 @@ def test_next_submap_is_the_same_map_in_the_same_frame() -> None:
 
 
 @pytest.mark.slow
-def test_five_thousand_keyframes_in_a_chain() -> None:
+def test_two_thousand_keyframes_in_a_chain() -> None:
     chain = Chain(Corridor(N_KEYFRAMES, 0.3), GraphConfig(), 0.01)
     for k in range(N_KEYFRAMES):
         chain.add(k)
