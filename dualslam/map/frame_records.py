@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -66,6 +67,8 @@ class FrameResult:
         How the pose was found.
     doubt : str
         Empty, or the code of what makes this stretch doubtful so far (`ReasonCode`).
+    covariance_now : callable or None
+        Computes `covariance`.
     """
 
     index: int
@@ -81,6 +84,16 @@ class FrameResult:
     world_id: int | None = None
     method: FrameMethod | None = None
     doubt: str = ""
+    covariance_now: Callable[[], FloatArray | None] | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def covariance(self) -> FloatArray | None:
+        """(6, 6) of xi in ``T_submap_cam @ exp(xi)``, relative to the first keyframe of the submap; None if not known.
+
+        Order: rotation (rad), then translation (unit of the submap), in the camera's axes. It is computed when it is
+        asked for, by the map as it is then: ask before the next frame.
+        """
+        return None if self.covariance_now is None else self.covariance_now()
 
     @property
     def pose(self) -> FloatArray | None:

@@ -5,9 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from dualslam.core.geometry import se3
+from dualslam.core.geometry.projection import projection_jacobians
 from dualslam.core.geometry.triangulation import point_covariance, triangulate_n_view
 from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
+
+MIN_LANDMARKS = 6
+"""Three fix a pose; twice as many tell how well."""
 
 
 def landmark_covariances(
@@ -33,6 +37,41 @@ def landmark_covariances(
     T_kf_submap = se3.inverse(submap.keyframe_poses(ids))[view]
     places = submap.landmarks["xyz_mu"][landmark_ids] if xyz is None else xyz
     return point_covariance(places, submap.K, point, T_kf_submap, sigma)
+
+
+def resection_covariance(
+    submap: Submap, landmark_ids: IntArray, sigma_px: FloatArray, T_cam_submap: FloatArray, covariances: FloatArray
+) -> FloatArray | None:
+    """Return the covariance (6, 6) of a pose by the landmarks that its image sees.
+
+    It is that of xi in ``T_submap_cam @ exp(xi)``: rotation (rad), then translation (unit of the submap), in the
+    camera's axes. Each landmark is as uncertain as its views leave it. The keyframes of these views are held.
+
+    Parameters
+    ----------
+    submap : Submap
+    landmark_ids : (N,) int64
+    sigma_px : (N,)
+        Of the pixels at which they are seen.
+    T_cam_submap : (4, 4)
+    covariances : (N, 3, 3)
+        Of `landmark_covariances`; landmarks that have none are left out.
+
+    Returns
+    -------
+    (6, 6) or None
+        None where fewer than `MIN_LANDMARKS` are left.
+    """
+    known = np.isfinite(covariances).all((1, 2)) & (submap.depths(landmark_ids, T_cam_submap) > 0)
+    if np.count_nonzero(known) < MIN_LANDMARKS:
+        return None
+    J_pose, J_point = projection_jacobians(submap.K, T_cam_submap, submap.landmarks["xyz_mu"][landmark_ids[known]])
+    spread = J_point @ covariances[known] @ J_point.transpose(0, 2, 1) + sigma_px[known, None, None] ** 2 * np.eye(2)
+    H = (J_pose.transpose(0, 2, 1) @ np.linalg.solve(spread, J_pose)).sum(axis=0)
+    try:
+        return np.asarray(np.linalg.inv(H))
+    except np.linalg.LinAlgError:
+        return None
 
 
 def triangulate_landmarks(submap: Submap, landmark_ids: IntArray, before: int) -> FloatArray:

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from dualslam.core.geometry import se3
-from dualslam.core.geometry.projection import projection_jacobians
 from dualslam.core.types import FloatArray
 from dualslam.linking.gates import PIXEL_CHI2
 from dualslam.linking.scale_observability import scale_sigmas_between
-from dualslam.map.landmark_views import landmark_covariances
+from dualslam.map.landmark_views import landmark_covariances, resection_covariance
 from dualslam.map.residual_noise import noise_excess
 from dualslam.map.submap import Submap
 from dualslam.recovery.scale_watch import GROUP, SCALE_INFLATION
@@ -23,7 +22,6 @@ from dualslam.recovery.scale_watch import GROUP, SCALE_INFLATION
 TOGETHER = 2
 """Groups that are asked of one set of normal equations, which takes little longer than for one. With more the sigmas
 sink, by a quarter with 6 (a room), since more of the map holds the scale: the inflation below is not made for that."""
-MIN_LANDMARKS = 6
 POSITION_INFLATION = 1.1
 """As `SCALE_INFLATION` (`recovery/scale_watch.py`), for positions."""
 NEAR = 2
@@ -64,22 +62,14 @@ def _position_sigma(submap: Submap, keyframe_id: int, covariances: FloatArray) -
     """Resect the keyframe from its landmarks, each as uncertain as its views leave it: `covariances` of all."""
     feature = np.flatnonzero(submap.landmark_of[keyframe_id] >= 0)
     ids = submap.landmark_of[keyframe_id][feature]
-    covariance = covariances[ids]
     T_cam_submap = se3.inverse(submap.T_submap_kf[keyframe_id])
+    sigma = submap.keyframes[keyframe_id].features.sigma_px[feature]
+    covariance = resection_covariance(submap, ids, sigma, T_cam_submap, covariances[ids])
+    if covariance is None:
+        return float("nan")
     depth = submap.depths(ids, T_cam_submap)
-    known = np.isfinite(covariance).all((1, 2)) & (depth > 0)
-    if np.count_nonzero(known) < MIN_LANDMARKS:
-        return float("nan")
-    ids, covariance = ids[known], covariance[known]
-    sigma = submap.keyframes[keyframe_id].features.sigma_px[feature[known]]
-    J_pose, J_point = projection_jacobians(submap.K, T_cam_submap, submap.landmarks["xyz_mu"][ids])
-    spread = J_point @ covariance @ J_point.transpose(0, 2, 1) + sigma[:, None, None] ** 2 * np.eye(2)
-    H = (J_pose.transpose(0, 2, 1) @ np.linalg.solve(spread, J_pose)).sum(axis=0)
-    try:
-        variance = float(np.trace(np.linalg.inv(H)[3:, 3:]))
-    except np.linalg.LinAlgError:
-        return float("nan")
-    return POSITION_INFLATION * float(np.sqrt(max(variance, 0.0)) / np.median(depth[known]))
+    variance = float(np.trace(covariance[3:, 3:]))
+    return POSITION_INFLATION * float(np.sqrt(max(variance, 0.0)) / np.median(depth[depth > 0]))
 
 
 def _scale_sigmas(submap: Submap, excess: dict[int, float]) -> dict[int, float]:

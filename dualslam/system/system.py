@@ -38,6 +38,7 @@ from dualslam.system.health import HealthMonitor
 from dualslam.system.masking import Masking
 from dualslam.system.motion_watch import Break
 from dualslam.system.places import PlaceKeeping
+from dualslam.system.pose_covariance import PoseCovariance
 from dualslam.system.starting import Starting
 from dualslam.system.state import State
 from dualslam.system.tracking import Tracking
@@ -452,6 +453,14 @@ class System:
         if pose is not None:
             T_submap_cam = self.atlas.submaps[pose.submap_id].resolve_anchor(pose.keyframe_id, pose.T_kf_cam)
         failure = outcome if isinstance(outcome, Failure) else None
+        live, covariance_now = self._state.live, None
+        if (
+            isinstance(outcome, Track)
+            and T_submap_cam is not None
+            and live is not None
+            and live.submap.id == row.submap
+        ):
+            covariance_now = PoseCovariance.of(live, outcome, T_submap_cam)
         S_world_submap, world_id = (None, None) if pose is None else self._worlds.of(pose.submap_id)
         return FrameResult(
             self.numbers.index_of(frame.index),
@@ -467,6 +476,7 @@ class System:
             world_id,
             row.method,
             "" if pose is None else self._doubt_about(pose.submap_id),
+            covariance_now,
         )
 
     def _doubt_about(self, submap_id: int) -> str:
