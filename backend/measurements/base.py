@@ -46,7 +46,7 @@ class Mount:
 
 
 class Measurement(Protocol):
-    """One reading with its sigmas: a frozen dataclass. `conformance` checks all that is said here.
+    """One reading with its sigmas: a frozen dataclass, which may inherit from this one. `conformance` checks it all.
 
     Attributes
     ----------
@@ -69,12 +69,12 @@ class Measurement(Protocol):
     columns: ClassVar[tuple[str, ...]]
     units: ClassVar[tuple[str, ...]]
     fixes: ClassVar[frozenset[Gauge]]
-    shared_sigmas: ClassVar[tuple[float, ...]]
+    shared_sigmas: ClassVar[tuple[float, ...]] = ()
 
     @property
     def times_s(self) -> tuple[float, ...]:
-        """Times of the poses."""
-        ...
+        """Times of the poses: the columns that begin with ``t_``."""
+        return tuple(getattr(self, name) for name in self.columns if name.startswith("t_"))
 
     @property
     def sigmas(self) -> FloatArray:
@@ -94,8 +94,8 @@ class Measurement(Protocol):
 
     @classmethod
     def of_row(cls, row: Sequence[float], mount: Mount) -> Self:
-        """Make a reading of the numbers of a line, in the order of `columns`."""
-        ...
+        """Make a reading of the numbers of a line, in the order of `columns`: the fields, where there are no others."""
+        return cls(*row)
 
     @classmethod
     def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:

@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.random import Generator
 
-from dualslam.backend.measurements.base import Gauge, Mount, Residual, noise
+from dualslam.backend.measurements.base import Gauge, Measurement, Mount, Residual, noise
 from dualslam.core.geometry import so3
 from dualslam.core.types import FloatArray
 
@@ -23,7 +23,7 @@ def _unit(v: Sequence[float] | FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True)
-class Direction:
+class Direction(Measurement):
     """A direction in the camera's axes, and the same one in the measurements' frame.
 
     Attributes
@@ -38,17 +38,11 @@ class Direction:
     columns: ClassVar[tuple[str, ...]] = ("t_s", "bx", "by", "bz", "wx", "wy", "wz", "sigma_rad")
     units: ClassVar[tuple[str, ...]] = ("rad",) * 3
     fixes: ClassVar[frozenset[Gauge]] = frozenset({Gauge.ROTATION})
-    shared_sigmas: ClassVar[tuple[float, ...]] = ()
 
     t_s: float
     in_camera: Vector
     in_world: Vector
     sigma_rad: float
-
-    @property
-    def times_s(self) -> tuple[float, ...]:
-        """Time of the pose."""
-        return (self.t_s,)
 
     @property
     def sigmas(self) -> FloatArray:

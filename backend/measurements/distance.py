@@ -9,12 +9,12 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.random import Generator
 
-from dualslam.backend.measurements.base import Gauge, Mount, Residual, noise
+from dualslam.backend.measurements.base import Gauge, Measurement, Residual, noise
 from dualslam.core.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class Distance:
+class Distance(Measurement):
     """How far two places of the camera lie apart, in a straight line.
 
     Attributes
@@ -26,17 +26,11 @@ class Distance:
     columns: ClassVar[tuple[str, ...]] = ("t_a_s", "t_b_s", "distance_m", "sigma_m")
     units: ClassVar[tuple[str, ...]] = ("m",)
     fixes: ClassVar[frozenset[Gauge]] = frozenset({Gauge.SCALE})
-    shared_sigmas: ClassVar[tuple[float, ...]] = ()
 
     t_a_s: float
     t_b_s: float
     distance_m: float
     sigma_m: float
-
-    @property
-    def times_s(self) -> tuple[float, ...]:
-        """Times of the two poses."""
-        return self.t_a_s, self.t_b_s
 
     @property
     def sigmas(self) -> FloatArray:
@@ -51,11 +45,6 @@ class Distance:
         J = np.zeros((1, 12))
         J[0, 3:6], J[0, 9:12] = -u @ T[0, :3, :3], u @ T[1, :3, :3]
         return np.array([length - self.distance_m]), J
-
-    @classmethod
-    def of_row(cls, row: Sequence[float], mount: Mount) -> Self:
-        """Make a reading of a line."""
-        return cls(*row)
 
     @classmethod
     def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:

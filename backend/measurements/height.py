@@ -9,12 +9,12 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.random import Generator
 
-from dualslam.backend.measurements.base import Gauge, Mount, Residual, noise, point_jacobian
+from dualslam.backend.measurements.base import Gauge, Measurement, Residual, noise, point_jacobian
 from dualslam.core.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class Height:
+class Height(Measurement):
     """The z coordinate of the camera.
 
     Attributes
@@ -26,16 +26,10 @@ class Height:
     columns: ClassVar[tuple[str, ...]] = ("t_s", "z_m", "sigma_m")
     units: ClassVar[tuple[str, ...]] = ("m",)
     fixes: ClassVar[frozenset[Gauge]] = frozenset(Gauge)
-    shared_sigmas: ClassVar[tuple[float, ...]] = ()
 
     t_s: float
     z_m: float
     sigma_m: float
-
-    @property
-    def times_s(self) -> tuple[float, ...]:
-        """Time of the pose."""
-        return (self.t_s,)
 
     @property
     def sigmas(self) -> FloatArray:
@@ -45,11 +39,6 @@ class Height:
     def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
         """Return predicted minus measured height, metres."""
         return np.array([T[0, 2, 3] - self.z_m]), point_jacobian(T[0], np.zeros(3))[2:]
-
-    @classmethod
-    def of_row(cls, row: Sequence[float], mount: Mount) -> Self:
-        """Make a reading of a line."""
-        return cls(*row)
 
     @classmethod
     def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:

@@ -9,12 +9,12 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.random import Generator
 
-from dualslam.backend.measurements.base import Gauge, Mount, Residual, noise, point_jacobian
+from dualslam.backend.measurements.base import Gauge, Measurement, Mount, Residual, noise, point_jacobian
 from dualslam.core.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class Position:
+class Position(Measurement):
     """Where the antenna is.
 
     Attributes
@@ -30,17 +30,11 @@ class Position:
     columns: ClassVar[tuple[str, ...]] = ("t_s", "x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m")
     units: ClassVar[tuple[str, ...]] = ("m",) * 3
     fixes: ClassVar[frozenset[Gauge]] = frozenset(Gauge)
-    shared_sigmas: ClassVar[tuple[float, ...]] = ()
 
     t_s: float
     xyz_m: tuple[float, float, float]
     sigma_m: float | tuple[float, float, float]
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    @property
-    def times_s(self) -> tuple[float, ...]:
-        """Time of the pose."""
-        return (self.t_s,)
 
     @property
     def sigmas(self) -> FloatArray:

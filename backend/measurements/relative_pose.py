@@ -9,13 +9,13 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.random import Generator
 
-from dualslam.backend.measurements.base import Gauge, Mount, Residual, between, noise
+from dualslam.backend.measurements.base import Gauge, Measurement, Mount, Residual, between, noise
 from dualslam.core.geometry import se3, so3
 from dualslam.core.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RelativePose:
+class RelativePose(Measurement):
     """How the body has moved.
 
     Attributes
@@ -33,7 +33,6 @@ class RelativePose:
     )
     units: ClassVar[tuple[str, ...]] = ("rad",) * 3 + ("m",) * 3
     fixes: ClassVar[frozenset[Gauge]] = frozenset({Gauge.SCALE})
-    shared_sigmas: ClassVar[tuple[float, ...]] = ()
 
     t_a_s: float
     t_b_s: float
@@ -41,11 +40,6 @@ class RelativePose:
     sigma_m: float
     sigma_rad: float
     mount: Mount = field(default_factory=Mount)
-
-    @property
-    def times_s(self) -> tuple[float, ...]:
-        """Times of the two poses."""
-        return self.t_a_s, self.t_b_s
 
     @property
     def sigmas(self) -> FloatArray:

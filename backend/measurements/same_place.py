@@ -9,12 +9,12 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.random import Generator
 
-from dualslam.backend.measurements.base import Gauge, Mount, Residual, between
+from dualslam.backend.measurements.base import Gauge, Measurement, Residual, between
 from dualslam.core.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class SamePlace:
+class SamePlace(Measurement):
     """Two times at which the camera had one pose, up to the sigmas.
 
     Attributes
@@ -26,17 +26,11 @@ class SamePlace:
     columns: ClassVar[tuple[str, ...]] = ("t_a_s", "t_b_s", "sigma_m", "sigma_rad")
     units: ClassVar[tuple[str, ...]] = ("rad",) * 3 + ("m",) * 3
     fixes: ClassVar[frozenset[Gauge]] = frozenset()
-    shared_sigmas: ClassVar[tuple[float, ...]] = ()
 
     t_a_s: float
     t_b_s: float
     sigma_m: float
     sigma_rad: float
-
-    @property
-    def times_s(self) -> tuple[float, ...]:
-        """Times of the two poses."""
-        return self.t_a_s, self.t_b_s
 
     @property
     def sigmas(self) -> FloatArray:
@@ -46,11 +40,6 @@ class SamePlace:
     def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
         """Return the logarithm of the motion between the two poses."""
         return between(T, np.eye(4), np.eye(4))
-
-    @classmethod
-    def of_row(cls, row: Sequence[float], mount: Mount) -> Self:
-        """Make a reading of a line."""
-        return cls(*row)
 
     @classmethod
     def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:
