@@ -32,7 +32,7 @@ BUILT_IN: Mapping[str, str] = {
 PIXEL_MATCHERS_GROUP = "dualslam.pixel_matchers"
 """The same for pixel matchers."""
 
-PIXEL_MATCHERS: Mapping[str, str] = {}
+PIXEL_MATCHERS: Mapping[str, str] = {"direct": "dualslam.frontends.direct.matcher:DirectMatcher"}
 """The built-in ones."""
 
 EXTRAS: Mapping[str, str] = {"kornia": "kornia"}

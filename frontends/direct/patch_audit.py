@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from dualslam.core.camera.base import Camera
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points
-from dualslam.core.types import BoolArray, FloatArray, IntArray, View
-from dualslam.frontends.direct.warp import build_pyramid, correlate, sample, warp_points
+from dualslam.core.types import FloatArray, IntArray, View
+from dualslam.frontends.direct.warp import build_pyramid, correlate, inside, sample, warp_points
 from dualslam.frontends.tracking.row_shifts import find_as_read
 from dualslam.map.submap import NO_LANDMARK, Submap
 
@@ -72,7 +72,7 @@ class PatchAudit:
         levels = build_pyramid(view.image.pixels())
         axes = np.broadcast_to(SPACING_PX * np.eye(2), (len(rows), 2, 2))
         greys = sample(levels, uv, axes, HALF)
-        usable = _inside(uv, axes, camera) & (greys.std(axis=(1, 2)) >= MIN_CONTRAST)
+        usable = inside(uv, axes, HALF, camera.size_px) & (greys.std(axis=(1, 2)) >= MIN_CONTRAST)
         self._kept[view.index] = _Patches(view.timestamp_s, rows[usable], np.rint(greys[usable]).astype(np.uint8))
         while len(self._kept) > N_KEYFRAMES:
             del self._kept[next(iter(self._kept))]
@@ -96,7 +96,7 @@ class PatchAudit:
         uv, axes = warp.uv_px, SPACING_PX * warp.J_b_a
         if view.turn_rad is not None:
             uv = find_as_read(uv, warp.uv_rect_px, camera, view.turn_rad)
-        usable = _inside(uv, axes, camera)
+        usable = inside(uv, axes, HALF, camera.size_px)
         if usable.sum() < MIN_PATCHES:
             return None
         found = sample(build_pyramid(view.image.pixels()), uv[usable], axes[usable], HALF)
@@ -130,9 +130,3 @@ def _spread(rows: IntArray, uv_px: FloatArray) -> IntArray:
     if len(order) <= N_PATCHES:
         return order
     return order[np.linspace(0, len(order) - 1, N_PATCHES).astype(np.int64)]
-
-
-def _inside(uv_px: FloatArray, axes: FloatArray, camera: Camera) -> BoolArray:
-    """Return which patches (N,) are wholly in the image; NaN is not."""
-    reach = HALF * np.abs(axes).sum(axis=2)
-    return np.asarray(((uv_px > reach) & (uv_px < np.array(camera.size_px) - 1 - reach)).all(axis=1), np.bool_)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.camera.base import Camera, plane
-from dualslam.core.types import FloatArray
+from dualslam.core.types import BoolArray, FloatArray
 
 Pyramid = list[NDArray[np.float32]]
 
@@ -50,10 +50,10 @@ class Warp:
         return np.asarray(np.sqrt(np.abs(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0])))
 
 
-def build_pyramid(image: NDArray[np.uint8]) -> Pyramid:
+def build_pyramid(image: NDArray[np.uint8], max_levels: int = MAX_LEVELS) -> Pyramid:
     """Return the image and its halves."""
     levels = [image.astype(np.float32)]
-    while len(levels) < MAX_LEVELS and min(levels[-1].shape) >= MIN_SIDE_PX:
+    while len(levels) < max_levels and min(levels[-1].shape) >= MIN_SIDE_PX:
         levels.append(np.asarray(cv2.pyrDown(levels[-1]), np.float32))
     return levels
 
@@ -68,6 +68,28 @@ def warp_points(camera: Camera, uv_px: FloatArray, depth: FloatArray, T_b_a: Flo
     here, right, down = camera.project(p_b).reshape(3, n, 2)
     rect, rect_b = (plane(x[:n]) * np.diag(camera.K)[:2] + camera.K[:2, 2] for x in (rays, p_b))
     return Warp(rect, here, rect_b, np.stack([right - here, down - here], axis=2))
+
+
+def project_with_jacobians(camera: Camera, p_cam: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the pixels (N, 2) of points (N, 3) as the lens shows them, and their derivatives (N, 2, 3) by the points.
+
+    NaN where the camera does not show a point.
+    """
+    n = len(p_cam)
+    step = 1e-3 * np.linalg.norm(p_cam, axis=1, keepdims=True)
+    moved = np.concatenate([p_cam, p_cam + step * [1.0, 0.0, 0.0], p_cam + step * [0.0, 1.0, 0.0]])
+    here, right, down = camera.project(moved).reshape(3, n, 2)
+    by_x, by_y = (right - here) / step, (down - here) / step
+    # A pixel depends on the ray alone: it does not change along it.
+    z = np.where(np.abs(p_cam[:, 2:]) > 1e-9, p_cam[:, 2:], np.nan)
+    by_z = -(p_cam[:, :1] * by_x + p_cam[:, 1:2] * by_y) / z
+    return here, np.stack([by_x, by_y, by_z], axis=2)
+
+
+def inside(uv_px: FloatArray, axes: FloatArray, half: int, size_px: tuple[int, int]) -> BoolArray:
+    """Return which patches (N,), as `sample` takes them, are wholly in the image; NaN is not."""
+    reach = half * np.abs(axes).sum(axis=2)
+    return np.asarray(((uv_px > reach) & (uv_px < np.array(size_px) - 1 - reach)).all(axis=1), np.bool_)
 
 
 def sample(levels: Pyramid, uv_px: FloatArray, axes: FloatArray, half: int) -> NDArray[np.float32]:

@@ -42,6 +42,9 @@ WIDER = 2.5  # second guided search: this many times the first radius
 GUIDE_TOLERANCE, POSE_TOLERANCE = 0.1, 1e-3
 """Chi-square that a step may still promise when a pose counts as found (`refine_pose`): a third of its standard
 deviation where it only guides the search in the local map, a thirtieth where it is the frame's."""
+REDETECTED = 0.25
+"""Share of the landmarks that pixels find from which on features pose a frame by themselves: a detector finds a third
+of its points again from another side, and most of these match."""
 BEFORE_GAP = 3  # keyframes whose landmarks are asked for a second pose beyond a gap
 GIVEN_POSE_CHI2 = 4 * CHI2_99[2]  # 99 % with 2 degrees of freedom, and the pose off by as much as a pixel
 
@@ -292,9 +295,19 @@ class Tracker:
         found = self._refine(seen, T_predicted, ids, self._submap.landmarks["xyz_mu"].take(ids, axis=0), feature)
         if isinstance(found, Failure):
             return guided
-        local, grid = self._local_map(found[1][found[1] >= 0]), FeatureGrid.build(seen.features.uv_rect_px)
-        track = self._pose_from_local_map(local, seen, grid, *found, T_predicted, wide)
-        if isinstance(track, Failure) or (isinstance(guided, Track) and guided.n_inliers >= track.n_inliers):
+        local, T = self._local_map(found[1][found[1] >= 0]), found[0]
+        track = self._pose_from_local_map(
+            local, seen, FeatureGrid.build(seen.features.uv_rect_px), *found, T_predicted, wide
+        )
+        if isinstance(track, Failure):
+            return guided
+        # Where the image is sharp, its features are there again under this pose: they are better known than patches.
+        nothing = np.full(len(view.features), NO_LANDMARK, np.int64)
+        grid = FeatureGrid.build(view.features.uv_rect_px)
+        again = self._pose_from_local_map(local, view, grid, T, nothing, T_predicted, wide)
+        if isinstance(again, Track) and again.n_inliers >= REDETECTED * track.n_inliers:
+            return again
+        if isinstance(guided, Track) and guided.n_inliers >= track.n_inliers:
             return guided
         n_by_pixels = np.count_nonzero(track.landmark_ids[len(view.features) :] >= 0)
         return replace(track, n_by_pixels=int(n_by_pixels))

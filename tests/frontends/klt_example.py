@@ -53,9 +53,9 @@ class KltMatcher:
         """Follow the landmarks of the last frame, from where they were in it."""
         last, options = references[0], self.options
         before = last.uv_px.astype(np.float32).reshape(-1, 1, 2)
-        window = {"winSize": (options.window_px, options.window_px), "maxLevel": options.n_levels - 1}
-        after, seen, _ = cv2.calcOpticalFlowPyrLK(last.image, image, before, None, **window)
-        back, seen_back, _ = cv2.calcOpticalFlowPyrLK(image, last.image, after, None, **window)
+        window: dict[str, Any] = {"winSize": (options.window_px, options.window_px), "maxLevel": options.n_levels - 1}
+        after, seen, _ = cv2.calcOpticalFlowPyrLK(last.image, image, before, np.empty_like(before), **window)
+        back, seen_back, _ = cv2.calcOpticalFlowPyrLK(image, last.image, after, np.empty_like(after), **window)
         uv_px = after.reshape(-1, 2).astype(np.float64)
         returned = np.linalg.norm((back - before).reshape(-1, 2), axis=1) < options.max_return_px
         inside = ((uv_px >= 0) & (uv_px <= np.array(camera.size_px) - 1)).all(axis=1)

@@ -28,7 +28,7 @@ class PixelsConfig(StrictModel):
     """The pixel matcher, which finds landmarks in the image itself where guided search finds too few."""
 
     name: str | None = None
-    """Which pixel matcher: one that a package offers as an entry point of `dualslam.pixel_matchers`, or
+    """Which pixel matcher: `direct`, one that a package offers as an entry point of `dualslam.pixel_matchers`, or
     `module:Class`, of what can be imported. null: none."""
     options: dict[str, Any] = Field(default_factory=dict)
     """Settings of the chosen pixel matcher alone; it checks their names itself."""

@@ -1,0 +1,135 @@
+"""Patches of landmarks in posed images, as templates for another image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dualslam.core.camera.base import Camera
+from dualslam.core.geometry import se3
+from dualslam.core.pixels import PosedImage
+from dualslam.core.types import BoolArray, FloatArray, IntArray
+from dualslam.frontends.direct.smear import Smear
+from dualslam.frontends.direct.warp import Pyramid, build_pyramid, inside, sample
+
+HALF = 4
+"""Half the side of a patch, in pixels of its level: 9 x 9 of them, 7 x 7 of which have gradients."""
+MAX_LEVELS = 5
+MIN_CONTRAST = 3.0
+"""Standard deviation of a patch's greys: less is noise."""
+MIN_SHARPNESS = 0.5
+"""Gradient energy of a reference relative to the sharpest one's: below, it is blurred, and its patches are not used."""
+MAX_PATCHES = 400
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Templates:
+    """Patches at one level of the pyramid, under one smear; the mean of each is 0.
+
+    Attributes
+    ----------
+    greys : (N, 9, 9)
+    gradient : (N, 49, 2)
+        Of the inner 7 x 7 pixels by the patch's own columns and rows.
+    usable : (N,) bool
+        In the image, and of enough contrast.
+    """
+
+    greys: NDArray[np.float32]
+    gradient: FloatArray
+    usable: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """N landmarks with a patch each, of one of several references.
+
+    Attributes
+    ----------
+    landmark_ids : (N,)
+    xyz : (N, 3)
+        Where the landmark's pixel is, in the submap.
+    J : (N, 3, 2)
+        How that place moves with the pixel, the plane of the patch parallel to its image.
+    of : (N,) int64
+        Row of its reference.
+    uv_px : (N, 2)
+        Where the reference shows it.
+    references : list of Pyramid
+    """
+
+    landmark_ids: IntArray
+    xyz: FloatArray
+    J: FloatArray
+    of: IntArray
+    uv_px: FloatArray
+    references: list[Pyramid]
+    _kept: dict[tuple[int, Smear], Templates] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.landmark_ids)
+
+    @property
+    def side(self) -> int:
+        """Pixels along a side of a patch."""
+        return 2 * HALF + 1
+
+    def templates(self, level: int, smear: Smear) -> Templates:
+        """Return the patches at a level, smeared; each kind is made once."""
+        if (level, smear) not in self._kept:
+            greys = self.greys(np.arange(len(self)), level, smear)
+            axes = np.broadcast_to(2.0**level * np.eye(2), (len(self), 2, 2))
+            usable = inside(self.uv_px, axes, HALF, self.references[0][0].shape[::-1])
+            usable &= greys.std(axis=(1, 2)) >= MIN_CONTRAST
+            du, dv = greys[:, 1:-1, 2:] - greys[:, 1:-1, :-2], greys[:, 2:, 1:-1] - greys[:, :-2, 1:-1]
+            gradient = 0.5 * np.stack([du, dv], axis=-1).reshape(len(self), -1, 2).astype(np.float64)
+            self._kept[level, smear] = Templates(greys, gradient, usable)
+        return self._kept[level, smear]
+
+    def greys(self, rows: IntArray, level: int, smear: Smear) -> NDArray[np.float32]:
+        """Return patches (N, 9, 9) at a level, smeared."""
+        greys = np.zeros((len(rows), self.side, self.side), np.float32)
+        for i in np.unique(self.of[rows]).tolist():
+            of = np.flatnonzero(self.of[rows] == i)
+            smeared = list(self.references[i])
+            smeared[level] = smear.of(smeared[level], level)
+            axes = np.broadcast_to(2.0**level * np.eye(2), (len(of), 2, 2))
+            greys[of] = sample(smeared, self.uv_px[rows[of]], axes, HALF)
+        return greys
+
+
+def patches_of(references: Sequence[PosedImage], camera: Camera) -> Patches | None:
+    """Take each landmark's patch from the first sharp reference that shows it; None without any."""
+    pyramids = [build_pyramid(reference.image, MAX_LEVELS) for reference in references]
+    energy = np.array([_gradient_energy(levels) for levels in pyramids])
+    sharp = np.flatnonzero(energy >= MIN_SHARPNESS * energy.max())
+    ids, of, row = (np.zeros(0, np.int64) for _ in range(3))
+    for i in sharp.tolist():
+        new = np.flatnonzero(~np.isin(references[i].landmark_ids, ids))
+        ids = np.concatenate([ids, references[i].landmark_ids[new]])
+        of, row = np.concatenate([of, np.full(len(new), i)]), np.concatenate([row, new])
+    if len(ids) == 0:
+        return None
+    chosen = np.unique(np.linspace(0, len(ids) - 1, min(len(ids), MAX_PATCHES)).astype(np.int64))
+    ids, of, row = ids[chosen], of[chosen], row[chosen]
+    xyz, J, uv = np.empty((len(ids), 3)), np.empty((len(ids), 3, 2)), np.empty((len(ids), 2))
+    for i in sharp.tolist():
+        mine, reference = of == i, references[i]
+        uv[mine], depth = reference.uv_px[row[mine]], reference.depth_mu[row[mine]]
+        moved = (uv[mine] + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])[:, None]).reshape(-1, 2)
+        rays = camera.unproject(moved)
+        here, right, down = (rays * (np.tile(depth, 3) / rays[:, 2])[:, None]).reshape(3, -1, 3)
+        T_submap_cam = se3.inverse(reference.T_cam_submap)
+        xyz[mine] = se3.act(T_submap_cam, here)
+        J[mine] = T_submap_cam[:3, :3] @ np.stack([right - here, down - here], axis=2)
+    return Patches(ids, xyz, J, of, uv, pyramids)
+
+
+def _gradient_energy(levels: Pyramid) -> float:
+    """Return the mean squared difference of neighbouring pixels, relative to the image's variance."""
+    image = levels[min(1, len(levels) - 1)]
+    steps = float((np.diff(image, axis=0) ** 2).mean() + (np.diff(image, axis=1) ** 2).mean())
+    return steps / max(float(image.var()), 1e-6)
