@@ -6,8 +6,8 @@ import argparse
 
 import numpy as np
 
-from dualslam.atlas.atlas import LinkKind
 from dualslam.build.parts import measurement_sources
+from dualslam.core.events import EventKind
 from dualslam.core.metric_problem import MeasurementSource
 from dualslam.io.run_folder import FRAMES
 from dualslam.io.run_reading import read_frames
@@ -28,7 +28,6 @@ def execute(args: argparse.Namespace) -> int:
 
     system = merge_runs(args.run_a, args.run_b, args.out, overwrite=args.overwrite, measurements=measurements)
     if not args.quiet:
-        kinds = [link.kind for link in system.atlas.believed]
-        n = kinds.count(LinkKind.MERGE)
+        n = len(system.events.of_kind(EventKind.MERGED, EventKind.LOOP_CLOSED))
         print(f"joined by {n} {'place' if n == 1 else 'places'}; written: {args.out}", flush=True)
     return 0
