@@ -186,7 +186,7 @@ def there_and_back(n: int) -> PointWorld:
     """A camera that goes the same short way again and again."""
     way = hand_held(24)
     turns = np.abs((np.arange(n) + 23) % 46 - 23)
-    return PointWorld(cloud(), way[turns])
+    return PointWorld(cloud(600), way[turns])
 
 
 DENSE = {"keyframes": {"max_parallax_deg": 2.0}}

@@ -51,7 +51,7 @@ def kinds(system: System) -> list[EventKind]:
 
 @pytest.fixture(scope="module")
 def world() -> PointWorld:
-    return PointWorld(cloud(), hand_held(70))
+    return PointWorld(cloud(600), hand_held(70))
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +142,7 @@ def test_all_frames_are_posed_and_right(plain: System, world: PointWorld) -> Non
 def test_the_frames_before_the_start_are_posed_in_reverse() -> None:
     """The camera stands still first: the start comes late, and none of the frames before it is lost."""
     still = np.repeat(np.eye(4)[None], 15, 0)
-    world = PointWorld(cloud(), np.concatenate([still, path(25, np.array([0.08, 0, 0.02]), np.array([0, -0.005, 0]))]))
+    world = PointWorld(cloud(600), np.concatenate([still, path(25, np.array([0.08, 0, 0.02]), np.array([0, -0.005, 0]))]))
     system = system_in(world)
     results = [system.step(frame) for frame in world.frames()]
     assert all(r.status is FrameStatus.INITIALISING and r.T_submap_cam is None for r in results[:15])
@@ -158,7 +158,7 @@ def test_the_frames_before_the_start_are_posed_in_reverse() -> None:
 def test_a_start_that_comes_late_poses_frames_older_than_the_buffer_keeps() -> None:
     still, moving = 40, path(30, np.array([0.08, 0, 0]), np.zeros(3))
     T = np.concatenate([np.repeat(moving[:1], still, axis=0), moving])
-    world = PointWorld(cloud(), T)
+    world = PointWorld(cloud(600), T)
     system = system_in(world, buffer={"duration_s": 0.5})
     for frame in world.frames():
         system.step(frame)
@@ -173,7 +173,7 @@ def test_a_long_cover_before_the_start_hides_no_more_than_what_it_covers() -> No
     moving = path(25, np.array([0.08, 0, 0.02]), np.array([0, -0.005, 0]))
     covered = frozenset(range(5, 45))
     assert len(covered) > RecoveryConfig().max_gap_frames
-    world = PointWorld(cloud(), np.concatenate([still, moving]), covered=covered)
+    world = PointWorld(cloud(600), np.concatenate([still, moving]), covered=covered)
     system = run(world)
     indices, T = main_trajectory(system)
     assert indices == [i for i in range(75) if i not in covered]
@@ -249,7 +249,7 @@ def test_a_map_that_starts_meanwhile_ends_the_wait(is_firm: bool, monkeypatch: p
     monkeypatch.setattr("dualslam.system.starting.FIRM_SIGMA_DEG", np.inf if is_firm else 0.0)
     before, after = path(20, np.array([0.08, 0, 0]), np.zeros(3)), path(20, np.array([0.08, 0, 0.02]), np.zeros(3))
     turned = path(2, np.zeros(3), np.array([0, np.pi, 0]))[1]
-    both_sides = np.concatenate([cloud(), cloud(seed=1) * (1, 1, -1)])
+    both_sides = np.concatenate([cloud(600), cloud(600, seed=1) * (1, 1, -1)])
     world = PointWorld(both_sides, np.concatenate([before, turned @ after]))
     system = run(world, tracking={"max_lost_s": 1.0})
     (failed,) = system.events.of_kind(EventKind.FAILED)
@@ -265,7 +265,7 @@ def test_frames_since_a_loss_wait_for_the_next_map_however_short_the_buffer() ->
     still = np.repeat(after[:1], 25, 0)
     turned = path(2, np.zeros(3), np.array([0, np.pi, 0]))[1]
     T = np.concatenate([before, turned @ still, turned @ after])
-    both_sides = np.concatenate([cloud(), cloud(seed=1) * (1, 1, -1)])
+    both_sides = np.concatenate([cloud(600), cloud(600, seed=1) * (1, 1, -1)])
     system = run(PointWorld(both_sides, T), buffer={"duration_s": 0.3})
     assert len(system.atlas.submaps) == 2
     assert {i: row.submap for i, row in system.rows.items()} == {i: int(i >= 20) for i in range(60)}
@@ -277,9 +277,9 @@ def turning_back(n_away: int) -> PointWorld:
     # Had it stopped unseen and gone on at the same speed, its motion would contradict it.
     walk[:, 0, 3] = np.cumsum(0.08 * np.minimum(np.abs(np.arange(45) - 24.5) / 10, 1.0))
     away = walk[24] @ path(2, np.zeros(3), np.array([0, np.pi, 0]))[1]
-    behind = cloud(seed=1) * (1, 1, -1) + walk[24][:3, 3]
+    behind = cloud(600, seed=1) * (1, 1, -1) + walk[24][:3, 3]
     T = np.concatenate([walk[:25], np.repeat(away[None], n_away, 0), walk[25:]])
-    return PointWorld(np.concatenate([cloud(), behind]), T)
+    return PointWorld(np.concatenate([cloud(600), behind]), T)
 
 
 def test_a_lost_map_that_is_seen_again_before_another_starts_is_gone_on_with() -> None:
@@ -413,7 +413,7 @@ def test_frames_may_come_in_reverse(world: PointWorld) -> None:
 
 
 def test_nothing_to_see_gives_no_map() -> None:
-    world = PointWorld(cloud(), hand_held(12), covered=frozenset(range(12)))
+    world = PointWorld(cloud(600), hand_held(12), covered=frozenset(range(12)))
     system = run(world)
     assert not system.atlas.submaps
     assert all(row.status is FrameStatus.INITIALISING for row in system.rows.values())
@@ -429,7 +429,7 @@ def test_cpu_times_of_the_stages_are_kept(plain: System) -> None:
 
 
 def test_a_pose_is_told_before_the_map_grows_from_it() -> None:
-    world = PointWorld(cloud(), hand_held(30))
+    world = PointWorld(cloud(600), hand_held(30))
     system = system_in(world)
     told: dict[int, bool] = {}
 
