@@ -25,7 +25,7 @@ SCALE = 0.02
 
 
 def run(backwards: bool = False, refined: bool = True) -> tuple[System, PointWorld]:
-    world = PointWorld(cloud(), hand_held(70), covered=COVERED)
+    world = PointWorld(cloud(600), hand_held(70), covered=COVERED)
     # A world of points has no images, so that the live features alone can walk.
     system = system_in(world, recovery={"enabled": True, "attempts": ["live"]})
     for frame in sorted(world.frames(), key=lambda frame: frame.index, reverse=backwards):
@@ -153,7 +153,7 @@ def test_the_walk_never_reads_the_old_map(recovered: tuple[System, PointWorld]) 
 def test_three_maps_chain() -> None:
     """Two black-outs: each new map is linked with the one before it, and all frames end in one true trajectory."""
     covered = frozenset((*range(35, 50), *range(100, 114)))
-    world = PointWorld(cloud(), hand_held(139), covered=covered)
+    world = PointWorld(cloud(600), hand_held(139), covered=covered)
     system = system_in(world, recovery={"enabled": True})
     for frame in world.frames():
         system.step(frame)
@@ -200,7 +200,7 @@ def test_a_sequence_that_is_read_backwards_is_linked_where_its_old_map_is_health
 
 
 def test_what_a_walk_may_ask_for_about_a_loss_is_foreseen() -> None:
-    world, foreseen = PointWorld(cloud(), hand_held(55), covered=COVERED), list[int]()
+    world, foreseen = PointWorld(cloud(600), hand_held(55), covered=COVERED), list[int]()
     system = system_in(world, recovery={"enabled": True})
     parts = system._state.parts
 
@@ -224,7 +224,7 @@ def test_a_walk_ends_at_a_tear_and_leaves_nothing_beyond_it(monkeypatch: pytest.
         return LinkRefusal(FailureReason.DEFORMED, "the new map is torn", torn_at=max(COVERED) + 1, walk_sigma=np.inf)
 
     monkeypatch.setattr("dualslam.recovery.reverse_tracking.estimate_link", torn)
-    world = PointWorld(cloud(), hand_held(60), covered=COVERED)
+    world = PointWorld(cloud(600), hand_held(60), covered=COVERED)
     system = system_in(world, recovery={"enabled": True, "retry_keyframes": []})
     for frame in world.frames():
         system.step(frame)

@@ -152,7 +152,7 @@ class TestFramesBeforeTheStart:
         assert_right(system, world, range(N_BEHIND, N_BEHIND + N_SWEEP))
 
     def test_nothing_is_tried_again_where_all_frames_have_a_pose(self) -> None:
-        world = PointWorld(cloud(), hand_held(50))
+        world = PointWorld(cloud(600), hand_held(50))
         system, watched = watched_system(world, retry_keyframes=[2, 3, 4, 5, 6])
         for frame in world.frames():
             system.step(frame)
@@ -308,7 +308,7 @@ class TestSchedule:
 def test_a_walk_reads_no_frame_that_is_older_than_the_lost_map() -> None:
     """The lost map has rolled over: older frames are another's, and no link can come of them."""
     covered = frozenset(range(100, 115))
-    world = PointWorld(cloud(), hand_held(130), covered=covered)
+    world = PointWorld(cloud(600), hand_held(130), covered=covered)
     settings = {
         "recovery": {"attempts": ["live"]},
         "graph": {"max_keyframes": 20, "rollover_keyframes": 6},

@@ -142,7 +142,9 @@ def test_all_frames_are_posed_and_right(plain: System, world: PointWorld) -> Non
 def test_the_frames_before_the_start_are_posed_in_reverse() -> None:
     """The camera stands still first: the start comes late, and none of the frames before it is lost."""
     still = np.repeat(np.eye(4)[None], 15, 0)
-    world = PointWorld(cloud(600), np.concatenate([still, path(25, np.array([0.08, 0, 0.02]), np.array([0, -0.005, 0]))]))
+    world = PointWorld(
+        cloud(600), np.concatenate([still, path(25, np.array([0.08, 0, 0.02]), np.array([0, -0.005, 0]))])
+    )
     system = system_in(world)
     results = [system.step(frame) for frame in world.frames()]
     assert all(r.status is FrameStatus.INITIALISING and r.T_submap_cam is None for r in results[:15])

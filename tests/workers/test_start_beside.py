@@ -39,7 +39,7 @@ def beside(world: PointWorld, polls: int) -> tuple[System, LateDesk]:
 
 @pytest.fixture(scope="module")
 def world() -> PointWorld:
-    return PointWorld(cloud(), hand_held(N))
+    return PointWorld(cloud(600), hand_held(N))
 
 
 @pytest.mark.parametrize("polls", [0, 1, 6])

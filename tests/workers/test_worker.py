@@ -33,7 +33,7 @@ PATIENCE_S = 120.0  # of the test, on a busy machine
 @pytest.fixture(scope="module")
 def job() -> RecoveryJob:
     """Reverse tracking that ends with a link."""
-    world = PointWorld(cloud(), hand_held(60), covered=COVERED)
+    world = PointWorld(cloud(600), hand_held(60), covered=COVERED)
     system = system_in(world, recovery={"enabled": True})
     kept = replace_walks(system, lambda _: KeptWalks())
     for frame in world.frames():
@@ -171,7 +171,7 @@ def test_the_end_of_a_run_waits_so_long_and_no_longer(job: RecoveryJob) -> None:
 
 @pytest.mark.slow
 def test_a_system_with_a_worker_ends_in_one_map() -> None:
-    world = PointWorld(cloud(), hand_held(70), covered=COVERED)
+    world = PointWorld(cloud(600), hand_held(70), covered=COVERED)
     settings = {"enabled": True, "workers": 1, "finish_wait_s": PATIENCE_S}
     system = system_in(world, recovery=settings)
     for frame in world.frames():
