@@ -92,7 +92,7 @@ def assert_one_right_map(system: System, world: PointWorld, missing: frozenset[i
 
 @pytest.fixture(scope="module")
 def world() -> PointWorld:
-    return PointWorld(cloud(), hand_held(N), covered=COVERED)
+    return PointWorld(cloud(600), hand_held(N), covered=COVERED)
 
 
 @pytest.mark.parametrize("polls", first_of([12, 1, 20]))
@@ -110,7 +110,7 @@ def test_the_live_map_has_grown_meanwhile(world: PointWorld, polls: int) -> None
 
 @pytest.mark.slow
 def test_the_live_map_has_rolled_over_meanwhile() -> None:
-    world = PointWorld(cloud(), hand_held(97), covered=COVERED)
+    world = PointWorld(cloud(600), hand_held(97), covered=COVERED)
     settings = {
         "graph": {"max_keyframes": 20, "rollover_keyframes": 6},
         "keyframes": {"max_parallax_deg": 0.6},
@@ -127,7 +127,7 @@ DENSE = {"keyframes": {"max_parallax_deg": 2.0}, "mapping": {"redundant_ratio": 
 
 @pytest.fixture(scope="module")
 def twice_lost() -> PointWorld:
-    return PointWorld(cloud(), hand_held(107), covered=COVERED | frozenset(range(55, 67)))
+    return PointWorld(cloud(600), hand_held(107), covered=COVERED | frozenset(range(55, 67)))
 
 
 @pytest.mark.slow
@@ -369,7 +369,7 @@ def test_any_schedule_leaves_a_consistent_atlas(seed: int) -> None:
         length = int(rng.integers(9, 16))
         covered |= set(range(at, at + length))
         at += length + int(rng.integers(8, 40))
-    world = PointWorld(cloud(), hand_held(n), covered=frozenset(covered), seed=seed)
+    world = PointWorld(cloud(600), hand_held(n), covered=frozenset(covered), seed=seed)
     system = system_in(world, recovery={"enabled": True}, graph={"max_keyframes": 20, "rollover_keyframes": 6}, **DENSE)
     replace_walks(system, lambda inner: UnsteadyExecutor(inner, seed))
     for frame in world.frames():
