@@ -42,7 +42,7 @@ class CameraConfig(StrictModel):
     calibrations and rectified data sets are off by half a pixel to a pixel towards the rim of the image."""
     readout_s: float | None = Field(None, ge=-0.1, le=0.1)
     """Time between reading the first and the last row of an image. 0 for a global shutter, about 0.03 for webcams and
-    the first Kinect, negative for images turned upside down, whose last row was read first. None: it is estimated from
+    the first Kinect, negative for images turned upside down, whose last row was read first. null: it is estimated from
     frames without a map. If the shutter probably rolls, no map starts from a fast turn until then."""
     find_still_pixels: bool = True
     """Find pixels that stand still in the image while the rest moves (a bonnet, black bars, a logo), and leave them
