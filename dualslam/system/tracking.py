@@ -13,7 +13,7 @@ from dualslam.core.errors import SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Seeker, VisualOdometry
 from dualslam.core.support import support_gates
-from dualslam.core.types import Failure, FailureReason, Track, View
+from dualslam.core.types import Failure, FailureReason, FrameMethod, Track, View
 from dualslam.map.frame_observations import FrameObservations
 from dualslam.system.camera.turns import with_turn_of_poses
 from dualslam.system.places import PlaceKeeping
@@ -66,8 +66,9 @@ class Tracking:
         seen = None if state.localises else FrameObservations.of(track.view.features, track.landmark_ids, submap.id)
         state.record.pose(pose, track.n_matches, track.n_inliers, seen, track.method)
         self._last_pose = pose
-        with state.record.timer.measure("audit of images"):
-            state.audit.take(submap, track)
+        if track.method is not FrameMethod.DIRECT:  # a pixel matcher has compared the images, and knows their blur
+            with state.record.timer.measure("audit of images"):
+                state.audit.take(submap, track)
         return track
 
     def _keyframe_due(self, odometry: VisualOdometry, track: Track) -> bool:
