@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from dualslam.atlas.trajectory import FramePose, Path
-from dualslam.core.config.settings import Config
+from dualslam.core.config.settings import Config, HealthConfig
 from dualslam.core.decisions import Gate
 from dualslam.core.errors import SolverError
 from dualslam.core.estimates import KeyframeReport, PreferredCamera
@@ -54,7 +54,6 @@ log = logging.getLogger(__name__)
 RELINK = "again"
 """Instead of an attempt's name: the link is measured again, without reverse tracking."""
 
-Judge = Callable[[Track | Failure], Track | Failure]
 Outcome = TypeVar("Outcome")
 Steps = Generator[WalkNews | None, bool | None, Outcome]
 """Yields at each step how far the walk has come, and is sent whether its time is over."""
@@ -227,8 +226,7 @@ def _make_attempt(
     views = job.views if job.lost else _there_and_back(job.views, progress)
     unsure_of: int | None = None  # the lost map with which a link would be, but for a loose scale
     trace = WalkTrace(submap.id, attempt.name, job.newest_id, submap.T_submap_kf[job.newest_id][:3, 3])
-    judge = partial(judge_track, config=parts.config.health)
-    for step in track_in_reverse(reverse_tracker, views, judge, relinker.keyframe_ids, max_gap_frames):
+    for step in track_in_reverse(reverse_tracker, views, parts.config.health, relinker.keyframe_ids, max_gap_frames):
         trace.note(step.view, step.track)
         progress.out_of_time = bool((yield trace.news()))
         if progress.out_of_time:
@@ -435,7 +433,11 @@ class ReverseStep:
 
 
 def track_in_reverse(
-    reverse_tracker: VisualOdometry, views: Iterable[View], judge: Judge, keyframe_ids: set[int], max_gap_frames: int
+    reverse_tracker: VisualOdometry,
+    views: Iterable[View],
+    health: HealthConfig,
+    keyframe_ids: set[int],
+    max_gap_frames: int,
 ) -> Iterator[ReverseStep]:
     """Pose frames one after the other in the order given, and extend the walker's submap by keyframes.
 
@@ -445,8 +447,8 @@ def track_in_reverse(
         Started at a keyframe of its submap.
     views : iterable of View
         Latest first.
-    judge : callable
-        The health verdict on a track.
+    health : HealthConfig
+        By which a track is taken for sound.
     keyframe_ids : set of int
         Frames that become keyframes in any case: those that were keyframes of an older submap.
     max_gap_frames : int
@@ -455,7 +457,8 @@ def track_in_reverse(
     n_failed = 0
     for view in views:
         try:
-            step = _track_one(reverse_tracker, view, judge(reverse_tracker.track(view)), view.index in keyframe_ids)
+            track = judge_track(reverse_tracker.track(view), health)
+            step = _track_one(reverse_tracker, view, track, view.index in keyframe_ids)
         except SolverError as error:
             log.warning("reverse tracking ends: %s", error)
             yield ReverseStep(view, Failure(FailureReason.SOLVER, str(error)), None)

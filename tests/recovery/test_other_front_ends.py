@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from dualslam.core.types import Features
-from dualslam.frontends.features.sift import SiftFrontend
-from dualslam.frontends.registry import BUILT_IN
 from dualslam.io.map_files import load_submap, save_submap
 from dualslam.run.results import trajectories_of
 from dualslam.system.system import System
@@ -56,16 +54,13 @@ def projected(features: Features, length: int) -> np.ndarray:
 @pytest.fixture(scope="module", params=[pytest.param(name, marks=pytest.mark.slow) for name in ("sift", "patches")])
 def recovered(request: pytest.FixtureRequest) -> tuple[System, PointWorld]:
     """A run through a black-out, live features and recovery on the front end of that name."""
-    world_of, module = {"sift": (SiftWorld, SiftFrontend), "patches": (PatchWorld, PatchFrontend)}[request.param]
+    patches = f"{PatchFrontend.__module__}:{PatchFrontend.__name__}"
+    world_of, name = {"sift": (SiftWorld, "sift"), "patches": (PatchWorld, patches)}[request.param]
     world = world_of(cloud(), hand_held(70), covered=COVERED)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "dualslam.frontends.registry.BUILT_IN", {**BUILT_IN, "patches": f"{module.__module__}:{module.__name__}"}
-        )
-        system = system_in(world, recovery={"enabled": True}, frontend={"name": request.param})
-        for frame in world.frames():
-            system.step(frame)
-        system.finish()
+    system = system_in(world, recovery={"enabled": True}, frontend={"name": name})
+    for frame in world.frames():
+        system.step(frame)
+    system.finish()
     return system, world
 
 
