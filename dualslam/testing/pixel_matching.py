@@ -27,7 +27,7 @@ from dualslam.core.interfaces import PixelMatcher
 from dualslam.core.pixels import PixelMatches, PosedImage
 from dualslam.core.types import FloatArray
 from dualslam.frontends.conformance.scene import PrintedPlane, transfer
-from dualslam.frontends.conformance.subject import NotConforming, expect
+from dualslam.frontends.conformance.subject import NotConforming, expect, run_checks
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.registry import PixelMatcherFactory
 
@@ -151,11 +151,4 @@ def check_matcher(factory: PixelMatcherFactory) -> None:
     NotConforming
         Says everything that is wrong, one line for each check.
     """
-    problems = []
-    for check in CHECKS:
-        try:
-            check(factory)
-        except Exception as error:
-            problems.append(f"{check.__name__}: {' '.join(str(error).split())}")
-    if problems:
-        raise NotConforming(f"{len(problems)} of {len(CHECKS)} checks failed\n" + "\n".join(problems))
+    run_checks(CHECKS, factory)

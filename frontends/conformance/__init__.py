@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from dualslam.frontends.conformance import features, matching
-from dualslam.frontends.conformance.subject import NotConforming, Subject
+from dualslam.frontends.conformance.subject import NotConforming, Subject, run_checks
 from dualslam.frontends.registry import FrontendFactory
 
 __all__ = ["CHECKS", "NotConforming", "Subject", "check_frontend"]
@@ -43,19 +43,4 @@ def check_frontend(factory: FrontendFactory, options: Mapping[str, Any] | None =
     NotConforming
         Says everything that is wrong, one line for each check; whatever the front end raises is wrong, too.
     """
-    subject = Subject(factory, options or {})
-    problems = []
-    for check in CHECKS:
-        try:
-            check(subject)
-        except NotConforming as problem:
-            problems.append(f"{check.__name__}: {problem}")
-        except Exception as error:  # theirs, whatever it is: the other checks have more to tell
-            problems.append(f"{check.__name__}: {_kind(error)}: {' '.join(str(error).split())}")
-    if problems:
-        raise NotConforming(f"{len(problems)} of {len(CHECKS)} checks failed\n" + "\n".join(problems))
-
-
-def _kind(error: Exception) -> str:
-    kind = type(error)
-    return kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__name__}"
+    run_checks(CHECKS, Subject(factory, options or {}))

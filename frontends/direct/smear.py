@@ -44,9 +44,9 @@ N_ANGLES = 8
 
 
 def smears(width_px: int) -> list[Smear]:
-    """Return no smear, and those that are tried in an image so wide."""
+    """Return the smears that are tried in an image so wide."""
     angles = np.arange(N_ANGLES) * np.pi / N_ANGLES
-    return [SHARP, *(Smear(float(a), n * width_px / 640) for n in LENGTHS_PX for a in angles)]
+    return [Smear(float(a), n * width_px / 640) for n in LENGTHS_PX for a in angles]
 
 
 def _line(angle_rad: float, length_px: float) -> NDArray[np.float32] | None:
