@@ -18,7 +18,7 @@ limit_threads()
 import numpy as np
 
 from dualslam.build.parts import measurement_sources, metric_parts
-from dualslam.core.config.files import load_config
+from dualslam.core.config.files import load_run_config
 from dualslam.core.geometry import sim3
 from dualslam.core.geometry.umeyama import umeyama
 from dualslam.core.metric_problem import RowSource
@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=100)
     args = parser.parse_args()
     stored, truth = read_stored(args.run), read_tum(args.run / "groundtruth.txt")
-    parts = metric_parts(load_config(args.run / "config.yaml"))
+    parts = metric_parts(load_run_config(args.run))
     print("case           RMSE m med / max   after SE(3) m   scale %   rejected   NEES (3)   in 95 % band")
     for case in CASES:
         rows = []

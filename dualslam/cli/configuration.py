@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dualslam.core.config import strict_yaml
-from dualslam.core.config.files import CONFIG, Override, load_config
+from dualslam.core.config.files import Override, load_config, load_run_config
 from dualslam.core.config.settings import Config
 from dualslam.core.errors import ConfigError, InputError
 from dualslam.core.schedule import SCHEDULE, Recorded
@@ -28,8 +28,10 @@ def config_of(args: argparse.Namespace) -> Config:
         take_selection(args)
         args.overrides = _overrides(args)
         replay: Path | None = getattr(args, "replay", None)
-        file = replay / CONFIG if args.config is None and replay is not None else args.config
-        args.resolved = load_config(file, args.overrides)
+        if args.config is None and replay is not None:
+            args.resolved = load_run_config(replay, args.overrides)
+        else:
+            args.resolved = load_config(args.config, args.overrides)
     config: Config = args.resolved
     return config
 

@@ -7,7 +7,7 @@ import argparse
 import numpy as np
 
 from dualslam.build.parts import measurement_sources, metric_parts
-from dualslam.core.config.files import CONFIG, load_config
+from dualslam.core.config.files import load_run_config
 from dualslam.core.errors import InputError
 from dualslam.io.export.exported_map import read_stored
 from dualslam.io.metric_files import TRAJECTORY_METRIC
@@ -21,7 +21,7 @@ def execute(args: argparse.Namespace) -> int:
     times_s = np.array([row.timestamp_s for row in read_frames(args.run / FRAMES)])
     sources = measurement_sources(read_rows(args.measurements, args.sigma, args.clock_offset, times_s))
     stored = read_stored(args.run)
-    parts = metric_parts(load_config(args.run / CONFIG))
+    parts = metric_parts(load_run_config(args.run))
     measured = measure(stored.atlas, stored.poses, stored.main, sources, parts)
     if measured.undone:
         pairs = ", ".join(f"{link.a} and {link.b}" for link in measured.undone)

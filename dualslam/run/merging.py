@@ -11,7 +11,7 @@ from typing import Any
 from dualslam.atlas.renumbering import bring_to_pixels, renumbered
 from dualslam.build import build_system, create_frontend
 from dualslam.core.camera.mapped import own_camera
-from dualslam.core.config.files import CONFIG, load_config
+from dualslam.core.config.files import load_run_config
 from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
@@ -53,7 +53,7 @@ class _Run:
 
     @classmethod
     def read(cls, path: Path) -> _Run:
-        config, stored = load_config(path / CONFIG), read_stored(path)
+        config, stored = load_run_config(path), read_stored(path)
         numbers = read_numbers(path)
         rows = [replace(row, index=numbers[row.index]) for row in read_frames(path / FRAMES)]
         return cls(path, config, stored, rows, read_summary(path))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -14,7 +15,9 @@ from pydantic import BaseModel, ValidationError
 from dualslam.core.config import strict_yaml
 from dualslam.core.config.problems import kind, sentence
 from dualslam.core.config.settings import Config
-from dualslam.core.errors import ConfigError
+from dualslam.core.errors import ConfigError, written
+
+log = logging.getLogger(__name__)
 
 CONFIG = "config.yaml"
 """In a run folder: the run's configuration."""
@@ -88,6 +91,42 @@ def load_config(path: str | Path | None = None, overrides: Iterable[str | Overri
     for override in parsed:
         _set(data, override)
     return _validate(data, str(path) if path is not None else "config", parsed, Config)
+
+
+def load_run_config(folder: str | Path, overrides: Iterable[str | Override] = ()) -> Config:
+    """Make the configuration of a run folder, which an earlier version may have written.
+
+    Fields that this version does not have are left out; a warning names them.
+
+    Raises
+    ------
+    ConfigError
+        As of `load_config`, for all else.
+    """
+    path = Path(folder) / CONFIG
+    data = _read(path)
+    gone = _unknown_fields(data)
+    for *sections, field in gone:
+        owner: Any = data
+        for section in sections:
+            owner = owner[section]
+        del owner[field]
+    if gone:
+        log.warning("%s: this version of dualslam has no %s; left out", path, ", ".join(map(written, gone)))
+    parsed = [Override.parse(o) if isinstance(o, str) else o for o in overrides]
+    for override in parsed:
+        _set(data, override)
+    return _validate(data, str(path), parsed, Config)
+
+
+def _unknown_fields(data: dict[str, Any]) -> list[tuple[int | str, ...]]:
+    try:
+        Config.model_validate_json(json.dumps(data), strict=True)
+    except ValidationError as error:
+        return [tuple(e["loc"]) for e in error.errors(include_url=False) if e["type"] == "extra_forbidden"]
+    except TypeError:  # `_validate` words it
+        pass
+    return []
 
 
 def config_from_dict(data: Mapping[str, Any], source: str = "config") -> Config:

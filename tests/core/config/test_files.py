@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dualslam.core.config import strict_yaml
-from dualslam.core.config.files import Override, config_from_dict, dump_config, load_config
+from dualslam.core.config.files import Override, config_from_dict, dump_config, load_config, load_run_config
 from dualslam.core.config.settings import Config, Corruption, GraphConfig
 from dualslam.core.errors import ConfigError
 
@@ -234,3 +234,21 @@ def test_sections_made_in_python_are_as_those_of_a_file() -> None:
     assert Config().model_copy(update={"recovery": {"enabled": False}}).recovery.enabled is False
     with pytest.raises(ConfigError, match="seed must be a whole number"):
         config_from_dict({"seed": "5"})  # in Python, too, a file's strictness for what could stand in a file
+
+
+def test_fields_of_an_earlier_version_are_left_out_of_a_run_folder_alone(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text("seed: 7\nold_section: {a: 1}\ngraph: {robust_k: 2.0, old_knob: 3}\n")
+    config = load_run_config(tmp_path, ["graph.robust_k=1.5"])
+    assert (config.seed, config.graph.robust_k) == (7, 1.5)
+    (warning,) = caplog.messages
+    assert "old_section" in warning
+    assert "graph.old_knob" in warning
+    assert "unknown field" in error_of(path=file)
+    with pytest.raises(ConfigError, match=r"unknown field graph\.old_knob"):  # a person's own, not the file's
+        load_run_config(tmp_path, ["graph.old_knob=1"])
+    file.write_text("seed: word\nold_section: 1\n")
+    with pytest.raises(ConfigError, match="seed must be a whole number"):
+        load_run_config(tmp_path)
