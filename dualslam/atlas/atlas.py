@@ -159,17 +159,16 @@ class Atlas:
         """The links that join something."""
         return [link for link in self.links if not link.rejected]
 
-    def components(self) -> list[list[int]]:
-        """Return the linked sets of submaps, each ascending, in order of their first submap."""
-        return joined(self.submaps, self.believed)
+    def components(self, sure: bool = False) -> list[list[int]]:
+        """Return the linked sets of submaps, each ascending, in order of their first submap.
 
-    def sure_sets(self) -> list[list[int]]:
-        """Return the sets of submaps that are linked by connections whose scale may be relied on."""
-        return joined(self.submaps, [link for link in self.believed if link.is_sure])
+        `sure`: linked by connections whose scale may be relied on.
+        """
+        return joined(self.submaps, [link for link in self.believed if link.is_sure or not sure])
 
-    def component_of(self, submap_id: int) -> list[int]:
-        """Return the linked set of a submap, ascending."""
-        return next(component for component in self.components() if submap_id in component)
+    def component_of(self, submap_id: int, sure: bool = False) -> list[int]:
+        """Return the linked set of a submap, ascending; `sure`: as for `components`."""
+        return next(component for component in self.components(sure) if submap_id in component)
 
     def S_world_submap(self, component: list[int]) -> dict[int, FloatArray]:
         """Return the transform of each submap of a linked set into the frame of its first one.

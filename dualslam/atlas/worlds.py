@@ -48,11 +48,10 @@ class Worlds:
         same = len(state) == len(self._made_from) and all(map(lambda a, b: a is b, state, self._made_from))
         if not same:
             self._made_from, self._found, self._sure = state, {}, set()
-            sure_sets = atlas.sure_sets()
             for component in atlas.components():
                 S_first = atlas.S_world_submap(component)
                 world = self._saved if self._saved in S_first else None
                 S = S_first if world is None else {m: sim3.inverse(S_first[world]) @ S_first[m] for m in component}
                 world = component[0] if world is None else world
                 self._found |= {m: (S[m], world) for m in component}
-                self._sure |= next(set(sure) for sure in sure_sets if world in sure)
+                self._sure.update(atlas.component_of(world, sure=True))

@@ -25,8 +25,8 @@ from dualslam.frontends.tracking.visual import VisualFrontEnd
 from dualslam.linking import DescriptorMatcher
 from dualslam.linking.gates import DESCRIPTOR_RADIUS_PX
 from dualslam.map.submap import Submap
+from dualslam.recovery.attempts import Attempt, RecoveryParts
 from dualslam.recovery.job import RecoveryJob
-from dualslam.recovery.reverse_tracking import Attempt, RecoveryParts
 
 FEATURE_THREADS = 2
 """That find other front ends' features beside reverse tracking, where the tracking waits for it."""

@@ -22,7 +22,8 @@ from dualslam.map.graph_beside import GraphServer
 from dualslam.map.lens import CalibrationAnswer, CalibrationJob, answer
 from dualslam.places import PlaceVerifier
 from dualslam.places.search import search_places
-from dualslam.recovery.reverse_tracking import RecoveryParts, recover_in_steps
+from dualslam.recovery.attempts import RecoveryParts
+from dualslam.recovery.reverse_tracking import recover_in_steps
 from dualslam.recovery.scale_watch import SCALE_HANDLERS
 from dualslam.workers.desk import Lane, WorkerDesk
 from dualslam.workers.features_beside import FeaturesBeside

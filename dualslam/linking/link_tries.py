@@ -33,13 +33,9 @@ class LinkTries:
 
     def copy(self) -> LinkTries:
         """Return tries that go on by themselves."""
-        copied = LinkTries()
-        copied.restore(self)
+        copied = LinkTries(self.refused)
+        copied._held = set(self._held)
         return copied
-
-    def restore(self, other: LinkTries) -> None:
-        """Know what `other` does, and no more."""
-        self.refused, self._held = Counter(other.refused), set(other._held)
 
     def take_in(self, old_id: int, before: LinkTries, after: LinkTries) -> None:
         """Add what a walk has tried at one lost map: it knew `before`, and knows `after` now."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from dualslam.atlas.trajectory import FramePose, Path
@@ -123,6 +124,8 @@ class RecoveryResult:
         The job's, with the tries of this walk.
     relinked : tuple of FoundLink
         The links with `joined` submaps, measured again.
+    failure : Failure or None
+        Why no walk was made, or why its result is lost: then there is nothing to take over.
     """
 
     submap: Submap
@@ -135,6 +138,26 @@ class RecoveryResult:
     needs_camera: bool = False
     tries: LinkTries = field(default_factory=LinkTries)
     relinked: tuple[FoundLink, ...] = ()
+    failure: Failure | None = None
+
+    @classmethod
+    def of(cls, job: RecoveryJob, outcome: RecoveryResult | Failure) -> RecoveryResult:
+        """Return the result of a job, an empty one where the job has failed."""
+        if not isinstance(outcome, Failure):
+            return outcome
+        return cls(job.submap, (), None, (), 0.0, 0.0, tries=job.tries, failure=outcome)
+
+    def apart_from(self, submap_ids: Collection[int]) -> RecoveryResult:
+        """Return the result without links to some submaps."""
+        link = None if self.link is None or self.link.old_id in submap_ids else self.link
+        return replace(self, link=link, relinked=tuple(k for k in self.relinked if k.old_id not in submap_ids))
+
+
+def path_of(submap: Submap, frames: Iterable[RecoveredFrame], own: Iterable[FramePose]) -> Path:
+    """Return the path of what reverse tracking has posed in a submap, and of the frames that it set out from."""
+    walked = {frame.pose.index: frame.pose for frame in frames}
+    before = [pose for pose in own if pose.index not in walked and pose.keyframe_id in submap.keyframes]
+    return Path.of([*before, *walked.values()], submap)
 
 
 def refusal_data(attempt: str, old_id: int, why: Failure, **known: Any) -> dict[str, Any]:

@@ -33,7 +33,7 @@ from dualslam.map.submap_change import change_of_frame
 from dualslam.recovery.bypass import absorb, n_frames, pose_frames
 from dualslam.recovery.frame_buffer import FrameBuffer
 from dualslam.recovery.fusion import fuse, gauge_at_overlap, note_refused, tighten
-from dualslam.recovery.job import FoundLink, RecoveryJob, RecoveryResult
+from dualslam.recovery.job import FoundLink, RecoveryJob, RecoveryResult, path_of
 from dualslam.recovery.merge import merge_recovery
 from dualslam.recovery.schedule import RetrySchedule, as_far_as_it_leads, way_to_gaps
 
@@ -129,7 +129,7 @@ class Recoveries:
 
     def settle(self, live: VisualOdometry) -> None:
         """Let no walk look any more for what has become one map with the live one."""
-        settled = self._surely_joined(live.submap.id)
+        settled = self._record.atlas.component_of(live.submap.id, sure=True)
         self._lost = {m: loss for m, loss in self._lost.items() if m not in settled}
 
     def start(self, submap: Submap, newest: View, now: FrameStamp | None = None) -> None:
@@ -243,56 +243,46 @@ class Recoveries:
     def _take(self, answers: Iterable[Ended], live: VisualOdometry | None, now: FrameStamp) -> None:
         for ended in answers:
             job: RecoveryJob = ended.work
-            result: RecoveryResult | Failure = ended.result
             walk = self._under_way.pop(job.submap.id)
-            if isinstance(result, Failure):
-                self._failed(job, now, result, time.perf_counter() - walk.began_s)
-            else:
+            result = RecoveryResult.of(job, ended.result).apart_from(walk.gone_on)
+            self._note_events(result)
+            if result.failure is None:
                 self._record.timer.add("walk back", result.cpu_s)
                 for lost in job.onsets:
                     self._tries.take_in(lost, job.tries, result.tries)
-                if result.link is not None and result.link.old_id in walk.gone_on:
-                    result = replace(result, link=None)
-                relinked = [found for found in result.relinked if found.old_id not in walk.gone_on]
-                result = replace(result, relinked=tuple(relinked))
-            if walk.again and not job.lost and not self._poses_any(result):
+            else:
+                self._failed(job, now, result.failure, time.perf_counter() - walk.began_s)
+            poses_any = any(frame.pose.index not in self._record.poses for frame in result.frames)
+            if walk.again and not job.lost and not poses_any:
                 # The last one for these frames; what it would add to the map is not worth a solution.
                 self._tighten(job, result, walk, live, now)
                 continue
-            link = None if isinstance(result, Failure) else result.link
-            if not isinstance(result, Failure) and link and (refused := self._refuse_motion(result, link)) is not None:
-                self._note_events(result)
+            link = result.link
+            if link is not None and (refused := self._refuse_motion(result, link)) is not None:
                 self._note_refused(link, job, refused, now)
                 self._failed(job, now, refused, time.perf_counter() - walk.began_s)
                 self._retries.leave_open(job.submap.id, walk.n_live, job.camera)  # grown, it knows its velocity better
                 continue
-            if not isinstance(result, Failure):
+            if result.failure is None:
                 with self._record.timer.measure("merging"):
                     self._take_in(job, result, live, now, walk.began_s)
             self._tighten(job, result, walk, live, now)
             unlinked = bool(job.lost) and (link is None or link.old_id in self._lost)
-            if not isinstance(result, Failure) and result.looks_alike:
+            if result.looks_alike:
                 continue
             if unlinked or self._way_to_gaps(self._record.atlas.submaps[job.submap.id]):
-                needs_camera = not isinstance(result, Failure) and result.needs_camera
-                self._retries.leave_open(job.submap.id, walk.n_live, job.camera, needs_camera)
+                self._retries.leave_open(job.submap.id, walk.n_live, job.camera, result.needs_camera)
 
     def _tighten(
-        self,
-        job: RecoveryJob,
-        result: RecoveryResult | Failure,
-        walk: _UnderWay,
-        live: VisualOdometry | None,
-        now: FrameStamp,
+        self, job: RecoveryJob, result: RecoveryResult, walk: _UnderWay, live: VisualOdometry | None, now: FrameStamp
     ) -> None:
         """Replace links that were too loose by what they were measured to be again; those that still are wait on."""
-        if isinstance(result, RecoveryResult):
-            for found in result.relinked:
-                if (refused := self._refuse_motion(result, found)) is not None:
-                    self._note_refused(found, job, refused, now)
-                else:
-                    tighten(self._record, self._connections, job, found, result.submap, now)
-                    self._settle(found.old_id, job.submap.id, live)
+        for found in result.relinked:
+            if (refused := self._refuse_motion(result, found)) is not None:
+                self._note_refused(found, job, refused, now)
+            else:
+                tighten(self._record, self._connections, job, found, result.submap, now)
+                self._settle(found.old_id, job.submap.id, live)
         if self._joined_loosely(job.submap.id):
             self._retries.leave_open(job.submap.id, walk.n_live, job.camera)
 
@@ -306,7 +296,8 @@ class Recoveries:
         Across the gaps that reverse tracking has crossed, and where the new map follows on the old one.
         """
         link = found.estimate
-        path = self._path_of(result)
+        own = (pose for pose in self._record.own_poses() if pose.submap_id == result.submap.id)
+        path = path_of(result.submap, result.frames, own)
         known = self._path_in(found.old_id).moved(sim3.inverse(link.S_old_new))
         newest = int(link.agreeing_keyframes[-1])
         old, new = known.take(known.index <= newest), path.take(path.index > newest)
@@ -320,13 +311,6 @@ class Recoveries:
         gaps = step_motions(path, gaps_of(path.times_s), known)
         return judge_motion(chain(gaps, seam_motions(old, new, slack))).refusal()
 
-    def _path_of(self, result: RecoveryResult) -> Path:
-        """Return the path of what reverse tracking has posed, and of the frames that it set out from."""
-        walked = {frame.pose.index: frame.pose for frame in result.frames}
-        own = [p for p in self._record.own_poses() if p.submap_id == result.submap.id and p.index not in walked]
-        own = [pose for pose in own if pose.keyframe_id in result.submap.keyframes]
-        return Path.of([*own, *walked.values()], result.submap)
-
     def _note_events(self, result: RecoveryResult) -> None:
         """Take over the events of a walk's attempts; each attempt says what was known of the loss, too."""
         told = self._circumstances.get(result.submap.id, {})
@@ -337,12 +321,6 @@ class Recoveries:
             data = event.data | (told if event.event is EventKind.RECOVERY_ATTEMPT else {})
             at = event.frame, event.timestamp_s, event.submap
             self._record.events.add(event.event, *at, event.gates, **data)
-
-    def _poses_any(self, result: RecoveryResult | Failure) -> bool:
-        """Whether a walk has found a pose for a frame that has none."""
-        if isinstance(result, Failure):
-            return False
-        return any(frame.pose.index not in self._record.poses for frame in result.frames)
 
     def _views_before(self, newest: View, submap: Submap, lost: Collection[int]) -> list[View]:
         """Return the buffered frames before a keyframe, the latest first: as far back as a lost map has seen any.
@@ -399,7 +377,6 @@ class Recoveries:
             if front_end.submap is submap:
                 front_end.adopt(graph, before)
         self._connections.follow(before, submap, now)
-        self._note_events(result)
         recovered_frames = pose_frames(self._record, result.frames, merged, submap, change)
         seconds = time.perf_counter() - started_s
         linked = False
@@ -436,14 +413,10 @@ class Recoveries:
 
     def _settle(self, old_id: int, new_id: int, live: VisualOdometry | None) -> None:
         """Let no walk look any more for a submap that is linked, nor for what is one map with the live one."""
-        if old_id in self._surely_joined(new_id):
+        if old_id in self._record.atlas.component_of(new_id, sure=True):
             self._lost.pop(old_id, None)
         if live is not None:
             self.settle(live)
-
-    def _surely_joined(self, submap_id: int) -> list[int]:
-        """Return what is one map with a submap by links that may be relied on."""
-        return next(s for s in self._record.atlas.sure_sets() if submap_id in s)
 
     def _apart_from(self, submap_id: int) -> dict[int, Loss]:
         """Return the lost submaps that no link joins with a submap."""

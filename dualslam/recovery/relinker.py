@@ -1,14 +1,22 @@
-"""Link attempts of reverse tracking: when to try its submap against the lost maps, and when to stop."""
+"""Links of reverse tracking: when to try its submap against the lost maps, what confirms a link, and when to stop."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
+import numpy as np
+
+from dualslam.core.geometry import sim3
 from dualslam.core.types import Failure
-from dualslam.linking import LinkEstimate, LinkRefusal
+from dualslam.linking import LinkEstimate, LinkRefusal, check_camera, propagate_to_live_end
 from dualslam.linking.gates import TIE_WINDOW
+from dualslam.linking.rivals import choose_by_velocity
 from dualslam.map.submap import Submap
+from dualslam.recovery.attempts import RecoveryParts
+from dualslam.recovery.job import FoundLink
+from dualslam.recovery.walk import Walk
 
 MIN_SHARED_KEYFRAMES = 4
 """Keyframes that both maps must hold before a link is tried."""
@@ -110,3 +118,63 @@ class Relinker:
             return False
         self._tried_with[old_id] = n_shared
         return True
+
+
+def confirm_link(
+    walk: Walk, parts: RecoveryParts, old_id: int, result: LinkEstimate | Failure, with_doubt: bool = False
+) -> FoundLink | Failure:
+    """Return a link that holds as far as the live end, under the camera that the pixels ask for.
+
+    `with_doubt`: its scale may be too loose to be relied on.
+    """
+    doubts: list[Failure] = []
+    link = _propagate(walk, parts, result, doubts if with_doubt else None)
+    if not isinstance(link, Failure) and not doubts:
+        again = walk.tries.judge(old_id, link.sigma_scale, parts.max_scale_sigma)
+        doubts = [] if again is None else [again]
+        link = link if again is None or with_doubt else again
+    if not isinstance(link, Failure) and (rivalled := _refuse_rivalled(walk, old_id, link)) is not None:
+        link = rivalled
+    why_not = doubts[0] if doubts else link
+    if isinstance(why_not, Failure):
+        walk.tries.note_try(old_id, why_not.reason)
+    if isinstance(link, Failure):
+        return link
+    told = {"tries": walk.tries.refused[old_id] + 1.0, "rivals": float(len(walk.rivals))}
+    return FoundLink(old_id, replace(link, numbers=link.numbers | told), walk.attempt, is_sure=not doubts)
+
+
+def _propagate(
+    walk: Walk, parts: RecoveryParts, result: LinkEstimate | Failure, doubts: list[Failure] | None
+) -> LinkEstimate | Failure:
+    """Carry a link to the live end, once its camera is checked; `doubts` takes what is to be said against it."""
+
+    def held(refused: LinkEstimate | Failure) -> LinkEstimate | Failure:
+        if doubts is None or not isinstance(refused, LinkRefusal) or refused.unsure is None:
+            return refused
+        doubts.append(refused)
+        return refused.unsure
+
+    submap, newest, config = walk.submap, walk.job.newest_id, parts.config.linking
+    if isinstance(found := held(result), Failure):
+        return found
+    if isinstance(link := held(propagate_to_live_end(found, submap, newest, config)), Failure):
+        return link
+    bend = check_camera(submap, link, newest, partial(parts.find_camera, walk.job), config)
+    if isinstance(bend, Failure):
+        return bend
+    if bend.doubt is not None:
+        doubted = held(LinkRefusal(bend.doubt.reason, bend.doubt.detail, bend.doubt.numbers, unsure=link))
+        if isinstance(doubted, Failure):
+            return doubted
+    return held(propagate_to_live_end(found, submap, newest, config, bend))
+
+
+def _refuse_rivalled(walk: Walk, old_id: int, link: LinkEstimate) -> Failure | None:
+    """Return why a link over a gap is not to be believed beyond which several poses are alike."""
+    if not walk.rivals:
+        return None
+    sound = np.inf if link.suspected_onset is None else link.suspected_onset
+    known = walk.job.paths[old_id].moved(sim3.inverse(link.S_old_new))
+    walk.choice = choose_by_velocity(walk.path, known.take(known.index < sound), walk.rivals)
+    return walk.choice.refusal

@@ -224,7 +224,8 @@ def _loose_joins(system: System, trajectories: Trajectories) -> list[Reason]:
     own = trajectories.S_world_submap.keys()
     main = trajectories.main.index.tolist()
     submap_of = {i: system.poses[system.numbers.number_of(i)].submap_id for i in main}
-    frames = [[i for i in main if submap_of[i] in part] for part in system.atlas.sure_sets() if own & set(part)]
+    parts = [part for part in system.atlas.components(sure=True) if own & set(part)]
+    frames = [[i for i in main if submap_of[i] in part] for part in parts]
     beyond = sorted(i for part in sorted(frames, key=len)[:-1] for i in part)
     if not beyond:
         return []

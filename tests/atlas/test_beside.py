@@ -215,12 +215,12 @@ def test_a_loose_link_that_is_measured_again_moves_its_map_even_while_the_atlas_
     loose = replace(sure, S_a_b=sure.S_a_b @ too_large, covariance=covariance, is_sure=False)
     assert world.connections.connect([loose], world.now)
     wait(world)
-    assert world.atlas.sure_sets() == [[0, 1, 2], [3]]
+    assert world.atlas.components(sure=True) == [[0, 1, 2], [3]]
     assert world.connections.connect_later(world.loop(*CLOSED), world.now) is None
     assert world.connections.tighten(sure, world.now)
     assert not world.connections.tighten(loose, world.now)
     wait(world)
-    assert world.atlas.sure_sets() == [[0, 1, 2, 3]]
+    assert world.atlas.components(sure=True) == [[0, 1, 2, 3]]
     assert [link.kind for link in world.atlas.links].count(LinkKind.RECOVERY) == 1
     S, _ = world.relative((1, 65), (3, 65))
     off = sim3.scale(sim3.inverse(world.true_S((1, 65), (3, 65))) @ S)
