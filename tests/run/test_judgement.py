@@ -128,13 +128,25 @@ def test_a_focal_length_far_from_the_one_used_is_told(log_focal: float, level: L
     assert [reason.code for reason in verdict.reasons] == [ReasonCode.CAMERA] * (level is not Level.GOOD)
 
 
-@pytest.mark.parametrize(("log_focal", "level"), [(-0.08, Level.GOOD), (-0.2, Level.USABLE)])
+@pytest.mark.parametrize(
+    ("answers", "level"),
+    [
+        ([-0.08], Level.GOOD),
+        ([-0.2], Level.USABLE),
+        ([-0.2, -0.21], Level.USABLE),
+        ([-0.08, -0.104], Level.GOOD),  # 7-Scenes, whose calibration is off by as much
+    ],
+)
+@pytest.mark.parametrize("last", [EventKind.CALIBRATED, EventKind.CALIBRATION_KEPT])
 def test_what_was_tracked_before_a_large_correction_was_taken_over_may_be_broken(
-    log_focal: float, level: Level
+    answers: list[float], level: Level, last: EventKind
 ) -> None:
+    """What counts is by how much the camera in use was off, not the one that was given."""
     system = run(ahead())
-    told = {"log_focal": log_focal, "log_focal_sigma": 0.004, "prior_sigmas": abs(log_focal) / 0.05}
-    system.events.add(EventKind.CALIBRATED, 60, 2.0, 0, **told)
+    for n, log_focal in enumerate(answers):
+        told = {"log_focal": log_focal, "log_focal_sigma": 0.004, "prior_sigmas": abs(log_focal) / 0.05}
+        kind = last if n == len(answers) - 1 else EventKind.CALIBRATED
+        system.events.add(kind, 60 + 20 * n, 2.0 + n, 0, **told)
     assert judged(system).level is level
 
 
