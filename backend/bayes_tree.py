@@ -15,41 +15,24 @@ _EDGE = re.compile(r"^(\d+)->(\d+)$")
 
 @dataclass(frozen=True, slots=True)
 class UpdateStatistics:
-    """Effect of one step of the incremental solver.
+    """Effect of one step of the incremental solver."""
 
-    Attributes
-    ----------
-    relinearised : int
-        Variables that had moved beyond their threshold and got a new linearisation.
-    reeliminated : int
-        Variables whose conditional was computed anew.
-    """
-
-    relinearised: int
-    reeliminated: int
+    relinearised: int  # variables that had moved beyond their threshold and got a new linearisation
+    reeliminated: int  # variables whose conditional was computed anew
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BayesTree:
-    """The square-root information matrix as a tree: each clique is p(frontal variables | separator).
-
-    Attributes
-    ----------
-    parent : (C,) int64
-        Clique above each one, -1 for a root. Parents come before their children.
-    keyframes, landmarks : tuple of tuple of int
-        Frontal variables of each clique.
-    separators : tuple of tuple of int
-        Keyframes that each clique is conditioned on; they are frontal somewhere above it.
-    separator_landmarks : (C,) int64
-        How many landmarks it is conditioned on besides.
-    """
+    """The square-root information matrix as a tree: each clique is p(frontal variables | separator)."""
 
     parent: IntArray
+    """(C,): clique above each one, -1 for a root. Parents come before their children."""
+    # Frontal variables of each clique.
     keyframes: tuple[tuple[int, ...], ...]
     landmarks: tuple[tuple[int, ...], ...]
     separators: tuple[tuple[int, ...], ...]
-    separator_landmarks: IntArray
+    """Keyframes that each clique is conditioned on; they are frontal somewhere above it."""
+    separator_landmarks: IntArray  # (C,): how many landmarks it is conditioned on besides
 
     def __len__(self) -> int:
         return len(self.parent)

@@ -29,31 +29,19 @@ MAX_DROPS = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedOptimum:
-    """Where the cost is least.
-
-    Attributes
-    ----------
-    T_submap_kf : (K, 4, 4)
-        The problem's keyframes; the first stays where it was, and so does its distance from the one farthest from it.
-    correction : (5,)
-        Of the camera as it was given.
-    covariance : (5, 5)
-        Of the correction, by the Hessian, prior and all.
-    noise_ratio : float
-        Of the typical residual to its sigma.
-    cost_before, cost_after : float
-        Sum of the Huber losses, and the prior's.
-    poses_under : callable
-        From another correction (5,) to the poses (K, 4, 4) at which the cost is least, were the camera to stay there.
-    """
+    """Where the cost is least."""
 
     T_submap_kf: FloatArray
-    correction: FloatArray
-    covariance: FloatArray
-    noise_ratio: float
+    """(K, 4, 4): the problem's keyframes; the first stays where it was, and so does its distance from the one farthest
+    from it."""
+    correction: FloatArray  # (5,): of the camera as it was given
+    covariance: FloatArray  # (5, 5): of the correction, by the Hessian, prior and all
+    noise_ratio: float  # of the typical residual to its sigma
+    # Sum of the Huber losses, and the prior's.
     cost_before: float
     cost_after: float
     poses_under: Callable[[FloatArray], FloatArray]
+    """From another correction (5,) to the poses (K, 4, 4) at which the cost is least, were the camera to stay there."""
 
 
 class CorrectedLens:

@@ -39,7 +39,6 @@ def edge_covariances(
 
     Parameters
     ----------
-    submap : Submap
     pairs : sequence of (int, int)
         Keyframe ids.
     robust_k : float

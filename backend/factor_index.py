@@ -47,31 +47,20 @@ LEAVE_RATIO = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """The changes that bring a graph up to date with its submap.
+    """The changes that bring a graph up to date with its submap."""
 
-    Attributes
-    ----------
-    entering, leaving : (R,) int64
-        Observation rows that are admitted from now on, and no more.
-    adding, removing : (R,) int64
-        Rows whose factors are added, and removed: those of the admitted that are chosen (`dualslam.backend.selection`).
-    refused : (R,) int64
-        Live rows that fit so badly that they are not let in.
-    new_landmarks : (L,) int64
-    new_keyframes, gone_keyframes : (K,) int64
-    weak_keyframes : (K,) int64
-        All keyframes that the graph, as it will be, ties to fewer than `MIN_TIES` well-seen landmarks.
-    """
-
-    entering: IntArray
-    leaving: IntArray
-    adding: IntArray
-    removing: IntArray
-    refused: IntArray
-    new_landmarks: IntArray
-    new_keyframes: IntArray
-    gone_keyframes: IntArray
+    # Observation rows that are admitted from now on, and no more.
+    entering: IntArray  # (R,)
+    leaving: IntArray  # (R,)
+    # Rows whose factors are added, and removed: those of the admitted that are chosen (`dualslam.backend.selection`).
+    adding: IntArray  # (R,)
+    removing: IntArray  # (R,)
+    refused: IntArray  # (R,): live rows that fit so badly that they are not let in
+    new_landmarks: IntArray  # (L,)
+    new_keyframes: IntArray  # (K,)
+    gone_keyframes: IntArray  # (K,)
     weak_keyframes: IntArray
+    """(K,): all keyframes that the graph, as it will be, ties to fewer than `MIN_TIES` well-seen landmarks."""
 
 
 class FactorIndex:
@@ -142,7 +131,6 @@ class FactorIndex:
 
         Parameters
         ----------
-        submap : Submap
         poses : mapping of int to (4, 4)
             ``T_submap_kf`` to judge by (normally the submap's).
         xyz_mu : (L, 3)

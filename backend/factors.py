@@ -28,8 +28,6 @@ def insert_projections(
         Is appended to.
     kf, landmark : (R,) int64
     uv_px : (R, 2), sigma_px : (R,)
-    K : Cal3_S2
-    noise : PixelNoise
 
     Returns
     -------

@@ -33,7 +33,6 @@ def refine_submap(submap: Submap, robust_k: float, frames: FrameRows | None = No
 
     Parameters
     ----------
-    submap : Submap
     robust_k : float
         Huber threshold in sigmas, for landmarks whose depth is too uncertain to take part: they follow the poses.
     frames : FrameRows, optional

@@ -20,20 +20,11 @@ N_NEIGHBOURS = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gauge:
-    """The pose and the distance that are held.
-
-    Attributes
-    ----------
-    first : int
-    T_submap_first : (4, 4)
-    second : int or None
-        None where there is no other keyframe at a distance.
-    baseline_mu : float
-    """
+    """The pose and the distance that are held."""
 
     first: int
-    T_submap_first: FloatArray
-    second: int | None
+    T_submap_first: FloatArray  # (4, 4)
+    second: int | None  # none where there is no other keyframe at a distance
     baseline_mu: float
 
     def was_moved_in(self, submap: Submap) -> bool:

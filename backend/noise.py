@@ -55,10 +55,7 @@ def residual_variance(chi2: FloatArray, n_views: IntArray, least: float) -> floa
 class PixelNoise:
     """Robust isotropic pixel noise, cached by its sigma: a pyramid has a handful of them.
 
-    Parameters
-    ----------
-    robust_k : float
-        Huber threshold in sigmas.
+    `robust_k`: Huber threshold in sigmas.
     """
 
     def __init__(self, robust_k: float) -> None:

@@ -20,20 +20,11 @@ MIN_DEPTH_MU = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """How R observations fit.
+    """How R observations fit."""
 
-    Attributes
-    ----------
-    chi2 : (R,) float64
-        Squared whitened residual; infinite where the point is not in front of the camera.
-    depth_mu : (R,) float64
-        Along the optical axis.
-    xyz_cam : (R, 3) float64
-    """
-
-    chi2: FloatArray
-    depth_mu: FloatArray
-    xyz_cam: FloatArray
+    chi2: FloatArray  # (R,): squared whitened residual; infinite where the point is not in front of the camera
+    depth_mu: FloatArray  # (R,): along the optical axis
+    xyz_cam: FloatArray  # (R, 3)
 
 
 def compute_residuals(

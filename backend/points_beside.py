@@ -52,7 +52,6 @@ def triangulated_covariances(
 
     Parameters
     ----------
-    submap : Submap
     landmark_ids : (L,) int64
     rows : Table
         `FactorIndex.rows`.

@@ -18,32 +18,18 @@ READ_ALL = 0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A part of a submap's graph.
+    """A part of a submap's graph."""
 
-    Attributes
-    ----------
-    kf, lm : (R,) int64
-        Keyframe and landmark of each observation row that the graph has looked at.
-    inside : (I,) int64
-        Rows that are admitted and alive.
-    row : (N,) int64
-        Those of them by which the part is judged.
-    keyframes, landmarks : int64
-        Ids of the variables to be read.
-    in_graph : (L,) bool
-        Which landmarks are variables at all.
-    is_whole : bool
-        Everything in the graph is read.
-    """
-
-    kf: IntArray
-    lm: IntArray
-    inside: IntArray
-    row: IntArray
+    # Keyframe and landmark of each observation row that the graph has looked at.
+    kf: IntArray  # (R,)
+    lm: IntArray  # (R,)
+    inside: IntArray  # (I,): rows that are admitted and alive
+    row: IntArray  # (N,): those of them by which the part is judged
+    # Ids of the variables to be read.
     keyframes: IntArray
     landmarks: IntArray
-    in_graph: BoolArray
-    is_whole: bool
+    in_graph: BoolArray  # (L,): which landmarks are variables at all
+    is_whole: bool  # everything in the graph is read
 
 
 def choose_part(submap: Submap, index: FactorIndex, entering: IntArray, window: int, everything: bool) -> Part:

@@ -60,62 +60,39 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Optimum:
-    """Where the optimisation ended.
-
-    Attributes
-    ----------
-    state : State
-    cost_before, cost_after : float
-        Sum of the losses.
-    """
+    """Where the optimisation ended."""
 
     state: State
+    # Sum of the losses.
     cost_before: float
     cost_after: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Linear:
-    """The observations of a chunk, linearised.
+    """The observations of a chunk, linearised."""
 
-    Attributes
-    ----------
-    pose, point : (R,) int64
-        Among the free poses, -1 for a fixed one; among the chunk's points.
-    residuals : (R, 2)
-        Whitened.
-    weight : (R,)
-    J_pose : (R, 2, 6), J_point : (R, 2, 3), J_lens : (R, 2, M)
-    """
-
-    pose: IntArray
-    point: IntArray
-    residuals: FloatArray
-    weight: FloatArray
-    J_pose: FloatArray
-    J_point: FloatArray
-    J_lens: FloatArray
+    # Among the free poses, -1 for a fixed one; among the chunk's points.
+    pose: IntArray  # (R,)
+    point: IntArray  # (R,)
+    residuals: FloatArray  # (R, 2): whitened
+    weight: FloatArray  # (R,)
+    J_pose: FloatArray  # (R, 2, 6)
+    J_point: FloatArray  # (R, 2, 3)
+    J_lens: FloatArray  # (R, 2, M)
 
 
 @dataclass(slots=True, eq=False)
 class _Reduced:
-    """Normal equations without the points, in sums over the chunks.
+    """Normal equations without the points, in sums over the chunks."""
 
-    Attributes
-    ----------
-    blocks : (N, B + 1, 6, 6)
-        At [j, d]: rows of pose j + d, columns of pose j.
-    border : (N, 6, M), corner : (M, M)
-        Rows and columns of the lens.
-    g_pose : (N, 6), g_lens : (M,)
-        The gradient.
-    """
-
-    blocks: FloatArray
-    border: FloatArray
-    corner: FloatArray
-    g_pose: FloatArray
-    g_lens: FloatArray
+    blocks: FloatArray  # (N, B + 1, 6, 6): at [j, d]: rows of pose j + d, columns of pose j
+    # Rows and columns of the lens.
+    border: FloatArray  # (N, 6, M)
+    corner: FloatArray  # (M, M)
+    # The gradient.
+    g_pose: FloatArray  # (N, 6)
+    g_lens: FloatArray  # (M,)
 
 
 def geman_mcclure(chi2: FloatArray, shape: float) -> tuple[FloatArray, FloatArray]:
@@ -139,8 +116,6 @@ def optimise(
     ----------
     problem : BundleProblem
         Each point has two views or more that tell its depth.
-    loss : callable
-    max_iterations : int
     tolerance : float
         Relative decrease of the cost below which to stop.
     lens : Lens, optional

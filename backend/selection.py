@@ -26,20 +26,12 @@ FIRST_VIEWS = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """All rows of a submap's observation table, as the selection looks at them.
+    """All rows of a submap's observation table, as the selection looks at them."""
 
-    Attributes
-    ----------
-    kf, landmark : (R,) int64
-    uv_px : (R, 2) float64
-    width_px : float
-        Of the image, about.
-    """
-
-    kf: IntArray
-    landmark: IntArray
-    uv_px: FloatArray
-    width_px: float
+    kf: IntArray  # (R,)
+    landmark: IntArray  # (R,)
+    uv_px: FloatArray  # (R, 2)
+    width_px: float  # of the image, about
 
 
 def rank_in_runs(key: IntArray) -> IntArray:
@@ -76,13 +68,11 @@ def choose_factors(
 
     Parameters
     ----------
-    candidates : Candidates
     admitted : (R,) bool
         Rows that the graph can bear.
     factors : (R,) bool
         Rows that are factors now.
     keyframes : (K,) int64
-    n_landmarks : int
     per_keyframe, max_views : int
         Factors that a keyframe should have, about, and views of a landmark.
     min_views : int

@@ -88,7 +88,6 @@ class IncrementalSolver:
 
         Parameters
         ----------
-        graph : NonlinearFactorGraph
         values : Values
             Of the variables that are new.
         remove : list of int
@@ -184,12 +183,10 @@ def optimise_batch(
 
     Parameters
     ----------
-    graph : NonlinearFactorGraph
     values : Values
         Of exactly the poses of `keyframes` and the points of `landmarks`, both ascending.
     keyframes : (K,) int64
     landmarks : (L,) int64
-    max_iterations : int
     tolerance : float
         Relative decrease of the cost below which to stop.
     """

@@ -22,28 +22,15 @@ HOLD_ROTATION_RAD, HOLD_TRANSLATION_MU = 0.01, 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TieChanges:
-    """Removed and added factors, in this order: a new gauge, holds, relative poses.
+    """Removed and added factors, in this order: a new gauge, holds, relative poses."""
 
-    Attributes
-    ----------
-    remove : list of int
-        Indices of factors.
-    gauge : Gauge
-    new_holds : list of int
-        Keyframes.
-    kept_holds : dict of int to int
-        Factors by keyframe.
-    new_relative : list of (int, RelativePose)
-    kept_relative : dict of int to (RelativePose, int)
-        With their factors, by keyframe.
-    """
-
-    remove: list[int]
+    remove: list[int]  # indices of factors
     gauge: Gauge
-    new_holds: list[int]
-    kept_holds: dict[int, int]
+    new_holds: list[int]  # keyframes
+    kept_holds: dict[int, int]  # factors by keyframe
     new_relative: list[tuple[int, RelativePose]]
     kept_relative: dict[int, tuple[RelativePose, int]]
+    """dict of int to (RelativePose, int): with their factors, by keyframe."""
 
 
 class Ties:
@@ -81,9 +68,6 @@ class Ties:
 
         Parameters
         ----------
-        graph : gtsam.NonlinearFactorGraph
-        submap : Submap
-        plan : Plan
         pose_now : callable
             Of a keyframe.
         n_rows : callable

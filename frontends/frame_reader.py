@@ -19,12 +19,10 @@ class FrameReader:
 
     Parameters
     ----------
-    frontend : Frontend
     camera : callable
         Returns the camera as it is known now: self-calibration may change it between two frames.
     model_sigma_px : float
         Error of the camera model itself, see `CameraConfig.model_sigma_px`.
-    shutter : Shutter
     scene : SceneMask
         Which pixels show the scene.
     """

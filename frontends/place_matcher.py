@@ -17,11 +17,7 @@ from dualslam.map.submap import Submap
 class FrontendPlaceMatcher:
     """A front end as the verification of places asks it (`dualslam.core.place_matcher.PlaceMatcher`).
 
-    Parameters
-    ----------
-    frontend : Frontend
-    camera : Camera
-        As it was given.
+    `camera`: as it was given.
     """
 
     def __init__(self, frontend: Frontend, camera: Camera) -> None:

@@ -26,18 +26,10 @@ MIN_WEIGHT = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cover:
-    """Pixels that show no scene, made ready for images and features.
+    """Pixels that show no scene, made ready for images and features."""
 
-    Attributes
-    ----------
-    hidden : (H, W) bool
-        Some of them, and not all.
-    distance_px : (H, W) float32
-        From each pixel to the nearest hidden one.
-    """
-
-    hidden: BoolArray
-    distance_px: F32Image
+    hidden: BoolArray  # (H, W): some of them, and not all
+    distance_px: F32Image  # (H, W) float32: from each pixel to the nearest hidden one
 
     @classmethod
     def of(cls, hidden: BoolArray) -> Cover:
@@ -81,10 +73,7 @@ def _spread(total: F32Image, weight: F32Image) -> F32Image:
 class SceneMask:
     """Tells which pixels show the scene: those that a frame's own mask leaves, and that do not stand still.
 
-    Parameters
-    ----------
-    still : StillPixels or None
-        Looks for pixels that stand still; None: only the frames' own masks count.
+    `still`: looks for pixels that stand still; None: only the frames' own masks count.
     """
 
     def __init__(self, still: StillPixels | None) -> None:

@@ -56,18 +56,11 @@ def atlas_solver(config: Config) -> GtsamAtlasSolver:
 
 @dataclass(frozen=True, slots=True)
 class MetricParts:
-    """The parts that put a map into the frame of measurements.
+    """The parts that put a map into the frame of measurements."""
 
-    Attributes
-    ----------
-    covariances : callable
-        A submap's word on its edges.
-    solve : callable
-        `dualslam.backend.measurements.joint_graph.solve_metric`.
-    """
-
-    covariances: Covariances
+    covariances: Covariances  # a submap's word on its edges
     solve: Callable[[MetricProblem, Sequence[MeasurementSource], Mapping[str, float] | None], MetricSolution]
+    """`dualslam.backend.measurements.joint_graph.solve_metric`."""
 
 
 def metric_parts(config: Config) -> MetricParts:

@@ -76,7 +76,6 @@ def build_system(
 
     Parameters
     ----------
-    config : Config
     camera : Camera
         Lens model and size of the images that `System.step` will be given.
     saved : StoredMap, optional
@@ -92,10 +91,6 @@ def build_system(
         come.
     in_process : bool
         Whether the workers' jobs are done in this process; the schedule is the same. So they are for `Recorded`.
-
-    Returns
-    -------
-    System
 
     Raises
     ------

@@ -12,7 +12,6 @@ def check_free(file: Path, overwrite: bool, instead: str) -> None:
 
     Parameters
     ----------
-    file : Path
     overwrite : bool
         Whether `--overwrite` was given.
     instead : str

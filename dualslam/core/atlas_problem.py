@@ -14,32 +14,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AtlasEdge:
-    """A measured similarity between two keyframes, each in its own submap's unit of length.
+    """A measured similarity between two keyframes, each in its own submap's unit of length."""
 
-    Attributes
-    ----------
-    first, second : int
-        Rows of `AtlasProblem.S_world_node`.
-    S_first_second : (4, 4)
-        ``[[s R, t], [0, 1]]``, takes coordinates in the second keyframe to the first.
-    covariance : (7, 7)
-        Of the right perturbation ``S_first_second @ exp(xi)``: rotation, translation, log-scale, in the second
-        keyframe's frame and unit.
-    kind : str
-        ``within`` a submap, or the kind of the connection.
-    doubtful : bool
-        Where true, and where others contradict it, it may be rejected.
-    known : bool
-        Whether an earlier solution has believed it.
-    """
-
+    # Rows of `AtlasProblem.S_world_node`.
     first: int
     second: int
-    S_first_second: FloatArray
+    S_first_second: FloatArray  # (4, 4): ``[[s R, t], [0, 1]]``, takes coordinates in the second keyframe to the first
     covariance: FloatArray
-    kind: str
-    doubtful: bool = False
-    known: bool = False
+    """(7, 7): of the right perturbation ``S_first_second @ exp(xi)``: rotation, translation, log-scale, in the second
+    keyframe's frame and unit."""
+    kind: str  # ``within`` a submap, or the kind of the connection
+    doubtful: bool = False  # where true, and where others contradict it, it may be rejected
+    known: bool = False  # whether an earlier solution has believed it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,23 +33,15 @@ class AtlasEdges(Sequence[AtlasEdge]):
     """Many edges, as arrays: each is made when it is asked for. See `AtlasEdge`.
 
     They go to another process ten times as fast as so many objects.
-
-    Attributes
-    ----------
-    first, second : (E,) int64
-    S_first_second : (E, 4, 4)
-    covariance : (E, 7, 7)
-    kind : tuple of str
-    doubtful, known : (E,) bool
     """
 
-    first: IntArray
-    second: IntArray
-    S_first_second: FloatArray
-    covariance: FloatArray
+    first: IntArray  # (E,)
+    second: IntArray  # (E,)
+    S_first_second: FloatArray  # (E, 4, 4)
+    covariance: FloatArray  # (E, 7, 7)
     kind: tuple[str, ...]
-    doubtful: BoolArray
-    known: BoolArray
+    doubtful: BoolArray  # (E,)
+    known: BoolArray  # (E,)
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -92,48 +70,28 @@ class AtlasEdges(Sequence[AtlasEdge]):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AtlasProblem:
-    """A connected piece of the atlas; plain arrays, so that it can be solved in another process.
+    """A connected piece of the atlas; plain arrays, so that it can be solved in another process."""
 
-    Attributes
-    ----------
-    S_world_node : (N, 4, 4)
-        Initial similarities: keyframe, in its submap's unit, to world.
-    fixed : int
-        The node that stays where it is: the gauge.
-    edges : sequence of AtlasEdge
-        Connections in the order in which they arrived.
-    """
-
-    S_world_node: FloatArray
-    fixed: int
-    edges: Sequence[AtlasEdge]
+    S_world_node: FloatArray  # (N, 4, 4): initial similarities: keyframe, in its submap's unit, to world
+    fixed: int  # the node that stays where it is: the gauge
+    edges: Sequence[AtlasEdge]  # connections in the order in which they arrived
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AtlasSolution:
-    """The optimum of an `AtlasProblem`.
+    """The optimum of an `AtlasProblem`."""
 
-    Attributes
-    ----------
-    S_world_node : (N, 4, 4)
-    believed : (E,) bool
-        False for doubtful edges that were rejected.
-    chi2 : (E,) float64
-        Of connections against all others that are believed (7 degrees of freedom). NaN if nothing else ties the ends,
-        for edges that are no connection, and for all but the newest of many that are not doubtful.
-    cost_before, cost_after : float
-        Half the sum of squared whitened residuals of the believed edges.
-    drift : float
-        By how much larger than claimed the errors within submaps are, as connections show that are not doubtful; 1
-        where none closes a cycle. All sigmas within submaps have been taken that many times.
-    """
-
-    S_world_node: FloatArray
-    believed: BoolArray
+    S_world_node: FloatArray  # (N, 4, 4)
+    believed: BoolArray  # (E,): false for doubtful edges that were rejected
     chi2: FloatArray
+    """(E,): of connections against all others that are believed (7 degrees of freedom). NaN if nothing else ties the
+    ends, for edges that are no connection, and for all but the newest of many that are not doubtful."""
+    # Half the sum of squared whitened residuals of the believed edges.
     cost_before: float
     cost_after: float
     drift: float = 1.0
+    """By how much larger than claimed the errors within submaps are, as connections show that are not doubtful; 1 where
+    none closes a cycle. All sigmas within submaps have been taken that many times."""
 
 
 class AtlasSolver(Protocol):

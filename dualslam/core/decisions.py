@@ -27,21 +27,11 @@ class DecisionKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """A number compared with a threshold.
+    """A number compared with a threshold."""
 
-    Attributes
-    ----------
-    name : str
-        With its unit.
-    value : float
-    sign : str
-        ``>``, ``>=``, ``<`` or ``<=``: the comparison that passes.
-    threshold : float
-    """
-
-    name: str
+    name: str  # with its unit
     value: float
-    sign: str
+    sign: str  # ``>``, ``>=``, ``<`` or ``<=``: the comparison that passes
     threshold: float
 
     @property
@@ -65,19 +55,11 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class Ruling:
-    """The answer to a yes-or-no question, with the comparisons that led to it. It is true or false itself.
-
-    Attributes
-    ----------
-    holds : bool
-    gates : tuple of Gate
-    detail : str
-        What else led to it.
-    """
+    """The answer to a yes-or-no question, with the comparisons that led to it. It is true or false itself."""
 
     holds: bool
     gates: tuple[Gate, ...] = ()
-    detail: str = ""
+    detail: str = ""  # what else led to it
 
     def __bool__(self) -> bool:
         return self.holds
@@ -85,31 +67,17 @@ class Ruling:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """One decision.
+    """One decision."""
 
-    Attributes
-    ----------
-    frame : int
-        Index of the frame.
-    what : DecisionKind
-    accepted : bool
-        Whether the frame was posed, the keyframe made, the map started, the maps linked.
-    submap : int or None
-    gates : tuple of Gate
-    reason, detail : str
-        Code and sentence of a refusal.
-    data : dict
-        Other numbers of the decision.
-    """
-
-    frame: int
+    frame: int  # index of the frame
     what: DecisionKind
-    accepted: bool
+    accepted: bool  # whether the frame was posed, the keyframe made, the map started, the maps linked
     submap: int | None = None
     gates: tuple[Gate, ...] = ()
+    # Code and sentence of a refusal.
     reason: str = ""
     detail: str = ""
-    data: dict[str, Any] = field(default_factory=dict)
+    data: dict[str, Any] = field(default_factory=dict)  # other numbers of the decision
 
     @classmethod
     def refused(cls, frame: int, what: DecisionKind, submap: int | None, why: Failure) -> Decision:

@@ -51,27 +51,16 @@ class EventKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One thing that happened.
-
-    Attributes
-    ----------
-    event : EventKind
-    frame : int
-        Index of the frame in the source.
-    timestamp_s : float
-    submap : int or None
-    data : dict
-        What belongs to this kind of event: plain numbers, strings and lists.
-    gates : tuple of Gate
-        Comparisons behind it. They go into ``decisions.jsonl``, not into ``events.jsonl``.
-    """
+    """One thing that happened."""
 
     event: EventKind
-    frame: int
+    frame: int  # index of the frame in the source
     timestamp_s: float
     submap: int | None
     data: dict[str, Any] = field(default_factory=dict)
+    """What belongs to this kind of event: plain numbers, strings and lists."""
     gates: tuple[Gate, ...] = ()
+    """Comparisons behind it. They go into ``decisions.jsonl``, not into ``events.jsonl``."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the flat object that ``events.jsonl`` holds."""

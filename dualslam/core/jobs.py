@@ -48,21 +48,11 @@ Handlers = Mapping[JobKind, Handler]
 
 @dataclass(slots=True)
 class Limit:
-    """The limit after which a job that works in steps must stop; by default none.
+    """The limit after which a job that works in steps must stop; by default none."""
 
-    Attributes
-    ----------
-    after_s : float or None
-        Wall time.
-    after_steps : int or None
-        Steps: the same on every machine.
-    steps : int or None
-        After which it was stopped.
-    """
-
-    after_s: float | None = None
-    after_steps: int | None = None
-    steps: int | None = None
+    after_s: float | None = None  # wall time
+    after_steps: int | None = None  # steps: the same on every machine
+    steps: int | None = None  # after which it was stopped
 
     def is_over(self, n_steps: int, seconds: float) -> bool:
         """Return whether the time is over, and note when it was for the first time."""
@@ -93,26 +83,13 @@ def result_of(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ended:
-    """A job that has come to its end.
+    """A job that has come to its end."""
 
-    Attributes
-    ----------
-    work : object
-        As it was submitted.
-    result : object or Failure
-    cpu_s : float
-        CPU time of the process that did it; 0 inline, where the caller's own clock has run.
-    wall_s : float
-        From when it was submitted, the time in the queue included; 0 inline.
-    stopped_after : int or None
-        Steps after which it was stopped early.
-    """
-
-    work: Any
+    work: Any  # as it was submitted
     result: Any | Failure
-    cpu_s: float = 0.0
-    wall_s: float = 0.0
-    stopped_after: int | None = None
+    cpu_s: float = 0.0  # CPU time of the process that did it; 0 inline, where the caller's own clock has run
+    wall_s: float = 0.0  # from when it was submitted, the time in the queue included; 0 inline
+    stopped_after: int | None = None  # steps after which it was stopped early
 
 
 class Desk(Protocol):

@@ -15,53 +15,28 @@ from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class MeasurementRow:
-    """A line of a file of measurements.
-
-    Attributes
-    ----------
-    kind : str
-    values : tuple of float
-    where : str
-        File and line, for messages.
-    """
+    """A line of a file of measurements."""
 
     kind: str
     values: tuple[float, ...]
-    where: str
+    where: str  # file and line, for messages
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowSource:
-    """Contents of a file of measurements.
-
-    Attributes
-    ----------
-    name : str
-    rows : sequence of MeasurementRow
-    has_clock : bool
-        False: its times are those of the frames, and no offset is estimated.
-    origin : (float, float, float) or None
-        Latitude, longitude (degrees) and height (metres) of the origin, if positions came as such. They are then east,
-        north, up.
-    """
+    """Contents of a file of measurements."""
 
     name: str
     rows: Sequence[MeasurementRow]
-    has_clock: bool = True
+    has_clock: bool = True  # false: its times are those of the frames, and no offset is estimated
     origin: tuple[float, float, float] | None = None
+    """Latitude, longitude (degrees) and height (metres) of the origin, if positions came as
+    such. They are then east, north, up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasurementSource:
-    """Readings on one clock. See `RowSource`.
-
-    Attributes
-    ----------
-    name : str
-    readings : sequence of Measurement
-    has_clock : bool
-    origin : (float, float, float) or None
-    """
+    """Readings on one clock. See `RowSource`."""
 
     name: str
     readings: Sequence[Any]
@@ -71,73 +46,39 @@ class MeasurementSource:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MetricProblem:
-    """A linked set of submaps, and where its frames stand.
+    """A linked set of submaps, and where its frames stand."""
 
-    Attributes
-    ----------
-    S_world_node : (N, 4, 4)
-        Some of its keyframes, each in its submap's unit.
-    edges : AtlasEdges
-        Between nodes, with the map's own covariances.
-    times_s : (F,)
-        Of the frames, ascending.
-    T_world_cam : (F, 4, 4)
-    node : (F,) int64
-        The node that each frame goes by.
-    """
-
-    S_world_node: FloatArray
-    edges: AtlasEdges
-    times_s: FloatArray
-    T_world_cam: FloatArray
-    node: IntArray
+    S_world_node: FloatArray  # (N, 4, 4): some of its keyframes, each in its submap's unit
+    edges: AtlasEdges  # between nodes, with the map's own covariances
+    times_s: FloatArray  # (F,): of the frames, ascending
+    T_world_cam: FloatArray  # (F, 4, 4)
+    node: IntArray  # (F,): the node that each frame goes by
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MetricSolution:
-    """The optimum of the joint graph.
+    """The optimum of the joint graph."""
 
-    Attributes
-    ----------
-    S_metric_node : (N, 4, 4)
-    covariance : (N, 7, 7)
-        Of the right perturbation of each node, in its own frame and unit.
-    believed : (E,) bool
-        False for connections between submaps that the measurements contradict.
-    used, rejected, outside : mapping of str to int
-        Readings by kind: those that count, those that were outvoted, those at times without a pose.
-    normalised : mapping of str to float
-        RMS of the residuals that count, in their sigmas, by kind.
-    clock_offset_s, clock_sigma_s : mapping of str to float
-        By source: add the offset to the source's times to have the frames'.
-    metres_per_unit, scale_sigma : float
-        Of the world's unit in the middle of the map; its relative standard deviation.
-    rotation_sigma_rad, translation_sigma_m : float
-        How well the frame of the measurements is known.
-    drift : float
-        How many times the map's own sigmas had to be taken.
-    misfit : float
-        Excess of the joint cost over its expectation, in its standard deviations, at that drift.
-    exports : mapping of str to str
-        The graph as other programs read it, by file name.
-    """
-
-    S_metric_node: FloatArray
-    covariance: FloatArray
-    believed: BoolArray
+    S_metric_node: FloatArray  # (N, 4, 4)
+    covariance: FloatArray  # (N, 7, 7): of the right perturbation of each node, in its own frame and unit
+    believed: BoolArray  # (E,): false for connections between submaps that the measurements contradict
+    # Readings by kind: those that count, those that were outvoted, those at times without a pose.
     used: Mapping[str, int]
     rejected: Mapping[str, int]
     outside: Mapping[str, int]
-    normalised: Mapping[str, float]
+    normalised: Mapping[str, float]  # RMS of the residuals that count, in their sigmas, by kind
+    # By source: add the offset to the source's times to have the frames'.
     clock_offset_s: Mapping[str, float]
     clock_sigma_s: Mapping[str, float]
+    # Of the world's unit in the middle of the map; its relative standard deviation.
     metres_per_unit: float
     scale_sigma: float
+    # How well the frame of the measurements is known.
     rotation_sigma_rad: float
     translation_sigma_m: float
-    drift: float
-    misfit: float
-    exports: Mapping[str, str] = field(default_factory=dict)
+    drift: float  # how many times the map's own sigmas had to be taken
+    misfit: float  # excess of the joint cost over its expectation, in its standard deviations, at that drift
+    exports: Mapping[str, str] = field(default_factory=dict)  # the graph as other programs read it, by file name
 
 
 def pose_by_node(s: float, T_node_cam: FloatArray) -> FloatArray:

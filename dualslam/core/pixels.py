@@ -12,27 +12,14 @@ from dualslam.core.types import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedImage:
-    """An image with a known pose, and N landmarks in it.
+    """An image with a known pose, and N landmarks in it."""
 
-    Attributes
-    ----------
-    index : int
-        Of its frame.
-    image : (H, W) uint8
-    T_cam_submap : (4, 4)
-    landmark_ids : (N,) int64
-    uv_px : (N, 2)
-        Where the image shows the landmarks: pixels as read, with the lens in them.
-    depth_mu : (N,)
-        Of the landmarks in this camera, along its axis.
-    """
-
-    index: int
-    image: NDArray[np.uint8]
-    T_cam_submap: FloatArray
-    landmark_ids: IntArray
-    uv_px: FloatArray
-    depth_mu: FloatArray
+    index: int  # of its frame
+    image: NDArray[np.uint8]  # (H, W)
+    T_cam_submap: FloatArray  # (4, 4)
+    landmark_ids: IntArray  # (N,)
+    uv_px: FloatArray  # (N, 2): where the image shows the landmarks: pixels as read, with the lens in them
+    depth_mu: FloatArray  # (N,): of the landmarks in this camera, along its axis
 
 
 @dataclass(frozen=True, slots=True, eq=False)

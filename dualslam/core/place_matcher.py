@@ -21,21 +21,12 @@ MIN_IN_CELL = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """Which landmarks a camera should see, and where they are found.
-
-    Attributes
-    ----------
-    landmark_ids : (V,) int64
-        In the image, in front of the camera, and from a like side and distance as they were seen from.
-    feature : (V,) int64
-        The feature that each is found at, or -1.
-    cell : (V,) int64
-        The part of the image, of `CELLS` x `CELLS`, in which it should be seen.
-    """
+    """Which landmarks a camera should see, and where they are found."""
 
     landmark_ids: IntArray
-    feature: IntArray
-    cell: IntArray
+    """(V,): in the image, in front of the camera, and from a like side and distance as they were seen from."""
+    feature: IntArray  # (V,): the feature that each is found at, or -1
+    cell: IntArray  # (V,): the part of the image, of `CELLS` x `CELLS`, in which it should be seen
 
     @property
     def share(self) -> float:

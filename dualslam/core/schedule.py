@@ -52,23 +52,12 @@ watch 0.7, readout 2.3, calibration 15, loop search 4.4, reverse tracking 8.2 (7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Request:
-    """A job that was asked for.
+    """A job that was asked for."""
 
-    Attributes
-    ----------
-    number : int
-        Counts the requests of the run.
-    kind : JobKind
-    submap : int or None
-        Without which the answer is of no use.
-    step, frame : int, int or "end"
-        When: the steps so far, and the frame's index in the source.
-    work : object
-    """
-
-    number: int
+    number: int  # counts the requests of the run
     kind: JobKind
-    submap: int | None
+    submap: int | None  # without which the answer is of no use
+    # When: the steps so far, and the frame's index in the source.
     step: int
     frame: When
     work: Any
@@ -76,34 +65,18 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class AnswerRecord:
-    """A request and what became of it: a line of ``schedule.jsonl``.
-
-    Attributes
-    ----------
-    number : int
-    kind : JobKind
-    submap : int or None
-    requested, used : int, "end" or None
-        Frames (their index in the source); None: never used.
-    outcome : str
-        `OK`, `WITHDRAWN`, `OPEN`, or the reason of a failure.
-    detail : str
-        Of the failure.
-    steps : int or None
-        Of the job, after which it was stopped, as its time was over.
-    drained : bool
-        Whether it was used because the run, or its map, ended there, and not when the frame began.
-    """
+    """A request and what became of it: a line of ``schedule.jsonl``."""
 
     number: int
     kind: JobKind
     submap: int | None
+    # Frames (their index in the source); None: never used.
     requested: When
     used: When
-    outcome: str
-    detail: str = ""
-    steps: int | None = None
-    drained: bool = False
+    outcome: str  # `OK`, `WITHDRAWN`, `OPEN`, or the reason of a failure
+    detail: str = ""  # of the failure
+    steps: int | None = None  # of the job, after which it was stopped, as its time was over
+    drained: bool = False  # whether it was used because the run, or its map, ended there, and not when the frame began
 
     @property
     def is_lost(self) -> bool:
@@ -159,32 +132,15 @@ AT_ONCE = After({})
 
 @dataclass(slots=True)
 class Recorded:
-    """The schedule of an earlier run, to be repeated in one process.
+    """The schedule of an earlier run, to be repeated in one process."""
 
-    Attributes
-    ----------
-    header : mapping
-        What the run was: version, source, selection of frames, real time or not.
-    answers : mapping of int to AnswerRecord
-        By the request's number.
-    dropped : frozenset of int
-        Frames (index in the source).
-    lateness : mapping of int to Lateness
-        By frame, of a run in real time.
-    last_frame : int or None
-        At which the run ended; None: it was cut off, and its last lines are missing.
-    interrupted : bool
-    departure : str
-        Where the repetition has come apart from the record, and why; empty while it has not.
-    """
-
-    header: Mapping[str, Any]
-    answers: Mapping[int, AnswerRecord]
-    dropped: frozenset[int] = frozenset()
-    lateness: Mapping[int, Lateness] = field(default_factory=dict)
-    last_frame: int | None = None
+    header: Mapping[str, Any]  # what the run was: version, source, selection of frames, real time or not
+    answers: Mapping[int, AnswerRecord]  # by the request's number
+    dropped: frozenset[int] = frozenset()  # frames (index in the source)
+    lateness: Mapping[int, Lateness] = field(default_factory=dict)  # by frame, of a run in real time
+    last_frame: int | None = None  # at which the run ended; None: it was cut off, and its last lines are missing
     interrupted: bool = False
-    departure: str = ""
+    departure: str = ""  # where the repetition has come apart from the record, and why; empty while it has not
     departed_at: When = None
 
     waits = True

@@ -25,7 +25,6 @@ def find_lack_of_support(n_inliers: int, n_matches: int, chi2: float, config: He
         Matches that agree with the pose, and all of them.
     chi2 : float
         Of those that agree, over the degrees of freedom.
-    config : HealthConfig
     """
     numbers = {"n_matches": float(n_matches), "n_inliers": float(n_inliers), "chi2": chi2}
     gates = support_gates(n_inliers, n_matches, chi2, config)

@@ -23,32 +23,17 @@ MAX_POINTS = 128
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WalkNews:
-    """How far reverse tracking has come.
+    """How far reverse tracking has come."""
 
-    Attributes
-    ----------
-    submap_id : int
-        From which it walks, and in whose frame its poses are.
-    attempt : str
-    frame : int
-        At which it is.
-    is_posed : bool
-        Whether that frame has a pose; if not, the walk looks for a way across a gap.
-    n_posed : int
-        Frames that have one.
-    T_submap_cam : (4, 4) float32 or None
-        Of the last frame that has a pose.
-    way : (N, 3) float32
-        Where the camera was, the earliest frame first: `MAX_POINTS` at most, as even as the frames are.
-    """
-
-    submap_id: int
+    submap_id: int  # from which it walks, and in whose frame its poses are
     attempt: str
-    frame: int
-    is_posed: bool
-    n_posed: int
-    T_submap_cam: NDArray[np.float32] | None
+    frame: int  # at which it is
+    is_posed: bool  # whether that frame has a pose; if not, the walk looks for a way across a gap
+    n_posed: int  # frames that have one
+    T_submap_cam: NDArray[np.float32] | None  # (4, 4): of the last frame that has a pose
     way: NDArray[np.float32]
+    """(N, 3) float32: where the camera was, the earliest frame first: `MAX_POINTS` at most, as even as the frames
+    are."""
 
 
 class WalkTrace:
@@ -56,8 +41,6 @@ class WalkTrace:
 
     Parameters
     ----------
-    submap_id : int
-    attempt : str
     started_from : (3,)
         Centre of the keyframe from which it sets out.
     newest_id : int

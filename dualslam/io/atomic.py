@@ -18,10 +18,6 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
 
     The new content is on the disk before the rename, so a crash at any moment leaves the old file or the new one.
 
-    Parameters
-    ----------
-    path : Path
-
     Raises
     ------
     OutputError

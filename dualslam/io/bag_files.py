@@ -44,20 +44,12 @@ class Place:
 
 @dataclass(slots=True, weakref_slot=True)
 class Bag:
-    """Contents of a bag.
-
-    Attributes
-    ----------
-    paths : list of Path
-    messages : dict of Topic to list of (time in nanoseconds, Place)
-        By the times at which they were recorded.
-    is_whole : bool
-        Whether no file was cut off.
-    """
+    """Contents of a bag."""
 
     paths: list[Path]
     messages: dict[Topic, list[tuple[int, Place]]] = field(default_factory=dict)
-    is_whole: bool = True
+    """dict of Topic to list of (time in nanoseconds, Place): by the times at which they were recorded."""
+    is_whole: bool = True  # whether no file was cut off
 
 
 def is_bag(path: Path) -> bool:

@@ -145,14 +145,7 @@ def _message(data: bytes, topic: Topic) -> Any:
 
 
 class BagImages:
-    """The images of a topic.
-
-    Parameters
-    ----------
-    bag : Bag
-    topic : Topic
-    places : list of Place
-    """
+    """The images of a topic."""
 
     def __init__(self, bag: Bag, topic: Topic, places: list[Place]) -> None:
         self._bag, self._topic, self._places = bag, topic, places

@@ -72,11 +72,7 @@ MAX_COLMAP_BYTES = 2**20
 def read_camera_file(path: str | Path, images_px: Callable[[], Size] | None = None) -> Camera:
     """Read a camera file of any kind that docs/calibration.md lists.
 
-    Parameters
-    ----------
-    path : path
-    images_px : callable, optional
-        Gives the size of the images, for files that do not say it, as some of ORB-SLAM.
+    `images_px`: gives the size of the images, for files that do not say it, as some of ORB-SLAM.
 
     Raises
     ------

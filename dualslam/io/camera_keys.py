@@ -27,7 +27,6 @@ def camera_of_mapping(content: dict[str, Any], where: str, images_px: Callable[[
 
     Parameters
     ----------
-    content : dict
     where : str
         The file, for messages.
     images_px : callable, optional

@@ -12,10 +12,6 @@ from dualslam.core.errors import OutputError
 class FolderLock:
     """Holds a folder until it is released or the process ends, however it ends; there is no file to be left behind.
 
-    Parameters
-    ----------
-    path : Path
-
     Raises
     ------
     OutputError

@@ -41,22 +41,14 @@ _DAMAGE = (KeyError, ValueError, IndexError, TypeError, OverflowError)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredMap:
-    """A map written by `save_atlas`: the submaps with their links, and where each frame stands.
-
-    Attributes
-    ----------
-    atlas : Atlas
-    poses : dict of int to FramePose
-    camera : Camera or None
-        By which the features are rectified, with what was found out about it; None in maps of before it was kept.
-    colours : mapping of int to (N, 3) uint8
-        Of each submap's landmarks; none where the map was saved without.
-    """
+    """A map written by `save_atlas`: the submaps with their links, and where each frame stands."""
 
     atlas: Atlas
     poses: dict[int, FramePose]
     camera: Camera | None = None
+    """By which the features are rectified, with what was found out about it; None in maps of before it was kept."""
     colours: Colours = field(default_factory=dict)
+    """mapping of int to (N, 3) uint8: of each submap's landmarks; none where the map was saved without."""
 
     @property
     def next_id(self) -> int:

@@ -30,12 +30,8 @@ MAX_FACTOR = 16
 def masked(sequence: Sequence, path: str | Path | None) -> Sequence:
     """Return a sequence whose frames have masks; itself without any.
 
-    Parameters
-    ----------
-    sequence : Sequence
-    path : path or None
-        An image of the size of the frames, 0 where no scene is. A folder has one for each frame of the source. They
-        are named as the frames, or in their order.
+    `path`: an image of the size of the frames, 0 where no scene is. A folder has one for each frame of the source. They
+    are named as the frames, or in their order.
 
     Raises
     ------
@@ -125,7 +121,6 @@ class MaskedSequence:
 
     Parameters
     ----------
-    sequence : Sequence
     mask_of : callable
         Returns what is hidden in the frame of an index.
     hidden : (H, W) bool or None

@@ -30,7 +30,6 @@ def write_metric(
 
     Parameters
     ----------
-    folder : Path
     frames : Trajectory
         In the frame of the measurements, metres.
     covariance : (F, 6, 6)

@@ -19,7 +19,6 @@ def write_scale(run: Path, metres_per_unit: float, sigma_rel: float | None, word
     ----------
     run : path
         Run folder with a map.
-    metres_per_unit : float
     sigma_rel : float or None
         Of it, relative.
     words : str

@@ -45,13 +45,7 @@ def reduced_camera(camera: Camera, factor: int) -> Camera:
 
 
 class ReducedImages:
-    """The images of another store, smaller.
-
-    Parameters
-    ----------
-    images : ImageStore
-    factor : int
-    """
+    """The images of another store, smaller."""
 
     def __init__(self, images: ImageStore, factor: int) -> None:
         self._images, self._factor = images, factor
@@ -93,7 +87,6 @@ class ResizedFrames:
 
     Parameters
     ----------
-    sequence : Sequence
     size_px : (width, height)
     """
 

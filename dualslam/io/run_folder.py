@@ -94,24 +94,13 @@ _MAP_NAME = re.compile(r"[\w.-]+\.(npz|json)")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunRecord:
-    """The result of a run as it goes to the disk.
+    """The result of a run as it goes to the disk."""
 
-    Attributes
-    ----------
-    frames : sequence of FrameRow
-        One for every input frame.
-    main : Trajectory
-        All frames posed in the main map.
-    unlinked : mapping of int to Trajectory
-        Submaps that are not linked to the main map, each in its own unit.
-    summary : mapping
-        Plain numbers, strings and lists.
-    """
-
-    frames: Sequence[FrameRow]
-    main: Trajectory
+    frames: Sequence[FrameRow]  # one for every input frame
+    main: Trajectory  # all frames posed in the main map
     unlinked: Mapping[int, Trajectory] = field(default_factory=dict)
-    summary: Mapping[str, Any] = field(default_factory=dict)
+    """Submaps that are not linked to the main map, each in its own unit."""
+    summary: Mapping[str, Any] = field(default_factory=dict)  # plain numbers, strings and lists
 
 
 class RunFolder:

@@ -29,54 +29,27 @@ MAX_ROUNDING_PX = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """Result of a format's reader: everything about a recorded sequence, no image read yet.
-
-    Attributes
-    ----------
-    name : str
-    images : ImageStore
-    timestamps_s : (N,) float64
-        One for each image, ascending.
-    camera : Camera or None
-        None where the source brings no calibration (`open_sequence` then needs one from the caller).
-    ground_truth : Trajectory or None
-    exposure_s : (N,) float64 or None
-    calibration : str
-        Where the camera is from, for messages.
-    clock : str
-        Where the times are from, for messages; empty where they are sure to be seconds.
-    """
+    """Result of a format's reader: everything about a recorded sequence, no image read yet."""
 
     name: str
     images: ImageStore
-    timestamps_s: FloatArray
+    timestamps_s: FloatArray  # (N,): one for each image, ascending
     camera: Camera | None
+    """None where the source brings no calibration (`open_sequence` then needs one from the caller)."""
     ground_truth: Trajectory | None = None
-    exposure_s: FloatArray | None = None
-    calibration: str = ""
-    clock: str = ""
+    exposure_s: FloatArray | None = None  # (N,)
+    calibration: str = ""  # where the camera is from, for messages
+    clock: str = ""  # where the times are from, for messages; empty where they are sure to be seconds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Given:
-    """Data that the caller supplies instead of the source.
+    """Data that the caller supplies instead of the source."""
 
-    Attributes
-    ----------
-    camera : bool
-        A camera file or a field of view was given.
-    times : path, array or None
-        A file of seconds, one a line, or the numbers.
-    rate_hz : float or None
-        Frames a second of a source that has no times, or none that are right.
-    topic : str or None
-        Of the images, where the source is a bag.
-    """
-
-    camera: bool = False
-    times: str | Path | ArrayLike | None = None
-    rate_hz: float | None = None
-    topic: str | None = None
+    camera: bool = False  # a camera file or a field of view was given
+    times: str | Path | ArrayLike | None = None  # a file of seconds, one a line, or the numbers
+    rate_hz: float | None = None  # frames a second of a source that has no times, or none that are right
+    topic: str | None = None  # of the images, where the source is a bag
 
 
 @dataclass(frozen=True, slots=True)

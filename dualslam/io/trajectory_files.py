@@ -27,7 +27,6 @@ def read_tum(path: str | Path, *, skip_nan: bool = False, allow_empty: bool = Fa
 
     Parameters
     ----------
-    path : path
     skip_nan : bool
         Leave out lines that hold a NaN (TUM-Mono marks unknown poses so) instead of refusing the file.
     allow_empty : bool

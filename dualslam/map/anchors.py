@@ -19,20 +19,11 @@ class Anchor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativePose:
-    """Where a keyframe stands by what is no observation of the submap's landmarks: a gap relocalisation.
+    """Where a keyframe stands by what is no observation of the submap's landmarks: a gap relocalisation."""
 
-    Attributes
-    ----------
-    keyframe_id : int
-        Relative to which other keyframe.
-    T_ref_kf : (4, 4)
-    covariance : (6, 6)
-        Of xi in ``T_ref_kf @ exp(xi)``: rotation, translation; positive definite.
-    """
-
-    keyframe_id: int
-    T_ref_kf: FloatArray
-    covariance: FloatArray
+    keyframe_id: int  # relative to which other keyframe
+    T_ref_kf: FloatArray  # (4, 4)
+    covariance: FloatArray  # (6, 6): of xi in ``T_ref_kf @ exp(xi)``: rotation, translation; positive definite
 
     def scaled(self, scale: float) -> RelativePose:
         """Return the same in another unit of length."""

@@ -26,11 +26,8 @@ def drop_dead_rows(submap: Submap, follower: RowFollower) -> int:
     The table is therefore never more than about twice as long as it must be. A drop costs a copy of the live rows; as
     many rows have come and died since the last one: a constant for each.
 
-    Parameters
-    ----------
-    submap : Submap
-    follower : RowFollower
-        All that follows this submap by the numbers of its rows. (One that does not hear of it makes its state anew.)
+    `follower`: all that follows this submap by the numbers of its rows. (One that does not hear of it makes its state
+    anew.)
 
     Returns
     -------

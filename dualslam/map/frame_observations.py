@@ -19,25 +19,16 @@ Change = Callable[[Features], Features]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameObservations:
-    """A frame's observations of a submap. In single precision: a run keeps thousands.
-
-    Attributes
-    ----------
-    submap_id : int
-    landmark_ids : (N,) int32
-    uv_px, uv_rect_px : (N, 2) float32
-        As in `Features`.
-    sigma_px : (N,) float32
-    changes : tuple of callables
-        What has become of the submap's pixels since, another camera or another shutter: made when asked for.
-    """
+    """A frame's observations of a submap. In single precision: a run keeps thousands."""
 
     submap_id: int
-    landmark_ids: NDArray[np.int32]
-    uv_px: NDArray[np.float32]
-    uv_rect_px: NDArray[np.float32]
-    sigma_px: NDArray[np.float32]
+    landmark_ids: NDArray[np.int32]  # (N,)
+    # As in `Features`.
+    uv_px: NDArray[np.float32]  # (N, 2)
+    uv_rect_px: NDArray[np.float32]  # (N, 2)
+    sigma_px: NDArray[np.float32]  # (N,)
     changes: tuple[Change, ...] = ()
+    """What has become of the submap's pixels since, another camera or another shutter: made when asked for."""
 
     @classmethod
     def of(cls, features: Features, landmark_ids: IntArray, submap_id: int) -> FrameObservations:
@@ -73,7 +64,6 @@ class FrameObservations:
 
         Parameters
         ----------
-        submap : Submap
         T_submap_cam : (4, 4)
             To begin with.
         shape, min_inliers

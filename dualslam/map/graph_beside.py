@@ -37,44 +37,23 @@ MAX_GRAPHS = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphJob:
-    """Job of a graph in another process. It can be pickled.
-
-    Attributes
-    ----------
-    graph_id : int
-    delta : SubmapDelta
-    rebuild : bool
-        Whether the graph is to be made anew, by a batch solution.
-    near_optimum : bool
-        See `SubmapGraph.rebuild`.
-    """
+    """Job of a graph in another process. It can be pickled."""
 
     graph_id: int
     delta: SubmapDelta
-    rebuild: bool
-    near_optimum: bool
+    rebuild: bool  # whether the graph is to be made anew, by a batch solution
+    near_optimum: bool  # see `SubmapGraph.rebuild`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphAnswer:
-    """State of a graph after a job.
+    """State of a graph after a job."""
 
-    Attributes
-    ----------
-    estimate : GraphEstimate
-        Of everything in it.
-    """
-
-    estimate: GraphEstimate
+    estimate: GraphEstimate  # of everything in it
 
 
 class GraphServer:
-    """Keeps graphs and the replicas of their submaps, in the process that solves them.
-
-    Parameters
-    ----------
-    new_graph : callable
-    """
+    """Keeps graphs and the replicas of their submaps, in the process that solves them."""
 
     def __init__(self, new_graph: Callable[[], SubmapGraph]) -> None:
         self._new_graph = new_graph
@@ -114,7 +93,6 @@ class BesideGraph:
 
     Parameters
     ----------
-    graph_id : int
     window : callable
         Adjusts the newest keyframes of a submap.
     register : callable
@@ -244,12 +222,7 @@ class Moved:
 class BesideGraphs:
     """Sends the changes of submaps to the process that has their graphs, and puts the results into the submaps.
 
-    Parameters
-    ----------
-    desk : Desk
-    window : WindowSolver
-    open_graph : callable
-        Makes a graph of a submap in this process, solved.
+    `open_graph`: makes a graph of a submap in this process, solved.
 
     Attributes
     ----------

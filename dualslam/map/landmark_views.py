@@ -21,7 +21,6 @@ def landmark_covariances(
 
     Parameters
     ----------
-    submap : Submap
     landmark_ids : (N,) int64
         Each once.
     xyz : (N, 3), optional
@@ -49,7 +48,6 @@ def resection_covariance(
 
     Parameters
     ----------
-    submap : Submap
     landmark_ids : (N,) int64
     sigma_px : (N,)
         Of the pixels at which they are seen.
@@ -79,12 +77,7 @@ def triangulate_landmarks(submap: Submap, landmark_ids: IntArray, before: int) -
 
     NaN where fewer than two of these see a landmark.
 
-    Parameters
-    ----------
-    submap : Submap
-    landmark_ids : (N,) int64
-        Each once.
-    before : int
+    `landmark_ids` (N,) int64: each once.
     """
     rows, point = _views(submap, landmark_ids, before)
     if len(rows) == 0:

@@ -31,7 +31,6 @@ def apply_late(
 
     Parameters
     ----------
-    submap : Submap
     keyframe_ids, T_submap_kf, landmark_ids, xyz_mu
         As for `Submap.apply_estimate`; in the frame and about the unit of the submap.
     """

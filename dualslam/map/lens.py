@@ -43,66 +43,32 @@ RETRY_KEYFRAMES, RETRY_SHARE = 10, 0.25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationJob:
-    """A question about the camera, with all that the answer is made from. It can be pickled.
+    """A question about the camera, with all that the answer is made from. It can be pickled."""
 
-    Attributes
-    ----------
-    submap : Submap
-        The one that is asked, a copy.
-    lost : dict of int to Submap
-        Copies of those that are to change with it.
-    camera : Camera
-        The present one, which rectified their features.
-    covariance : (5, 5) or None
-        Of the correction that it has, if it was estimated.
-    """
-
-    submap: Submap
-    lost: dict[int, Submap]
-    camera: Camera
-    covariance: FloatArray | None
+    submap: Submap  # the one that is asked, a copy
+    lost: dict[int, Submap]  # copies of those that are to change with it
+    camera: Camera  # the present one, which rectified their features
+    covariance: FloatArray | None  # (5, 5): of the correction that it has, if it was estimated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationAnswer:
-    """A submap's estimate of its camera, and the effect on the maps.
-
-    Attributes
-    ----------
-    camera : Camera
-    covariance : (5, 5)
-    submap : Submap
-        The job's, changed to that camera and adjusted.
-    lost : dict of int to Submap
-        Those of the job's that could be changed, solved.
-    numbers : dict
-        For the event log.
-    """
+    """A submap's estimate of its camera, and the effect on the maps."""
 
     camera: Camera
-    covariance: FloatArray
-    submap: Submap
-    lost: dict[int, Submap]
-    numbers: dict[str, float]
+    covariance: FloatArray  # (5, 5)
+    submap: Submap  # the job's, changed to that camera and adjusted
+    lost: dict[int, Submap]  # those of the job's that could be changed, solved
+    numbers: dict[str, float]  # for the event log
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refinement:
-    """A submap's change to a better calibration.
+    """A submap's change to a better calibration."""
 
-    Attributes
-    ----------
-    graph : SubmapGraph or None
-        Made from the changed submap, where one was given.
-    before : Submap
-        A copy of the submap as it was.
-    numbers : dict
-        For the event log.
-    """
-
-    graph: SubmapGraph | None
-    before: Submap
-    numbers: dict[str, float]
+    graph: SubmapGraph | None  # made from the changed submap, where one was given
+    before: Submap  # a copy of the submap as it was
+    numbers: dict[str, float]  # for the event log
 
 
 class Calibration:
@@ -112,9 +78,6 @@ class Calibration:
     ----------
     camera : Camera
         As it was given.
-    config : CalibrationConfig
-    estimate : SelfCalibrator
-    adjust : SubmapAdjuster
     covariance : (5, 5), optional
         Of the correction that the camera has, if it was estimated.
     """
@@ -275,7 +238,6 @@ def answer(
         Its submaps are not changed.
     calibration : Calibration
         One of its own, with the camera and the covariance of the job.
-    new_graph : callable
     """
     submap, changed = job.submap.copy(), {}
     refined = calibration.refine(submap)

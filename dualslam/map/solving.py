@@ -25,12 +25,7 @@ def open_graph(submap: Submap, new_graph: Callable[[], SubmapGraph]) -> SubmapGr
 def solve(submap: Submap, graph: SubmapGraph, near_optimum: bool = False) -> int:
     """Solve a submap in a graph made anew, and drop what the solution contradicts; return how many observations.
 
-    Parameters
-    ----------
-    submap : Submap
-    graph : SubmapGraph
-    near_optimum : bool
-        Whether its parts are solved already.
+    `near_optimum`: whether its parts are solved already.
 
     Raises
     ------

@@ -18,8 +18,6 @@ def next_submap(full: Submap, submap_id: int, n_shared: int, newest_id: int | No
 
     Parameters
     ----------
-    full : Submap
-    submap_id : int
     n_shared : int
         How many of the newest keyframes (in order of insertion) both submaps hold.
     newest_id : int, optional

@@ -23,51 +23,28 @@ NO_DESCRIPTORS = np.zeros((0, 1), np.uint8)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SubmapDelta:
-    """A change of a replica. It can be pickled.
-
-    Attributes
-    ----------
-    submap_id : int
-    is_whole : bool
-        Whether it holds the whole submap: the replica is made anew.
-    K : (3, 3)
-    gauge : tuple of int
-    keyframes : tuple of Keyframe
-        Those added, and those that have more features now: pixels and sigmas only, in the submap's order.
-    poses : dict of int to (4, 4)
-        Of those, and of the newest ones.
-    removed : dict of int to Anchor or None
-        Keyframes that were culled.
-    relative_poses : dict of int to RelativePose or None
-        Those that have changed; None: gone.
-    landmarks : (L,) int64
-        Rows whose points come with it, those added included; `xyz_mu` : (L, 3), `first_kf` : (L,)
-    n_landmarks : int
-        Rows of the table.
-    kept_rows : (R,) int64 or None
-        Rows of the replica's observations that stay in its table, if some do not. All other rows are named as they are
-        numbered after that.
-    dead_landmarks, dead_rows : int64 arrays
-        Landmarks and observations that have died.
-    kf, feature, landmark, alive : arrays
-        Observations added.
-    """
+    """A change of a replica. It can be pickled."""
 
     submap_id: int
-    is_whole: bool
-    K: FloatArray
+    is_whole: bool  # whether it holds the whole submap: the replica is made anew
+    K: FloatArray  # (3, 3)
     gauge: tuple[int, int]
     keyframes: tuple[Keyframe, ...]
-    poses: dict[int, FloatArray]
-    removed: dict[int, Anchor | None]
-    relative_poses: dict[int, RelativePose | None]
-    landmarks: IntArray
-    xyz_mu: FloatArray
-    first_kf: IntArray
-    n_landmarks: int
+    """Those added, and those that have more features now: pixels and sigmas only, in the submap's order."""
+    poses: dict[int, FloatArray]  # dict of int to (4, 4): of those, and of the newest ones
+    removed: dict[int, Anchor | None]  # keyframes that were culled
+    relative_poses: dict[int, RelativePose | None]  # those that have changed; None: gone
+    landmarks: IntArray  # (L,): rows whose points come with it, those added included
+    xyz_mu: FloatArray  # (L, 3)
+    first_kf: IntArray  # (L,)
+    n_landmarks: int  # rows of the table
     kept_rows: IntArray | None
+    """(R,): rows of the replica's observations that stay in its table, if some do not. All other rows are named as they
+    are numbered after that."""
+    # Landmarks and observations that have died.
     dead_landmarks: IntArray
     dead_rows: IntArray
+    # Observations added.
     kf: IntArray
     feature: IntArray
     landmark: IntArray

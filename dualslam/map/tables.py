@@ -14,10 +14,7 @@ class Table:
     Columns are reached by ``table["name"]`` as views of the live rows, writable in place. A view taken before an
     append may be left behind by it: take it anew.
 
-    Parameters
-    ----------
-    **columns : (dtype, shape)
-        Type and trailing shape of each column.
+    `**columns` (dtype, shape): type and trailing shape of each column.
     """
 
     def __init__(self, **columns: tuple[Any, tuple[int, ...]]) -> None:

@@ -35,7 +35,6 @@ def draw_rates(path: Path, rates: Mapping[str, Mapping[str, tuple[float, float, 
 
     Parameters
     ----------
-    path : Path
     rates : mapping of str to mapping of str to (float, float, float)
         By what was counted over, then by variant: percent, and the ends of its interval.
     """
@@ -59,11 +58,7 @@ def draw_rates(path: Path, rates: Mapping[str, Mapping[str, tuple[float, float, 
 def draw_delays(path: Path, delays_s: Mapping[str, Sequence[float | None]]) -> None:
     """Draw how long the trials took to their first map (Fig. 6): the share of them that had one after so long.
 
-    Parameters
-    ----------
-    path : Path
-    delays_s : mapping of str to sequence of float or None
-        By variant, one for each trial; None where it never had a map: its curve ends below 100 %.
+    `delays_s`: by variant, one for each trial; None where it never had a map: its curve ends below 100 %.
     """
     figure, (axes,) = _figure(1, (7.0, 3.6))
     longest = max((d for row in delays_s.values() for d in row if d is not None), default=1.0)
@@ -84,12 +79,7 @@ def draw_delays(path: Path, delays_s: Mapping[str, Sequence[float | None]]) -> N
 def draw_statuses(path: Path, title: str, statuses: Mapping[str, Mapping[str, Sequence[str]]]) -> None:
     """Draw the status of every frame of every trial (Fig. 7): trials side by side, frames upwards.
 
-    Parameters
-    ----------
-    path : Path
-    title : str
-    statuses : mapping of str to mapping of str to sequence of str
-        By condition, then by variant: a letter for each frame of each trial, as in the lines of a bench.
+    `statuses`: by condition, then by variant: a letter for each frame of each trial, as in the lines of a bench.
     """
     variants = list(dict.fromkeys(variant for row in statuses.values() for variant in row))
     rows, columns = len(statuses), len(variants)
@@ -123,11 +113,7 @@ def draw_statuses(path: Path, title: str, statuses: Mapping[str, Mapping[str, Se
 def draw_end_points(path: Path, errors_m: Mapping[str, Mapping[str, Sequence[float | None]]]) -> None:
     """Draw the end-point error of every trial (Fig. 9): sequences across, trials upwards; failed ones are crossed.
 
-    Parameters
-    ----------
-    path : Path
-    errors_m : mapping of str to mapping of str to sequence of float or None
-        By variant, then by sequence; None for a trial that failed.
+    `errors_m`: by variant, then by sequence; None for a trial that failed.
     """
     figure, panels = _figure(
         len(errors_m), (max(5.0, 0.35 * len(next(iter(errors_m.values()))) + 3), 1.9 * len(errors_m))

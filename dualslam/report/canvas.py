@@ -18,17 +18,10 @@ _FOOT_PERCENT = 20.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Canvas:
-    """Maps the plane of a drawing (right, up) to the units of an SVG.
+    """Maps the plane of a drawing (right, up) to the units of an SVG."""
 
-    Attributes
-    ----------
-    corner : (2,) float64
-        Lowest coordinates that are shown.
-    size : (2,) float64
-    """
-
-    corner: FloatArray
-    size: FloatArray
+    corner: FloatArray  # (2,): lowest coordinates that are shown
+    size: FloatArray  # (2,)
 
     @classmethod
     def around(cls, low: FloatArray, high: FloatArray) -> Canvas:

@@ -26,38 +26,18 @@ _TRIES = ("link_refused", "linked")
 
 @dataclass(frozen=True, slots=True)
 class FailureStory:
-    """The events that belong to one failure.
-
-    Attributes
-    ----------
-    letter : str
-    failed : dict
-    restart : dict or None
-        Where the next map began.
-    walks : list of dict
-        Attempts at reverse tracking from a later map to the lost one.
-    broken : list of dict
-        Recoveries that came to nothing by themselves: the worker died, the solver failed.
-    tries : list of dict
-        Links to the lost map, accepted or refused.
-    linked : dict or None
-    fused : dict or None
-    absorbed : dict or None
-        Where a later map had posed all its frames.
-    relocalised : dict or None
-        Where it was found again, before another map had started.
-    """
+    """The events that belong to one failure."""
 
     letter: str
     failed: Event
-    restart: Event | None
-    walks: list[Event]
-    broken: list[Event]
-    tries: list[Event]
+    restart: Event | None  # where the next map began
+    walks: list[Event]  # attempts at reverse tracking from a later map to the lost one
+    broken: list[Event]  # recoveries that came to nothing by themselves: the worker died, the solver failed
+    tries: list[Event]  # links to the lost map, accepted or refused
     linked: Event | None
     fused: Event | None
-    absorbed: Event | None
-    relocalised: Event | None
+    absorbed: Event | None  # where a later map had posed all its frames
+    relocalised: Event | None  # where it was found again, before another map had started
 
     @property
     def lost_since(self) -> int:

@@ -22,7 +22,6 @@ def tag(name: str, /, *children: object, **attributes: object) -> Markup:
 
     Parameters
     ----------
-    name : str
     *children : Markup, str, number, None or iterable of these
         Text is escaped, None is left out.
     **attributes

@@ -18,52 +18,26 @@ MIN_UPRIGHT = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """A trajectory in the frame of a drawing.
+    """A trajectory in the frame of a drawing."""
 
-    Attributes
-    ----------
-    submap : int or None
-        None for the main map.
-    row : (N,) int64
-    xyz : (N, 3) float64
-    error : (N,) float64
-        Distance from the true position, NaN where there is none.
-    """
-
-    submap: int | None
-    row: IntArray
-    xyz: FloatArray
-    error: FloatArray
+    submap: int | None  # none for the main map
+    row: IntArray  # (N,)
+    xyz: FloatArray  # (N, 3)
+    error: FloatArray  # (N,): distance from the true position, NaN where there is none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedRun:
-    """All that one drawing shows, in one frame.
+    """All that one drawing shows, in one frame."""
 
-    Attributes
-    ----------
-    placed : list of Placed
-        The main map first, where there is one.
-    apart : list of Placed
-        Submaps that nothing places in this frame: each has a frame and a unit of its own.
-    truth_row : (T,) int64, truth_xyz : (T, 3) float64
-    points : (P, 3) float64
-    unit : str
-        ``m``, or empty where a monocular map's own unit is all there is.
-    down : (3,) float64
-        Mean of the cameras' downward axes (as unit vectors).
-    note : str
-        What was done to bring it all together.
-    """
-
-    placed: list[Placed]
-    apart: list[Placed]
-    truth_row: IntArray
-    truth_xyz: FloatArray
-    points: FloatArray
-    unit: str
-    down: FloatArray
-    note: str
+    placed: list[Placed]  # the main map first, where there is one
+    apart: list[Placed]  # submaps that nothing places in this frame: each has a frame and a unit of its own
+    truth_row: IntArray  # (T,)
+    truth_xyz: FloatArray  # (T, 3)
+    points: FloatArray  # (P, 3)
+    unit: str  # ``m``, or empty where a monocular map's own unit is all there is
+    down: FloatArray  # (3,): mean of the cameras' downward axes (as unit vectors)
+    note: str  # what was done to bring it all together
 
 
 def place(run: RunData) -> PlacedRun:

@@ -36,17 +36,10 @@ CONDEMNED = "landmarks_condemned"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedRows:
-    """Rows of ``frames.csv`` with a pose, N of them, in one map.
+    """Rows of ``frames.csv`` with a pose, N of them, in one map."""
 
-    Attributes
-    ----------
-    row : (N,) int64
-        Ascending.
-    T_map_cam : (N, 4, 4) float64
-    """
-
-    row: IntArray
-    T_map_cam: FloatArray
+    row: IntArray  # (N,): ascending
+    T_map_cam: FloatArray  # (N, 4, 4)
 
     def __len__(self) -> int:
         return len(self.row)
@@ -59,44 +52,20 @@ class PosedRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunData:
-    """Data of a finished run.
-
-    Attributes
-    ----------
-    path : Path
-    rows : list of FrameRow
-        Every input frame, in the order in which they came.
-    events : list of dict
-    summary : dict
-    config : dict
-        The resolved configuration, nested.
-    config_text : str
-        The same as it was written, with its comments.
-    main : PosedRows
-    unlinked : dict of int to PosedRows
-        Submaps that are not linked to the main map, each in its own unit.
-    truth : PosedRows
-        True poses of the frames that have one; empty where there is no ground truth.
-    points : (P, 3) float64
-        Some of the main map's landmarks.
-    samples : dict of int to bytes
-        Small JPEGs of frames around the gaps, by frame index.
-    mask : bytes or None
-        The run's mask as a PNG; None where nothing was left out.
-    """
+    """Data of a finished run."""
 
     path: Path
-    rows: list[FrameRow]
+    rows: list[FrameRow]  # every input frame, in the order in which they came
     events: list[dict[str, Any]]
     summary: dict[str, Any]
-    config: dict[str, Any]
-    config_text: str
+    config: dict[str, Any]  # the resolved configuration, nested
+    config_text: str  # the same as it was written, with its comments
     main: PosedRows
-    unlinked: dict[int, PosedRows]
-    truth: PosedRows
-    points: FloatArray
-    samples: dict[int, bytes]
-    mask: bytes | None = None
+    unlinked: dict[int, PosedRows]  # submaps that are not linked to the main map, each in its own unit
+    truth: PosedRows  # true poses of the frames that have one; empty where there is no ground truth
+    points: FloatArray  # (P, 3): some of the main map's landmarks
+    samples: dict[int, bytes]  # small JPEGs of frames around the gaps, by frame index
+    mask: bytes | None = None  # the run's mask as a PNG; None where nothing was left out
 
     def __repr__(self) -> str:
         return f"<run {self.path}: {len(self.main)} of {len(self.rows)} frames posed, {len(self.events)} events>"
@@ -109,10 +78,7 @@ class RunData:
     def plot(self, path: str | Path | None = None) -> Figure:
         """Draw the trajectory from above, with matplotlib (extra `report`).
 
-        Parameters
-        ----------
-        path : path, optional
-            File to write, in the format of its ending: ``.pdf``, ``.svg``, ``.png``.
+        `path`: file to write, in the format of its ending: ``.pdf``, ``.svg``, ``.png``.
 
         Raises
         ------

@@ -26,10 +26,7 @@ POSED = frozenset({FrameStatus.TRACKED, FrameStatus.RECOVERED, FrameStatus.BYPAS
 class SampleKeeper:
     """Watches a run, and keeps of each gap the last frame before it, its first and last one, and the first after it.
 
-    Parameters
-    ----------
-    keep : callable
-        Given the frame's index and a JPEG, as soon as a gap is over.
+    `keep`: given the frame's index and a JPEG, as soon as a gap is over.
     """
 
     def __init__(self, keep: Callable[[int, bytes], None]) -> None:
@@ -70,10 +67,7 @@ class SampleKeeper:
 class PlaceAlbum:
     """Remembers what the camera has seen, so that a revisited place can be shown then and now.
 
-    Parameters
-    ----------
-    keep : callable
-        Given the frame's index and a JPEG, once a place is revisited.
+    `keep`: given the frame's index and a JPEG, once a place is revisited.
     """
 
     def __init__(self, keep: Callable[[int, bytes], None]) -> None:

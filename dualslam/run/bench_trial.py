@@ -55,11 +55,7 @@ class _TimedOutError(Exception):
 def describe_source(sequence: SequenceSpec, data: Path | None) -> SourceInfo:
     """Open a sequence so far that its length is known.
 
-    Parameters
-    ----------
-    sequence : SequenceSpec
-    data : Path, optional
-        The folder in which paths are sought.
+    `data`: the folder in which paths are sought.
 
     Raises
     ------

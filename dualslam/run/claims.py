@@ -31,19 +31,13 @@ after a blurred stretch see sharply what the blurred ones have placed."""
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """A map's claims about one keyframe; NaN if unknown.
-
-    Attributes
-    ----------
-    sigma_position_rel : float
-        Standard deviation of the position against what the keyframe sees, over the median depth of that.
-    sigma_scale : float
-        Standard deviation of the logarithm of the scale after the keyframe against that before it: how firmly the scale
-        is handed on across it. Infinite where it is not.
-    """
+    """A map's claims about one keyframe; NaN if unknown."""
 
     sigma_position_rel: float
+    """Standard deviation of the position against what the keyframe sees, over the median depth of that."""
     sigma_scale: float
+    """Standard deviation of the logarithm of the scale after the keyframe against that before it: how firmly the scale
+    is handed on across it. Infinite where it is not."""
 
 
 def claims_of(submap: Submap) -> dict[int, Claim]:

@@ -53,12 +53,10 @@ def judge_run(
 
     Parameters
     ----------
-    system : System
     trajectories : Trajectories
         Of `trajectories_of`.
     rows : sequence of FrameRow
         Of `frame_rows`: one for each frame of the source.
-    crashed : bool
     measured : Measured, optional
         The run in the frame of measurements from outside.
     besides : iterable of Reason

@@ -54,7 +54,6 @@ def camera_that_fits(config: Config, frames: Iterable[Frame], camera: Camera, sa
 
     Parameters
     ----------
-    config : Config
     frames : iterable of Frame
         The first ones are looked for in the map, which is not changed.
     camera : Camera

@@ -36,27 +36,13 @@ MANY_REJECTED = 0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """A run in the frame of its measurements.
+    """A run in the frame of its measurements."""
 
-    Attributes
-    ----------
-    frames : Trajectory
-        All frames that could be placed, by their numbers.
-    covariance : (F, 6, 6)
-    main : MetricSolution
-        Of the main map.
-    placed_alone : list of int
-        Submaps outside the main map that only measurements place.
-    undone : list of Link
-        Connections that the measurements contradict.
-    origin : (float, float, float) or None
-    """
-
-    frames: Trajectory
-    covariance: FloatArray
-    main: MetricSolution
-    placed_alone: list[int] = field(default_factory=list)
-    undone: list[Link] = field(default_factory=list)
+    frames: Trajectory  # all frames that could be placed, by their numbers
+    covariance: FloatArray  # (F, 6, 6)
+    main: MetricSolution  # of the main map
+    placed_alone: list[int] = field(default_factory=list)  # submaps outside the main map that only measurements place
+    undone: list[Link] = field(default_factory=list)  # connections that the measurements contradict
     origin: tuple[float, float, float] | None = None
 
     @property
@@ -135,14 +121,7 @@ def measure(
 
     Connections that the measurements contradict are marked as rejected in the atlas, and the main map is solved again.
 
-    Parameters
-    ----------
-    atlas : Atlas
-    poses : mapping of int to FramePose
-    main : list of int
-        Submaps of the main map.
-    sources : sequence of MeasurementSource
-    parts : MetricParts
+    `main`: submaps of the main map.
 
     Raises
     ------

@@ -125,12 +125,7 @@ def merge_runs(
 ) -> System:
     """Join the maps of two runs, and write a run folder in the frame of the first one's map.
 
-    Parameters
-    ----------
-    run_a, run_b, out : Path
-    overwrite : bool
-    measurements : callable
-        Gives those of both runs, given the shift of the second run's clock.
+    `measurements`: gives those of both runs, given the shift of the second run's clock.
 
     Returns
     -------

@@ -39,44 +39,25 @@ class Steppable(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """Cost and end of a run. The map itself stays in the system.
+    """Cost and end of a run. The map itself stays in the system."""
 
-    Attributes
-    ----------
-    n_frames : int
-        Frames that the source gave, those dropped included.
-    dropped : tuple of (int, float)
-        Index and time of the frames that came too late to be looked at (`realtime`).
-    latencies_ms : tuple of float
-        Of each frame that was looked at: in real time from the moment when it was due to its pose, waiting included (to
-        the end of its step, where it has none). Else the wall time of its step.
-    steps_ms : tuple of float
-        Wall time of each step.
-    n_late : int
-        Frames that the system was ready for only after their time (`realtime`).
-    wall_s, cpu_s : float
-        From the first frame to the end; user and system time of this process and of the children that have ended.
-    peak_rss_mb : float
-        Highest resident memory of the process since it started, and of the largest of its children that have ended.
-    interrupted : bool
-        True where a signal ended the run early, its end too.
-    error : InputError, OutputError or None
-        What ended the source early, or kept its results from being written.
-    bug : Exception or None
-        What else was raised and ended the run: by the system, the source or `on_frame`, no property of the input.
-    """
-
-    n_frames: int
+    n_frames: int  # frames that the source gave, those dropped included
     dropped: tuple[tuple[int, float], ...]
+    """tuple of (int, float): index and time of the frames that came too late to be looked at (`realtime`)."""
     latencies_ms: tuple[float, ...]
-    steps_ms: tuple[float, ...]
-    n_late: int
+    """Of each frame that was looked at: in real time from the moment when it was due to its pose, waiting included (to
+    the end of its step, where it has none). Else the wall time of its step."""
+    steps_ms: tuple[float, ...]  # wall time of each step
+    n_late: int  # frames that the system was ready for only after their time (`realtime`)
+    # From the first frame to the end; user and system time of this process and of the children that have ended.
     wall_s: float
     cpu_s: float
     peak_rss_mb: float
-    interrupted: bool
-    error: InputError | OutputError | None
+    """Highest resident memory of the process since it started, and of the largest of its children that have ended."""
+    interrupted: bool  # true where a signal ended the run early, its end too
+    error: InputError | OutputError | None  # what ended the source early, or kept its results from being written
     bug: Exception | None
+    """What else was raised and ended the run: by the system, the source or `on_frame`, no property of the input."""
 
     @property
     def fps(self) -> float:
@@ -107,8 +88,6 @@ def run_sequence(
 
     Parameters
     ----------
-    system : Steppable
-    sequence : Sequence
     realtime : bool
         Frames come at the times that their timestamps tell, and those that are too late are dropped before anything is
         done with them: a frame is, if it is more than `MAX_LATE_S` late when the system is ready for it, and the next
@@ -128,10 +107,6 @@ def run_sequence(
         The schedule of a run that is repeated: its frames are given, without those that it dropped.
     clock, sleep : callables
         For tests.
-
-    Returns
-    -------
-    RunReport
 
     Raises
     ------

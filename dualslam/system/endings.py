@@ -34,14 +34,7 @@ ROOM_TO_COME_BACK = 1.2
 class Endings:
     """Archives live maps, and continues in the next where the end is no loss.
 
-    Parameters
-    ----------
-    state : State
-    recoveries : Recoveries
-    connections : Connections
-    sightings : Sightings
-    earlier : set of int
-        The submaps that earlier runs have left.
+    `earlier`: the submaps that earlier runs have left.
     """
 
     def __init__(

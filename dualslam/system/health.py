@@ -49,22 +49,14 @@ MIN_INNOVATIONS = 8
 
 @dataclass(frozen=True, slots=True)
 class FrameHealth:
-    """The verdict on one frame: whether the map explains it, and what speaks against that.
-
-    Attributes
-    ----------
-    index : int
-    signs : tuple of FailureReason
-        Empty for a healthy frame. Signs alone fail nothing: they mark the stretch that may be corrupted.
-    failed : bool
-    numbers : dict
-        Inlier ratio, chi-square over its degrees of freedom, squared Mahalanobis distance from the motion model.
-    """
+    """The verdict on one frame: whether the map explains it, and what speaks against that."""
 
     index: int
     signs: tuple[FailureReason, ...]
+    """Empty for a healthy frame. Signs alone fail nothing: they mark the stretch that may be corrupted."""
     failed: bool
     numbers: dict[str, float]
+    """Inlier ratio, chi-square over its degrees of freedom, squared Mahalanobis distance from the motion model."""
 
 
 class HealthMonitor:
@@ -72,10 +64,6 @@ class HealthMonitor:
 
     The motion model's error has no sigma that could be known beforehand: a car and a hand differ. It is measured on the
     frames of the last seconds. So is the level of the chi-square, which contains the camera model's own error.
-
-    Parameters
-    ----------
-    config : HealthConfig
     """
 
     def __init__(self, config: HealthConfig) -> None:

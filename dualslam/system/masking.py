@@ -13,13 +13,7 @@ from dualslam.system.state import State
 
 
 class Masking:
-    """Follows what is known to stand still.
-
-    Parameters
-    ----------
-    state : State
-    starting : Starting
-    """
+    """Follows what is known to stand still."""
 
     def __init__(self, state: State, starting: Starting) -> None:
         self._state = state

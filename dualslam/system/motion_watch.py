@@ -44,10 +44,8 @@ class MotionWatch:
 
         Parameters
         ----------
-        at : FrameStamp
         wide : bool
             Whether it was found beyond a gap.
-        record : Record
         submap : Submap
             In which it was posed.
         """

@@ -30,21 +30,11 @@ URGENT_TIMES = 2
 
 @dataclass(slots=True)
 class PaceStatistics:
-    """Counts of the work left out.
+    """Counts of the work left out."""
 
-    Attributes
-    ----------
-    put_off : int
-        Frames at which a keyframe was due and did not come.
-    behind : int
-        Frames that were looked at while the system was behind.
-    max_lag_keyframes : int
-        Keyframes that the graph beside did not know yet, at most.
-    """
-
-    put_off: int = 0
-    behind: int = 0
-    max_lag_keyframes: int = 0
+    put_off: int = 0  # frames at which a keyframe was due and did not come
+    behind: int = 0  # frames that were looked at while the system was behind
+    max_lag_keyframes: int = 0  # keyframes that the graph beside did not know yet, at most
 
 
 class Pace:

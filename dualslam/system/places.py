@@ -24,13 +24,7 @@ tracking take 20."""
 class PlaceKeeping:
     """Links the live map where it shows a place again, between two frames and not during reverse tracking from it.
 
-    Parameters
-    ----------
-    state : State
-    revisits : Revisits
-    recoveries : Recoveries
-    handover : Handover or None
-        None where no map of an earlier run is extended.
+    `handover`: none where no map of an earlier run is extended.
     """
 
     def __init__(self, state: State, revisits: Revisits, recoveries: Recoveries, handover: Handover | None) -> None:

@@ -25,25 +25,14 @@ class PoseCovariance:
 
     Two parts add up: the marginal covariance of the reference keyframe in the submap's graph, and that of the frame
     against the landmarks that it sees.
-
-    Attributes
-    ----------
-    submap : Submap
-    graph : SubmapGraph
-    keyframe_id : int
-    T_submap_cam : (4, 4)
-    landmark_ids : (N,) int64
-        That the frame agrees with.
-    sigma_px : (N,)
-        Of the pixels at which it sees them.
     """
 
     submap: Submap
     graph: SubmapGraph
     keyframe_id: int
-    T_submap_cam: FloatArray
-    landmark_ids: IntArray
-    sigma_px: FloatArray
+    T_submap_cam: FloatArray  # (4, 4)
+    landmark_ids: IntArray  # (N,): that the frame agrees with
+    sigma_px: FloatArray  # (N,): of the pixels at which it sees them
 
     @classmethod
     def of(cls, live: VisualOdometry, track: Track, T_submap_cam: FloatArray) -> Self:

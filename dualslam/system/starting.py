@@ -37,13 +37,7 @@ FORESEEN = 3
 class Starting:
     """Finds a map again, or starts one.
 
-    Parameters
-    ----------
-    state : State
-    tracking : Tracking
-    recoveries : Recoveries
-    sightings : Sightings
-        Tells whether any submap shows a frame.
+    `sightings`: tells whether any submap shows a frame.
     """
 
     def __init__(self, state: State, tracking: Tracking, recoveries: Recoveries, sightings: Sightings) -> None:

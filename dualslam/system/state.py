@@ -20,44 +20,21 @@ from dualslam.system.pace import Pace
 
 @dataclass(slots=True)
 class State:
-    """State that the steps of a frame share.
-
-    Attributes
-    ----------
-    parts : Components
-    config : Config
-    record : Record
-    buffer : FrameBuffer
-    pace : Pace
-    saved : StoredMap or None
-        The map that this run continues.
-    localises : bool
-        Frames are only found in that map, and nothing is added to it.
-    relocaliser : Relocaliser
-        Looks for the map that was lost last.
-    health : HealthMonitor
-        Of the tracking in the live map, or of the attempts at one.
-    motion_watch : MotionWatch
-    audit : PhotometricAudit
-    live : VisualOdometry or None
-        The front end of the live submap; None while there is no map.
-    lost : list of View
-        The frames since tracking was lost in the live map.
-    """
+    """State that the steps of a frame share."""
 
     parts: Components
     config: Config
     record: Record
     buffer: FrameBuffer
-    saved: StoredMap | None
-    localises: bool
-    relocaliser: Relocaliser
-    health: HealthMonitor
+    saved: StoredMap | None  # the map that this run continues
+    localises: bool  # frames are only found in that map, and nothing is added to it
+    relocaliser: Relocaliser  # looks for the map that was lost last
+    health: HealthMonitor  # of the tracking in the live map, or of the attempts at one
     audit: PhotometricAudit
     pace: Pace = field(default_factory=Pace)
     motion_watch: MotionWatch = field(default_factory=MotionWatch)
-    live: VisualOdometry | None = None
-    lost: list[View] = field(default_factory=list)
+    live: VisualOdometry | None = None  # the front end of the live submap; None while there is no map
+    lost: list[View] = field(default_factory=list)  # the frames since tracking was lost in the live map
 
     def front_ends(self) -> list[VisualOdometry]:
         """Return the front ends that track in a submap, or may soon: they must follow when it moves."""

@@ -40,10 +40,7 @@ PAUSE, SAVE = "pause", "save"
 class LiveView:
     """A run in the browser, at an address of this machine alone.
 
-    Parameters
-    ----------
-    port : int
-        Of 127.0.0.1; 0 takes a free one.
+    `port`: of 127.0.0.1; 0 takes a free one.
 
     Attributes
     ----------

@@ -103,12 +103,7 @@ def _free_port() -> int:
 
 
 class Page:
-    """Contents of the page.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-    """
+    """Contents of the page."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server

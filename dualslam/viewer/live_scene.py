@@ -43,46 +43,23 @@ FEATURE_RGB, MATCHED_RGB = (150, 150, 150), (60, 220, 90)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """A submap as it is drawn.
+    """A submap as it is drawn."""
 
-    Attributes
-    ----------
-    lines : (N, 2, 3) float32
-        Its keyframes as pyramids, and the way between them.
-    line_rgb : (N, 2, 3) uint8
-    points : (L, 3) float32
-    centres : (K, 3) float64
-    """
-
-    lines: NDArray[np.float32]
-    line_rgb: NDArray[np.uint8]
-    points: NDArray[np.float32]
-    centres: FloatArray
+    lines: NDArray[np.float32]  # (N, 2, 3): its keyframes as pyramids, and the way between them
+    line_rgb: NDArray[np.uint8]  # (N, 2, 3)
+    points: NDArray[np.float32]  # (L, 3)
+    centres: FloatArray  # (K, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnWalk:
-    """Reverse tracking that is under way.
-
-    Attributes
-    ----------
-    submap_id : int
-    way : (N, 3) float32
-        The earliest frame first.
-    T_world_cam : (4, 4) or None
-        Of the last frame that has a pose.
-    is_posed : bool
-        Whether that is the frame at which the walk is.
-    place : int or None
-        Of that frame among the statuses.
-    words : str
-    """
+    """Reverse tracking that is under way."""
 
     submap_id: int
-    way: NDArray[np.float32]
-    T_world_cam: FloatArray | None
-    is_posed: bool
-    place: int | None
+    way: NDArray[np.float32]  # (N, 3): the earliest frame first
+    T_world_cam: FloatArray | None  # (4, 4): of the last frame that has a pose
+    is_posed: bool  # whether that is the frame at which the walk is
+    place: int | None  # of that frame among the statuses
     words: str
 
 

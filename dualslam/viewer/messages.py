@@ -32,24 +32,13 @@ MAX_LANDMARKS = 20_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SubmapArrays:
-    """A submap's geometry in its own frame.
-
-    Attributes
-    ----------
-    submap_id : int
-    kf : (K,) int64
-        Keyframes, ascending.
-    T_submap_kf : (K, 4, 4) float32
-    condemned : (K,) bool
-        Keyframes marked invalid.
-    landmarks_xyz : (L, 3) float32
-    """
+    """A submap's geometry in its own frame."""
 
     submap_id: int
-    kf: IntArray
-    T_submap_kf: NDArray[np.float32]
-    condemned: BoolArray
-    landmarks_xyz: NDArray[np.float32]
+    kf: IntArray  # (K,): keyframes, ascending
+    T_submap_kf: NDArray[np.float32]  # (K, 4, 4)
+    condemned: BoolArray  # (K,): keyframes marked invalid
+    landmarks_xyz: NDArray[np.float32]  # (L, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,21 +55,11 @@ class LinkLine:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """The newest frame, small.
+    """The newest frame, small."""
 
-    Attributes
-    ----------
-    pixels : (H, W, 3) uint8
-        RGB.
-    uv_px : (N, 2) float32
-        Its features, in pixels of the picture.
-    matched : (N,) bool
-        Those that show a landmark.
-    """
-
-    pixels: NDArray[np.uint8]
-    uv_px: NDArray[np.float32]
-    matched: BoolArray
+    pixels: NDArray[np.uint8]  # (H, W, 3): RGB
+    uv_px: NDArray[np.float32]  # (N, 2): its features, in pixels of the picture
+    matched: BoolArray  # (N,): those that show a landmark
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,65 +82,33 @@ class Walk:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Message:
-    """A run as it stands after a frame.
-
-    Attributes
-    ----------
-    frame : int
-    timestamp_s : float
-    status : FrameStatus
-    latency_ms : float
-    submap_id : int or None
-    T_submap_cam : (4, 4) or None
-    picture : Picture or None
-        None where there is no image.
-    changed : tuple of SubmapArrays
-        Submaps of which anything but their place is new.
-    components : tuple of dict of int to (4, 4)
-        The linked sets of submaps: each submap's similarity into the frame of the set's first.
-    links : tuple of LinkLine
-    statuses : tuple of str
-        Of all frames so far, or of those after `n_statuses_before`.
-    n_statuses_before : int
-        0 where frames may have been posed later: then `statuses` has all.
-    events : tuple of EventWords
-        New ones.
-    walking : tuple of int
-        Submaps that are being tracked from in reverse.
-    walks : tuple of Walk
-        Those walks of which anything is known.
-    backlog : int
-        Background jobs that wait or are under way.
-    over : bool
-        The run has ended.
-    """
+    """A run as it stands after a frame."""
 
     frame: int
     timestamp_s: float
     status: FrameStatus
     latency_ms: float
     submap_id: int | None
-    T_submap_cam: FloatArray | None
-    picture: Picture | None
-    changed: tuple[SubmapArrays, ...]
+    T_submap_cam: FloatArray | None  # (4, 4)
+    picture: Picture | None  # none where there is no image
+    changed: tuple[SubmapArrays, ...]  # submaps of which anything but their place is new
     components: tuple[dict[int, FloatArray], ...]
+    """tuple of dict of int to (4, 4): the linked sets of submaps: each submap's similarity into the frame of the set's
+    first."""
     links: tuple[LinkLine, ...]
-    statuses: tuple[str, ...]
-    n_statuses_before: int
-    events: tuple[EventWords, ...]
-    walking: tuple[int, ...]
-    walks: tuple[Walk, ...]
-    backlog: int
-    over: bool = False
+    statuses: tuple[str, ...]  # of all frames so far, or of those after `n_statuses_before`
+    n_statuses_before: int  # 0 where frames may have been posed later: then `statuses` has all
+    events: tuple[EventWords, ...]  # new ones
+    walking: tuple[int, ...]  # submaps that are being tracked from in reverse
+    walks: tuple[Walk, ...]  # those walks of which anything is known
+    backlog: int  # background jobs that wait or are under way
+    over: bool = False  # the run has ended
 
 
 class Teller:
     """Makes the messages of a run, each with what is new since the one before.
 
-    Parameters
-    ----------
-    system : System
-        Its `on_pose` is taken, in front of one that is there.
+    `system`: its `on_pose` is taken, in front of one that is there.
     """
 
     def __init__(self, system: System) -> None:

@@ -35,22 +35,12 @@ _NO_XYZ = np.zeros((0, 3))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Appearing:
-    """Points that appear one by one and stay.
+    """Points that appear one by one and stay."""
 
-    Attributes
-    ----------
-    row : (N,) int64
-        The frame at which each appears, ascending: a row of `Playback.rows`.
-    xyz : (N, 3) float64
-    submap : (N,) int64
-    rgb : (N, 3) uint8
-        Their colours in the images; of keyframes, and where none are known, `GREY`.
-    """
-
-    row: IntArray
-    xyz: FloatArray
-    submap: IntArray
-    rgb: NDArray[np.uint8]
+    row: IntArray  # (N,): the frame at which each appears, ascending: a row of `Playback.rows`
+    xyz: FloatArray  # (N, 3)
+    submap: IntArray  # (N,)
+    rgb: NDArray[np.uint8]  # (N, 3): their colours in the images; of keyframes, and where none are known, `GREY`
 
     def __len__(self) -> int:
         return len(self.row)
@@ -58,26 +48,16 @@ class Appearing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Space:
-    """One frame of reference with all that stands in it, in the unit of its map.
+    """One frame of reference with all that stands in it, in the unit of its map."""
 
-    Attributes
-    ----------
-    submap : int or None
-        None for the main map; a submap that is not linked to it has a space of its own.
-    posed : PosedRows
-        Poses as the trajectory file has them.
-    keyframes, landmarks : Appearing
-        Camera centres at their own frames; landmarks at the keyframe that first described them. Landmarks that were far
-        from it are left out, as in the pictures of the report.
-    truth_xyz : (T, 3) float64
-        True camera centres, taken into this space by one similarity; empty where there are none.
-    """
-
-    submap: int | None
-    posed: PosedRows
+    submap: int | None  # none for the main map; a submap that is not linked to it has a space of its own
+    posed: PosedRows  # poses as the trajectory file has them
+    # Camera centres at their own frames; landmarks at the keyframe that first described them. Landmarks that were far
+    # from it are left out, as in the pictures of the report.
     keyframes: Appearing
     landmarks: Appearing
     truth_xyz: FloatArray
+    """(T, 3): true camera centres, taken into this space by one similarity; empty where there are none."""
 
     @property
     def size(self) -> float:
@@ -87,20 +67,11 @@ class Space:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Playback:
-    """A run as it is played.
+    """A run as it is played."""
 
-    Attributes
-    ----------
-    rows : list of FrameRow
-        Every input frame, ascending in time (a run may have read them backwards).
-    camera : Camera
-    spaces : list of Space
-        The main map first; it is there even if it is empty.
-    """
-
-    rows: list[FrameRow]
+    rows: list[FrameRow]  # every input frame, ascending in time (a run may have read them backwards)
     camera: Camera
-    spaces: list[Space]
+    spaces: list[Space]  # the main map first; it is there even if it is empty
 
 
 def play(run: RunData) -> Playback:

@@ -22,10 +22,7 @@ IN_PLACE_S, LINE_S = 0.5, 15.0
 class RunState:
     """Current activity of a run, for a viewer.
 
-    Parameters
-    ----------
-    n_frames : int or None
-        How many frames there are, if that is known.
+    `n_frames`: how many frames there are, if that is known.
 
     Attributes
     ----------

@@ -41,31 +41,15 @@ MAX_WAITING = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lane:
-    """Processes for some kinds of jobs.
-
-    Attributes
-    ----------
-    name : str
-    kinds : sequence of JobKind
-        The most urgent first: where several jobs wait, one of it goes first.
-    make_handlers : callable
-    n_workers : int
-        Jobs that run at the same time; further ones wait their turn.
-    time_limit_s : float
-        How long a job may take before its worker counts as hung.
-    niceness : int
-        See `Worker`.
-    max_waiting : int
-        Jobs of a kind that may wait for a worker.
-    """
+    """Processes for some kinds of jobs."""
 
     name: str
-    kinds: Sequence[JobKind]
+    kinds: Sequence[JobKind]  # the most urgent first: where several jobs wait, one of it goes first
     make_handlers: MakeHandlers
-    n_workers: int
-    time_limit_s: float
-    niceness: int = 0
-    max_waiting: int = MAX_WAITING
+    n_workers: int  # jobs that run at the same time; further ones wait their turn
+    time_limit_s: float  # how long a job may take before its worker counts as hung
+    niceness: int = 0  # see `Worker`
+    max_waiting: int = MAX_WAITING  # jobs of a kind that may wait for a worker
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,31 +99,17 @@ class _Queue:
 
 @dataclass(slots=True)
 class QueueStatistics:
-    """Statistics of the jobs of a kind.
+    """Statistics of the jobs of a kind."""
 
-    Attributes
-    ----------
-    n_done, n_failed : int
-        Jobs that have ended; and those of them whose worker died or hung, or that were one too many.
-    max_waiting : int
-        Jobs that waited at the same time.
-    longest_s : float
-        From when a job was submitted to its end.
-    wall_s : float
-        The same, all jobs together.
-    cpu_s : float
-        Of the processes.
-    peak_rss_mb : float
-        Highest resident memory that a process had had when it ended one: all that is done in a lane is in it.
-    """
-
+    # Jobs that have ended; and those of them whose worker died or hung, or that were one too many.
     n_done: int = 0
     n_failed: int = 0
-    max_waiting: int = 0
-    longest_s: float = 0.0
-    wall_s: float = 0.0
-    cpu_s: float = 0.0
+    max_waiting: int = 0  # jobs that waited at the same time
+    longest_s: float = 0.0  # from when a job was submitted to its end
+    wall_s: float = 0.0  # the same, all jobs together
+    cpu_s: float = 0.0  # of the processes
     peak_rss_mb: float = 0.0
+    """Highest resident memory that a process had had when it ended one: all that is done in a lane is in it."""
 
 
 class WorkerDesk:

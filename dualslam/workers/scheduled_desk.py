@@ -40,8 +40,6 @@ class ScheduledDesk:
 
     Parameters
     ----------
-    executor : Executor
-    policy : Policy
     finish_wait_s : float
         How long the end of a run in real time, or of one that was interrupted, waits for what is under way.
     budget_s : float, optional

@@ -20,33 +20,18 @@ _SESSIONS = count()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StartQuestion:
-    """Frames to be collected, the last of which is to be tried.
+    """Frames to be collected, the last of which is to be tried."""
 
-    Attributes
-    ----------
-    session : int
-        Of one search: with another one all that was collected is forgotten.
-    K : (3, 3) float64
-        Intrinsics of the frames.
-    views : tuple of View
-        Those that the search does not know yet, without their images.
-    waited_s : float
-        For how long there has been no map.
-    """
-
-    session: int
-    K: FloatArray
-    views: tuple[View, ...]
-    waited_s: float
+    session: int  # of one search: with another one all that was collected is forgotten
+    K: FloatArray  # (3, 3): intrinsics of the frames
+    views: tuple[View, ...]  # those that the search does not know yet, without their images
+    waited_s: float  # for how long there has been no map
 
 
 class StartServer:
     """Collects and tries, in the process that searches.
 
-    Parameters
-    ----------
-    new_starter : callable
-        Makes what searches among frames of these intrinsics.
+    `new_starter`: makes what searches among frames of these intrinsics.
     """
 
     def __init__(self, new_starter: Callable[[FloatArray], MapStarter]) -> None:
@@ -76,7 +61,6 @@ class StartBeside:
 
     Parameters
     ----------
-    desk : Desk
     starter : MapStarter
         Searches here and now when the system is on time.
     K : (3, 3) float64

@@ -40,11 +40,7 @@ _COUNT = struct.Struct("<Q")
 class Channel:
     """One end of a pipe.
 
-    Parameters
-    ----------
-    connection : Connection
-    gives : bool
-        Whether this end gives jobs, and says what is kept; the other one does them, and keeps.
+    `gives`: whether this end gives jobs, and says what is kept; the other one does them, and keeps.
     """
 
     def __init__(self, connection: Connection, gives: bool) -> None:

@@ -51,7 +51,6 @@ class Worker:
         See `MakeHandlers`.
     niceness : int
         By so much it stands behind the process that tracks.
-    name : str
     """
 
     def __init__(self, make_handlers: MakeHandlers, niceness: int = 0, name: str = "worker") -> None:

@@ -18,17 +18,10 @@ MARGIN_PX = 160
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrintedPlane:
-    """A printed plane, `size_px` wide and high in the straight view.
+    """A printed plane, `size_px` wide and high in the straight view."""
 
-    Attributes
-    ----------
-    texture : (H, W) uint8
-        The print, `TEXELS` to a pixel, `MARGIN_PX` pixels wider on every side.
-    size_px : (width, height)
-    """
-
-    texture: NDArray[np.uint8]
-    size_px: tuple[int, int]
+    texture: NDArray[np.uint8]  # (H, W): the print, `TEXELS` to a pixel, `MARGIN_PX` pixels wider on every side
+    size_px: tuple[int, int]  # (width, height)
 
     @classmethod
     def printed(cls, seed: int, size_px: tuple[int, int] = (480, 360)) -> PrintedPlane:

@@ -52,18 +52,10 @@ def _kind(error: Exception) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """The front end under examination, and the scene that it is shown.
+    """The front end under examination, and the scene that it is shown."""
 
-    Attributes
-    ----------
-    factory : FrontendFactory
-        What the entry point names.
-    options : mapping
-        `frontend.options` to build it with.
-    """
-
-    factory: FrontendFactory
-    options: Mapping[str, Any] = field(default_factory=dict)
+    factory: FrontendFactory  # what the entry point names
+    options: Mapping[str, Any] = field(default_factory=dict)  # `frontend.options` to build it with
 
     def make(self, n_features: int = N_FEATURES) -> Frontend:
         """Build it anew."""

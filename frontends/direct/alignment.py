@@ -30,23 +30,12 @@ DAMPING = 1e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """Where a pose puts M of the patches in the image.
+    """Where a pose puts M of the patches in the image."""
 
-    Attributes
-    ----------
-    row : (M,)
-        Of the patches: those that are wholly in the image and of enough contrast.
-    uv_px : (M, 2)
-    axes : (M, 2, 2)
-        Steps in the image from one pixel of the patch to its neighbours.
-    J_pose : (M, 2, 6)
-        Of the pixel by a left perturbation of the pose (rotation, translation).
-    """
-
-    row: IntArray
-    uv_px: FloatArray
-    axes: FloatArray
-    J_pose: FloatArray
+    row: IntArray  # (M,): of the patches: those that are wholly in the image and of enough contrast
+    uv_px: FloatArray  # (M, 2)
+    axes: FloatArray  # (M, 2, 2): steps in the image from one pixel of the patch to its neighbours
+    J_pose: FloatArray  # (M, 2, 6): of the pixel by a left perturbation of the pose (rotation, translation)
 
 
 def place(patches: Patches, camera: Camera, T_cam_submap: FloatArray, level: int, usable: BoolArray) -> Placed:

@@ -50,10 +50,7 @@ class _Patches:
 class PatchAudit:
     """Keeps small patches of keyframes, and measures how well a frame at its estimated pose agrees with them.
 
-    Parameters
-    ----------
-    camera : callable
-        The camera that rectifies the features now.
+    `camera`: the camera that rectifies the features now.
     """
 
     def __init__(self, camera: Callable[[], Camera]) -> None:

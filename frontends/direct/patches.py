@@ -27,45 +27,22 @@ MAX_PATCHES = 400
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Templates:
-    """Patches at one level of the pyramid, under one smear; the mean of each is 0.
+    """Patches at one level of the pyramid, under one smear; the mean of each is 0."""
 
-    Attributes
-    ----------
-    greys : (N, 9, 9)
-    gradient : (N, 49, 2)
-        Of the inner 7 x 7 pixels by the patch's own columns and rows.
-    usable : (N,) bool
-        In the image, and of enough contrast.
-    """
-
-    greys: NDArray[np.float32]
-    gradient: FloatArray
-    usable: BoolArray
+    greys: NDArray[np.float32]  # (N, 9, 9)
+    gradient: FloatArray  # (N, 49, 2): of the inner 7 x 7 pixels by the patch's own columns and rows
+    usable: BoolArray  # (N,): in the image, and of enough contrast
 
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """N landmarks with a patch each, of one of several references.
+    """N landmarks with a patch each, of one of several references."""
 
-    Attributes
-    ----------
-    landmark_ids : (N,)
-    xyz : (N, 3)
-        Where the landmark's pixel is, in the submap.
-    J : (N, 3, 2)
-        How that place moves with the pixel, the plane of the patch parallel to its image.
-    of : (N,) int64
-        Row of its reference.
-    uv_px : (N, 2)
-        Where the reference shows it.
-    references : list of Pyramid
-    """
-
-    landmark_ids: IntArray
-    xyz: FloatArray
-    J: FloatArray
-    of: IntArray
-    uv_px: FloatArray
+    landmark_ids: IntArray  # (N,)
+    xyz: FloatArray  # (N, 3): where the landmark's pixel is, in the submap
+    J: FloatArray  # (N, 3, 2): how that place moves with the pixel, the plane of the patch parallel to its image
+    of: IntArray  # (N,): row of its reference
+    uv_px: FloatArray  # (N, 2): where the reference shows it
     references: list[Pyramid]
     _kept: dict[tuple[int, Smear], Templates] = field(default_factory=dict)
 

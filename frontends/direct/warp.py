@@ -26,22 +26,13 @@ REMAP_ROWS = 30000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Warp:
-    """Where N points of view a are in view b.
+    """Where N points of view a are in view b."""
 
-    Attributes
-    ----------
-    uv_rect_a_px : (N, 2)
-        Rectified pixels of the points in a.
-    uv_px, uv_rect_px : (N, 2)
-        Pixels in b as its lens shows them, and rectified; NaN where b does not show a point.
-    J_b_a : (N, 2, 2)
-        Derivative of a pixel in b by its pixel in a.
-    """
-
-    uv_rect_a_px: FloatArray
-    uv_px: FloatArray
-    uv_rect_px: FloatArray
-    J_b_a: FloatArray
+    uv_rect_a_px: FloatArray  # (N, 2): rectified pixels of the points in a
+    # Pixels in b as its lens shows them, and rectified; NaN where b does not show a point.
+    uv_px: FloatArray  # (N, 2)
+    uv_rect_px: FloatArray  # (N, 2)
+    J_b_a: FloatArray  # (N, 2, 2): derivative of a pixel in b by its pixel in a
 
     @property
     def zoom(self) -> FloatArray:
@@ -101,7 +92,6 @@ def sample(levels: Pyramid, uv_px: FloatArray, axes: FloatArray, half: int) -> N
     uv_px : (N, 2)
     axes : (N, 2, 2)
         Columns: steps in the image from one pixel of the patch to its right and lower neighbour.
-    half : int
     """
     step = np.sqrt(np.abs(np.linalg.det(axes)))
     side = 2 * half + 1

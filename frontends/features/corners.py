@@ -78,7 +78,6 @@ def select_spread(xy: IntArray, response: FloatArray, n_wanted: int) -> IntArray
     xy : (N, 2) int64
     response : (N,) float64
         Strength, whole numbers below 256.
-    n_wanted : int
 
     Returns
     -------
@@ -138,18 +137,11 @@ def share_out(n_available: Sequence[int], weights: FloatArray, n_wanted: int) ->
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Peaks:
-    """Differences of Gaussians around the corners, shared by the sub-pixel step and its doubts.
-
-    Attributes
-    ----------
-    response : (N, 3, 3) float32
-        About its extremum beside each corner, turned so that the extremum is a maximum.
-    middle : (N, 2) int64
-        Where the extremum is, (du, dv) from the corner in whole pixels.
-    """
+    """Differences of Gaussians around the corners, shared by the sub-pixel step and its doubts."""
 
     response: NDArray[np.float32]
-    middle: IntArray
+    """(N, 3, 3) float32: about its extremum beside each corner, turned so that the extremum is a maximum."""
+    middle: IntArray  # (N, 2): where the extremum is, (du, dv) from the corner in whole pixels
 
 
 def find_peaks(patches: NDArray[np.uint8]) -> Peaks:
@@ -181,11 +173,7 @@ def stand_out(peaks: Peaks, noise: FloatArray) -> BoolArray:
     What tells is how the extremum that `refine_corners` looks for curves in the direction in which it curves least: in
     a soft image, and along an edge in any, not more than noise makes it.
 
-    Parameters
-    ----------
-    peaks : Peaks
-    noise : (N,) float64
-        Its standard deviation about each of them, grey levels.
+    `noise` (N,) float64: its standard deviation about each of them, grey levels.
     """
     least = _least_curvature(peaks.response)
     return np.asarray(least > _STANDS_OUT_SIGMAS * _DOG_CURVATURE_NOISE * noise)

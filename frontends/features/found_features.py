@@ -32,7 +32,6 @@ def features_found(
         Where the new image shows them, as read.
     sigma_px, zoom, turn_rad : (N,)
         Noise of each coordinate; by how much larger the image shows them, and turned by which angle.
-    frontend : Frontend
     camera : Camera
         The one that rectifies now.
     model_sigma_px : float

@@ -23,11 +23,7 @@ class GmsOptions(OrbOptions):
 class GmsFrontend(OrbFrontend):
     """ORB with another `match_wide`; all else is ORB's. Implements `Frontend`.
 
-    Parameters
-    ----------
-    n_features : int
-        Keypoints per image, at most.
-    options : GmsOptions, optional
+    `n_features`: keypoints per image, at most.
     """
 
     name = "gms"

@@ -118,10 +118,8 @@ def mutual(near: Nearest, ratio: float, max_distance: float, nearest_rows: Calla
 
     Parameters
     ----------
-    near : Nearest
     ratio : float
         Greatest best distance over second best, row-wise.
-    max_distance : float
     nearest_rows : callable
         Returns which row is nearest to each of some columns, the first of equals.
     """

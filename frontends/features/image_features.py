@@ -24,12 +24,8 @@ class ImageFeatures:
     """Features of images, as long as somebody holds these, and up to `MAX_BYTES`: then the one goes first that was
     not used for longest.
 
-    Parameters
-    ----------
-    frontend : Frontend
-    n_threads : int
-        That look at prefetched images; at a gap six to eight are wanted at once, and the walk goes no further without
-        them. With none they are looked at when they are wanted.
+    `n_threads`: that look at prefetched images; at a gap six to eight are wanted at once, and the walk goes no further
+    without them. With none they are looked at when they are wanted.
     """
 
     def __init__(self, frontend: Frontend, n_threads: int) -> None:

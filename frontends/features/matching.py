@@ -16,29 +16,14 @@ from dualslam.frontends.features.groups import NO_MATCHES, best_pairs, best_per_
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureGrid:
-    """Features sorted into square cells, row by row, so that a disc is a few contiguous runs of the sorted list.
+    """Features sorted into square cells, row by row, so that a disc is a few contiguous runs of the sorted list."""
 
-    Attributes
-    ----------
-    uv_px : (N, 2) float64
-        The features' positions, in their own order.
-    cell_px : float
-    origin_px : (2,) float64
-        Corner of the first cell.
-    shape : (int, int)
-        Cell rows and columns.
-    order : (N,) int64
-        Feature rows sorted by cell.
-    start : (rows * columns + 1,) int64
-        Where each cell begins in `order`.
-    """
-
-    uv_px: FloatArray
+    uv_px: FloatArray  # (N, 2): the features' positions, in their own order
     cell_px: float
-    origin_px: FloatArray
-    shape: tuple[int, int]
-    order: IntArray
-    start: IntArray
+    origin_px: FloatArray  # (2,): corner of the first cell
+    shape: tuple[int, int]  # cell rows and columns
+    order: IntArray  # (N,): feature rows sorted by cell
+    start: IntArray  # (rows * columns + 1,): where each cell begins in `order`
 
     @classmethod
     def build(
@@ -120,7 +105,6 @@ def match_projected(
 
     Parameters
     ----------
-    frontend : Frontend
     grid : FeatureGrid
         Of `features.uv_rect_px`.
     features : Features
@@ -190,8 +174,6 @@ def match_epipolar(
 
     Parameters
     ----------
-    frontend : Frontend
-    a, b : Features
     rows_a : (A,) int64, rows_b : (B,) int64
         Features that take part, usually those without a landmark.
     F_b_a : (3, 3) float64
@@ -200,7 +182,6 @@ def match_epipolar(
         Standard deviation of the line's place caused by the relative pose's own error.
     epipole_px : float
         Features nearer than this to the epipole of their image are passed over: no parallax there.
-    octave_tolerance : int
     max_distance : float, optional
         `frontend.max_distance` by default.
     ratio : float

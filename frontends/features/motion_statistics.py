@@ -35,27 +35,16 @@ _RING = np.array([0, 1, 2, 5, 8, 7, 6, 3])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Table:
-    """Matches counted by pairs of cells.
+    """Matches counted by pairs of cells."""
 
-    Attributes
-    ----------
-    match : (V,) int64
-        Matches whose first member is in the grid; `cell_a`, `cell_b` (V,) are their cells.
-    counts : (A, B) int32
-        Matches from cell to cell.
-    n_a : (A,) int64
-        Matches of each cell of the first image.
-    occupied, favourite : (O,) int64
-        Cells with matches, and where most of them go (the first of equals).
-    """
-
-    match: IntArray
+    match: IntArray  # (V,): matches whose first member is in the grid; `cell_a`, `cell_b` (V,) are their cells
     cell_a: IntArray
     cell_b: IntArray
-    counts: NDArray[np.int32]
-    n_a: IntArray
-    occupied: IntArray
-    favourite: IntArray
+    counts: NDArray[np.int32]  # (A, B): matches from cell to cell
+    n_a: IntArray  # (A,): matches of each cell of the first image
+    # Cells with matches, and where most of them go (the first of equals).
+    occupied: IntArray  # (O,)
+    favourite: IntArray  # (O,)
 
 
 def supported_matches(

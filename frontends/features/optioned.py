@@ -11,17 +11,10 @@ from dualslam.frontends.registry import parse_options
 
 
 class OptionedFrontend:
-    """A front end that is made of a number of features and its own strict options.
-
-    Attributes
-    ----------
-    name : str
-    options_model : type
-        Of its options.
-    """
+    """A front end that is made of a number of features and its own strict options."""
 
     name: str
-    options_model: ClassVar[type[BaseModel]]
+    options_model: ClassVar[type[BaseModel]]  # of its options
 
     def __init__(self, n_features: int, options: Any = None) -> None:
         self.n_features = n_features

@@ -116,11 +116,7 @@ class OrbOptions(StrictModel):
 class OrbFrontend(OptionedFrontend):
     """FAST corners, intensity-centroid orientation, rotated BRIEF descriptors of 256 bits. Implements `Frontend`.
 
-    Parameters
-    ----------
-    n_features : int
-        Keypoints per image, at most.
-    options : OrbOptions, optional
+    `n_features`: keypoints per image, at most.
     """
 
     name = "orb"
@@ -140,10 +136,7 @@ class OrbFrontend(OptionedFrontend):
     def extract(self, image: NDArray[np.uint8]) -> Features:
         """Detect and describe up to `n_features` corners, the finest octave first.
 
-        Parameters
-        ----------
-        image : (H, W) or (H, W, 3) RGB uint8
-            Of any size; a flat or a tiny one has no features.
+        `image` (H, W) or (H, W, 3) RGB uint8: of any size; a flat or a tiny one has no features.
 
         Raises
         ------

@@ -80,11 +80,7 @@ class SiftOptions(StrictModel):
 class SiftFrontend(OptionedFrontend):
     """Difference-of-Gaussian extrema, gradient orientation, RootSIFT descriptors. Implements `Frontend`.
 
-    Parameters
-    ----------
-    n_features : int
-        Keypoints per image, at most.
-    options : SiftOptions, optional
+    `n_features`: keypoints per image, at most.
     """
 
     name = "sift"
@@ -103,10 +99,7 @@ class SiftFrontend(OptionedFrontend):
     def extract(self, image: NDArray[np.uint8]) -> Features:
         """Detect and describe up to `n_features` extrema, the finest octave first.
 
-        Parameters
-        ----------
-        image : (H, W) or (H, W, 3) RGB uint8
-            Of any size; a flat or a tiny one has no features.
+        `image` (H, W) or (H, W, 3) RGB uint8: of any size; a flat or a tiny one has no features.
 
         Raises
         ------

@@ -48,12 +48,7 @@ class OwnFeatures:
 class BufferedFeatures:
     """Those that another front end finds in the buffered images. Implements `AuxiliaryFeatures`.
 
-    Parameters
-    ----------
-    images : ImageFeatures
-    model_sigma_px : float
-        See `CameraConfig.model_sigma_px`.
-    camera : Camera
+    `model_sigma_px`: see `CameraConfig.model_sigma_px`.
     """
 
     def __init__(self, images: ImageFeatures, model_sigma_px: float, camera: Camera) -> None:

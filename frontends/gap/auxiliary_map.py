@@ -24,30 +24,18 @@ MAX_DEPTH_SIGMA = 0.25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackViews:
-    """N tracks in V frames.
+    """N tracks in V frames."""
 
-    Attributes
-    ----------
-    T_cam_submap : (V, 4, 4)
-    uv_px : (N, V, 2)
-        Rectified; zero where not visible.
-    sigma_px : (N, V)
-    visible : (N, V) bool
-    """
-
-    T_cam_submap: FloatArray
-    uv_px: FloatArray
-    sigma_px: FloatArray
-    visible: BoolArray
+    T_cam_submap: FloatArray  # (V, 4, 4)
+    uv_px: FloatArray  # (N, V, 2): rectified; zero where not visible
+    sigma_px: FloatArray  # (N, V)
+    visible: BoolArray  # (N, V)
 
 
 class AuxiliaryMap:
     """Features of another front end in some frames, and which of them belong together.
 
-    Parameters
-    ----------
-    submap : Submap
-        Only the poses of its keyframes are read.
+    `submap`: only the poses of its keyframes are read.
     """
 
     def __init__(self, submap: Submap) -> None:
@@ -82,12 +70,8 @@ class AuxiliaryMap:
     def add(self, index: int, features: Features, matches: Mapping[int, Matches]) -> None:
         """Take a frame's features in.
 
-        Parameters
-        ----------
-        index : int
-        features : Features
-        matches : mapping of int to Matches
-            Rows of an earlier frame's features, rows of `features`; where two earlier frames disagree, the first holds.
+        `matches`: rows of an earlier frame's features, rows of `features`; where two earlier frames disagree, the first
+        holds.
         """
         self._features[index] = features
         self._track_of[index] = np.full(len(features), NO_TRACK, np.int64)
@@ -113,7 +97,6 @@ class AuxiliaryMap:
 
         Parameters
         ----------
-        tracks_of : int
         rows : (N,) int64
             Features that have a track.
         frames : list of int

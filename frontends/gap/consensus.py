@@ -31,19 +31,10 @@ STEP = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BeyondGap:
-    """A frame beyond a gap.
+    """A frame beyond a gap."""
 
-    Attributes
-    ----------
-    features : Features
-        Of the auxiliary front end.
-    rows : (N,) int64
-        Features whose tracks agree with the pose, as ``pose.inliers`` has them.
-    pose : GapPose
-    """
-
-    features: Features
-    rows: IntArray
+    features: Features  # of the auxiliary front end
+    rows: IntArray  # (N,): features whose tracks agree with the pose, as ``pose.inliers`` has them
     pose: GapPose
 
 
@@ -56,7 +47,6 @@ def confirmed_share(first: BeyondGap, second: BeyondGap, matches: IntArray, K: F
 
     Parameters
     ----------
-    first, second : BeyondGap
     matches : (M, 2) int64
         Rows of their features.
     K : (3, 3)
@@ -93,7 +83,6 @@ def are_no_copies(
 
     Parameters
     ----------
-    first, second : BeyondGap
     matches : (M, 2) int64
         Rows of their features.
     rivals : iterable of Rival

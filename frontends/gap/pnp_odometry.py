@@ -48,9 +48,6 @@ class PnpOdometry:
         Of the submap.
     auxiliaries : sequence of Auxiliary
         The quickest first: the next one is asked where those before it find no pose that is believed.
-    route : Route
-    adjuster : BundleAdjuster
-    config : Config
     camera : Camera
         As it was given.
     tracks_live : bool

@@ -63,19 +63,11 @@ class FrameBeyond(BeyondGap):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crossing:
-    """A gap that is crossed.
+    """A gap that is crossed."""
 
-    Attributes
-    ----------
-    pose : GivenPose
-        Of the frame beyond it that confirms the first.
-    first : FrameBeyond
-    T_first_confirming : (4, 4)
-    """
-
-    pose: GivenPose
+    pose: GivenPose  # of the frame beyond it that confirms the first
     first: FrameBeyond
-    T_first_confirming: FloatArray
+    T_first_confirming: FloatArray  # (4, 4)
 
 
 class PoseFinder:
@@ -85,9 +77,6 @@ class PoseFinder:
     ----------
     live : VisualFrontEnd
         Of the submap.
-    auxiliary : Auxiliary
-    adjuster : BundleAdjuster
-    config : Config
     camera : Camera
         As it was given.
     is_short_cut : bool

@@ -93,7 +93,6 @@ class Refinder:
 
     Parameters
     ----------
-    submap : Submap
     frontend : Frontend
         The live one.
     camera : callable
@@ -134,11 +133,7 @@ class Refinder:
 
         Its features are those that it had, and behind them those that were found; its pose is refined with all.
 
-        Parameters
-        ----------
-        track : Track
-        pose_is_given : bool
-            Its pose and covariance are not by the landmarks that it sees, and count beside these.
+        `pose_is_given`: its pose and covariance are not by the landmarks that it sees, and count beside these.
         """
         view = track.view
         if self._n_left == 0 or view.image is None:

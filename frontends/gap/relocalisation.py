@@ -34,29 +34,14 @@ from dualslam.frontends.tracking.two_view_hypotheses import estimate_relative_po
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GapPose:
-    """A pose beyond a gap.
+    """A pose beyond a gap."""
 
-    Attributes
-    ----------
-    T_cam_submap : (4, 4)
-    xyz_mu : (N, 3)
-        Of the tracks.
-    inliers : (N,) bool
-        Tracks that agree in every view.
-    chi2 : float
-        Mean squared whitened residual per degree of freedom of the agreeing tracks.
-    covariance : (6, 6)
-        Of the pose, for a left perturbation (rotation, translation).
-    scale_sigma : float
-        Standard deviation of the log of the scale at which the frame sees its points.
-    """
-
-    T_cam_submap: FloatArray
-    xyz_mu: FloatArray
-    inliers: BoolArray
-    chi2: float
-    covariance: FloatArray
-    scale_sigma: float
+    T_cam_submap: FloatArray  # (4, 4)
+    xyz_mu: FloatArray  # (N, 3): of the tracks
+    inliers: BoolArray  # (N,): tracks that agree in every view
+    chi2: float  # mean squared whitened residual per degree of freedom of the agreeing tracks
+    covariance: FloatArray  # (6, 6): of the pose, for a left perturbation (rotation, translation)
+    scale_sigma: float  # standard deviation of the log of the scale at which the frame sees its points
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -87,8 +72,6 @@ def relocalise_across_gap(
         The tracks in the new frame.
     K : (3, 3)
     size_px : (width, height)
-    adjuster : BundleAdjuster
-    seed : int
     """
     n = len(uv_px)
     if n < MIN_CONSENSUS:

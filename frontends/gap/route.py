@@ -16,18 +16,10 @@ N_PREFETCHED = 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Route:
-    """Start of a walk, and the frames on its way.
+    """Start of a walk, and the frames on its way."""
 
-    Attributes
-    ----------
-    own : sequence of View
-        Of the submap's own keyframes.
-    ahead : sequence of View
-        In the order in which they will be given.
-    """
-
-    own: Sequence[View]
-    ahead: Sequence[View]
+    own: Sequence[View]  # of the submap's own keyframes
+    ahead: Sequence[View]  # in the order in which they will be given
 
     def usable_after(self, view: View, min_features: int) -> Iterator[View]:
         """Yield the next frames after one in which features can be found."""

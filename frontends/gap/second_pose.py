@@ -51,19 +51,12 @@ themselves, as in a map of few keyframes, the sigma is that of the pairs that th
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SecondPose:
-    """Another pose, and how many points it and the first one explain.
+    """Another pose, and how many points it and the first one explain."""
 
-    Attributes
-    ----------
-    T_cam_w : (4, 4)
-    support, first_support : int
-    in_view, first_in_view : int
-        Points that the poses have in the image.
-    """
-
-    T_cam_w: FloatArray
+    T_cam_w: FloatArray  # (4, 4)
     support: int
     first_support: int
+    # Points that the poses have in the image.
     in_view: int
     first_in_view: int
 
@@ -99,7 +92,6 @@ def refuse_look_alike(
     K : (3, 3)
     camera : Camera
         As it was given: what self-calibration corrects moves the rim of its image by little.
-    seed : int
     any_is_doubt : bool
         However few points another pose explains, the first is not believed; all points are compared.
     """

@@ -68,7 +68,6 @@ def pose_uncertainty(
 
     Parameters
     ----------
-    submap : Submap
     T_cam_submap : (4, 4)
     landmark_ids : (N,) int64
         Those that agree with the pose, each once.

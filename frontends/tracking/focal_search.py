@@ -77,7 +77,6 @@ def search_focal(
         Of neighbouring frames.
     size_px : (int, int)
         Width and height.
-    seed : int
     told : ToldFocal, optional
         The focal length in the source's own data.
 

@@ -37,11 +37,8 @@ def keyframe_due(track: Track, submap: Submap, reference_id: int, config: Keyfra
 
     Parameters
     ----------
-    track : Track
-    submap : Submap
     reference_id : int
         The last keyframe, in the direction in which the frames come.
-    config : KeyframeConfig
     first_id : int
         Number of this run's first frame: how long ago another run was says nothing.
     """
@@ -67,13 +64,7 @@ def keyframe_like(track: Track, submap: Submap, first_id: int, config: KeyframeC
     That keyframe sees the same from much the same place. Whether the frame's own content is found there, or has
     changed, does not matter as long as enough of the map is.
 
-    Parameters
-    ----------
-    track : Track
-    submap : Submap
-    first_id : int
-        Number of this run's first frame.
-    config : KeyframeConfig
+    `first_id`: number of this run's first frame.
     """
     if track.n_inliers < config.weak_landmarks:
         return None

@@ -47,22 +47,15 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalMap:
-    """A snapshot of landmarks, as contiguous arrays (N rows), that lives until the next keyframe.
+    """A snapshot of landmarks, as contiguous arrays (N rows), that lives until the next keyframe."""
 
-    Attributes
-    ----------
-    landmark_ids : (N,) int64
-    xyz_mu, normal : (N, 3) float64
-    reference_mu : (N,) float64
-        Distance times patch scale at the view that described the landmark: the distance at which its patch has scale 1.
-    descriptors : (N, D)
-    """
-
-    landmark_ids: IntArray
-    xyz_mu: FloatArray
-    normal: FloatArray
+    landmark_ids: IntArray  # (N,)
+    xyz_mu: FloatArray  # (N, 3)
+    normal: FloatArray  # (N, 3)
     reference_mu: FloatArray
-    descriptors: NDArray[np.generic]
+    """(N,): distance times patch scale at the view that described the landmark: the distance at which its patch has
+    scale 1."""
+    descriptors: NDArray[np.generic]  # (N, D)
 
     @classmethod
     def of_keyframes(cls, submap: Submap, keyframe_ids: IntArray | list[int]) -> LocalMap:

@@ -50,7 +50,6 @@ def spread_choice(uv_px: FloatArray, priority: IntArray, n: int, size_px: tuple[
     ----------
     uv_px : (N, 2) float64
     priority : (N,) int64
-    n : int
     size_px : (width, height)
 
     Returns

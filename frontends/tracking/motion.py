@@ -23,22 +23,14 @@ to three of four frames are left out, the next one is still a quarter away."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Constant velocity in the camera's frame.
-
-    Attributes
-    ----------
-    xi : (6,) or None
-        The motion from one frame to the next; None: none is known, and the camera is taken to be at rest.
-    interval_s : float
-        The time that it took; negative where frames come in reverse. At rest, the shortest time between two keyframes:
-        no frame of a slow sequence is a gap.
-    recent_s : tuple of float
-        The last intervals, as they were stamped.
-    """
+    """Constant velocity in the camera's frame."""
 
     xi: FloatArray | None = None
+    """(6,): the motion from one frame to the next; None: none is known, and the camera is taken to be at rest."""
     interval_s: float = 0.0
-    recent_s: tuple[float, ...] = ()
+    """The time that it took; negative where frames come in reverse. At rest, the shortest time between two keyframes:
+    no frame of a slow sequence is a gap."""
+    recent_s: tuple[float, ...] = ()  # the last intervals, as they were stamped
 
     def next(self, before: Track, after: Track) -> Motion:
         """Return the motion that follows this one, from one track to the next."""

@@ -45,11 +45,7 @@ STEP_TOLERANCE = 1e-4
 class ReadoutEstimator:
     """The readout time by which matches of turning views fit the epipolar geometry best: from pixels alone.
 
-    Parameters
-    ----------
-    seed : int
-    min_evidence : float
-        See `READOUT_EVIDENCE`.
+    `min_evidence`: see `READOUT_EVIDENCE`.
 
     Attributes
     ----------

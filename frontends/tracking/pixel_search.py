@@ -37,8 +37,6 @@ class PixelSearch:
 
     Parameters
     ----------
-    matcher : PixelMatcher
-    images : KeyframeImages
     frontend : Frontend
         The live one.
     camera : callable

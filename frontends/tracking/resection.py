@@ -15,16 +15,10 @@ MIN_SAMPLE = 3
 
 
 class Resection(NamedTuple):
-    """A pose found by RANSAC, and the points that agree with it.
+    """A pose found by RANSAC, and the points that agree with it."""
 
-    Attributes
-    ----------
-    T_cam_w : (4, 4) float64
-    inliers : (N,) bool
-    """
-
-    T_cam_w: FloatArray
-    inliers: BoolArray
+    T_cam_w: FloatArray  # (4, 4)
+    inliers: BoolArray  # (N,)
 
 
 def poselib_camera(K: FloatArray, size_px: tuple[int, int]) -> dict[str, Any]:
@@ -52,13 +46,8 @@ def resect(
     xyz : (N, 3) float64
     sigma_px : float
         Typical noise of the pixels; the inlier threshold is three times that.
-    seed : int
     max_iterations : int
         Hypotheses at most; a thousand find one where a sixth of the matches are right.
-
-    Returns
-    -------
-    Resection
     """
     camera = poselib_camera(K, size_px)
     options: dict[str, Any] = {

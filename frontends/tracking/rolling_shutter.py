@@ -78,14 +78,7 @@ class TurnMeter:
 
 
 class RollingShutter:
-    """The shutter of a run's camera: what is known of it, and the views as they would be without it.
-
-    Parameters
-    ----------
-    frontend : Frontend
-    config : CameraConfig
-    seed : int
-    """
+    """The shutter of a run's camera: what is known of it, and the views as they would be without it."""
 
     def __init__(self, frontend: Frontend, config: CameraConfig, seed: int) -> None:
         self._frontend = frontend

@@ -20,7 +20,6 @@ def correct_shutter(
     ----------
     features : Features
         As found in an image that was read row by row.
-    camera : Camera
     turn_rad : (3,)
         Rotation vector by which the camera turns while an image is read, in its own axes.
     read_v_px : (N,), optional

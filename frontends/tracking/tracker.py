@@ -51,25 +51,14 @@ GIVEN_POSE_CHI2 = 4 * CHI2_99[2]  # 99 % with 2 degrees of freedom, and the pose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GivenPose:
-    """A pose that the tracker did not find itself, with the evidence that it came with.
+    """A pose that the tracker did not find itself, with the evidence that it came with."""
 
-    Attributes
-    ----------
-    T_cam_submap : (4, 4)
-    n_matches, n_inliers : int
-    chi2 : float
-        Mean squared whitened residual per degree of freedom of the inliers.
-    covariance : (6, 6)
-    wide : bool
-        Whether frames were skipped between the last one and this.
-    """
-
-    T_cam_submap: FloatArray
+    T_cam_submap: FloatArray  # (4, 4)
     n_matches: int
     n_inliers: int
-    chi2: float
-    covariance: FloatArray
-    wide: bool
+    chi2: float  # mean squared whitened residual per degree of freedom of the inliers
+    covariance: FloatArray  # (6, 6)
+    wide: bool  # whether frames were skipped between the last one and this
 
 
 class Tracker:

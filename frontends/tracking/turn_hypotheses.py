@@ -32,7 +32,6 @@ class TurnHypotheses:
     sigma_px : (N,)
         Of a pixel's coordinate.
     K : (3, 3)
-    seed : int
 
     Attributes
     ----------

@@ -40,7 +40,6 @@ class RelativePoses:
     sigma_px : (N,)
     K : (3, 3)
     size_px : (width, height)
-    seed : int
     """
 
     def __init__(

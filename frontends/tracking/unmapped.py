@@ -29,10 +29,8 @@ def passes_unmapped(
     ----------
     track : Track
         Of a frame.
-    submap : Submap
     keyframe_id : int
         Of the submap: the last keyframe.
-    frontend : Frontend
     parallax_deg : float
         At which a keyframe is due if what is mapped shows it. At the angle from which on a match could be a landmark,
         1 degree, keyframes came in turns on the spot as well, and broke maps of `tum_fr1_rpy`.

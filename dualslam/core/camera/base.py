@@ -31,25 +31,16 @@ focal lengths in millimetres or of normalised coordinates, and slips of an expon
 
 @dataclass(frozen=True)
 class Camera(ABC):
-    """A calibrated camera: raw pixels of its image, rays, and rectified pixels.
+    """A calibrated camera: raw pixels of its image, rays, and rectified pixels."""
 
-    Attributes
-    ----------
-    width, height : int
-        Of the raw image, pixels.
-    fx, fy, cx, cy : float
-        Of the raw image, pixels: raw pixel = (fx x + cx, fy y + cy) for distorted normalised (x, y).
-    model : str
-        Name of the class in files.
-    corners_matter : bool
-        Whether `validate` wants an inverse in the corners of the image, or only at the middle of its sides.
-    """
-
-    model: ClassVar[str]
+    model: ClassVar[str]  # name of the class in files
     corners_matter: ClassVar[bool] = True
+    """Whether `validate` wants an inverse in the corners of the image, or only at the middle of its sides."""
 
+    # Of the raw image, pixels.
     width: int
     height: int
+    # Of the raw image, pixels: raw pixel = (fx x + cx, fy y + cy) for distorted normalised (x, y).
     fx: float
     fy: float
     cx: float

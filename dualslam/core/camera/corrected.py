@@ -23,20 +23,13 @@ class LensCorrection:
 
     A ray (x, y, 1) is seen, in the given camera's rectified pixels, at ``K diag(e^a, e^a, 1) (x_d, y_d, 1)`` plus (du,
     dv). Here ``(x_d, y_d) = (x, y) (1 + k1 r^2 + k2 r^4)``.
-
-    Attributes
-    ----------
-    log_focal : float
-        a, of both focal lengths.
-    du_px, dv_px : float
-        Of the principal point.
-    k1, k2 : float
-        Radial distortion that the given model has left.
     """
 
-    log_focal: float = 0.0
+    log_focal: float = 0.0  # a, of both focal lengths
+    # Of the principal point.
     du_px: float = 0.0
     dv_px: float = 0.0
+    # Radial distortion that the given model has left.
     k1: float = 0.0
     k2: float = 0.0
 
@@ -75,7 +68,6 @@ class CorrectedCamera(Camera):
     ----------
     base : Camera
         As it was given; `width` to `cy` are its own.
-    correction : LensCorrection
     """
 
     model: ClassVar[str] = "corrected"

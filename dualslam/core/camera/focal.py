@@ -17,46 +17,26 @@ SIGMAS_90 = 1.645
 
 @dataclass(frozen=True, slots=True)
 class ToldFocal:
-    """The focal length that a source's own data tell.
+    """The focal length that a source's own data tell."""
 
-    Attributes
-    ----------
-    over_side : float
-        Over the image's longer side, however the camera was held.
-    log_sigma : float
-        Standard deviation of its logarithm.
-    """
-
-    over_side: float
-    log_sigma: float
+    over_side: float  # over the image's longer side, however the camera was held
+    log_sigma: float  # standard deviation of its logarithm
 
 
 @dataclass(frozen=True, slots=True)
 class FocalSearch:
-    """Result of the search.
-
-    Attributes
-    ----------
-    focal_px : float
-    log_sigma : float
-        Standard deviation of its logarithm.
-    lens : float
-        Of the division model, at half the image's longer side: an undistorted radius is r / (1 + lens r^2); zero: none.
-    width, height : int
-        Of the image, pixels.
-    n_pairs : int
-        Of frames, that had an answer.
-    told_px : float or None
-        Focal length by the EXIF data of the first image, or by the container of the video.
-    """
+    """Result of the search."""
 
     focal_px: float
-    log_sigma: float
+    log_sigma: float  # standard deviation of its logarithm
     lens: float
+    """Of the division model, at half the image's longer side: an undistorted radius is r / (1 + lens r^2); zero:
+    none."""
+    # Of the image, pixels.
     width: int
     height: int
-    n_pairs: int
-    told_px: float | None = None
+    n_pairs: int  # of frames, that had an answer
+    told_px: float | None = None  # focal length by the EXIF data of the first image, or by the container of the video
 
     @property
     def range_px(self) -> tuple[float, float]:

@@ -26,14 +26,12 @@ class MappedCamera(Camera):
     ----------
     base : Camera
         `width` to `cy` are its own.
-    map_K : tuple of float
-        fx, fy, cx, cy of the map's rectified pixels.
     """
 
     model: ClassVar[str] = "mapped"
 
     base: Camera = None  # type: ignore[assignment]  # dataclass inheritance wants a default
-    map_K: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)
+    map_K: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)  # fx, fy, cx, cy of the map's rectified pixels
 
     @classmethod
     def of(cls, base: Camera, K: FloatArray) -> MappedCamera:

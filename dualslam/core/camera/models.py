@@ -39,16 +39,11 @@ class PinholeCamera(Camera):
 
 @dataclass(frozen=True)
 class RadTanCamera(Camera):
-    """Brown's radial-tangential model, as OpenCV has it ("plumb bob").
-
-    Attributes
-    ----------
-    k1, k2, p1, p2, k3 : float
-        In OpenCV's order. Points beyond the radius where the polynomial turns back are not imaged.
-    """
+    """Brown's radial-tangential model, as OpenCV has it ("plumb bob")."""
 
     model: ClassVar[str] = "radtan"
 
+    # In OpenCV's order. Points beyond the radius where the polynomial turns back are not imaged.
     k1: float = 0.0
     k2: float = 0.0
     p1: float = 0.0
@@ -143,17 +138,11 @@ class KannalaBrandtCamera(_RadialCamera):
 
 @dataclass(frozen=True)
 class FovCamera(_RadialCamera):
-    """The field-of-view model of Devernay and Faugeras (2001), as TUM-Mono and DSO use it.
-
-    Attributes
-    ----------
-    omega : float
-        Radians: distorted radius = atan(2 tan(omega / 2) r) / omega.
-    """
+    """The field-of-view model of Devernay and Faugeras (2001), as TUM-Mono and DSO use it."""
 
     model: ClassVar[str] = "fov"
 
-    omega: float = 1.0
+    omega: float = 1.0  # radians: distorted radius = atan(2 tan(omega / 2) r) / omega
 
     @classmethod
     def from_tum_mono(cls, fx: float, fy: float, cx: float, cy: float, omega: float, width: int, height: int) -> Camera:
@@ -194,17 +183,12 @@ class FovCamera(_RadialCamera):
 
 @dataclass(frozen=True)
 class DivisionCamera(Camera):
-    """The division model of Fitzgibbon (2001), which one number says: what is found where nothing is known of a lens.
-
-    Attributes
-    ----------
-    k : float
-        Undistorted radius = r / (1 + k r^2) of the distorted one, on the normalised plane; a barrel's is negative.
-    """
+    """The division model of Fitzgibbon (2001), of one number: found where nothing is known of a lens."""
 
     model: ClassVar[str] = "division"
 
     k: float = 0.0
+    """Undistorted radius = r / (1 + k r^2) of the distorted one, on the normalised plane; a barrel's is negative."""
 
     def _distort(self, p_cam: FloatArray) -> FloatArray:
         xy = plane(p_cam)

@@ -51,19 +51,12 @@ def _root(square: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class OmniCamera(_SphereCamera):
-    """Mei's unified model (2007): Kalibr's ``omni``, the ``MEI`` of VINS-Mono.
-
-    Attributes
-    ----------
-    xi : float
-        Points are divided by z + xi |p|.
-    k1, k2, p1, p2 : float
-        Radial-tangential distortion after the division.
-    """
+    """Mei's unified model (2007): Kalibr's ``omni``, the ``MEI`` of VINS-Mono."""
 
     model: ClassVar[str] = "omni"
 
-    xi: float = 0.0
+    xi: float = 0.0  # points are divided by z + xi |p|
+    # Radial-tangential distortion after the division.
     k1: float = 0.0
     k2: float = 0.0
     p1: float = 0.0
@@ -100,16 +93,11 @@ class OmniCamera(_SphereCamera):
 
 @dataclass(frozen=True)
 class EucmCamera(_SphereCamera):
-    """The extended unified model of Khomutenko (2016): Kalibr's and Basalt's ``eucm``; with beta = 1, their ``ucm``.
-
-    Attributes
-    ----------
-    alpha, beta : float
-        Points are divided by alpha sqrt(beta r^2 + z^2) + (1 - alpha) z.
-    """
+    """The extended unified model of Khomutenko (2016): Kalibr's and Basalt's ``eucm``; with beta = 1, their ``ucm``."""
 
     model: ClassVar[str] = "eucm"
 
+    # Points are divided by alpha sqrt(beta r^2 + z^2) + (1 - alpha) z.
     alpha: float = 0.0
     beta: float = 1.0
 
@@ -135,16 +123,11 @@ class EucmCamera(_SphereCamera):
 
 @dataclass(frozen=True)
 class DoubleSphereCamera(_SphereCamera):
-    """The double-sphere model of Usenko (2018): Kalibr's and Basalt's ``ds``.
-
-    Attributes
-    ----------
-    xi, alpha : float
-        Points are divided by alpha |(x, y, s)| + (1 - alpha) s, where s = z + xi |p|.
-    """
+    """The double-sphere model of Usenko (2018): Kalibr's and Basalt's ``ds``."""
 
     model: ClassVar[str] = "double_sphere"
 
+    # Points are divided by alpha |(x, y, s)| + (1 - alpha) s, where s = z + xi |p|.
     xi: float = 0.0
     alpha: float = 0.0
 

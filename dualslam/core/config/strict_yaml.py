@@ -74,7 +74,6 @@ def read(path: Path, what: str, source: str = "") -> Any:
 
     Parameters
     ----------
-    path : Path
     what : str
         What the file is, for the error: ``the configuration``.
     source : str

@@ -37,27 +37,16 @@ SAME_BASIN = 0.9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sim3Estimate:
-    """A similarity between two maps with what supports it.
+    """A similarity between two maps with what supports it."""
 
-    Attributes
-    ----------
-    S_dst_src : (4, 4)
-        x -> s R x + t.
-    covariance : (7, 7)
-        Of xi in ``S_dst_src @ exp(xi)``: rotation (rad), translation (unit of src), log-scale; frame src. That is the
-        convention of GTSAM's noise models on ``Similarity3``. `COVARIANCE_INFLATION` is included.
-    inliers : (N,) bool
-    n_iterations : int
-        RANSAC hypotheses tried.
-    chi2_per_dof : float
-        Summed squared Mahalanobis distance of the inliers over 3 n - 7: 1 is expected, or a little less for the gate.
-    """
-
-    S_dst_src: FloatArray
+    S_dst_src: FloatArray  # (4, 4): x -> s R x + t
     covariance: FloatArray
-    inliers: BoolArray
-    n_iterations: int
+    """(7, 7): of xi in ``S_dst_src @ exp(xi)``: rotation (rad), translation (unit of src), log-scale; frame src. That
+    is the convention of GTSAM's noise models on ``Similarity3``. `COVARIANCE_INFLATION` is included."""
+    inliers: BoolArray  # (N,)
+    n_iterations: int  # RANSAC hypotheses tried
     chi2_per_dof: float
+    """Summed squared Mahalanobis distance of the inliers over 3 n - 7: 1 is expected, or a little less for the gate."""
 
 
 class _Sim3Problem:

@@ -81,27 +81,15 @@ def projection_jacobians(K: FloatArray, T_cam_w: FloatArray, xyz: ArrayLike) -> 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseEstimate:
-    """A pose with what supports it.
+    """A pose with what supports it."""
 
-    Attributes
-    ----------
-    T_cam_w : (4, 4)
-    covariance : (6, 6)
-        Of xi in ``exp(xi) @ T_cam_w``: rotation (rad), translation (unit of the points), camera frame.
-    inliers : (N,) bool
-    chi2 : (N,)
-        Squared whitened residual of every point; infinite where it is not in front of the camera.
-    n_inliers : int
-    n_iterations : int
-        Gauss-Newton steps taken.
-    """
-
-    T_cam_w: FloatArray
+    T_cam_w: FloatArray  # (4, 4)
     covariance: FloatArray
-    inliers: BoolArray
-    chi2: FloatArray
+    """(6, 6): of xi in ``exp(xi) @ T_cam_w``: rotation (rad), translation (unit of the points), camera frame."""
+    inliers: BoolArray  # (N,)
+    chi2: FloatArray  # (N,): squared whitened residual of every point; infinite where it is not in front of the camera
     n_inliers: int
-    n_iterations: int
+    n_iterations: int  # Gauss-Newton steps taken
 
 
 class _PoseProblem:

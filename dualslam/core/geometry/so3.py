@@ -76,10 +76,7 @@ def hat(omega: ArrayLike) -> FloatArray:
 def exp(omega: ArrayLike) -> FloatArray:
     """Return the rotation matrix of a rotation vector (Rodrigues' formula).
 
-    Parameters
-    ----------
-    omega : (..., 3)
-        Axis times angle, radians.
+    `omega` (..., 3): axis times angle, radians.
 
     Returns
     -------
@@ -157,10 +154,7 @@ def right_jacobian_inverse(omega: ArrayLike) -> FloatArray:
 def orthonormalise(R: ArrayLike) -> FloatArray:
     """Return the rotation nearest to a matrix in the Frobenius norm: removes the drift of long products.
 
-    Parameters
-    ----------
-    R : (..., 3, 3)
-        Nearly a rotation, up to a positive scale.
+    `R` (..., 3, 3): nearly a rotation, up to a positive scale.
     """
     U, _, Vt = np.linalg.svd(np.asarray(R, np.float64))
     U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]

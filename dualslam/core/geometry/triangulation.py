@@ -25,48 +25,28 @@ MIN_COLUMNS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoViewPoints:
-    """Triangulated points of N matched pixels.
-
-    Attributes
-    ----------
-    xyz : (N, 3)
-        In the frame w of the given poses. Behind both cameras where the rays diverge.
-    depth_a, depth_b : (N,)
-        z in either camera; negative behind it.
-    cos_parallax : (N,)
-        Cosine of the angle between the two observed rays.
-    error2_a, error2_b : (N,)
-        Squared reprojection errors, px^2.
-    """
+    """Triangulated points of N matched pixels."""
 
     xyz: FloatArray
-    depth_a: FloatArray
-    depth_b: FloatArray
-    cos_parallax: FloatArray
-    error2_a: FloatArray
-    error2_b: FloatArray
+    """(N, 3): in the frame w of the given poses. Behind both cameras where the rays diverge."""
+    # z in either camera; negative behind it.
+    depth_a: FloatArray  # (N,)
+    depth_b: FloatArray  # (N,)
+    cos_parallax: FloatArray  # (N,): cosine of the angle between the two observed rays
+    # Squared reprojection errors, px^2.
+    error2_a: FloatArray  # (N,)
+    error2_b: FloatArray  # (N,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NViewPoints:
-    """Triangulated points of N tracks.
-
-    Attributes
-    ----------
-    xyz : (N, 3)
-        In w; NaN where fewer than two views see the point. Parallel rays meet very far away.
-    depth : (N, V)
-        z in each camera, NaN where not visible.
-    error2 : (N, V)
-        Squared reprojection errors, px^2, NaN where not visible.
-    min_cos_parallax : (N,)
-        Smallest cosine between any two of the rays: the widest parallax.
-    """
+    """Triangulated points of N tracks."""
 
     xyz: FloatArray
-    depth: FloatArray
-    error2: FloatArray
-    min_cos_parallax: FloatArray
+    """(N, 3): in w; NaN where fewer than two views see the point. Parallel rays meet very far away."""
+    depth: FloatArray  # (N, V): z in each camera, NaN where not visible
+    error2: FloatArray  # (N, V): squared reprojection errors, px^2, NaN where not visible
+    min_cos_parallax: FloatArray  # (N,): smallest cosine between any two of the rays: the widest parallax
 
 
 def in_front(*depths: FloatArray, min_depth: float = 0.0) -> BoolArray:
@@ -103,10 +83,6 @@ def triangulate_two_view(
         Camera poses in w; their centres must differ.
     n_polish : int
         Gauss-Newton steps; two reach the minimum to about 1e-3 px even at several px of noise.
-
-    Returns
-    -------
-    TwoViewPoints
     """
     T_b_a = se3.inverse(T_w_b) @ T_w_a
     R, t = T_b_a[:3, :3], T_b_a[:3, 3]
@@ -181,10 +157,6 @@ def triangulate_n_view(
         Which views see which point; all by default.
     n_polish : int
         Gauss-Newton steps.
-
-    Returns
-    -------
-    NViewPoints
     """
     n, n_views = uv.shape[:2]
     seen = np.ones((n, n_views), bool) if visible is None else np.asarray(visible, bool)

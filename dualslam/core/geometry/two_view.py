@@ -83,18 +83,12 @@ def homography_transfer_error(H_b_a: FloatArray, uv_a: FloatArray, uv_b: FloatAr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HomographyPoses:
-    """The poses that a homography of a plane allows, M of them: four, or one where it is a mere rotation.
+    """The poses that a homography of a plane allows, M of them: four, or one where it is a mere rotation."""
 
-    Attributes
-    ----------
-    T_b_a : (M, 4, 4)
-        Translations in units of the distance of the plane from camera a.
-    normal_a : (M, 3)
-        Unit normal, ``normal_a' X_a`` is the distance: it points away from camera a where the plane is in front of it.
-    """
-
-    T_b_a: FloatArray
+    T_b_a: FloatArray  # (M, 4, 4): translations in units of the distance of the plane from camera a
     normal_a: FloatArray
+    """(M, 3): unit normal, ``normal_a' X_a`` is the distance: it points away from camera a where the plane is in front
+    of it."""
 
 
 def decompose_homography(H_b_a: FloatArray, K: FloatArray) -> HomographyPoses:

@@ -23,18 +23,10 @@ MIN_RELATIVE_EXTENT = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """A least-squares similarity between two point sets.
+    """A least-squares similarity between two point sets."""
 
-    Attributes
-    ----------
-    S_dst_src : (4, 4)
-        x -> s R x + t; a rigid pose where the scale was held at 1.
-    rmse : float
-        Root of the (weighted) mean squared residual, in the unit of dst.
-    """
-
-    S_dst_src: FloatArray
-    rmse: float
+    S_dst_src: FloatArray  # (4, 4): x -> s R x + t; a rigid pose where the scale was held at 1
+    rmse: float  # root of the (weighted) mean squared residual, in the unit of dst
 
 
 def umeyama(
@@ -93,10 +85,7 @@ def _rotation(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
 def umeyama_batch(src: FloatArray, dst: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Align many triplets of points at once: the minimal solver of a RANSAC.
 
-    Parameters
-    ----------
-    src, dst : (B, 3, 3)
-        B sets of three corresponding points, one point a row. (Any number of points a set works.)
+    `src`, `dst` (B, 3, 3): B sets of three corresponding points, one point a row. (Any number of points a set works.)
 
     Returns
     -------

@@ -21,7 +21,6 @@ def landmark_colours(
 
     Parameters
     ----------
-    atlas : Atlas
     frames : iterable of Frame
         Colour images (H, W, 3) of keyframes, or grey ones; others are ignored.
     numbers : mapping of int to int

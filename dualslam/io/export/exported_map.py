@@ -27,46 +27,22 @@ class ExportedMap:
 
     A keyframe that two submaps share appears once, in the submap that its frame's pose belongs to. What a by-pass has
     marked invalid is left out.
-
-    Attributes
-    ----------
-    frame : (V,) int64
-        Keyframes, by their number in the map, ascending.
-    timestamp_s : (V,)
-    camera : (V,) int64
-        Row of `K`.
-    K : (C, 3, 3)
-        Pinhole intrinsics of rectified pixels: submaps may have been calibrated apart.
-    size_px : (int, int)
-        Width and height.
-    T_world_cam : (V, 4, 4)
-        Camera to world; the world is the frame of the main map's first submap.
-    xyz : (P, 3)
-        World, unit of the map; metres where the map has a metric scale.
-    colour : (P, 3) uint8
-        Red, green, blue; `GREY` where no colour is known.
-    view, point : (R,) int64
-        Rows of the views and the points, sorted by point, then by view.
-    uv_px : (R, 2)
-        Rectified pixels; the centre of the first pixel is (0, 0).
-    sigma_px : (R,)
-    feature : (R,) int64
-        Row of the observation among the features of its keyframe.
     """
 
-    frame: IntArray
-    timestamp_s: FloatArray
-    camera: IntArray
-    K: FloatArray
-    size_px: tuple[int, int]
-    T_world_cam: FloatArray
-    xyz: FloatArray
-    colour: NDArray[np.uint8]
-    view: IntArray
-    point: IntArray
-    uv_px: FloatArray
-    sigma_px: FloatArray
-    feature: IntArray
+    frame: IntArray  # (V,): keyframes, by their number in the map, ascending
+    timestamp_s: FloatArray  # (V,)
+    camera: IntArray  # (V,): row of `K`
+    K: FloatArray  # (C, 3, 3): pinhole intrinsics of rectified pixels: submaps may have been calibrated apart
+    size_px: tuple[int, int]  # width and height
+    T_world_cam: FloatArray  # (V, 4, 4): camera to world; the world is the frame of the main map's first submap
+    xyz: FloatArray  # (P, 3): world, unit of the map; metres where the map has a metric scale
+    colour: NDArray[np.uint8]  # (P, 3): red, green, blue; `GREY` where no colour is known
+    # Rows of the views and the points, sorted by point, then by view.
+    view: IntArray  # (R,)
+    point: IntArray  # (R,)
+    uv_px: FloatArray  # (R, 2): rectified pixels; the centre of the first pixel is (0, 0)
+    sigma_px: FloatArray  # (R,)
+    feature: IntArray  # (R,): row of the observation among the features of its keyframe
 
     def reprojection_errors_px(self) -> FloatArray:
         """Return (R,) distances between observations and projections; NaN behind the camera."""
@@ -189,7 +165,6 @@ def with_frames(exported: ExportedMap, stored: StoredMap, chosen: Iterable[int])
     ----------
     exported : ExportedMap
         That of `flatten`, in the map's unit.
-    stored : StoredMap
     chosen : iterable of int
         Frames, by their number in the map. Those that are views already, have no pose in the main map, or hang on a
         keyframe that a by-pass has marked invalid are ignored.

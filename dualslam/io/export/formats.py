@@ -16,27 +16,13 @@ from dualslam.io.export.ply import write_ply
 
 @dataclass(frozen=True, slots=True)
 class ExportFormat:
-    """A way to write a map.
+    """A way to write a map."""
 
-    Attributes
-    ----------
-    write : callable
-        Takes the map and the path.
-    is_folder : bool
-        Whether the path is a folder; else one file.
-    has_images : bool
-        Whether the views' images belong to it.
-    has_colours : bool
-        Whether its points have colours.
-    next_command : str
-        To type next, with the path as ``{out}``; empty if there is none.
-    """
-
-    write: Callable[[ExportedMap, Path], None]
-    is_folder: bool = False
-    has_images: bool = False
-    has_colours: bool = False
-    next_command: str = ""
+    write: Callable[[ExportedMap, Path], None]  # takes the map and the path
+    is_folder: bool = False  # whether the path is a folder; else one file
+    has_images: bool = False  # whether the views' images belong to it
+    has_colours: bool = False  # whether its points have colours
+    next_command: str = ""  # to type next, with the path as ``{out}``; empty if there is none
 
 
 GSPLAT = "python examples/simple_trainer.py default --data_factor 1 --data_dir {out} --result_dir {out}_splat"

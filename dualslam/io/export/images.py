@@ -34,7 +34,6 @@ def with_images(
 
     Parameters
     ----------
-    exported : ExportedMap
     camera : Camera
         As in the saved map: it knows the lens.
     frames : iterable of Frame

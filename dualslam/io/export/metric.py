@@ -42,32 +42,17 @@ DICTIONARIES = {
 
 @dataclass(frozen=True, slots=True)
 class MetricScale:
-    """How long a unit of a map is.
-
-    Attributes
-    ----------
-    metres_per_unit : float
-    sigma_rel : float or None
-        Of it, relative, by how its measurements differ; None where there is one.
-    words : str
-        What it is from.
-    """
+    """How long a unit of a map is."""
 
     metres_per_unit: float
-    sigma_rel: float | None
-    words: str
+    sigma_rel: float | None  # of it, relative, by how its measurements differ; None where there is one
+    words: str  # what it is from
 
 
 def by_distance(exported: ExportedMap, numbers: Mapping[int, int], a: int, b: int, metres: float) -> MetricScale:
     """Return the scale by the true distance between two views, named by their indices in the source.
 
-    Parameters
-    ----------
-    exported : ExportedMap
-    numbers : mapping of int to int
-        Of the run's frames, as `read_numbers` gives them.
-    a, b : int
-    metres : float
+    `numbers`: of the run's frames, as `read_numbers` gives them.
 
     Raises
     ------
@@ -175,7 +160,6 @@ def by_marker(
 
     Parameters
     ----------
-    exported : ExportedMap
     camera : Camera
         As in the saved map: it knows the lens.
     frames : iterable of Frame

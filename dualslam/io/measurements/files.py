@@ -50,7 +50,6 @@ def read_measurements(
 
     Parameters
     ----------
-    path : Path
     sigma : float, optional
         For formats that state none: metres of a position, rad/s of a gyroscope, rad of an accelerometer's direction.
     clock_offset_s : float

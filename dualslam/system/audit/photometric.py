@@ -24,22 +24,12 @@ MIN_SAMPLES = 3
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One frame compared with patches of an older keyframe.
+    """One frame compared with patches of an older keyframe."""
 
-    Attributes
-    ----------
-    index : int
-        The frame's number inside the system.
-    timestamp_s : float
-    submap_id : int
-    agreement : float
-        Share of the patches that look as the map predicts, 0 to 1.
-    """
-
-    index: int
+    index: int  # the frame's number inside the system
     timestamp_s: float
     submap_id: int
-    agreement: float
+    agreement: float  # share of the patches that look as the map predicts, 0 to 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +43,6 @@ class Stretch:
 
 class PhotometricAudit:
     """Compares tracked frames with the patches of older keyframes, a few times a second.
-
-    Parameters
-    ----------
-    patches : PatchCheck
 
     Attributes
     ----------
@@ -108,19 +94,12 @@ class PhotometricAudit:
 
 @dataclass(frozen=True, slots=True)
 class Disagreement:
-    """Where the samples of a run disagree with the map.
+    """Where the samples of a run disagree with the map."""
 
-    Attributes
-    ----------
-    stretches : tuple of Stretch
-        By ascending time.
-    worst : float
-        Largest share of patches that disagree in all of `MIN_SAMPLES` consecutive samples of one map. Above
-        ``1 - MIN_AGREEMENT`` there is a stretch.
-    """
-
-    stretches: tuple[Stretch, ...]
+    stretches: tuple[Stretch, ...]  # by ascending time
     worst: float
+    """Largest share of patches that disagree in all of `MIN_SAMPLES` consecutive samples of one map. Above ``1 -
+    MIN_AGREEMENT`` there is a stretch."""
 
 
 def find_disagreement(samples: Iterable[Sample]) -> Disagreement:

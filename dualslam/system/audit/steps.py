@@ -18,18 +18,10 @@ MIN_INTERVAL_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps:
-    """The steps between N consecutive frames of a trajectory.
+    """The steps between N consecutive frames of a trajectory."""
 
-    Attributes
-    ----------
-    ratio : (N - 1,)
-        Speed of each step over the speed about it.
-    excess : (N - 1,)
-        Length beyond what the speed about it explains, in the trajectory's unit.
-    """
-
-    ratio: FloatArray
-    excess: FloatArray
+    ratio: FloatArray  # (N - 1,): speed of each step over the speed about it
+    excess: FloatArray  # (N - 1,): length beyond what the speed about it explains, in the trajectory's unit
 
 
 def measure_steps(times_s: FloatArray, centres: FloatArray) -> Steps:

@@ -41,42 +41,24 @@ class ReasonCode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """One reason of a verdict.
-
-    Attributes
-    ----------
-    code : ReasonCode
-    level : Level
-        The best level that a run with this reason can have.
-    text : str
-        What was found and what to do, in plain words.
-    first_frame, last_frame : int
-        The frames that it is about, by their index in the source.
-    """
+    """One reason of a verdict."""
 
     code: ReasonCode
-    level: Level
-    text: str
+    level: Level  # the best level that a run with this reason can have
+    text: str  # what was found and what to do, in plain words
+    # The frames that it is about, by their index in the source.
     first_frame: int
     last_frame: int
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """How far to trust a run.
-
-    Attributes
-    ----------
-    level : Level
-    reasons : tuple of Reason
-        The gravest first, at most three; of a good run only remarks.
-    scores : dict of str to float
-        By the reasons' codes: how strongly the run speaks for each, given or not. The higher, the worse.
-    """
+    """How far to trust a run."""
 
     level: Level
-    reasons: tuple[Reason, ...] = ()
+    reasons: tuple[Reason, ...] = ()  # the gravest first, at most three; of a good run only remarks
     scores: dict[str, float] = field(default_factory=dict, compare=False)
+    """By the reasons' codes: how strongly the run speaks for each, given or not. The higher, the worse."""
 
     @classmethod
     def of(cls, reasons: Iterable[Reason], scores: dict[str, float] | None = None) -> Verdict:

@@ -36,12 +36,7 @@ SAME_GAUGE = 1e-6
 class Calibrations:
     """Asks live submaps about their camera, and takes the answers in between two frames.
 
-    Parameters
-    ----------
-    state : State
-    recoveries : Recoveries
-        Knows the lost submaps, which are to be linked with the live one and must have the same camera.
-    connections : Connections
+    `recoveries`: knows the lost submaps, which are to be linked with the live one and must have the same camera.
     """
 
     def __init__(self, state: State, recoveries: Recoveries, connections: Connections) -> None:

@@ -47,12 +47,7 @@ rendered street, which hardly turns, gave -0.020 s with 0.008 claimed. There it 
 class ShutterWatch:
     """Asks live submaps how long their images were read, and takes the answer in between two frames.
 
-    Parameters
-    ----------
-    state : State
-    recoveries : Recoveries
-        Knows the lost submaps, which are to be linked with the live one and must have the same pixels.
-    connections : Connections
+    `recoveries`: knows the lost submaps, which are to be linked with the live one and must have the same pixels.
     """
 
     def __init__(self, state: State, recoveries: Recoveries, connections: Connections) -> None:

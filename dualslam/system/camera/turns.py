@@ -22,11 +22,7 @@ MAX_GAP_S = 0.2
 def turn_rates(submap: Submap, poses: Iterable[FramePose]) -> dict[int, FloatArray]:
     """Return how the camera turns at the frames that a submap has posed (rad/s, in its own axes), by their index.
 
-    Parameters
-    ----------
-    submap : Submap
-    poses : iterable of FramePose
-        In any order; those of other submaps are left out.
+    `poses`: in any order; those of other submaps are left out.
     """
     posed = sorted((p for p in poses if p.submap_id == submap.id), key=attrgetter("index"))
     if len(posed) < 2:
@@ -52,12 +48,10 @@ def with_turn_of_poses(
 
     Parameters
     ----------
-    track : Track
     submap : Submap
         In which the frame is posed.
     before : FramePose or None
         Of the frame before it.
-    shutter : Shutter
     camera : Camera
         That rectified the frame's pixels.
     """

@@ -36,11 +36,7 @@ class KorniaFrontend(OptionedFrontend):
 
     Descriptors are float32 unit vectors, and distances those between them.
 
-    Parameters
-    ----------
-    n_features : int
-        Keypoints per image, at most.
-    options : KorniaOptions, optional
+    `n_features`: keypoints per image, at most.
 
     Raises
     ------
@@ -75,10 +71,7 @@ class KorniaFrontend(OptionedFrontend):
     def extract(self, image: NDArray[np.uint8]) -> Features:
         """Detect and describe up to `n_features` keypoints.
 
-        Parameters
-        ----------
-        image : (H, W) or (H, W, 3) RGB uint8
-            Of any size; a flat or a tiny one has no features.
+        `image` (H, W) or (H, W, 3) RGB uint8: of any size; a flat or a tiny one has no features.
 
         Raises
         ------

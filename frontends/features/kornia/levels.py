@@ -26,30 +26,17 @@ GREY = 1.0 / 255.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
-    """Keypoints of one image, finest octave first.
+    """Keypoints of one image, finest octave first."""
 
-    Attributes
-    ----------
-    uv_px : (N, 2) float64
-    octave : (N,) int64
-    refined : (N,) bool
-        Whether the maximum was found between the pixels too.
-    """
-
-    uv_px: FloatArray
-    octave: IntArray
-    refined: BoolArray
+    uv_px: FloatArray  # (N, 2)
+    octave: IntArray  # (N,)
+    refined: BoolArray  # (N,): whether the maximum was found between the pixels too
 
 
 class LevelFeatures:
     """Detector, orientation and descriptor of `dog` and `harris`.
 
-    Parameters
-    ----------
-    options : KorniaOptions
-    n_features : int
-        Keypoints per image, at most.
-    device : torch.device
+    `n_features`: keypoints per image, at most.
     """
 
     def __init__(self, options: KorniaOptions, n_features: int, device: torch.device) -> None:

@@ -19,10 +19,8 @@ class Network:
 
     Parameters
     ----------
-    name : {"xfeat", "aliked", "disk"}
     n_candidates : int
         Keypoints per image, at most.
-    device : torch.device
     weights : Path or None
         See `KorniaOptions`.
     """

