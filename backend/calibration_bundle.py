@@ -47,12 +47,8 @@ class CalibratedOptimum:
 class CorrectedLens:
     """The `dualslam.backend.schur.Lens` whose parameters are those of a `LensCorrection`.
 
-    Parameters
-    ----------
-    K : (3, 3)
-        Of the camera as it was given.
-    information : (5, 5)
-        Of the prior.
+    - `K` (3, 3): of the camera as it was given.
+    - `information` (5, 5): of the prior.
     """
 
     def __init__(self, K: FloatArray, information: FloatArray) -> None:
@@ -98,19 +94,11 @@ def optimise_with_camera(
 ) -> CalibratedOptimum:
     """Minimise over poses, points and correction, without the few points that a step has put behind a camera.
 
-    Parameters
-    ----------
-    problem : BundleProblem
-        In the rectified pixels of the camera as it was given; `fixed` is not looked at.
-    start, prior : (5,)
-        The correction to begin at, and the prior sigmas of its parts about zero.
-    robust_k : float
-        Huber threshold in sigmas.
+    - `problem`: in the rectified pixels of the camera as it was given; `fixed` is not looked at.
+    - `start`, `prior` (5,): the correction to begin at, and the prior sigmas of its parts about zero.
+    - `robust_k`: Huber threshold in sigmas.
 
-    Raises
-    ------
-    SolverError
-        If there is no optimum, or nothing fixes the correction.
+    Raises `SolverError` if there is no optimum, or nothing fixes the correction.
     """
     problem = replace(problem, fixed=np.arange(len(problem.T_submap_kf)) == 0)
     lens = CorrectedLens(problem.K, np.diag(prior**-2.0))

@@ -54,10 +54,7 @@ def from_pose3(T: gtsam.Pose3) -> FloatArray:
 def to_similarity3(S: FloatArray) -> gtsam.Similarity3:
     """Make a `Similarity3` of our (4, 4) ``[[s R, t], [0, 1]]``.
 
-    Raises
-    ------
-    ValueError
-        If the scale is not positive and finite.
+    Raises `ValueError` if the scale is not positive and finite.
     """
     determinant = float(np.linalg.det(S[:3, :3])) if np.isfinite(S).all() else float("nan")
     if not 0 < determinant < np.inf:

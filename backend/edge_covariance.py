@@ -37,25 +37,14 @@ def edge_covariances(
 ) -> FloatArray:
     """Return the covariances of similarities between keyframes of a submap.
 
-    Parameters
-    ----------
-    pairs : sequence of (int, int)
-        Keyframe ids.
-    robust_k : float
-        Huber threshold in sigmas.
-    held : frozenset of int
-        Keyframes whose relative pose is no evidence.
+    - `pairs` (sequence of (int, int)): keyframe ids.
+    - `robust_k`: Huber threshold in sigmas.
+    - `held`: keyframes whose relative pose is no evidence.
 
-    Returns
-    -------
-    (E, 7, 7)
-        Of the right perturbation of ``S_first_second``: rotation, translation, log-scale, in the second keyframe's
-        frame and the submap's unit.
+    Returns (E, 7, 7): of the right perturbation of ``S_first_second``: rotation, translation, log-scale, in the second
+    keyframe's frame and the submap's unit.
 
-    Raises
-    ------
-    SolverError
-        If a keyframe is not in the submap, or the answer is not finite.
+    Raises `SolverError` if a keyframe is not in the submap, or the answer is not finite.
     """
     for k in {k for pair in pairs for k in pair}:
         if k not in submap.keyframes:

@@ -129,20 +129,12 @@ class FactorIndex:
     ) -> Plan:
         """Compare the submap with the graph; nothing changes until `commit`.
 
-        Parameters
-        ----------
-        poses : mapping of int to (4, 4)
-            ``T_submap_kf`` to judge by (normally the submap's).
-        xyz_mu : (L, 3)
-            Points to judge by (normally the submap's).
-        caution : float
-            Above 1 landmarks are asked for that much more certainty.
-        strict : bool
-            Hold the observations of new landmarks to `ENTER_SIGMAS`; False before a batch optimisation.
-        suspects : (S,) int64, optional
-            Landmarks to look at again although nothing of theirs changed.
-        choose : bool
-            Whether a part of what is admitted becomes factors; False: all of it.
+        - `poses` (mapping of int to (4, 4)): ``T_submap_kf`` to judge by (normally the submap's).
+        - `xyz_mu` (L, 3): points to judge by (normally the submap's).
+        - `caution`: above 1 landmarks are asked for that much more certainty.
+        - `strict`: hold the observations of new landmarks to `ENTER_SIGMAS`; False before a batch optimisation.
+        - `suspects` (S,): landmarks to look at again although nothing of theirs changed.
+        - `choose`: whether a part of what is admitted becomes factors; False: all of it.
         """
         self._take_new_rows(submap)
         obs = submap.observations

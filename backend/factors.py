@@ -22,17 +22,10 @@ def insert_projections(
 ) -> IntArray:
     """Append one projection factor per observation, in as few calls as keyframes and sigmas allow.
 
-    Parameters
-    ----------
-    graph : NonlinearFactorGraph
-        Is appended to.
-    kf, landmark : (R,) int64
-    uv_px : (R, 2), sigma_px : (R,)
+    - `kf`, `landmark` (R,), `uv_px` (R, 2), `sigma_px` (R,).
+    - `graph`: is appended to.
 
-    Returns
-    -------
-    (R,) int64
-        Order of insertion: the i-th new factor is that of observation ``order[i]``.
+    Returns (R,) int64: order of insertion: the i-th new factor is that of observation ``order[i]``.
     """
     order = np.lexsort((landmark, sigma_px, kf))
     if len(order) == 0:

@@ -31,22 +31,13 @@ def refine_submap(submap: Submap, robust_k: float, frames: FrameRows | None = No
 
     Its first keyframe stays where it is, and the mean square distance of the others from it stays what it is.
 
-    Parameters
-    ----------
-    robust_k : float
-        Huber threshold in sigmas, for landmarks whose depth is too uncertain to take part: they follow the poses.
-    frames : FrameRows, optional
-        What frames that are no keyframes have seen: more views of the same landmarks.
+    - `robust_k`: Huber threshold in sigmas, for landmarks whose depth is too uncertain to take part: they follow the
+      poses.
+    - `frames`: what frames that are no keyframes have seen: more views of the same landmarks.
 
-    Returns
-    -------
-    float
-        Shape of the loss, in the pixels' sigmas; `FORGETS_AT` where there is one keyframe.
+    Returns float: shape of the loss, in the pixels' sigmas; `FORGETS_AT` where there is one keyframe.
 
-    Raises
-    ------
-    SolverError
-        If the solver fails. The submap is as it was.
+    Raises `SolverError` if the solver fails. The submap is as it was.
     """
     first, *others = submap.keyframes
     if not others:

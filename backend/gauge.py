@@ -49,14 +49,9 @@ def choose_gauge(submap: Submap, current: Gauge | None, pose: Callable[[int], Fl
 
     A new gauge is taken at the poses as they are estimated now, so that nothing jumps.
 
-    Parameters
-    ----------
-    submap : Submap
-        With at least one keyframe.
-    current : Gauge or None
-        Is returned itself where nothing has to change.
-    pose : callable
-        Gives the present ``T_submap_kf`` of a keyframe.
+    - `submap`: with at least one keyframe.
+    - `current`: is returned itself where nothing has to change.
+    - `pose`: gives the present ``T_submap_kf`` of a keyframe.
     """
     live = submap.keyframes.keys()
     mine = (current.first, current.second) if current is not None else (None, None)

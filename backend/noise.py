@@ -32,19 +32,11 @@ def residual_variance(chi2: FloatArray, n_views: IntArray, least: float) -> floa
     a gate in the pixel's sigmas lets outliers in. Where pixels are noisier than their sigmas say, a gate that follows
     opens.
 
-    Parameters
-    ----------
-    chi2 : (R,) float64
-        Squared whitened residuals (2 degrees of freedom) of observations.
-    n_views : (R,) int64
-        Views that each one's landmark has.
-    least : float
-        The smallest answer, at most 1.
+    - `chi2` (R,): squared whitened residuals (2 degrees of freedom) of observations.
+    - `n_views` (R,): views that each one's landmark has.
+    - `least`: the smallest answer, at most 1.
 
-    Returns
-    -------
-    float
-        1 where too few landmarks have views enough to tell.
+    Returns float: 1 where too few landmarks have views enough to tell.
     """
     tells = n_views >= MIN_VIEWS
     if np.count_nonzero(tells) < MIN_OBSERVATIONS:

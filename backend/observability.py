@@ -32,14 +32,8 @@ def compute_residuals(
 ) -> Residuals:
     """Reproject.
 
-    Parameters
-    ----------
-    K : (3, 3)
-    T_submap_kf : (P, 4, 4)
-    pose : (R,) int64
-        Row of `T_submap_kf` of each observation.
-    xyz_mu : (R, 3)
-    uv_px : (R, 2), sigma_px : (R,)
+    - `K` (3, 3), `T_submap_kf` (P, 4, 4), `xyz_mu` (R, 3), `uv_px` (R, 2), `sigma_px` (R,).
+    - `pose` (R,): row of `T_submap_kf` of each observation.
     """
     xyz_cam, front, uv = reproject(K, T_submap_kf, pose, xyz_mu)
     u, v = (uv - uv_px).T
@@ -79,13 +73,8 @@ def projection_jacobian(
 ) -> FloatArray:
     """Return (2, 3, R): the whitened derivative of pixels by points in the submap, coordinate by coordinate.
 
-    Parameters
-    ----------
-    K : (3, 3)
-    R_submap_kf : (R, 3, 3)
-    xyz_cam : (R, 3)
-        In front of the camera.
-    sigma_px : (R,)
+    - `K` (3, 3), `R_submap_kf` (R, 3, 3), `sigma_px` (R,).
+    - `xyz_cam` (R, 3): in front of the camera.
     """
     x, y, z = xyz_cam.T
     w = 1 / (z * sigma_px)
@@ -115,19 +104,12 @@ def compute_depth_sigmas(
 ) -> FloatArray:
     """Return how well each point is fixed by its views alone, the poses taken as known.
 
-    Parameters
-    ----------
-    K : (3, 3), T_submap_kf : (P, 4, 4), pose : (R,), sigma_px : (R,)
-        As in `compute_residuals`.
-    xyz_cam : (R, 3)
-        The point of each observation, in front of its camera.
-    point : (R,) int64
-        Which of the `n_points` points each observation sees.
+    - `K` (3, 3), `T_submap_kf` (P, 4, 4), `pose` (R,), `sigma_px` (R,): as in `compute_residuals`.
+    - `xyz_cam` (R, 3): the point of each observation, in front of its camera.
+    - `point` (R,): which of the `n_points` points each observation sees.
 
-    Returns
-    -------
-    (n_points,) float64
-        Largest standard deviation of the point relative to its least depth; infinite with fewer than two views.
+    Returns (n_points,) float64: largest standard deviation of the point relative to its least depth; infinite with
+    fewer than two views.
     """
     J = projection_jacobian(K, T_submap_kf.take(pose, axis=0)[:, :3, :3], xyz_cam, sigma_px)
     information = sum_products(J, J, point, n_points)

@@ -46,18 +46,10 @@ def refine_points(
 ) -> FloatArray:
     """Return (P, 3) points that fit their views better, robustly; one that would not gain stays where it is.
 
-    Parameters
-    ----------
-    K : (3, 3)
-    T_submap_kf : (F, 4, 4)
-    pose, point : (R,) int64
-        Rows of `T_submap_kf` and `xyz_mu` of each observation.
-    xyz_mu : (P, 3)
-    uv_px : (R, 2), sigma_px : (R,)
-    robust_k : float
-        Huber threshold in sigmas.
-    steps : int
-        Of Gauss-Newton.
+    - `K` (3, 3), `T_submap_kf` (F, 4, 4), `xyz_mu` (P, 3), `uv_px` (R, 2), `sigma_px` (R,).
+    - `pose`, `point` (R,): rows of `T_submap_kf` and `xyz_mu` of each observation.
+    - `robust_k`: Huber threshold in sigmas.
+    - `steps`: of Gauss-Newton.
     """
     n = len(xyz_mu)
     if n == 0 or len(pose) == 0:
@@ -90,14 +82,9 @@ def refine_points(
 def refit_points(submap: Submap, robust_k: float, landmark_ids: IntArray) -> FloatArray:
     """Return (N, 3) landmarks that fit all their views in a submap better, as `refine_points` does.
 
-    Parameters
-    ----------
-    submap : Submap
-        Is not changed.
-    robust_k : float
-        Huber threshold in sigmas.
-    landmark_ids : (N,) int64
-        Each once.
+    - `submap`: is not changed.
+    - `robust_k`: Huber threshold in sigmas.
+    - `landmark_ids` (N,): each once.
     """
     obs, place = submap.observations, np.full(len(submap.landmarks), -1)
     place[landmark_ids] = np.arange(len(landmark_ids))
@@ -118,10 +105,7 @@ def triangulation_covariances(
 ) -> FloatArray:
     """Return (P, 3, 3): the covariance of each point by its views alone, the poses taken as known; NaN without a depth.
 
-    Parameters
-    ----------
-    K, T_submap_kf, pose, xyz_mu, point, sigma_px
-        As in `refine_points`.
+    `K`, `T_submap_kf`, `pose`, `xyz_mu`, `point`, `sigma_px`: as in `refine_points`.
     """
     R, t = T_submap_kf[pose, :3, :3], T_submap_kf[pose, :3, 3]
     xyz_cam = np.einsum("rji,rj->ri", R, xyz_mu[point] - t)

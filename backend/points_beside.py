@@ -50,13 +50,9 @@ def triangulated_covariances(
 
     Of the views of a point, the poses held, and of the pose of the newest of them, with which the point moves.
 
-    Parameters
-    ----------
-    landmark_ids : (L,) int64
-    rows : Table
-        `FactorIndex.rows`.
-    pose_covariance : callable
-        Of a keyframe.
+    - `landmark_ids` (L,).
+    - `rows`: `FactorIndex.rows`.
+    - `pose_covariance`: of a keyframe.
     """
     ids = np.asarray(landmark_ids, np.int64)
     covariances = np.full((len(ids), 3, 3), np.nan)

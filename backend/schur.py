@@ -112,23 +112,13 @@ def optimise(
 ) -> Optimum:
     """Run Levenberg-Marquardt on the poses that are not fixed, and on all points.
 
-    Parameters
-    ----------
-    problem : BundleProblem
-        Each point has two views or more that tell its depth.
-    tolerance : float
-        Relative decrease of the cost below which to stop.
-    lens : Lens, optional
-        One more variable, instead of ``problem.K``.
-    parameters : (M,), optional
-        Of the lens, to begin with.
-    behind_chi2 : float
-        What a view of a point behind its camera counts as; with 0 a step may put a point there.
+    - `problem`: each point has two views or more that tell its depth.
+    - `tolerance`: relative decrease of the cost below which to stop.
+    - `lens`: one more variable, instead of ``problem.K``.
+    - `parameters` (M,): of the lens, to begin with.
+    - `behind_chi2`: what a view of a point behind its camera counts as; with 0 a step may put a point there.
 
-    Raises
-    ------
-    SolverError
-        If no damping makes the system definite, or a residual is not finite.
+    Raises `SolverError` if no damping makes the system definite, or a residual is not finite.
     """
     system = System(problem, loss, lens, behind_chi2)
     state = State(problem.T_submap_kf, problem.xyz_mu, np.zeros(0) if parameters is None else parameters)
@@ -251,10 +241,7 @@ class System:
     def lens_covariance(self, state: State) -> FloatArray:
         """Return (M, M): the marginal covariance of the lens, by the weights at a state.
 
-        Raises
-        ------
-        SolverError
-            If the system is not definite.
+        Raises `SolverError` if the system is not definite.
         """
         reduced, _ = self._without_points(state, FIRST_DAMPING, self._linear(state))
         solved = None if reduced is None else self._solve(reduced, FIRST_DAMPING)

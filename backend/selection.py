@@ -66,17 +66,11 @@ def choose_factors(
     over their track, at last from chosen ones beyond their cap. Each time the least occupied cell of the image comes
     first, and the longest track (in time: the few that bridge a gap are long).
 
-    Parameters
-    ----------
-    admitted : (R,) bool
-        Rows that the graph can bear.
-    factors : (R,) bool
-        Rows that are factors now.
-    keyframes : (K,) int64
-    per_keyframe, max_views : int
-        Factors that a keyframe should have, about, and views of a landmark.
-    min_views : int
-        Views that a landmark must bring.
+    - `keyframes` (K,).
+    - `admitted` (R,) bool: rows that the graph can bear.
+    - `factors` (R,) bool: rows that are factors now.
+    - `per_keyframe`, `max_views`: factors that a keyframe should have, about, and views of a landmark.
+    - `min_views`: views that a landmark must bring.
     """
     kf, landmark = candidates.kf, candidates.landmark
     chosen = factors & admitted

@@ -86,16 +86,10 @@ class IncrementalSolver:
     ) -> IntArray:
         """Add and remove factors, solve, and return the indices of the new factors in the order of `graph`.
 
-        Parameters
-        ----------
-        values : Values
-            Of the variables that are new.
-        remove : list of int
-            Factor indices.
-        newest : list of int
-            Keyframes to eliminate last.
-        relinearise : bool
-            Whether variables that moved beyond their threshold get a new linearisation.
+        - `values`: of the variables that are new.
+        - `remove`: factor indices.
+        - `newest`: keyframes to eliminate last.
+        - `relinearise`: whether variables that moved beyond their threshold get a new linearisation.
         """
         params = gtsam.ISAM2UpdateParams()
         params.removeFactorIndices = remove
@@ -181,14 +175,9 @@ def optimise_batch(
 ) -> BatchOptimum:
     """Run Levenberg-Marquardt on poses and points, the points eliminated first.
 
-    Parameters
-    ----------
-    values : Values
-        Of exactly the poses of `keyframes` and the points of `landmarks`, both ascending.
-    keyframes : (K,) int64
-    landmarks : (L,) int64
-    tolerance : float
-        Relative decrease of the cost below which to stop.
+    - `keyframes` (K,), `landmarks` (L,).
+    - `values`: of exactly the poses of `keyframes` and the points of `landmarks`, both ascending.
+    - `tolerance`: relative decrease of the cost below which to stop.
     """
     params = gtsam.LevenbergMarquardtParams()
     params.setMaxIterations(max_iterations)

@@ -66,12 +66,8 @@ class Ties:
     ) -> TieChanges:
         """Add the new factors to a graph, and return what changes.
 
-        Parameters
-        ----------
-        pose_now : callable
-            Of a keyframe.
-        n_rows : callable
-            How many projections a keyframe will have.
+        - `pose_now`: of a keyframe.
+        - `n_rows`: how many projections a keyframe will have.
         """
         remove: list[int] = []
         gauge = choose_gauge(submap, self.gauge, pose_now)

@@ -18,10 +18,7 @@ _KINDS = {"uv_px": "f", "uv_rect_px": "f", "sigma_px": "f", "scale": "f", "octav
 def features_of(frontend: Frontend, image: NDArray[np.uint8]) -> Features:
     """Return the features of an image.
 
-    Raises
-    ------
-    FrontendError
-        As `checked` says.
+    Raises `FrontendError`: as `checked` says.
     """
     return checked(frontend, frontend.extract(image))
 
@@ -29,10 +26,7 @@ def features_of(frontend: Frontend, image: NDArray[np.uint8]) -> Features:
 def checked(frontend: Frontend, found: object) -> Features:
     """Return what a front end has found, if it is what it should be.
 
-    Raises
-    ------
-    FrontendError
-        If it is not `Features`, or its arrays are of different lengths or of other types.
+    Raises `FrontendError` if it is not `Features`, or its arrays are of different lengths or of other types.
     """
     ours = type(frontend).__module__.startswith("dualslam.")
     if not ours and (problem := _problem(found)):

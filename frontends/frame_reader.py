@@ -17,14 +17,9 @@ from dualslam.frontends.scene_mask import Cover, SceneMask
 class FrameReader:
     """Finds the features of live frames, as an ideal camera would have seen them.
 
-    Parameters
-    ----------
-    camera : callable
-        Returns the camera as it is known now: self-calibration may change it between two frames.
-    model_sigma_px : float
-        Error of the camera model itself, see `CameraConfig.model_sigma_px`.
-    scene : SceneMask
-        Which pixels show the scene.
+    - `camera`: returns the camera as it is known now: self-calibration may change it between two frames.
+    - `model_sigma_px`: error of the camera model itself, see `CameraConfig.model_sigma_px`.
+    - `scene`: which pixels show the scene.
     """
 
     def __init__(

@@ -97,10 +97,8 @@ class PixelMatcherFactory(Protocol):
 def create_pixel_matcher(config: PixelsConfig) -> PixelMatcher | None:
     """Build the pixel matcher that the config names, by the same rules as a front end; None where it names none.
 
-    Raises
-    ------
-    ConfigError
-        The name is unknown, what it points to cannot be imported or is no pixel matcher, or an option is wrong.
+    Raises `ConfigError`: the name is unknown, what it points to cannot be imported or is no pixel matcher, or an option
+    is wrong.
     """
     if config.name is None:
         return None
@@ -116,10 +114,8 @@ def create_frontend(config: FrontendConfig, needs: Iterable[str] = FOR_MAPS) -> 
 
     ``module:Class`` is a name as well: of what can be imported, whether it is installed or just being written.
 
-    Raises
-    ------
-    ConfigError
-        The name is unknown, its target cannot be imported, an option is wrong, or the result lacks one of `needs`.
+    Raises `ConfigError`: the name is unknown, its target cannot be imported, an option is wrong, or the result lacks
+    one of `needs`.
     """
     factory: FrontendFactory = _factory(config.name)
     frontend = factory.from_options(config.n_features, config.options)
@@ -150,14 +146,10 @@ def find_missing(name: str) -> str | None:
 def check_frontend(config: FrontendConfig) -> Frontend | None:
     """Refuse what `create_frontend` would, as far as possible without an extra's packages and without weights.
 
-    Returns
-    -------
-    Frontend or None
-        A built-in one that needs neither; None for another, of which only the name (and built-in options) is checked.
+    Returns Frontend or None: a built-in one that needs neither; None for another, of which only the name (and built-in
+    options) is checked.
 
-    Raises
-    ------
-    ConfigError
+    Raises `ConfigError`.
     """
     if config.name in EXTRA_OPTIONS:
         module, _, attribute = EXTRA_OPTIONS[config.name].partition(":")
@@ -172,10 +164,7 @@ def check_frontend(config: FrontendConfig) -> Frontend | None:
 def parse_options(model: type[OptionsT], owner: str, options: Mapping[str, Any], kind: Kind = FRONTENDS) -> OptionsT:
     """Check the `options` of a section of the config against a front end's or pixel matcher's own strict model.
 
-    Raises
-    ------
-    ConfigError
-        Of the first offending option; it tells the others too, and lists those that exist.
+    Raises `ConfigError`: of the first offending option; it tells the others too, and lists those that exist.
     """
     place = (kind.section, "options")
     try:

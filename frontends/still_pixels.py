@@ -85,9 +85,7 @@ class _Reduced:
 class StillPixels:
     """Looks at one frame after the other, and tells which pixels show no scene.
 
-    Parameters
-    ----------
-    size_px : (width, height)
+    `size_px` (width, height).
 
     Attributes
     ----------

@@ -17,11 +17,8 @@ from dualslam.io.map_store import StoredMap
 def check_config(config: Config) -> None:
     """Refuse a config that no system can be built from, as far as it shows without extras and weights.
 
-    Raises
-    ------
-    ConfigError
-        If it is no configuration. If a front end (also of an attempt at a recovery) or the pixel matcher is not known,
-        or its options are wrong. If the initialiser cannot match with it.
+    Raises `ConfigError` if it is no configuration. If a front end (also of an attempt at a recovery) or the pixel
+    matcher is not known, or its options are wrong. If the initialiser cannot match with it.
     """
     if not isinstance(config, Config):
         raise ConfigError(f"the configuration is a {type(config).__name__}; load_config or config_from_dict makes one")
@@ -38,9 +35,7 @@ def check_config(config: Config) -> None:
 def check_given(camera: Camera, saved: StoredMap | None) -> None:
     """Refuse what is no camera and no saved map, such as a path to one.
 
-    Raises
-    ------
-    InputError
+    Raises `InputError`.
     """
     if not isinstance(camera, Camera):
         raise InputError(f"the camera is a {type(camera).__name__}; a sequence has one, as sequence.camera.")

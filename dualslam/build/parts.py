@@ -73,10 +73,7 @@ def metric_parts(config: Config) -> MetricParts:
 def measurement_sources(rows: Iterable[RowSource]) -> list[MeasurementSource]:
     """Make readings of files' lines.
 
-    Raises
-    ------
-    InputError
-        Naming the line.
+    Raises `InputError`: naming the line.
     """
     from dualslam.backend.measurements.registry import readings_of
 
@@ -113,10 +110,7 @@ def find_focal(
 
     `told`: the focal length in the source's own data, if any.
 
-    Raises
-    ------
-    ConfigError
-        If the front end is not known, or its options are wrong.
+    Raises `ConfigError` if the front end is not known, or its options are wrong.
     """
     from dualslam.frontends.tracking.focal_search import search_focal  # an optimiser that no other run needs
 

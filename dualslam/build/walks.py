@@ -44,10 +44,7 @@ def recovery_parts(
     `frontend`: the live one, where this process has it already: it may hold networks. `n_threads`: that find other
     front ends' features beside the walk; the results do not depend on it. `new_graph`: instead of `ISam2SubmapGraph`.
 
-    Raises
-    ------
-    ConfigError
-        If a front end that an attempt names is not known, or its options are wrong.
+    Raises `ConfigError` if a front end that an attempt names is not known, or its options are wrong.
     """
     frontend = frontend or create_frontend(config.frontend)
 

@@ -20,9 +20,7 @@ def config_of(args: argparse.Namespace) -> Config:
 
     The files are read once, as they may be pipes: `args` keeps what is found, as `resolved` and `overrides`.
 
-    Raises
-    ------
-    ConfigError
+    Raises `ConfigError`.
     """
     if getattr(args, "resolved", None) is None:
         take_selection(args)
@@ -39,10 +37,7 @@ def config_of(args: argparse.Namespace) -> Config:
 def take_selection(args: argparse.Namespace) -> None:
     """Take the frames of the run that `--replay` repeats, where the options select none.
 
-    Raises
-    ------
-    InputError
-        If there is no such run, or the options say that it is not repeated in one process.
+    Raises `InputError` if there is no such run, or the options say that it is not repeated in one process.
     """
     if getattr(args, "replay", None) is None:
         return

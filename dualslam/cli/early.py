@@ -12,9 +12,7 @@ from dualslam.core.missing import check_exists
 def check(args: argparse.Namespace) -> None:
     """Refuse a configuration that names what does not exist, and a source that is not there.
 
-    Raises
-    ------
-    ConfigError, InputError
+    Raises `ConfigError`, `InputError`.
     """
     if hasattr(args, "set"):
         config_of(args)

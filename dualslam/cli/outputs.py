@@ -10,16 +10,10 @@ from dualslam.core.errors import OutputError
 def check_free(file: Path, overwrite: bool, instead: str) -> None:
     """Refuse a file that is there already, unless it may be replaced.
 
-    Parameters
-    ----------
-    overwrite : bool
-        Whether `--overwrite` was given.
-    instead : str
-        What to name in its place, and by which option: "another with --out".
+    - `overwrite`: whether `--overwrite` was given.
+    - `instead`: what to name in its place, and by which option: "another with --out".
 
-    Raises
-    ------
-    OutputError
+    Raises `OutputError`.
     """
     if file.exists() and not overwrite:
         raise OutputError(f"{file} is there already; name {instead}, or give --overwrite.")

@@ -76,10 +76,8 @@ class _Parser(argparse.ArgumentParser):
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Parse a command line; the result's `execute` is the function to call with it.
 
-    Raises
-    ------
-    SystemExit
-        With status 2 and one sentence on stderr where the usage is wrong; with 0 after ``--help`` and ``--version``.
+    Raises `SystemExit`: with status 2 and one sentence on stderr where the usage is wrong; with 0 after ``--help`` and
+    ``--version``.
     """
     return _build_parser().parse_args(arguments)
 

@@ -100,19 +100,14 @@ class AtlasSolver(Protocol):
     def solve(self, problem: AtlasProblem) -> AtlasSolution:
         """Find the similarities that agree best with the edges, without those that are wrong.
 
-        Raises
-        ------
-        SolverError
+        Raises `SolverError`.
         """
         ...
 
     def relative_covariance(self, problem: AtlasProblem, first: int, second: int) -> FloatArray:
         """Return the (7, 7) covariance of ``inv(S_world_first) @ S_world_second`` (right perturbation), as solved.
 
-        Raises
-        ------
-        SolverError
-            Also where nothing ties the two.
+        Raises `SolverError`: also where nothing ties the two.
         """
         ...
 
@@ -123,9 +118,7 @@ class AtlasSolver(Protocol):
 
         `held`: keyframes whose `Submap.relative_poses` hold an earlier bend, and are no evidence.
 
-        Raises
-        ------
-        SolverError
+        Raises `SolverError`.
         """
         ...
 

@@ -34,12 +34,8 @@ def squared_distances(residuals: FloatArray, covariances: FloatArray) -> FloatAr
 def variance_by_median(chi2: FloatArray, n_views: IntArray) -> float:
     """Return the variance of whitened pixel residuals, by their median: 1 where the pixels' sigmas are right.
 
-    Parameters
-    ----------
-    chi2 : (R,) float64
-        Squared whitened residuals (2 degrees of freedom) of observations.
-    n_views : (R,) int64
-        Views that each one's landmark has, at least 2. The landmark takes 3 of their ``2 n`` numbers, which is given
-        back.
+    - `chi2` (R,): squared whitened residuals (2 degrees of freedom) of observations.
+    - `n_views` (R,): views that each one's landmark has, at least 2. The landmark takes 3 of their ``2 n`` numbers,
+      which is given back.
     """
     return float(np.median(chi2 / (1 - 1.5 / n_views))) / MEDIAN_CHI2[2]

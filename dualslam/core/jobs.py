@@ -158,16 +158,11 @@ PAUSE_S = 1e-3
 class InlineDesk:
     """Does each job when it is submitted: one process, deterministic.
 
-    Parameters
-    ----------
-    handlers : mapping of JobKind to Handler
-        One that keeps a state from job to job may have a method `forget`.
-    tell : callable, optional
-        Called, during a job that works in steps, with how far it has come.
-    is_lost : callable, optional
-        Whether a job (its kind and its work) is to end as if its process had died: where the failure lab takes hold.
-    copied : set of JobKind
-        Kinds whose handlers keep what they are given, which is therefore copied, as into another process.
+    - `handlers`: one that keeps a state from job to job may have a method `forget`.
+    - `tell`: called, during a job that works in steps, with how far it has come.
+    - `is_lost`: whether a job (its kind and its work) is to end as if its process had died: where the failure lab takes
+      hold.
+    - `copied`: kinds whose handlers keep what they are given, which is therefore copied, as into another process.
     """
 
     def __init__(

@@ -22,10 +22,7 @@ def keep_freed_memory() -> bool:
 
     Call it in a program of your own as in ours; importing dualslam does not call it.
 
-    Returns
-    -------
-    bool
-        False where the C library has no such setting: elsewhere than on Linux with glibc nothing is changed.
+    Returns bool: false where the C library has no such setting: elsewhere than on Linux with glibc nothing is changed.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -10,9 +10,7 @@ from dualslam.core.errors import InputError
 def check_exists(source: Path) -> None:
     """Refuse a path at which there is nothing.
 
-    Raises
-    ------
-    InputError
+    Raises `InputError`.
     """
     if not source.exists():
         raise InputError(

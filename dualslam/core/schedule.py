@@ -171,10 +171,7 @@ class Recorded:
     def read(cls, path: Path) -> Recorded:
         """Read ``schedule.jsonl``.
 
-        Raises
-        ------
-        InputError
-            If it is not there, or no schedule of this version.
+        Raises `InputError` if it is not there, or no schedule of this version.
         """
         try:
             lines = path.read_text(encoding="utf-8").splitlines()

@@ -19,12 +19,8 @@ MAX_CHI2 = 2.5
 def find_lack_of_support(n_inliers: int, n_matches: int, chi2: float, config: HealthConfig) -> Failure | None:
     """Return what a pose lacks, or None where its matches explain it.
 
-    Parameters
-    ----------
-    n_inliers, n_matches : int
-        Matches that agree with the pose, and all of them.
-    chi2 : float
-        Of those that agree, over the degrees of freedom.
+    - `n_inliers`, `n_matches`: matches that agree with the pose, and all of them.
+    - `chi2`: of those that agree, over the degrees of freedom.
     """
     numbers = {"n_matches": float(n_matches), "n_inliers": float(n_inliers), "chi2": chi2}
     gates = support_gates(n_inliers, n_matches, chi2, config)
@@ -52,12 +48,8 @@ def support_gates(n_inliers: int, n_matches: int, chi2: float, config: HealthCon
 def judge_track(track: Track | Failure, config: HealthConfig) -> Track | Failure:
     """Return the track if the map explains it, else why not.
 
-    Parameters
-    ----------
-    track : Track or Failure
-        What the tracker made of a frame.
-    config : HealthConfig
-        Thresholds, each with its meaning.
+    - `track`: what the tracker made of a frame.
+    - `config`: thresholds, each with its meaning.
     """
     if isinstance(track, Failure):
         return track

@@ -20,10 +20,7 @@ def limit_threads() -> bool:
     Variables that the user has set are left as they are. Call it before numpy is imported, in a program of your own as
     in ours; importing dualslam does not call it.
 
-    Returns
-    -------
-    bool
-        False where numpy was loaded already, so that the limits came too late for it.
+    Returns bool: false where numpy was loaded already, so that the limits came too late for it.
     """
     for name, value in LIMITS.items():
         os.environ.setdefault(name, value)

@@ -39,12 +39,8 @@ class WalkNews:
 class WalkTrace:
     """Where one attempt at a walk has been.
 
-    Parameters
-    ----------
-    started_from : (3,)
-        Centre of the keyframe from which it sets out.
-    newest_id : int
-        That keyframe.
+    - `started_from` (3,): centre of the keyframe from which it sets out.
+    - `newest_id`: that keyframe.
     """
 
     def __init__(self, submap_id: int, attempt: str, newest_id: int, started_from: FloatArray) -> None:

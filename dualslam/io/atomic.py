@@ -18,10 +18,7 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
 
     The new content is on the disk before the rename, so a crash at any moment leaves the old file or the new one.
 
-    Raises
-    ------
-    OutputError
-        If the folder cannot be written to.
+    Raises `OutputError` if the folder cannot be written to.
     """
     path = Path(path)
     try:

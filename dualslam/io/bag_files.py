@@ -65,10 +65,7 @@ def is_bag(path: Path) -> bool:
 def scan(paths: list[Path]) -> Bag:
     """Find the messages of the files of a bag.
 
-    Raises
-    ------
-    InputError
-        If one is no bag.
+    Raises `InputError` if one is no bag.
     """
     bag = Bag(paths)
     for number, path in enumerate(paths):

@@ -27,14 +27,9 @@ _JPEG = b"\xff\xd8\xff"
 def used_bits(n: int, read: Callable[[int], bytes | None], name: str) -> int:
     """Return the number of bits that the images of a source use; `WHOLE` where their files have eight.
 
-    Parameters
-    ----------
-    n : int
-        How many there are.
-    read : callable
-        Gives the bytes of one; None where it cannot be read.
-    name : str
-        Of the source, for the message.
+    - `n`: how many there are.
+    - `read`: gives the bytes of one; None where it cannot be read.
+    - `name`: of the source, for the message.
     """
     brightest = -1
     for index in np.linspace(0, n - 1, min(n, N_LOOKED_AT)).astype(int).tolist():

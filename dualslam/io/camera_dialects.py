@@ -20,10 +20,7 @@ STRETCH = "input_horizontal_stretch"
 def in_common_keys(content: dict[str, Any], where: str) -> dict[str, Any]:
     """Return a file of Theia or Gyroflow in the keys of other tools, and any other as it is.
 
-    Raises
-    ------
-    InputError
-        If its images are stretched.
+    Raises `InputError` if its images are stretched.
     """
     if isinstance(content.get("intrinsics"), dict) and "intrinsic_type" in content:
         return _of_theia(content)

@@ -74,10 +74,8 @@ def read_camera_file(path: str | Path, images_px: Callable[[], Size] | None = No
 
     `images_px`: gives the size of the images, for files that do not say it, as some of ORB-SLAM.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, of no known kind, says what is not read, or holds a calibration that makes no sense.
+    Raises `InputError` if the file is missing, of no known kind, says what is not read, or holds a calibration that
+    makes no sense.
     """
     path = Path(path)
     if path.suffix.lower() == ".bin":

@@ -25,17 +25,10 @@ MAX_SKEW_PX = 0.1
 def camera_of_mapping(content: dict[str, Any], where: str, images_px: Callable[[], Size] | None = None) -> Camera:
     """Return the camera that a mapping of another tool describes.
 
-    Parameters
-    ----------
-    where : str
-        The file, for messages.
-    images_px : callable, optional
-        Gives the size of the images, for a file that does not say it.
+    - `where`: the file, for messages.
+    - `images_px`: gives the size of the images, for a file that does not say it.
 
-    Raises
-    ------
-    InputError
-        Names the key that is missing, wrong, or not read.
+    Raises `InputError`: names the key that is missing, wrong, or not read.
     """
     said = CameraTable.of(content, where)
     lens = said.lens()

@@ -39,10 +39,7 @@ for _tag in ("opencv-matrix", "opencv-nd-matrix"):
 def read_mappings(path: Path, text: str) -> list[Mapping]:
     """Return the mappings of a file: one for each of its documents, as ROS writes them behind ``---``.
 
-    Raises
-    ------
-    InputError
-        It is none of these formats, or holds none.
+    Raises `InputError`: it is none of these formats, or holds none.
     """
     if text.lstrip().startswith("<"):
         documents = [_of_xml(path, text)]

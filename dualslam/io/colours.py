@@ -27,10 +27,7 @@ def save_colours(map_folder: Path, colours: Colours) -> None:
 def load_colours(map_folder: Path) -> dict[int, NDArray[np.uint8]]:
     """Return the colours of a map; empty where it was saved without.
 
-    Raises
-    ------
-    InputError
-        If the file is damaged.
+    Raises `InputError` if the file is damaged.
     """
     path = map_folder / COLOURS
     if not path.is_file():
@@ -53,10 +50,7 @@ def save_pictures(map_folder: Path, pictures: Mapping[int, bytes]) -> None:
 def load_pictures(map_folder: Path) -> dict[int, bytes]:
     """Return the pictures of a map; empty where it was saved without.
 
-    Raises
-    ------
-    InputError
-        If the file is damaged.
+    Raises `InputError` if the file is damaged.
     """
     path = map_folder / PICTURES
     return {int(name): jpeg.tobytes() for name, jpeg in load_arrays(path).items()} if path.is_file() else {}

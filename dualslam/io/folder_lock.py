@@ -12,12 +12,8 @@ from dualslam.core.errors import OutputError
 class FolderLock:
     """Holds a folder until it is released or the process ends, however it ends; there is no file to be left behind.
 
-    Raises
-    ------
-    OutputError
-        If another one holds it.
-    OSError
-        If the folder cannot be opened.
+    Raises `OutputError` if another one holds it.
+    Raises `OSError` if the folder cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:

@@ -71,10 +71,7 @@ def natural_key(name: str) -> list[tuple[int, int | str]]:
 def list_images(folder: Path) -> list[Path]:
     """Return the image files of a folder in natural order.
 
-    Raises
-    ------
-    InputError
-        If the folder is missing or holds no image.
+    Raises `InputError` if the folder is missing or holds no image.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} does not exist or is no folder; it should hold the images.")

@@ -60,9 +60,7 @@ def check_rows(arrays: Arrays, *groups: Rows) -> None:
 
     Arrays that are not there pass: which may be missing is for the reader to know.
 
-    Raises
-    ------
-    ValueError
+    Raises `ValueError`.
     """
     for rows in groups:
         there = {name: row for name, row in rows.items() if name in arrays}
@@ -82,12 +80,8 @@ def check_rows(arrays: Arrays, *groups: Rows) -> None:
 def check_submap(arrays: Arrays) -> None:
     """Refuse arrays that no submap would give.
 
-    Raises
-    ------
-    KeyError
-        If one is missing.
-    ValueError
-        If one is of another shape or type, not finite, or points at what is not there.
+    Raises `KeyError` if one is missing.
+    Raises `ValueError` if one is of another shape or type, not finite, or points at what is not there.
     """
     check_rows(arrays, *_SUBMAP_ROWS)
     fresh = Submap(0, np.eye(3), np.zeros_like(arrays["landmarks_descriptor"][:0]).reshape(-1)[:0])

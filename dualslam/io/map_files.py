@@ -40,10 +40,7 @@ _FEATURE_FIELDS = tuple(f.name for f in fields(Features))
 def save_arrays(path: str | Path, arrays: Arrays) -> None:
     """Write named arrays as one ``.npz``, atomically.
 
-    Raises
-    ------
-    OutputError
-        If an array holds Python objects, which only a pickle could keep.
+    Raises `OutputError` if an array holds Python objects, which only a pickle could keep.
     """
     path = Path(path)
     for name, array in arrays.items():
@@ -207,10 +204,7 @@ def submap_to_arrays(submap: Submap) -> dict[str, NDArray[Any]]:
 def submap_from_arrays(arrays: Arrays) -> Submap:
     """Make the submap of `submap_to_arrays` again.
 
-    Raises
-    ------
-    KeyError, ValueError
-        If an array is missing or of another shape.
+    Raises `KeyError`, `ValueError` if an array is missing or of another shape.
     """
     version = int(arrays["format"])
     if version not in (SUBMAP_FORMAT - 1, SUBMAP_FORMAT):

@@ -121,10 +121,7 @@ def save_atlas(folder: str | Path, atlas: Atlas, poses: dict[int, FramePose], ca
 def load_atlas(folder: str | Path) -> StoredMap:
     """Read a map that `save_atlas` wrote, from a run folder or its ``map`` folder.
 
-    Raises
-    ------
-    InputError
-        If there is no map, or it is damaged.
+    Raises `InputError` if there is no map, or it is damaged.
     """
     folder = _map_folder(folder)
     groups, metadata = load_map(folder)
@@ -149,10 +146,7 @@ def load_atlas(folder: str | Path) -> StoredMap:
 def load_camera(folder: str | Path) -> Camera | None:
     """Read the camera of a map, from a run folder or its ``map`` folder, and nothing larger; None where it has none.
 
-    Raises
-    ------
-    InputError
-        If there is no map, or it is damaged.
+    Raises `InputError` if there is no map, or it is damaged.
     """
     folder = _map_folder(folder)
     _, metadata = load_metadata(folder)
@@ -165,15 +159,9 @@ def load_camera(folder: str | Path) -> Camera | None:
 def load_joints(folder: str | Path) -> tuple[list[int], Atlas]:
     """Read the ids of a map's submaps and how they are joined, from its ``map`` folder, and nothing larger.
 
-    Returns
-    -------
-    list of int, Atlas
-        The atlas has links and what was solved of them, but no submaps.
+    Returns list of int, Atlas: the atlas has links and what was solved of them, but no submaps.
 
-    Raises
-    ------
-    InputError
-        If there is no map, or it is damaged.
+    Raises `InputError` if there is no map, or it is damaged.
     """
     folder = Path(folder)
     groups, metadata = load_metadata(folder)

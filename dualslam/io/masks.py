@@ -33,10 +33,7 @@ def masked(sequence: Sequence, path: str | Path | None) -> Sequence:
     `path`: an image of the size of the frames, 0 where no scene is. A folder has one for each frame of the source. They
     are named as the frames, or in their order.
 
-    Raises
-    ------
-    InputError
-        If there is no such file, a frame has no mask, or the first mask cannot be used.
+    Raises `InputError` if there is no such file, a frame has no mask, or the first mask cannot be used.
     """
     if path is None:
         return sequence
@@ -56,10 +53,7 @@ def masked(sequence: Sequence, path: str | Path | None) -> Sequence:
 def read_mask(path: Path, size_px: tuple[int, int]) -> BoolArray:
     """Return the pixels (H, W) that a mask hides in images of a size (width, height).
 
-    Raises
-    ------
-    InputError
-        If it cannot be read, is of another size, or hides all.
+    Raises `InputError` if it cannot be read, is of another size, or hides all.
     """
     width, height = size_px
     data = np.fromfile(path, np.uint8)
@@ -119,12 +113,8 @@ def hidden_pixels(sequence: Sequence, found: BoolArray | None) -> BoolArray | No
 class MaskedSequence:
     """Frames of another sequence with their masks. All else about it is that sequence's.
 
-    Parameters
-    ----------
-    mask_of : callable
-        Returns what is hidden in the frame of an index.
-    hidden : (H, W) bool or None
-        The same, where it is the same in all frames.
+    - `mask_of`: returns what is hidden in the frame of an index.
+    - `hidden` (H, W) bool or None: the same, where it is the same in all frames.
     """
 
     def __init__(

@@ -28,15 +28,10 @@ def write_metric(
 ) -> None:
     """Write them; GPX and GeoJSON where positions came as latitude and longitude.
 
-    Parameters
-    ----------
-    frames : Trajectory
-        In the frame of the measurements, metres.
-    covariance : (F, 6, 6)
-        Of each: right perturbation, rotation (rad), then translation (metres).
-    exports : mapping of str to str
-        Texts of further files by name.
-    origin : (float, float, float) or None
+    - `origin` (float, float, float) or None.
+    - `frames`: in the frame of the measurements, metres.
+    - `covariance` (F, 6, 6): of each: right perturbation, rotation (rad), then translation (metres).
+    - `exports`: texts of further files by name.
     """
     order = frames.timestamps_s.argsort(kind="stable")
     frames, covariance = frames.in_time_order(), covariance[order]

@@ -15,14 +15,9 @@ SCALE = "scale.json"
 def write_scale(run: Path, metres_per_unit: float, sigma_rel: float | None, words: str) -> None:
     """Keep the scale of a run's map.
 
-    Parameters
-    ----------
-    run : path
-        Run folder with a map.
-    sigma_rel : float or None
-        Of it, relative.
-    words : str
-        What it is from.
+    - `run`: run folder with a map.
+    - `sigma_rel`: of it, relative.
+    - `words`: what it is from.
     """
     content = {"metres_per_unit": metres_per_unit, "sigma_rel": sigma_rel, "from": words}
     write_text(run / MAP / SCALE, json.dumps(content, indent=1) + "\n")
@@ -31,10 +26,7 @@ def write_scale(run: Path, metres_per_unit: float, sigma_rel: float | None, word
 def read_scale(run: Path) -> float | None:
     """Return the metres per unit of a run's map, or None if unknown.
 
-    Raises
-    ------
-    InputError
-        If the file is damaged.
+    Raises `InputError` if the file is damaged.
     """
     path = run / MAP / SCALE
     if not path.is_file():

@@ -63,36 +63,22 @@ def open_sequence(
 ) -> RecordedSequence | WebcamSequence:
     """Open a source of frames, whatever it is.
 
-    Parameters
-    ----------
-    source : path, address, or number of a webcam
-        A video, a folder of images, or one of a known layout (ours, KITTI odometry, TUM RGB-D, TUM-Mono, EuRoC). ``0``,
-        ``1``, ... for a webcam, or the address of a stream (``rtsp://``, ``http://``).
-    camera_file : path, optional
-        Calibration to use instead of the source's own (see `dualslam.io.camera_files`).
-    fov_degrees : float, optional
-        Field of view along the longer side of the images, where there is no calibration at all.
-    start, stride, max_frames : int
-        Which frames: counted in the source, from `start`, every `stride`-th, at most `max_frames`.
-    reverse : bool
-        Read the same frames last to first. Their indices and timestamps stay what they are.
-    times : path or array, optional
-        Times to use instead of the source's own, for each of its images.
-    rate_hz : float, optional
-        Frames a second, instead of the source's own times.
-    time_unit : {"s", "ms", "us", "ns"}, optional
-        Of the source's own times. Where it is not given they must make the rate of a camera as seconds.
-    topic : str, optional
-        Of the images of a bag that has several.
-    grey : bool
-        Decode to (H, W) grey; otherwise (H, W, 3) RGB.
-    max_side_px : int or None
-        Larger recorded images are read smaller, by a whole factor, and their camera with them; None: never.
+    - `source`: a video, a folder of images, or one of a known layout (ours, KITTI odometry, TUM RGB-D, TUM-Mono,
+      EuRoC). ``0``, ``1``, ... for a webcam, or the address of a stream (``rtsp://``, ``http://``).
+    - `camera_file`: calibration to use instead of the source's own (see `dualslam.io.camera_files`).
+    - `fov_degrees`: field of view along the longer side of the images, where there is no calibration at all.
+    - `start`, `stride`, `max_frames`: which frames: counted in the source, from `start`, every `stride`-th, at most
+      `max_frames`.
+    - `reverse`: read the same frames last to first. Their indices and timestamps stay what they are.
+    - `times`: times to use instead of the source's own, for each of its images.
+    - `rate_hz`: frames a second, instead of the source's own times.
+    - `time_unit`: of the source's own times. Where it is not given they must make the rate of a camera as seconds.
+    - `topic`: of the images of a bag that has several.
+    - `grey`: decode to (H, W) grey; otherwise (H, W, 3) RGB.
+    - `max_side_px`: larger recorded images are read smaller, by a whole factor, and their camera with them; None:
+      never.
 
-    Raises
-    ------
-    InputError
-        If the source is nothing that can be read, or its parts do not fit together.
+    Raises `InputError` if the source is nothing that can be read, or its parts do not fit together.
     """
     if camera_file is not None and fov_degrees is not None:
         raise InputError("A camera file and a field of view were both given; give one of them.")

@@ -16,14 +16,9 @@ def read_ahead(items: Iterator[T], depth: int = 8, *, drop_oldest: bool = False)
     The thread starts with the first item asked for. It ends when the items do, or when this generator is closed, as by
     a ``break`` in the consumer's loop. If the items raise, the exception comes out here, after the items before it.
 
-    Parameters
-    ----------
-    items : iterator
-        Closed on its own thread if it is a generator.
-    depth : int
-        How many items may wait: the next one is produced once one of so many has been consumed.
-    drop_oldest : bool
-        For live sources: a full queue drops its oldest item instead of making the producer wait.
+    - `items`: closed on its own thread if it is a generator.
+    - `depth`: how many items may wait: the next one is produced once one of so many has been consumed.
+    - `drop_oldest`: for live sources: a full queue drops its oldest item instead of making the producer wait.
     """
     channel: _Channel[T] = _Channel(depth, drop_oldest)
     thread = Thread(target=channel.produce, args=(items,), name="dualslam-read-ahead", daemon=True)

@@ -85,9 +85,7 @@ class _ReducedReader:
 class ResizedFrames:
     """The frames of a sequence, whole and in another size. What else it has is the sequence's.
 
-    Parameters
-    ----------
-    size_px : (width, height)
+    `size_px` (width, height).
     """
 
     def __init__(self, sequence: Sequence, size_px: tuple[int, int]) -> None:

@@ -106,12 +106,8 @@ class RunRecord:
 class RunFolder:
     """A folder that a run writes to. Every file appears whole; events are on the disk as soon as they happen.
 
-    Parameters
-    ----------
-    path : path
-        Made if it is not there.
-    overwrite : bool
-        Remove the files of an earlier run. Files that no run writes stay in any case.
+    - `path`: made if it is not there.
+    - `overwrite`: remove the files of an earlier run. Files that no run writes stay in any case.
 
     Attributes
     ----------
@@ -305,11 +301,8 @@ def write_summary(run: Path, summary: Mapping[str, Any]) -> None:
 def check_vacant(path: Path, *, overwrite: bool) -> None:
     """Refuse a folder that a run must not write to. It changes nothing: to be asked before long work, too.
 
-    Raises
-    ------
-    OutputError
-        If there is an earlier run (or files of its names) and `overwrite` is not set. If it holds files of these names
-        that no run has written, such as the ``groundtruth.txt`` of a sequence. If it is a file.
+    Raises `OutputError` if there is an earlier run (or files of its names) and `overwrite` is not set. If it holds
+    files of these names that no run has written, such as the ``groundtruth.txt`` of a sequence. If it is a file.
     """
     try:
         present = _run_files(path)

@@ -120,10 +120,7 @@ def _sigma(cell: str | None) -> float | None:
 def read_summary(run: Path) -> dict[str, Any]:
     """Read ``summary.json`` of a run folder.
 
-    Raises
-    ------
-    InputError
-        If the folder is none of a run, or the file is damaged.
+    Raises `InputError` if the folder is none of a run, or the file is damaged.
     """
     path = run / SUMMARY
     if not path.is_file():
@@ -142,10 +139,7 @@ def read_summary(run: Path) -> dict[str, Any]:
 def read_numbers(run: Path) -> dict[int, int]:
     """Return the number that each frame of a run has in the run's map, by its index in the source.
 
-    Raises
-    ------
-    InputError
-        If the folder is none of a run, or a file is damaged.
+    Raises `InputError` if the folder is none of a run, or a file is damaged.
     """
     summary = read_summary(run)
     numbers = FrameNumbers(summary.get("first_id", 0), summary.get("first_index"))

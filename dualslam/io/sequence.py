@@ -208,10 +208,7 @@ def image_size(images: ImageStore, name: str, wanted: tuple[int, int] | None = N
     Looks at a few images, so that a single odd one does no harm: if one is of the `wanted` size that is the answer,
     otherwise the size of most of them.
 
-    Raises
-    ------
-    InputError
-        If none of all the images can be read.
+    Raises `InputError` if none of all the images can be read.
     """
     n = len(images)
     few = list(dict.fromkeys(np.linspace(0, n - 1, min(n, 5)).astype(int).tolist()))
@@ -242,10 +239,7 @@ def image_size(images: ImageStore, name: str, wanted: tuple[int, int] | None = N
 def camera_of_size(camera: Camera, size_px: tuple[int, int], name: str, calibration: str) -> Camera:
     """Return a calibration for images of this size: scaled if it is for another size of the same shape.
 
-    Raises
-    ------
-    InputError
-        If the shape is another one: it cannot be known what was cut off.
+    Raises `InputError` if the shape is another one: it cannot be known what was cut off.
     """
     if camera.size_px == size_px:
         return camera

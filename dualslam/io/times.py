@@ -33,10 +33,7 @@ def read_times(path: Path) -> FloatArray:
 def checked_times(times_s: ArrayLike, where: str) -> FloatArray:
     """Return `times_s` as an array if every one is finite and later than the one before.
 
-    Raises
-    ------
-    InputError
-        Naming `where` and the first entry that is wrong.
+    Raises `InputError`: naming `where` and the first entry that is wrong.
     """
     times = np.asarray(times_s, float).ravel()
     if not np.isfinite(times).all():
@@ -60,10 +57,8 @@ def epoch_unit(time: float) -> str | None:
 def in_seconds(times: FloatArray, where: str, unit: str | None) -> FloatArray:
     """Return times in seconds: of the stated unit, or of an epoch's; otherwise they must make a camera's rate.
 
-    Raises
-    ------
-    InputError
-        If their rate is none of a camera, with the unit that they seem to have; or if they count frames.
+    Raises `InputError` if their rate is none of a camera, with the unit that they seem to have; or if they count
+    frames.
     """
     if unit is not None:
         return times * UNITS[unit]

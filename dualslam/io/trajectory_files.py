@@ -25,17 +25,11 @@ MAX_BEGIN_GAP_S = 1e6
 def read_tum(path: str | Path, *, skip_nan: bool = False, allow_empty: bool = False) -> Trajectory:
     """Read ``t tx ty tz qx qy qz qw`` lines (``#`` starts a comment), sorted by time.
 
-    Parameters
-    ----------
-    skip_nan : bool
-        Leave out lines that hold a NaN (TUM-Mono marks unknown poses so) instead of refusing the file.
-    allow_empty : bool
-        Take a file without lines for a trajectory without poses: a run that could not pose a frame leaves one.
+    - `skip_nan`: leave out lines that hold a NaN (TUM-Mono marks unknown poses so) instead of refusing the file.
+    - `allow_empty`: take a file without lines for a trajectory without poses: a run that could not pose a frame leaves
+      one.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, empty or holds a line that is no pose.
+    Raises `InputError` if the file is missing, empty or holds a line that is no pose.
     """
     table = read_number_table(path, 8, "a TUM trajectory (t tx ty tz qx qy qz qw)", allow_empty)
     finite = np.isfinite(table).all(axis=1)
@@ -129,14 +123,9 @@ def associate(reference_s: FloatArray, query_s: FloatArray, max_dt_s: float) -> 
 def read_number_table(path: str | Path, columns: int, what: str, allow_empty: bool = False) -> FloatArray:
     """Read lines of `columns` numbers, separated by blanks or commas; ``#`` starts a comment.
 
-    Returns
-    -------
-    (N, columns) float64
+    Returns (N, columns) float64.
 
-    Raises
-    ------
-    InputError
-        Naming the file and the line that is not `what`.
+    Raises `InputError`: naming the file and the line that is not `what`.
     """
     rows: list[list[float]] = []
     for number, line in enumerate(read_text(path).splitlines(), 1):

@@ -29,10 +29,7 @@ def drop_dead_rows(submap: Submap, follower: RowFollower) -> int:
     `follower`: all that follows this submap by the numbers of its rows. (One that does not hear of it makes its state
     anew.)
 
-    Returns
-    -------
-    int
-        How many rows have gone.
+    Returns int: how many rows have gone.
     """
     n, n_alive = len(submap.observations), int(np.count_nonzero(submap.observations["alive"]))
     least = max(MIN_DEAD, n_alive + 1)

@@ -36,12 +36,8 @@ class FrameNumbers:
     A number is as far from the first frame's as their indices are: frames that were left out leave a gap. Read from its
     beginning, a source's frames have their index, on top of `first_id`.
 
-    Parameters
-    ----------
-    first_id : int
-        0, or where a saved map's count has ended.
-    first_index : int, optional
-        The index of the first frame, if it is known.
+    - `first_id`: 0, or where a saved map's count has ended.
+    - `first_index`: the index of the first frame, if it is known.
     """
 
     def __init__(self, first_id: int = 0, first_index: int | None = None) -> None:
@@ -58,10 +54,7 @@ class FrameNumbers:
     def numbered(self, frame: Frame) -> Frame:
         """Return the next frame with its number instead of its index.
 
-        Raises
-        ------
-        InputError
-            If it cannot be the next one.
+        Raises `InputError` if it cannot be the next one.
         """
         if not isinstance(frame, Frame):
             raise InputError(f"step takes a dualslam.Frame(index, timestamp_s, image), not a {type(frame).__name__}.")

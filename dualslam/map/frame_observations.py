@@ -62,12 +62,8 @@ class FrameObservations:
     def pose(self, submap: Submap, T_submap_cam: FloatArray, shape: float, min_inliers: int) -> FloatArray | None:
         """Return (4, 4) ``T_submap_cam`` by the current landmarks; None where they do not fix it.
 
-        Parameters
-        ----------
-        T_submap_cam : (4, 4)
-            To begin with.
-        shape, min_inliers
-            See `settle_pose`.
+        - `T_submap_cam` (4, 4): to begin with.
+        - `shape`, `min_inliers`: see `settle_pose`.
         """
         ids, uv_px, sigma_px = self.seen_now(submap)
         pose = settle_pose(

@@ -91,16 +91,10 @@ class GraphServer:
 class BesideGraph:
     """The `SubmapGraph` of the tracking, whose solutions come from a window first and from beside later.
 
-    Parameters
-    ----------
-    window : callable
-        Adjusts the newest keyframes of a submap.
-    register : callable
-        Called with the submap, whenever there is something to send.
-    in_real_time : callable
-        Whether frames come by a clock.
-    open_graph : callable
-        Makes a graph of a submap in this process, solved.
+    - `window`: adjusts the newest keyframes of a submap.
+    - `register`: called with the submap, whenever there is something to send.
+    - `in_real_time`: whether frames come by a clock.
+    - `open_graph`: makes a graph of a submap in this process, solved.
     """
 
     def __init__(
@@ -186,10 +180,7 @@ class BesideGraph:
     def opened(self) -> Any:
         """Return a graph of the submap in this process: made in batch, at the first question after a change.
 
-        Raises
-        ------
-        SolverError
-            If there is no submap yet, or it cannot be solved.
+        Raises `SolverError` if there is no submap yet, or it cannot be solved.
         """
         if self._submap is None:
             raise SolverError("the graph is empty: update it with its submap first")

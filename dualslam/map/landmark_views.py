@@ -19,14 +19,9 @@ def landmark_covariances(
 ) -> FloatArray:
     """Return the covariances (N, 3, 3) of landmarks given the poses of their keyframes; NaN where these fix them not.
 
-    Parameters
-    ----------
-    landmark_ids : (N,) int64
-        Each once.
-    xyz : (N, 3), optional
-        Their places in the submap, where these are not its own.
-    before : int, optional
-        Only keyframes older than this one count.
+    - `landmark_ids` (N,): each once.
+    - `xyz` (N, 3): their places in the submap, where these are not its own.
+    - `before`: only keyframes older than this one count.
     """
     rows, point = _views(submap, landmark_ids, before)
     if len(rows) == 0:
@@ -46,19 +41,11 @@ def resection_covariance(
     It is that of xi in ``T_submap_cam @ exp(xi)``: rotation (rad), then translation (unit of the submap), in the
     camera's axes. Each landmark is as uncertain as its views leave it. The keyframes of these views are held.
 
-    Parameters
-    ----------
-    landmark_ids : (N,) int64
-    sigma_px : (N,)
-        Of the pixels at which they are seen.
-    T_cam_submap : (4, 4)
-    covariances : (N, 3, 3)
-        Of `landmark_covariances`; landmarks that have none are left out.
+    - `landmark_ids` (N,), `T_cam_submap` (4, 4).
+    - `sigma_px` (N,): of the pixels at which they are seen.
+    - `covariances` (N, 3, 3): of `landmark_covariances`; landmarks that have none are left out.
 
-    Returns
-    -------
-    (6, 6) or None
-        None where fewer than `MIN_LANDMARKS` are left.
+    Returns (6, 6) or None: none where fewer than `MIN_LANDMARKS` are left.
     """
     known = np.isfinite(covariances).all((1, 2)) & (submap.depths(landmark_ids, T_cam_submap) > 0)
     if np.count_nonzero(known) < MIN_LANDMARKS:

@@ -29,10 +29,8 @@ def apply_late(
 ) -> Submap:
     """Apply an estimate of a part of a submap, and let the rest follow; return a copy of the submap as it was.
 
-    Parameters
-    ----------
-    keyframe_ids, T_submap_kf, landmark_ids, xyz_mu
-        As for `Submap.apply_estimate`; in the frame and about the unit of the submap.
+    `keyframe_ids`, `T_submap_kf`, `landmark_ids`, `xyz_mu`: as for `Submap.apply_estimate`; in the frame and about the
+    unit of the submap.
     """
     before = submap.copy()
     known = np.array([k for k in keyframe_ids.tolist() if k in submap.keyframes], np.int64)

@@ -74,12 +74,8 @@ class Refinement:
 class Calibration:
     """The camera that features are rectified by, from the one that was given to the best one known.
 
-    Parameters
-    ----------
-    camera : Camera
-        As it was given.
-    covariance : (5, 5), optional
-        Of the correction that the camera has, if it was estimated.
+    - `camera`: as it was given.
+    - `covariance` (5, 5): of the correction that the camera has, if it was estimated.
     """
 
     def __init__(
@@ -167,12 +163,9 @@ class Calibration:
     def refine(self, submap: Submap, graph: SubmapGraph | None = None) -> Refinement | Failure:
         """Ask a submap about its camera and, where the answer is clear, change the submap to it.
 
-        Parameters
-        ----------
-        submap : Submap
-            Keeps its ids. Only where the whole change succeeds, it gets other intrinsics, pixels, poses and points.
-        graph : SubmapGraph, optional
-            Makes a new graph for the changed submap; without it, the caller solves.
+        - `submap`: keeps its ids. Only where the whole change succeeds, it gets other intrinsics, pixels, poses and
+          points.
+        - `graph`: makes a new graph for the changed submap; without it, the caller solves.
         """
         n = len(submap.keyframes)
         self._asked(submap.id, n)
@@ -232,12 +225,8 @@ def answer(
 ) -> CalibrationAnswer | Failure:
     """Do a job: ask its submap, and change it and the lost maps where the answer is clear.
 
-    Parameters
-    ----------
-    job : CalibrationJob
-        Its submaps are not changed.
-    calibration : Calibration
-        One of its own, with the camera and the covariance of the job.
+    - `job`: its submaps are not changed.
+    - `calibration`: one of its own, with the camera and the covariance of the job.
     """
     submap, changed = job.submap.copy(), {}
     refined = calibration.refine(submap)

@@ -13,9 +13,7 @@ def open_graph(submap: Submap, new_graph: Callable[[], SubmapGraph]) -> SubmapGr
 
     The submap stays as it is.
 
-    Raises
-    ------
-    SolverError
+    Raises `SolverError`.
     """
     graph = new_graph()
     graph.rebuild(submap.copy(), near_optimum=True)
@@ -27,9 +25,7 @@ def solve(submap: Submap, graph: SubmapGraph, near_optimum: bool = False) -> int
 
     `near_optimum`: whether its parts are solved already.
 
-    Raises
-    ------
-    SolverError
+    Raises `SolverError`.
     """
     estimate = graph.rebuild(submap, near_optimum)
     submap.apply_estimate(*estimate.values)

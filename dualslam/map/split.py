@@ -16,18 +16,12 @@ def next_submap(full: Submap, submap_id: int, n_shared: int, newest_id: int | No
     The newest keyframe may not see what earlier ones see, if the map was full when it was relocalised. Then those that
     do are taken.
 
-    Parameters
-    ----------
-    n_shared : int
-        How many of the newest keyframes (in order of insertion) both submaps hold.
-    newest_id : int, optional
-        The keyframe that was inserted last.
+    - `n_shared`: how many of the newest keyframes (in order of insertion) both submaps hold.
+    - `newest_id`: the keyframe that was inserted last.
 
-    Returns
-    -------
-    Submap
-        With the shared keyframes and those of their landmarks that at least two of them see. Its gauge is the pair of
-        shared keyframes that stand farthest apart in the full submap. So the link between the two is the identity.
+    Returns Submap: with the shared keyframes and those of their landmarks that at least two of them see. Its gauge is
+    the pair of shared keyframes that stand farthest apart in the full submap. So the link between the two is the
+    identity.
     """
     shared = list(full.keyframes)[-n_shared:]
     if newest_id is not None:

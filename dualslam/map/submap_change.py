@@ -20,18 +20,11 @@ def change_of_frame(
     and shifts as their poses did on average, and scales as the median depth of what they see. (Distances between
     cameras would not tell the scale of a turn in place.)
 
-    Parameters
-    ----------
-    before, after : Submap
-        Two states of one submap.
-    keyframe_ids : iterable of int
-        At least one of them stands in both.
-    n_landmarks : int, optional
-        Landmarks from this id on are not the same in both states.
+    - `before`, `after`: two states of one submap.
+    - `keyframe_ids`: at least one of them stands in both.
+    - `n_landmarks`: landmarks from this id on are not the same in both states.
 
-    Returns
-    -------
-    (4, 4) float64
+    Returns (4, 4) float64.
     """
     shared = [k for k in keyframe_ids if k in before.keyframes and k in after.keyframes]
     if not shared:

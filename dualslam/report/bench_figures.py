@@ -33,10 +33,8 @@ _DPI = 130
 def draw_rates(path: Path, rates: Mapping[str, Mapping[str, tuple[float, float, float]]]) -> None:
     """Draw failure rates with their intervals.
 
-    Parameters
-    ----------
-    rates : mapping of str to mapping of str to (float, float, float)
-        By what was counted over, then by variant: percent, and the ends of its interval.
+    `rates` (mapping of str to mapping of str to (float, float, float)): by what was counted over, then by variant:
+    percent, and the ends of its interval.
     """
     variants = list(dict.fromkeys(variant for row in rates.values() for variant in row))
     figure, (axes,) = _figure(1, (max(5.0, 1.6 * len(rates) + 2), 4.0))

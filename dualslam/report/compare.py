@@ -37,10 +37,7 @@ Measure = tuple[str, Callable[[dict[str, Any]], str]]
 def comparison_page(runs: Sequence[RunData | str | Path]) -> str:
     """Return a page for several runs, or for the runs in several folders.
 
-    Raises
-    ------
-    InputError
-        If a folder cannot be read as a run's (`read_run`).
+    Raises `InputError` if a folder cannot be read as a run's (`read_run`).
     """
     return _page([run if isinstance(run, RunData) else read_run(run) for run in runs])
 

@@ -27,17 +27,10 @@ _SIGNS = {">": "more than", ">=": "at least", "<": "less than", "<=": "at most"}
 def explain(run: str | Path, frame: int) -> list[str]:
     """Return lines that say what happened to a frame, and why.
 
-    Parameters
-    ----------
-    run : path
-        A run folder. All decisions are known of a run with ``--decisions``, else the frame's row and its events.
-    frame : int
-        Index of the frame in the source.
+    - `run`: a run folder. All decisions are known of a run with ``--decisions``, else the frame's row and its events.
+    - `frame`: index of the frame in the source.
 
-    Raises
-    ------
-    InputError
-        If the folder is none of a run, a file is damaged, or the run has no such frame.
+    Raises `InputError` if the folder is none of a run, a file is damaged, or the run has no such frame.
     """
     run = Path(run)
     read_summary(run)

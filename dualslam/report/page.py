@@ -37,10 +37,7 @@ _EVENT_COLUMNS = {"frame": "num", "time": "num", "event": None, "submap": "num",
 def report_page(run: RunData | str | Path) -> str:
     """Return the whole page of a run, or of the run in a folder.
 
-    Raises
-    ------
-    InputError
-        If the folder cannot be read as one (`read_run`).
+    Raises `InputError` if the folder cannot be read as one (`read_run`).
     """
     if not isinstance(run, RunData):
         run = read_run(run)

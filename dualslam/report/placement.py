@@ -75,12 +75,8 @@ def align(posed: PosedRows, truth: PosedRows) -> FloatArray | Failure:
 def plane_from_above(xyz: FloatArray, down: FloatArray) -> tuple[FloatArray, str]:
     """Return (2, 3) axes of the paper, right and up, with the longest extent to the right, and what is looked along.
 
-    Parameters
-    ----------
-    xyz : (N, 3)
-        What is drawn.
-    down : (3,)
-        Mean of the cameras' downward axes; short where the camera was held at all angles.
+    - `xyz` (N, 3): what is drawn.
+    - `down` (3,): mean of the cameras' downward axes; short where the camera was held at all angles.
     """
     centred = xyz - xyz.mean(axis=0)
     _, _, principal = np.linalg.svd(centred, full_matrices=False) if len(xyz) >= 3 else (0, 0, np.eye(3))

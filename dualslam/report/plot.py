@@ -21,10 +21,7 @@ DPI = 120
 def plot_run(run: RunData, path: str | Path | None = None) -> Figure:
     """Return the drawing of a run, and write it to a file if one is given.
 
-    Raises
-    ------
-    InputError, OutputError
-        If no frame has a pose, or the file cannot be written.
+    Raises `InputError`, `OutputError` if no frame has a pose, or the file cannot be written.
     """
     scene = place(run)
     if not scene.placed:

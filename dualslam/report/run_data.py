@@ -80,10 +80,7 @@ class RunData:
 
         `path`: file to write, in the format of its ending: ``.pdf``, ``.svg``, ``.png``.
 
-        Raises
-        ------
-        InputError
-            If matplotlib is not installed, or no frame has a pose.
+        Raises `InputError` if matplotlib is not installed, or no frame has a pose.
         """
         try:
             plot = import_module("dualslam.report.plot")
@@ -114,10 +111,7 @@ class RunData:
 def read_run(path: str | Path) -> RunData:
     """Read a run folder.
 
-    Raises
-    ------
-    InputError
-        If it is none, the run did not come to its end, or a file is damaged.
+    Raises `InputError` if it is none, the run did not come to its end, or a file is damaged.
     """
     path = Path(path)
     if not (path / run_folder.SUMMARY).is_file():

@@ -44,11 +44,8 @@ def _nothing() -> tuple[np.ndarray, FloatArray]:
 def close_up(run: RunData, scene: PlacedRun, rows: tuple[int, int], marked: Sequence[int]) -> Markup | None:
     """Return the part of the drawing that some frames are in, or None where none of them has a place.
 
-    Parameters
-    ----------
-    rows : (first, last)
-    marked : sequence of int
-        Rows that get a mark: the keyframes on which a link rests.
+    - `rows` (first, last).
+    - `marked`: rows that get a mark: the keyframes on which a link rests.
     """
     window = [xyz[(row >= rows[0]) & (row <= rows[1])] for row, xyz in _lines(scene)]
     if sum(len(xyz) for xyz in window) < MIN_CLOSE_UP:

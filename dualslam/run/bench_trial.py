@@ -57,9 +57,7 @@ def describe_source(sequence: SequenceSpec, data: Path | None) -> SourceInfo:
 
     `data`: the folder in which paths are sought.
 
-    Raises
-    ------
-    InputError
+    Raises `InputError`.
     """
     source = sequence.source if sequence.source.startswith(SYNTHETIC) else _place(sequence.source, data)
     camera = _place(sequence.camera, data) if sequence.camera else ""
@@ -70,10 +68,7 @@ def describe_source(sequence: SequenceSpec, data: Path | None) -> SourceInfo:
 def run_trial(trial: Trial, out: str) -> TrialRecord:
     """Run a trial into its folder under `out`, and return its line. Whatever goes wrong in it is in the line.
 
-    Raises
-    ------
-    KeyboardInterrupt
-        Where a signal ended the run early: that is no result.
+    Raises `KeyboardInterrupt`: where a signal ended the run early: that is no result.
     """
     limit_threads()
     keep_freed_memory()

@@ -43,10 +43,7 @@ def open_without_calibration(source: str, **selection: Any) -> RecordedSequence:
 def with_camera_found(config: Config, sequence: RecordedSequence) -> tuple[RecordedSequence, FocalSearch]:
     """Return a sequence with the camera that its first frames tell, and the source's own data, and what they tell.
 
-    Raises
-    ------
-    InputError
-        If they do not tell.
+    Raises `InputError` if they do not tell.
     """
     found = find_focal(config, islice(sequence, SEARCHED_FRAMES), sequence.camera.size_px, sequence.told_focal())
     if isinstance(found, Failure):
@@ -65,10 +62,7 @@ def with_camera_of_map(saved_map: str | Path, sequence: RecordedSequence) -> Rec
     Images of another size and the same shape are taken for the same camera's. None where the map has no camera, or one
     of images of another shape: then it was another.
 
-    Raises
-    ------
-    InputError
-        If the map cannot be read.
+    Raises `InputError` if the map cannot be read.
     """
     camera = load_camera(saved_map)
     if camera is None:

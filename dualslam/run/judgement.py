@@ -51,16 +51,10 @@ def judge_run(
 ) -> Verdict:
     """Judge a run that has ended.
 
-    Parameters
-    ----------
-    trajectories : Trajectories
-        Of `trajectories_of`.
-    rows : sequence of FrameRow
-        Of `frame_rows`: one for each frame of the source.
-    measured : Measured, optional
-        The run in the frame of measurements from outside.
-    besides : iterable of Reason
-        What is known against it already.
+    - `trajectories`: of `trajectories_of`.
+    - `rows`: of `frame_rows`: one for each frame of the source.
+    - `measured`: the run in the frame of measurements from outside.
+    - `besides`: what is known against it already.
     """
     if not rows:
         return Verdict(Level.DOUBTFUL)

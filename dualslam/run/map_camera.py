@@ -52,19 +52,11 @@ class _Seen:
 def camera_that_fits(config: Config, frames: Iterable[Frame], camera: Camera, saved_map: str | Path) -> Camera:
     """Return the camera by which frames fit a saved map: the given one, or one of another focal length.
 
-    Parameters
-    ----------
-    frames : iterable of Frame
-        The first ones are looked for in the map, which is not changed.
-    camera : Camera
-        As it was given.
-    saved_map : path
-        Of its run folder.
+    - `frames`: the first ones are looked for in the map, which is not changed.
+    - `camera`: as it was given.
+    - `saved_map`: of its run folder.
 
-    Raises
-    ------
-    InputError
-        If the frames fit the map with no focal length.
+    Raises `InputError` if the frames fit the map with no focal length.
     """
     known = load_camera(saved_map)
     if known is None:

@@ -99,9 +99,7 @@ def read_rows(
 ) -> list[RowSource]:
     """Read files of measurements; positions by latitude and longitude have the origin given, or the first one's.
 
-    Raises
-    ------
-    InputError
+    Raises `InputError`.
     """
     found: list[RowSource] = []
     for path in paths:
@@ -123,11 +121,8 @@ def measure(
 
     `main`: submaps of the main map.
 
-    Raises
-    ------
-    InputError
-        In one sentence, where the measurements cannot belong to the main map.
-    SolverError
+    Raises `InputError`: in one sentence, where the measurements cannot belong to the main map.
+    Raises `SolverError`.
     """
     undone: list[Link] = []
     while True:

@@ -127,16 +127,10 @@ def merge_runs(
 
     `measurements`: gives those of both runs, given the shift of the second run's clock.
 
-    Returns
-    -------
-    System
-        With the whole map.
+    Returns System: with the whole map.
 
-    Raises
-    ------
-    InputError
-        If a folder holds no map, the maps cannot be compared, or no place is in both.
-    OutputError
+    Raises `InputError` if a folder holds no map, the maps cannot be compared, or no place is in both.
+    Raises `OutputError`.
     """
     check_vacant(out, overwrite=overwrite)
     if out.resolve() in (run_a.resolve(), run_b.resolve()):

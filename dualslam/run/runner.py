@@ -86,34 +86,20 @@ def run_sequence(
     first frame (source, system, `on_frame`, full disk) ends the run in the same way. It is in the report, for the
     caller to raise again once the rest is saved.
 
-    Parameters
-    ----------
-    realtime : bool
-        Frames come at the times that their timestamps tell, and those that are too late are dropped before anything is
-        done with them: a frame is, if it is more than `MAX_LATE_S` late when the system is ready for it, and the next
-        one is due already. A system that has not been in time for `CATCH_UP_S` is given the newest frame.
-    prepare : callable, optional
-        In real time: called with a frame, on a thread of its own, while the one before it is in its step; returns what
-        the system is given.
-    pace : Pace, optional
-        Receives, in real time, how late each frame is.
-    on_frame : callable, optional
-        Called with the result of each step.
-    is_paused : callable, optional
-        Asked before each frame; the run waits for as long as it says so, or until a signal ends it.
-    interrupts : Interrupts, optional
-        Entered already, where the caller has more to do that signals must not end.
-    repeats : Recorded, optional
-        The schedule of a run that is repeated: its frames are given, without those that it dropped.
-    clock, sleep : callables
-        For tests.
+    - `realtime`: frames come at the times that their timestamps tell, and those that are too late are dropped before
+      anything is done with them: a frame is, if it is more than `MAX_LATE_S` late when the system is ready for it, and
+      the next one is due already. A system that has not been in time for `CATCH_UP_S` is given the newest frame.
+    - `prepare`: in real time: called with a frame, on a thread of its own, while the one before it is in its step;
+      returns what the system is given.
+    - `pace`: receives, in real time, how late each frame is.
+    - `on_frame`: called with the result of each step.
+    - `is_paused`: asked before each frame; the run waits for as long as it says so, or until a signal ends it.
+    - `interrupts`: entered already, where the caller has more to do that signals must not end.
+    - `repeats`: the schedule of a run that is repeated: its frames are given, without those that it dropped.
+    - `clock`, `sleep`: for tests.
 
-    Raises
-    ------
-    InputError
-        If the source gives no frame at all.
-    Exception
-        Whatever the source raises before its first frame.
+    Raises `InputError` if the source gives no frame at all.
+    Raises `Exception`: whatever the source raises before its first frame.
     """
     dropped: list[tuple[int, float]] = []
     began, cpu_began = clock(), _cpu_s()
@@ -183,10 +169,7 @@ class _Steps:
     def take_next(self, frames: Iterator[tuple[Frame, float]]) -> bool:
         """Give the system the next frame; return whether another may follow.
 
-        Raises
-        ------
-        Exception
-            The source breaks before its first frame.
+        Raises `Exception`: the source breaks before its first frame.
         """
         try:
             frame, spent_s = next(frames)

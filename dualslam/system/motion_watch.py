@@ -42,12 +42,8 @@ class MotionWatch:
     def judge(self, at: FrameStamp, wide: bool, record: Record, submap: Submap) -> Break | None:
         """Note a posed frame, and return where the map is broken, once the velocity beyond the gap is known.
 
-        Parameters
-        ----------
-        wide : bool
-            Whether it was found beyond a gap.
-        submap : Submap
-            In which it was posed.
+        - `wide`: whether it was found beyond a gap.
+        - `submap`: in which it was posed.
         """
         if wide and self._first_beyond is None:
             self._first_beyond = at

@@ -85,12 +85,8 @@ class Pace:
     def puts_off(self, n_tracked: int, n_weak: int) -> bool:
         """Whether a keyframe that is due is put off to a later frame.
 
-        Parameters
-        ----------
-        n_tracked : int
-            Landmarks that the frame tracks.
-        n_weak : int
-            So few are a weak track (`KeyframeConfig.weak_landmarks`).
+        - `n_tracked`: landmarks that the frame tracks.
+        - `n_weak`: so few are a weak track (`KeyframeConfig.weak_landmarks`).
         """
         return n_tracked >= URGENT_TIMES * n_weak and self._puts_off()
 

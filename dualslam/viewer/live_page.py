@@ -63,12 +63,9 @@ NARROW_PX, COVERED = 640, 0.6
 def serve(pipe: Connection, port: int) -> None:
     """Show a run until the pipe is closed.
 
-    Parameters
-    ----------
-    pipe : Connection
-        First it receives where the page is; then each message is answered with what was pressed since the one before.
-    port : int
-        0: a free one.
+    - `pipe`: first it receives where the page is; then each message is answered with what was pressed since the one
+      before.
+    - `port`: 0: a free one.
     """
     with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):  # of viser: the run says where the page is
         _serve(pipe, port)

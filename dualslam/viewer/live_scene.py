@@ -140,14 +140,9 @@ class LiveScene:
     ) -> tuple[FloatArray, FloatArray]:
         """Return what to look at, and from where, so that the box around the map fills what of a window is not covered.
 
-        Parameters
-        ----------
-        fov_rad : float
-            From the upper rim to the lower one.
-        aspect : float
-            Width over height.
-        covered : float
-            Share of the height, at the lower rim.
+        - `fov_rad`: from the upper rim to the lower one.
+        - `aspect`: width over height.
+        - `covered`: share of the height, at the lower rim.
         """
         low, high = self.bounds()
         middle, half = (low + high) / 2, np.maximum(high - low, LEAST_EXTENT / 2) / 2

@@ -44,10 +44,7 @@ def map_page(run: RunData) -> str | None:
     statuses. All appear with the frame that brought them. Maps that are not linked stand beside the main one, in units
     of their own.
 
-    Raises
-    ------
-    InputError
-        If the run folder is damaged.
+    Raises `InputError` if the run folder is damaged.
     """
     playback = play(run)
     spaces = [space for space in playback.spaces if len(space.posed)]

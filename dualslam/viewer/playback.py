@@ -77,10 +77,8 @@ class Playback:
 def play(run: RunData) -> Playback:
     """Lay a run out in time and space.
 
-    Raises
-    ------
-    InputError
-        If the map or an event is damaged or is not of these frames, or the run does not name its camera.
+    Raises `InputError` if the map or an event is damaged or is not of these frames, or the run does not name its
+    camera.
     """
     order = np.argsort([row.timestamp_s for row in run.rows], kind="stable")
     rows = [run.rows[i] for i in order.tolist()]

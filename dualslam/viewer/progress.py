@@ -94,12 +94,9 @@ class RunState:
 class Progress(RunState):
     """Writes it, now and then: ``run_to_folder(..., watcher=Progress(len(sequence)))``.
 
-    Parameters
-    ----------
-    n_frames : int, optional
-        How many frames there are; without it nothing is said of the time that is left.
-    stream : text stream, optional
-        Standard error if it is not given. On a terminal and in a notebook a line takes the place of the one before.
+    - `n_frames`: how many frames there are; without it nothing is said of the time that is left.
+    - `stream`: standard error if it is not given. On a terminal and in a notebook a line takes the place of the one
+      before.
     """
 
     def __init__(self, n_frames: int | None = None, stream: TextIO | None = None) -> None:

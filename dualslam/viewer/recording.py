@@ -50,10 +50,7 @@ def make_recording(run: RunData) -> bytes:
     ``truth``. The same below ``apart/NN`` for each submap that is not linked to it. ``status``, ``matches``,
     ``latency_ms`` and ``events``. Timelines: ``timestamp_s`` and ``frame``.
 
-    Raises
-    ------
-    InputError
-        As `play`; or if the environment switches rerun off.
+    Raises `InputError`: as `play`; or if the environment switches rerun off.
     """
     playback = play(run)
     # An id of the content: the same run makes the same recording, two runs never flow into one.

@@ -30,10 +30,7 @@ def open_viewer(recording: bytes) -> None:
     The viewer sends usage data, and asks for newer versions, unless its settings forbid it. Its own settings forbid the
     former, so that the user's stay unchanged. A proxy that leads nowhere stops the latter.
 
-    Raises
-    ------
-    OutputError
-        If the viewer cannot be started.
+    Raises `OutputError` if the viewer cannot be started.
     """
     with tempfile.TemporaryDirectory(prefix="dualslam-view-") as folder:
         file = Path(folder) / "run.rrd"

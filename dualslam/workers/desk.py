@@ -81,10 +81,7 @@ class _Queue:
     def replaced(self, worker: Worker) -> Worker:
         """Return a new worker for one that is lost.
 
-        Raises
-        ------
-        ConfigError
-            If several in a row have ended before they were ready.
+        Raises `ConfigError` if several in a row have ended before they were ready.
         """
         self.n_stillborn = 0 if worker.was_ready else self.n_stillborn + 1
         worker.stop()
@@ -115,17 +112,11 @@ class QueueStatistics:
 class WorkerDesk:
     """The executor whose jobs run in processes of their own.
 
-    Parameters
-    ----------
-    lanes : sequence of Lane
-        No kind stands in two of them.
-    finish_wait_s : float
-        How long the end of the run waits for what is under way.
-    on_start : callable, optional
-        Called with each job that a process begins (kind and work), and the process's id: where the failure lab takes
-        hold.
-    on_news : callable, optional
-        Called with the job's progress reports, when its result is asked for.
+    - `lanes`: no kind stands in two of them.
+    - `finish_wait_s`: how long the end of the run waits for what is under way.
+    - `on_start`: called with each job that a process begins (kind and work), and the process's id: where the failure
+      lab takes hold.
+    - `on_news`: called with the job's progress reports, when its result is asked for.
     """
 
     def __init__(

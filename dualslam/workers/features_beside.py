@@ -20,12 +20,8 @@ class FeaturesBeside:
     Called on one thread that is not the tracking's. A process that has died or hangs costs nothing but time: the frame
     comes back without features, and the tracking process finds them. So do all that follow where no process starts.
 
-    Parameters
-    ----------
-    desk : WorkerDesk
-        With a lane for features.
-    painted : callable
-        Returns a frame as the front end is to see it.
+    - `desk`: with a lane for features.
+    - `painted`: returns a frame as the front end is to see it.
     """
 
     def __init__(self, desk: WorkerDesk, painted: Callable[[Frame], Frame]) -> None:

@@ -38,12 +38,9 @@ UNANSWERED = frozenset({JobKind.FORESIGHT})
 class ScheduledDesk:
     """The `dualslam.core.jobs.Desk` whose answers come by a schedule.
 
-    Parameters
-    ----------
-    finish_wait_s : float
-        How long the end of a run in real time, or of one that was interrupted, waits for what is under way.
-    budget_s : float, optional
-        Time after which a job that can stop early must, in real time.
+    - `finish_wait_s`: how long the end of a run in real time, or of one that was interrupted, waits for what is under
+      way.
+    - `budget_s`: time after which a job that can stop early must, in real time.
 
     Attributes
     ----------

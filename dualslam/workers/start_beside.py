@@ -59,12 +59,8 @@ class StartBeside:
     Frames that come while one is tried are collected with the next. A start that is found ends with a frame some frames
     back, and who asked has to go on from there.
 
-    Parameters
-    ----------
-    starter : MapStarter
-        Searches here and now when the system is on time.
-    K : (3, 3) float64
-        Intrinsics of the frames.
+    - `starter`: searches here and now when the system is on time.
+    - `K` (3, 3): intrinsics of the frames.
     """
 
     def __init__(self, desk: Desk, starter: MapStarter, K: FloatArray) -> None:

@@ -55,10 +55,7 @@ class Channel:
     def send(self, thing: Any) -> int:
         """Send what can be pickled; blocks until all of it is under way, and returns how many bytes it was.
 
-        Raises
-        ------
-        OSError
-            Nobody is at the other end any more.
+        Raises `OSError`: nobody is at the other end any more.
         """
         large: list[memoryview] = []
         fresh: dict[int, Any] = {}
@@ -79,10 +76,7 @@ class Channel:
 
         A pipe counts as free while most of its buffer is; that is some ten times the size of such a message.
 
-        Raises
-        ------
-        OSError
-            Nobody is at the other end any more.
+        Raises `OSError`: nobody is at the other end any more.
         """
         free = select.poll()
         free.register(self._connection.fileno(), select.POLLOUT)
@@ -94,10 +88,7 @@ class Channel:
     def receive(self) -> Any:
         """Wait for what the other end sends, and return it; its arrays can be written to, each in memory of its own.
 
-        Raises
-        ------
-        EOFError
-            The other end was closed.
+        Raises `EOFError`: the other end was closed.
         """
         fd = self._connection.fileno()
         n, n_own = (_COUNT.unpack(each)[0] for each in _read(fd, [_COUNT.size] * 2))

@@ -45,12 +45,8 @@ class _News:
 class Worker:
     """A process that does one job after the other. It has imported all that it needs before the first comes.
 
-    Parameters
-    ----------
-    make_handlers : callable
-        See `MakeHandlers`.
-    niceness : int
-        By so much it stands behind the process that tracks.
+    - `make_handlers`: see `MakeHandlers`.
+    - `niceness`: by so much it stands behind the process that tracks.
     """
 
     def __init__(self, make_handlers: MakeHandlers, niceness: int = 0, name: str = "worker") -> None:

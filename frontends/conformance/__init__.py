@@ -31,16 +31,10 @@ CHECKS: tuple[Callable[[Subject], None], ...] = (*features.CHECKS, *matching.CHE
 def check_frontend(factory: FrontendFactory, options: Mapping[str, Any] | None = None) -> None:
     """Run all checks.
 
-    Parameters
-    ----------
-    factory : FrontendFactory
-        What the entry point names: usually the front end's class.
-    options : mapping, optional
-        `frontend.options` to build it with.
+    - `factory`: what the entry point names: usually the front end's class.
+    - `options`: `frontend.options` to build it with.
 
-    Raises
-    ------
-    NotConforming
-        Says everything that is wrong, one line for each check; whatever the front end raises is wrong, too.
+    Raises `NotConforming`: says everything that is wrong, one line for each check; whatever the front end raises is
+    wrong, too.
     """
     run_checks(CHECKS, Subject(factory, options or {}))

@@ -60,17 +60,11 @@ class PrintedPlane:
     ) -> NDArray[np.uint8]:
         """Return the image of a camera.
 
-        Parameters
-        ----------
-        H_view_scene : (3, 3) float64, optional
-            Takes pixels of the straight view to pixels of this one; the straight view itself by default. Pixel (0, 0)
-            is the centre of the top-left pixel.
-        noise : float
-            Of the sensor, grey levels, other for every `seed`.
+        - `H_view_scene` (3, 3): takes pixels of the straight view to pixels of this one; the straight view itself by
+          default. Pixel (0, 0) is the centre of the top-left pixel.
+        - `noise`: of the sensor, grey levels, other for every `seed`.
 
-        Returns
-        -------
-        (height, width) uint8
+        Returns (height, width) uint8.
         """
         width, height = self.size_px
         # Samples of the view, from the texture: pixel p holds samples 3 p to 3 p + 2.

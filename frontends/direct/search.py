@@ -49,16 +49,10 @@ def match_patches(
 ) -> PatchMatches:
     """Find points of one image (N of them) in another.
 
-    Parameters
-    ----------
-    levels_a, levels_b : list of (H, W)
-        Pyramids of the two images.
-    uv_a_px, uv_b_px : (N, 2)
-        Where the points are, and where they are expected.
-    J_b_a : (N, 2, 2)
-        By how much a place in b moves with one in a.
-    radius_px : float
-        Half the side of the square that is searched, in pixels of the coarser image.
+    - `levels_a`, `levels_b` (list of (H, W)): pyramids of the two images.
+    - `uv_a_px`, `uv_b_px` (N, 2): where the points are, and where they are expected.
+    - `J_b_a` (N, 2, 2): by how much a place in b moves with one in a.
+    - `radius_px`: half the side of the square that is searched, in pixels of the coarser image.
     """
     zoom = np.sqrt(np.abs(np.linalg.det(J_b_a)))
     spacing = np.maximum(1.0, zoom)

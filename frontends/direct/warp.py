@@ -86,12 +86,8 @@ def inside(uv_px: FloatArray, axes: FloatArray, half: int, size_px: tuple[int, i
 def sample(levels: Pyramid, uv_px: FloatArray, axes: FloatArray, half: int) -> NDArray[np.float32]:
     """Return patches (N, S, S), S = 2 half + 1, about places (N, 2).
 
-    Parameters
-    ----------
-    levels : list of (H, W)
-    uv_px : (N, 2)
-    axes : (N, 2, 2)
-        Columns: steps in the image from one pixel of the patch to its right and lower neighbour.
+    - `levels` (list of (H, W)), `uv_px` (N, 2).
+    - `axes` (N, 2, 2): columns: steps in the image from one pixel of the patch to its right and lower neighbour.
     """
     step = np.sqrt(np.abs(np.linalg.det(axes)))
     side = 2 * half + 1

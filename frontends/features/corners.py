@@ -39,15 +39,10 @@ def detect_corners(
 ) -> tuple[IntArray, FloatArray]:
     """FAST corners of one pyramid level: the first threshold everywhere, lower ones only in cells still empty.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-    thresholds : sequence of int
-        Grey-level contrasts, descending.
-    margin_px : int
-        Width of the rim without corners, >= 3.
-    cell_px : int
-        Side of the square cells in which emptiness is judged.
+    - `image` (H, W) uint8.
+    - `thresholds`: grey-level contrasts, descending.
+    - `margin_px`: width of the rim without corners, >= 3.
+    - `cell_px`: side of the square cells in which emptiness is judged.
 
     Returns
     -------
@@ -73,16 +68,10 @@ def select_spread(xy: IntArray, response: FloatArray, n_wanted: int) -> IntArray
 
     The cells are as many as the corners wanted, over the corners' bounding box.
 
-    Parameters
-    ----------
-    xy : (N, 2) int64
-    response : (N,) float64
-        Strength, whole numbers below 256.
+    - `xy` (N, 2).
+    - `response` (N,): strength, whole numbers below 256.
 
-    Returns
-    -------
-    (min(N, n_wanted),) int64
-        Rows, ascending.
+    Returns (min(N, n_wanted),) int64: rows, ascending.
     """
     if len(xy) <= n_wanted:
         return np.arange(len(xy))
@@ -116,12 +105,8 @@ def grades(response: FloatArray) -> FloatArray:
 def share_out(n_available: Sequence[int], weights: FloatArray, n_wanted: int) -> list[int]:
     """Divide `n_wanted` among levels by weight; what a poor level cannot fill goes to the others, finest first.
 
-    Parameters
-    ----------
-    n_available : sequence of int
-        Corners of each level.
-    weights : (L,) float64
-        Positive; only their ratios count.
+    - `n_available`: corners of each level.
+    - `weights` (L,): positive; only their ratios count.
     """
     available = np.asarray(n_available, np.int64)
     quota = np.zeros(len(available), np.int64)
@@ -206,12 +191,8 @@ def _second_derivatives(r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArr
 def quadratic_peak(response: NDArray[np.floating], min_curvature: float = 0.0) -> tuple[FloatArray, BoolArray]:
     """Maximum of the parabola through each 3 x 3 neighbourhood, and whether it lies within 0.75 px.
 
-    Parameters
-    ----------
-    response : (N, 3, 3)
-        The middle is the highest, or nearly.
-    min_curvature : float
-        By so much a peak curves downwards at least, in both directions together.
+    - `response` (N, 3, 3): the middle is the highest, or nearly.
+    - `min_curvature`: by so much a peak curves downwards at least, in both directions together.
 
     Returns
     -------

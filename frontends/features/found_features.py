@@ -24,20 +24,13 @@ def features_found(
 ) -> tuple[IntArray, Features]:
     """Return which of N features were found at pixels that the camera can rectify, and these as features there.
 
-    Parameters
-    ----------
-    of : Features
-        Of another view: the same landmarks.
-    uv_px : (N, 2)
-        Where the new image shows them, as read.
-    sigma_px, zoom, turn_rad : (N,)
-        Noise of each coordinate; by how much larger the image shows them, and turned by which angle.
-    camera : Camera
-        The one that rectifies now.
-    model_sigma_px : float
-        Error of its model, see `CameraConfig.model_sigma_px`.
-    readout_turn_rad : (3,) or None
-        Rotation during the readout that is taken out of the new view's features.
+    - `of`: of another view: the same landmarks.
+    - `uv_px` (N, 2): where the new image shows them, as read.
+    - `sigma_px`, `zoom`, `turn_rad` (N,): noise of each coordinate; by how much larger the image shows them, and turned
+      by which angle.
+    - `camera`: the one that rectifies now.
+    - `model_sigma_px`: error of its model, see `CameraConfig.model_sigma_px`.
+    - `readout_turn_rad` (3,) or None: rotation during the readout that is taken out of the new view's features.
     """
     if readout_turn_rad is not None:
         uv_px = straighten(uv_px, camera, readout_turn_rad)

@@ -35,16 +35,10 @@ def lowest_in_group(group: IntArray, cost: FloatArray, n_groups: int) -> FloatAr
 def best_per_group(group: IntArray, cost: FloatArray, n_groups: int) -> IntArray:
     """Row of the least cost in each group, ascending; ties go to the earlier row, infinite costs are never chosen.
 
-    Parameters
-    ----------
-    group : (N,) int64
-        In [0, n_groups).
-    cost : (N,) float64
+    - `cost` (N,).
+    - `group` (N,): in [0, n_groups).
 
-    Returns
-    -------
-    (G,) int64
-        Rows, one for each group that has a finite cost.
+    Returns (G,) int64: rows, one for each group that has a finite cost.
     """
     lowest = lowest_in_group(group, cost, n_groups)
     candidates = np.flatnonzero((cost == lowest[group]) & np.isfinite(cost))
@@ -58,21 +52,13 @@ def best_pairs(
 ) -> IntArray:
     """One-to-one choice among candidate pairs: best for the first, clearly so, then best for the second.
 
-    Parameters
-    ----------
-    first, second : (P,) int64
-        The two members of each pair.
-    cost : (P,) float64
-    rival : (P,) int64
-        Class of the second member. The ratio test compares the best one with candidates of its class alone: a corner
-        seen in two octaves must not compete with itself.
-    ratio : float
-        The best cost must not exceed this share of the second best; 1 switches the test off.
+    - `cost` (P,).
+    - `first`, `second` (P,): the two members of each pair.
+    - `rival` (P,): class of the second member. The ratio test compares the best one with candidates of its class alone:
+      a corner seen in two octaves must not compete with itself.
+    - `ratio`: the best cost must not exceed this share of the second best; 1 switches the test off.
 
-    Returns
-    -------
-    (M,) int64
-        Rows of the chosen pairs, ascending in `first` where the pairs are.
+    Returns (M,) int64: rows of the chosen pairs, ascending in `first` where the pairs are.
     """
     best = best_per_group(first, cost, n_first)
     if ratio < 1.0:
@@ -116,12 +102,8 @@ def nearest_by_parts(n_rows: int, distances: Callable[[slice], NDArray[Any]]) ->
 def mutual(near: Nearest, ratio: float, max_distance: float, nearest_rows: Callable[[IntArray], IntArray]) -> Matches:
     """One-to-one matches of rows to what is nearest to them: near enough, clearly nearest, and they to it.
 
-    Parameters
-    ----------
-    ratio : float
-        Greatest best distance over second best, row-wise.
-    nearest_rows : callable
-        Returns which row is nearest to each of some columns, the first of equals.
+    - `ratio`: greatest best distance over second best, row-wise.
+    - `nearest_rows`: returns which row is nearest to each of some columns, the first of equals.
     """
     rows = np.flatnonzero((near.distance <= max_distance) & (near.distance <= ratio * near.runner_up))
     if len(rows):
@@ -143,14 +125,9 @@ def _highest(kind: np.dtype[Any]) -> float:
 def consistent_rotation(turn_rad: FloatArray, tolerance_rad: float = np.radians(30.0), n_min: int = 8) -> BoolArray:
     """Which pairs agree with the rotation that most of them share.
 
-    Parameters
-    ----------
-    turn_rad : (M,) float64
-        Orientation in the second image minus that in the first, any winding.
-    tolerance_rad : float
-        Greatest departure from the shared rotation.
-    n_min : int
-        With fewer pairs all are kept: there is no majority to ask.
+    - `turn_rad` (M,): orientation in the second image minus that in the first, any winding.
+    - `tolerance_rad`: greatest departure from the shared rotation.
+    - `n_min`: with fewer pairs all are kept: there is no majority to ask.
     """
     if len(turn_rad) < n_min:
         return np.ones(len(turn_rad), np.bool_)

@@ -24,9 +24,7 @@ def estimate_noise(image: NDArray[np.uint8]) -> float:
     Cells that touch black or white, where noise is cut off, do not count; an image without others counts as free of
     noise.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
+    `image` (H, W) uint8.
     """
     n_rows, n_columns = image.shape[0] // CELL_PX, image.shape[1] // CELL_PX
     if n_rows == 0 or n_columns == 0:

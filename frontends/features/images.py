@@ -12,14 +12,9 @@ from dualslam.core.errors import InputError
 def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The image as contiguous (H, W) uint8.
 
-    Parameters
-    ----------
-    image : (H, W) or (H, W, 3) RGB uint8
+    `image` (H, W) or (H, W, 3) RGB uint8.
 
-    Raises
-    ------
-    InputError
-        The array is no such image.
+    Raises `InputError`: the array is no such image.
     """
     if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)) or image.size == 0:
         raise InputError(f"an image must be (H, W) or (H, W, 3) uint8, not {image.shape} {image.dtype}")

@@ -31,15 +31,10 @@ class FeatureGrid:
     ) -> FeatureGrid:
         """Sort features into cells.
 
-        Parameters
-        ----------
-        uv_px : (N, 2) float64
-            Usually `features.uv_rect_px`. Non-finite positions are never found.
-        cell_px : float
-            About the usual search radius.
-        bounds : (left, top, right, bottom), optional
-            What the cells cover, pixels; the features' bounding box by default. Features outside are found all the
-            same: they are kept in the cells of the rim.
+        - `uv_px` (N, 2): usually `features.uv_rect_px`. Non-finite positions are never found.
+        - `cell_px`: about the usual search radius.
+        - `bounds` (left, top, right, bottom): what the cells cover, pixels; the features' bounding box by default.
+          Features outside are found all the same: they are kept in the cells of the rim.
         """
         finite = np.isfinite(uv_px).all(axis=1)
         if bounds is None:
@@ -58,16 +53,10 @@ class FeatureGrid:
     def within(self, uv_px: FloatArray, radius_px: FloatArray) -> tuple[IntArray, IntArray]:
         """Every feature in a disc around each position.
 
-        Parameters
-        ----------
-        uv_px : (M, 2) float64
-            Non-finite positions find nothing.
-        radius_px : (M,) float64
+        - `radius_px` (M,).
+        - `uv_px` (M, 2): non-finite positions find nothing.
 
-        Returns
-        -------
-        query, feature : (P,) int64
-            Rows of `uv_px` (ascending) and of the features.
+        Returns query, feature : (P,) int64: rows of `uv_px` (ascending) and of the features.
         """
         asked = np.flatnonzero(np.isfinite(uv_px).all(axis=1) & (radius_px >= 0))
         at, reach = uv_px[asked], radius_px[asked]
@@ -103,34 +92,20 @@ def match_projected(
 ) -> Matches:
     """Match points whose positions in an image are predicted to its features, one to one.
 
-    Parameters
-    ----------
-    grid : FeatureGrid
-        Of `features.uv_rect_px`.
-    features : Features
-        Of the image, N of them.
-    uv_pred : (M, 2) float64
-        Predicted pixels, rectified; non-finite rows stay unmatched.
-    radius_px : (M,) float64
-        Search radius.
-    descriptors : (M, D)
-        Of the predicted points.
-    octave : (M,), optional
-        Predicted pyramid level, may be fractional; features further than `octave_tolerance` from it are passed over.
-    max_distance : float, optional
-        `frontend.max_distance` by default.
-    ratio : float
-        Greatest best distance over second best, among the candidates of the best one's octave. 1: no test.
-    taken : (N,) bool, optional
-        Features that may not be chosen.
-    angle_rad : (M,) float64, optional
-        Orientation of the predicted points where they were seen before: pairs that do not share the common rotation
-        are dropped.
+    - `grid`: of `features.uv_rect_px`.
+    - `features`: of the image, N of them.
+    - `uv_pred` (M, 2): predicted pixels, rectified; non-finite rows stay unmatched.
+    - `radius_px` (M,): search radius.
+    - `descriptors` (M, D): of the predicted points.
+    - `octave` (M,): predicted pyramid level, may be fractional; features further than `octave_tolerance` from it are
+      passed over.
+    - `max_distance`: `frontend.max_distance` by default.
+    - `ratio`: greatest best distance over second best, among the candidates of the best one's octave. 1: no test.
+    - `taken` (N,) bool: features that may not be chosen.
+    - `angle_rad` (M,): orientation of the predicted points where they were seen before: pairs that do not share the
+      common rotation are dropped.
 
-    Returns
-    -------
-    Matches
-        Rows of `uv_pred` (ascending), rows of `features`.
+    Returns Matches: rows of `uv_pred` (ascending), rows of `features`.
     """
     query, feature = grid.within(uv_pred, np.asarray(radius_px, np.float64))
     usable = np.ones(len(query), np.bool_)
@@ -172,27 +147,16 @@ def match_epipolar(
     A pair is a candidate if the feature of b lies on the epipolar line of that of a, and the octaves are close. The
     tolerance is the 95 % gate of both features' noise. Of the candidates, pairs that are best for each other are kept.
 
-    Parameters
-    ----------
-    rows_a : (A,) int64, rows_b : (B,) int64
-        Features that take part, usually those without a landmark.
-    F_b_a : (3, 3) float64
-        Fundamental matrix on rectified pixels: the line in b of x_a is ``F_b_a @ x_a``, its sign and scale are free.
-    pose_sigma_px : float
-        Standard deviation of the line's place caused by the relative pose's own error.
-    epipole_px : float
-        Features nearer than this to the epipole of their image are passed over: no parallax there.
-    max_distance : float, optional
-        `frontend.max_distance` by default.
-    ratio : float
-        Greatest best distance over second best on the line, in the best one's octave. 1: no test.
-    check_rotation : bool
-        Drop pairs that do not share the common change of orientation.
+    - `rows_a` (A,), `rows_b` (B,): features that take part, usually those without a landmark.
+    - `F_b_a` (3, 3): fundamental matrix on rectified pixels: the line in b of x_a is ``F_b_a @ x_a``, its sign and
+      scale are free.
+    - `pose_sigma_px`: standard deviation of the line's place caused by the relative pose's own error.
+    - `epipole_px`: features nearer than this to the epipole of their image are passed over: no parallax there.
+    - `max_distance`: `frontend.max_distance` by default.
+    - `ratio`: greatest best distance over second best on the line, in the best one's octave. 1: no test.
+    - `check_rotation`: drop pairs that do not share the common change of orientation.
 
-    Returns
-    -------
-    Matches
-        Rows of `a` (ascending in the order of `rows_a`), rows of `b`.
+    Returns Matches: rows of `a` (ascending in the order of `rows_a`), rows of `b`.
     """
     uv_a, uv_b = a.uv_rect_px[rows_a], b.uv_rect_px[rows_b]
     first, second = _near_lines(

@@ -60,23 +60,14 @@ def supported_matches(
 ) -> BoolArray:
     """Which matches their neighbourhood supports.
 
-    Parameters
-    ----------
-    uv_a, uv_b : (M, 2) float64
-        Matched pixels, inside the images.
-    size_a_px, size_b_px : (width, height)
-    rotation : bool
-        Also try turns of the second image by multiples of 45 degrees, and take the turn with most support.
-    zoom : bool
-        Also try second images of half to twice the size, likewise.
-    threshold : float
-        The paper's alpha.
-    cells : int
-        Cells along a side.
+    - `size_a_px`, `size_b_px` (width, height).
+    - `uv_a`, `uv_b` (M, 2): matched pixels, inside the images.
+    - `rotation`: also try turns of the second image by multiples of 45 degrees, and take the turn with most support.
+    - `zoom`: also try second images of half to twice the size, likewise.
+    - `threshold`: the paper's alpha.
+    - `cells`: cells along a side.
 
-    Returns
-    -------
-    (M,) bool
+    Returns (M,) bool.
     """
     # Single precision up to here, as everybody has it: which cell a pixel on an edge falls into depends on it.
     share_a = (uv_a.astype(np.float32) / np.array(size_a_px, np.float32)).astype(np.float32)
@@ -111,24 +102,13 @@ def match_by_motion(
     A pair needs the support of one direction and to be the best of those that have it, for both of its features: so the
     matches of b with a are those of a with b.
 
-    Parameters
-    ----------
-    frontend : Frontend
-        One that offers `NearestSearch`.
-    a, b : Features
-        Of images of one size, or parts of them. The grid spans both images' features.
-    rotation, zoom, threshold
-        As for `supported_matches`.
+    - `frontend`: one that offers `NearestSearch`.
+    - `a`, `b`: of images of one size, or parts of them. The grid spans both images' features.
+    - `rotation`, `zoom`, `threshold`: as for `supported_matches`.
 
-    Returns
-    -------
-    Matches
-        Rows of a, ascending; rows of b.
+    Returns Matches: rows of a, ascending; rows of b.
 
-    Raises
-    ------
-    ConfigError
-        The front end has no search for nearest neighbours.
+    Raises `ConfigError`: the front end has no search for nearest neighbours.
     """
     search = nearest_search(frontend)
     if len(a) == 0 or len(b) == 0:
@@ -150,10 +130,7 @@ def match_by_motion(
 def nearest_search(frontend: Frontend) -> NearestSearch:
     """Return the front end as one that finds nearest neighbours.
 
-    Raises
-    ------
-    ConfigError
-        It does not.
+    Raises `ConfigError`: it does not.
     """
     if not isinstance(frontend, NearestSearch):
         raise ConfigError(

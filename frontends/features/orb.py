@@ -138,10 +138,7 @@ class OrbFrontend(OptionedFrontend):
 
         `image` (H, W) or (H, W, 3) RGB uint8: of any size; a flat or a tiny one has no features.
 
-        Raises
-        ------
-        InputError
-            The array is no such image.
+        Raises `InputError`: the array is no such image.
         """
         levels = self._pyramid(to_grey(image))
         noise = noise_of_levels(estimate_noise(levels[0]), len(levels), self.scale_factor)

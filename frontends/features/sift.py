@@ -101,10 +101,7 @@ class SiftFrontend(OptionedFrontend):
 
         `image` (H, W) or (H, W, 3) RGB uint8: of any size; a flat or a tiny one has no features.
 
-        Raises
-        ------
-        InputError
-            The array is no such image.
+        Raises `InputError`: the array is no such image.
         """
         grey = to_grey(image)
         detector = self._detector()

@@ -95,12 +95,8 @@ class AuxiliaryMap:
     def views(self, tracks_of: int, rows: IntArray, frames: list[int]) -> TrackViews:
         """Return the pixels, in `frames`, of the tracks of some features of frame `tracks_of`.
 
-        Parameters
-        ----------
-        rows : (N,) int64
-            Features that have a track.
-        frames : list of int
-            With a pose.
+        - `rows` (N,): features that have a track.
+        - `frames`: with a pose.
         """
         wanted = self._track_of[tracks_of][rows]
         n, n_views = len(wanted), len(frames)

@@ -45,16 +45,10 @@ def confirmed_share(first: BeyondGap, second: BeyondGap, matches: IntArray, K: F
     under the second. And of all else, which was never seen before the gap and had no part in the poses: how much lies
     on its epipolar line and in front of the cameras. Where the scene repeats itself, only that tells.
 
-    Parameters
-    ----------
-    matches : (M, 2) int64
-        Rows of their features.
-    K : (3, 3)
+    - `K` (3, 3).
+    - `matches` (M, 2): rows of their features.
 
-    Returns
-    -------
-    float
-        Zero where they share too little to tell.
+    Returns float: zero where they share too little to tell.
     """
     T_b_a = second.pose.T_cam_submap @ se3.inverse(first.pose.T_cam_submap)
     Ad = se3.adjoint(T_b_a)
@@ -81,17 +75,11 @@ def are_no_copies(
 
     A match counts if it is nearer to the poses' prediction than half way to that of another pose, at the median depth.
 
-    Parameters
-    ----------
-    matches : (M, 2) int64
-        Rows of their features.
-    rivals : iterable of Rival
-        Other poses beyond the gap, of either frame.
-    K : (3, 3)
+    - `K` (3, 3).
+    - `matches` (M, 2): rows of their features.
+    - `rivals`: other poses beyond the gap, of either frame.
 
-    Returns
-    -------
-    (M,) bool
+    Returns (M,) bool.
     """
     T_first, T_second = first.pose.T_cam_submap, second.pose.T_cam_submap
     xyz = first.pose.xyz_mu[first.pose.inliers]

@@ -42,18 +42,11 @@ Pose = GivenPose | Crossing | Track
 class PnpOdometry:
     """Implements `VisualOdometry` on the live front end's submap with other front ends' poses.
 
-    Parameters
-    ----------
-    live : VisualFrontEnd
-        Of the submap.
-    auxiliaries : sequence of Auxiliary
-        The quickest first: the next one is asked where those before it find no pose that is believed.
-    camera : Camera
-        As it was given.
-    tracks_live : bool
-        The live front end poses the frames as long as it can by itself, and the others where it cannot.
-    notes_rivals, expected
-        As for `PoseFinder`.
+    - `live`: of the submap.
+    - `auxiliaries`: the quickest first: the next one is asked where those before it find no pose that is believed.
+    - `camera`: as it was given.
+    - `tracks_live`: the live front end poses the frames as long as it can by itself, and the others where it cannot.
+    - `notes_rivals`, `expected`: as for `PoseFinder`.
     """
 
     def __init__(

@@ -73,21 +73,16 @@ class Crossing:
 class PoseFinder:
     """Finds poses by a front end's features, in a submap of which it reads the keyframes' poses.
 
-    Parameters
-    ----------
-    live : VisualFrontEnd
-        Of the submap.
-    camera : Camera
-        As it was given.
-    is_short_cut : bool
-        There are other features, better ones: what these leave in doubt beyond a gap is for those to decide. Binary
-        descriptors know a thing again only where they see it from about the same side. Past rows of parked cars, each a
-        copy of the one before, the right pose had only 16 to 46 points of 186 to 294. In scenes without repetition no
-        second pose has the required 12 (8 at most).
-    notes_rivals : bool
-        Whether an ambiguous pose beyond a gap is used, and left to the caller to decide. Otherwise it is refused.
-    expected : mapping of int to (4, 4)
-        ``T_cam_submap`` of frames beyond the gap, where it is known which of several like places they show.
+    - `live`: of the submap.
+    - `camera`: as it was given.
+    - `is_short_cut`: there are other features, better ones: what these leave in doubt beyond a gap is for those to
+      decide. Binary descriptors know a thing again only where they see it from about the same side. Past rows of parked
+      cars, each a copy of the one before, the right pose had only 16 to 46 points of 186 to 294. In scenes without
+      repetition no second pose has the required 12 (8 at most).
+    - `notes_rivals`: whether an ambiguous pose beyond a gap is used, and left to the caller to decide. Otherwise it is
+      refused.
+    - `expected` (mapping of int to (4, 4)): ``T_cam_submap`` of frames beyond the gap, where it is known which of
+      several like places they show.
     """
 
     def __init__(

@@ -64,14 +64,9 @@ def relocalise_across_gap(
 ) -> GapPose | Failure:
     """Estimate the pose of a frame.
 
-    Parameters
-    ----------
-    known : TrackViews
-        Each track in the frames of known pose; every track is seen in at least one.
-    uv_px : (N, 2), sigma_px : (N,)
-        The tracks in the new frame.
-    K : (3, 3)
-    size_px : (width, height)
+    - `K` (3, 3), `size_px` (width, height).
+    - `known`: each track in the frames of known pose; every track is seen in at least one.
+    - `uv_px` (N, 2), `sigma_px` (N,): the tracks in the new frame.
     """
     n = len(uv_px)
     if n < MIN_CONSENSUS:

@@ -79,21 +79,13 @@ def refuse_look_alike(
 ) -> Failure | None:
     """Return why a pose beyond a gap is not to be believed, if another one explains nearly as much.
 
-    Parameters
-    ----------
-    frontend : Frontend
-        Whose descriptors these are.
-    descriptors : (N, D), xyz : (N, 3)
-        What is known of before the gap, whether or not it was matched.
-    features : Features
-        Of the frame beyond the gap.
-    T_cam_w : (4, 4)
-        The first pose.
-    K : (3, 3)
-    camera : Camera
-        As it was given: what self-calibration corrects moves the rim of its image by little.
-    any_is_doubt : bool
-        However few points another pose explains, the first is not believed; all points are compared.
+    - `K` (3, 3).
+    - `frontend`: whose descriptors these are.
+    - `descriptors` (N, D), `xyz` (N, 3): what is known of before the gap, whether or not it was matched.
+    - `features`: of the frame beyond the gap.
+    - `T_cam_w` (4, 4): the first pose.
+    - `camera`: as it was given: what self-calibration corrects moves the rim of its image by little.
+    - `any_is_doubt`: however few points another pose explains, the first is not believed; all points are compared.
     """
     n_points = len(xyz) if any_is_doubt else N_POINTS
     others = find_other_poses(frontend, descriptors, xyz, features, T_cam_w, K, camera, seed, n_points)

@@ -27,16 +27,11 @@ def gap_uncertainty(
 ) -> tuple[FloatArray, float]:
     """Return the covariance of a pose (6, 6), and the standard deviation of the points' mean log depth there.
 
-    Parameters
-    ----------
-    K : (3, 3)
-    T_cam_submap : (4, 4)
-    xyz : (N, 3)
-        Points that the camera sees.
-    sigma_px : (N,)
-        Noise of their pixels.
-    information : (N, 3, 3)
-        What is known of the points without this camera: inverse covariances, which need not be of full rank.
+    - `K` (3, 3), `T_cam_submap` (4, 4).
+    - `xyz` (N, 3): points that the camera sees.
+    - `sigma_px` (N,): noise of their pixels.
+    - `information` (N, 3, 3): what is known of the points without this camera: inverse covariances, which need not be
+      of full rank.
     """
     n = len(xyz)
     J_pose, J_point = projection_jacobians(K, T_cam_submap, xyz)
@@ -66,12 +61,8 @@ def pose_uncertainty(
 
     Tracking takes landmarks for exact, which is good enough from one frame to the next.
 
-    Parameters
-    ----------
-    T_cam_submap : (4, 4)
-    landmark_ids : (N,) int64
-        Those that agree with the pose, each once.
-    sigma_px : (N,)
+    - `T_cam_submap` (4, 4), `sigma_px` (N,).
+    - `landmark_ids` (N,): those that agree with the pose, each once.
     """
     covariances = landmark_covariances(submap, landmark_ids)
     known = np.isfinite(covariances).all(axis=(1, 2)) & (submap.depths(landmark_ids, T_cam_submap) > 0)

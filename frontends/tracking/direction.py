@@ -16,14 +16,9 @@ def direction_sigma_deg(
 
     The points are eliminated by the Schur complement; the scale, which two views cannot tell, is held by its own prior.
 
-    Parameters
-    ----------
-    K : (3, 3)
-    T_w_a, T_w_b : (4, 4)
-    xyz : (N, 3)
-        Points that both see.
-    sigma_px : (N,)
-        Of their pixels.
+    - `K` (3, 3), `T_w_a`, `T_w_b` (4, 4).
+    - `xyz` (N, 3): points that both see.
+    - `sigma_px` (N,): of their pixels.
     """
     T_a_w, T_b_w = se3.inverse(T_w_a), se3.inverse(T_w_b)
     weight = 1 / sigma_px[:, None, None] ** 2

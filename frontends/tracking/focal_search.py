@@ -69,21 +69,13 @@ def search_focal(
 ) -> FocalSearch | Failure:
     """Search for the camera that pairs of frames agree about.
 
-    Parameters
-    ----------
-    frontend : Frontend
-        Whose features these are.
-    features : sequence of Features
-        Of neighbouring frames.
-    size_px : (int, int)
-        Width and height.
-    told : ToldFocal, optional
-        The focal length in the source's own data.
+    - `frontend`: whose features these are.
+    - `features`: of neighbouring frames.
+    - `size_px`: width and height.
+    - `told`: the focal length in the source's own data.
 
-    Returns
-    -------
-    FocalSearch or Failure
-        Fewer than `MIN_PAIRS` pairs moved enough, and the source's data have no focal length: `LOW_PARALLAX`.
+    Returns FocalSearch or Failure: fewer than `MIN_PAIRS` pairs moved enough, and the source's data have no focal
+    length: `LOW_PARALLAX`.
     """
     pairs = list(_find_pairs(frontend, features, size_px, seed))
     told_px = None if told is None else told.over_side * max(size_px)

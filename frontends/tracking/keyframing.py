@@ -35,12 +35,8 @@ NEAREST = 1e-6  # of a submap's unit, its first median depth
 def keyframe_due(track: Track, submap: Submap, reference_id: int, config: KeyframeConfig, first_id: int = 0) -> Ruling:
     """Decide by what is still tracked of the last keyframe and by how far the camera has moved since.
 
-    Parameters
-    ----------
-    reference_id : int
-        The last keyframe, in the direction in which the frames come.
-    first_id : int
-        Number of this run's first frame: how long ago another run was says nothing.
+    - `reference_id`: the last keyframe, in the direction in which the frames come.
+    - `first_id`: number of this run's first frame: how long ago another run was says nothing.
     """
     if track.view.index in submap.keyframes:
         return Ruling(False, detail="it is one already")

@@ -92,14 +92,9 @@ class LocalMap:
     ) -> Prediction:
         """Project into a camera and keep what it can see: in front, in the image, from a like side and distance.
 
-        Parameters
-        ----------
-        T_cam_submap : (4, 4) float64
-        K : (3, 3) float64
-        camera : Camera
-            As it was given: what self-calibration corrects moves the rim of its image by little.
-        scale_factor, n_octaves
-            The front end's pyramid.
+        - `T_cam_submap` (4, 4), `K` (3, 3).
+        - `camera`: as it was given: what self-calibration corrects moves the rim of its image by little.
+        - `scale_factor`, `n_octaves`: the front end's pyramid.
         """
         R, t = T_cam_submap[:3, :3], T_cam_submap[:3, 3]
         uv, _ = project_points(K, T_cam_submap, self.xyz_mu)

@@ -73,14 +73,10 @@ class ReadoutQuestion:
 def ask_readout(submap: Submap, rates_rad_s: Mapping[int, FloatArray], height_px: int) -> ReadoutQuestion | Failure:
     """Ask a submap for how much longer its images were read than its features were corrected for.
 
-    Parameters
-    ----------
-    submap : Submap
-        Is not changed.
-    rates_rad_s : mapping of int to (3,)
-        How the camera turns at each keyframe, in its own axes; those that are missing tell nothing.
-    height_px : int
-        Of the image.
+    - `submap`: is not changed.
+    - `rates_rad_s` (mapping of int to (3,)): how the camera turns at each keyframe, in its own axes; those that are
+      missing tell nothing.
+    - `height_px`: of the image.
     """
     ids = np.array(sorted(k for k in submap.keyframes if k in rates_rad_s), np.int64)
     if len(ids) < MIN_KEYFRAMES:

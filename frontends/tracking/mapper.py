@@ -46,15 +46,9 @@ N_OTHERS = 3  # views by others that make an observation redundant
 def spread_choice(uv_px: FloatArray, priority: IntArray, n: int, size_px: tuple[int, int]) -> BoolArray:
     """Choose up to `n` features, evenly from all cells of the image, the highest priority in each cell first.
 
-    Parameters
-    ----------
-    uv_px : (N, 2) float64
-    priority : (N,) int64
-    size_px : (width, height)
+    `uv_px` (N, 2), `priority` (N,), `size_px` (width, height).
 
-    Returns
-    -------
-    (N,) bool
+    Returns (N,) bool.
     """
     chosen = np.ones(len(uv_px), bool)
     if len(uv_px) <= n:

@@ -21,15 +21,9 @@ def nearer_than_proven(depth: FloatArray, proven: BoolArray) -> BoolArray:
     near ones weigh most: they hold the camera where it is, and a turn takes the place of its motion. Where true points
     are near, some are proven, and unproven ones beside them stay.
 
-    Parameters
-    ----------
-    depth : (N,) float64
-    proven : (N,) bool
+    `depth` (N,), `proven` (N,) bool.
 
-    Returns
-    -------
-    (N,) bool
-        All False where nothing is proven.
+    Returns (N,) bool: all False where nothing is proven.
     """
     if not proven.any():
         return np.zeros(len(depth), np.bool_)

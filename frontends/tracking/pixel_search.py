@@ -35,14 +35,9 @@ MAX_CHAIN_S = 3.0
 class PixelSearch:
     """Asks a pixel matcher for landmarks, and makes features of those that it finds.
 
-    Parameters
-    ----------
-    frontend : Frontend
-        The live one.
-    camera : callable
-        The camera that rectifies the features now.
-    model_sigma_px : float
-        Error of its model, see `CameraConfig.model_sigma_px`.
+    - `frontend`: the live one.
+    - `camera`: the camera that rectifies the features now.
+    - `model_sigma_px`: error of its model, see `CameraConfig.model_sigma_px`.
     """
 
     def __init__(
@@ -160,10 +155,7 @@ class _Described:
 def checked_matches(matcher: PixelMatcher, found: object) -> PixelMatches:
     """Return what a pixel matcher found, if it is what it should be.
 
-    Raises
-    ------
-    FrontendError
-        If it is not `PixelMatches`, or its arrays do not belong together.
+    Raises `FrontendError` if it is not `PixelMatches`, or its arrays do not belong together.
     """
     problem = None
     if not isinstance(found, PixelMatches):

@@ -38,16 +38,9 @@ def resect(
 ) -> Resection:
     """RANSAC over the 3-point problem (PoseLib).
 
-    Parameters
-    ----------
-    K : (3, 3) float64
-    size_px : (width, height)
-    uv_px : (N, 2) float64, rectified pixels
-    xyz : (N, 3) float64
-    sigma_px : float
-        Typical noise of the pixels; the inlier threshold is three times that.
-    max_iterations : int
-        Hypotheses at most; a thousand find one where a sixth of the matches are right.
+    - `K` (3, 3), `size_px` (width, height), `uv_px` (N, 2), rectified pixels, `xyz` (N, 3).
+    - `sigma_px`: typical noise of the pixels; the inlier threshold is three times that.
+    - `max_iterations`: hypotheses at most; a thousand find one where a sixth of the matches are right.
     """
     camera = poselib_camera(K, size_px)
     options: dict[str, Any] = {
@@ -75,19 +68,11 @@ def estimate_pose(
 ) -> PoseEstimate | Failure:
     """Estimate a pose without a guess: RANSAC, then a refinement that starts from its inliers.
 
-    Parameters
-    ----------
-    K, size_px, uv_px, xyz, seed
-        As for `resect`.
-    sigma_px : (N,) float64
-        Standard deviation of each pixel coordinate.
-    min_inliers, tolerance
-        As for `refine_pose`.
+    - `K`, `size_px`, `uv_px`, `xyz`, `seed`: as for `resect`.
+    - `sigma_px` (N,): standard deviation of each pixel coordinate.
+    - `min_inliers`, `tolerance`: as for `refine_pose`.
 
-    Returns
-    -------
-    PoseEstimate or Failure
-        As `refine_pose` returns it.
+    Returns PoseEstimate or Failure: as `refine_pose` returns it.
     """
     start = resect(K, size_px, uv_px, xyz, float(np.median(sigma_px)), seed)
     return refine_pose(

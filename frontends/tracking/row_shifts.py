@@ -16,14 +16,9 @@ def correct_shutter(
 ) -> Features:
     """Move features to where they would be had all rows been read at the time of the middle one.
 
-    Parameters
-    ----------
-    features : Features
-        As found in an image that was read row by row.
-    turn_rad : (3,)
-        Rotation vector by which the camera turns while an image is read, in its own axes.
-    read_v_px : (N,), optional
-        Rows in which the features were read, where `features` does not tell.
+    - `features`: as found in an image that was read row by row.
+    - `turn_rad` (3,): rotation vector by which the camera turns while an image is read, in its own axes.
+    - `read_v_px` (N,): rows in which the features were read, where `features` does not tell.
     """
     read_v_px = features.uv_px[:, 1] if read_v_px is None else read_v_px
     (uv_rect_px,) = at_mid_row(features.uv_rect_px, read_v_px, camera, turn_rad)

@@ -25,13 +25,9 @@ MIN_FAR, MIN_FAR_SHARE = 20, 0.1
 class TurnHypotheses:
     """Matches of two views under turns and translations.
 
-    Parameters
-    ----------
-    uv_a_px, uv_b_px : (N, 2)
-        Matched pixels of two views, undistorted; N > 0.
-    sigma_px : (N,)
-        Of a pixel's coordinate.
-    K : (3, 3)
+    - `K` (3, 3).
+    - `uv_a_px`, `uv_b_px` (N, 2): matched pixels of two views, undistorted; N > 0.
+    - `sigma_px` (N,): of a pixel's coordinate.
 
     Attributes
     ----------
@@ -54,10 +50,7 @@ class TurnHypotheses:
 
         The first layer may be a near plane that moved like a turn: what it leaves is asked for the next.
 
-        Returns
-        -------
-        list of (4, 4)
-            T_b_a with a baseline of 1; at most `N_LAYERS`, or none.
+        Returns list of (4, 4): t_b_a with a baseline of 1; at most `N_LAYERS`, or none.
         """
         views, rng, R, far = self._views, self._rng, self._turn, self._far
         enough = max(MIN_FAR, MIN_FAR_SHARE * len(self._all))

@@ -21,11 +21,8 @@ def turn_between(K: FloatArray, uv_a_px: FloatArray, uv_b_px: FloatArray) -> Flo
 
     Horn's rotation from rays, re-weighted (Cauchy): near points and wrong matches lose their say.
 
-    Parameters
-    ----------
-    K : (3, 3)
-    uv_a_px, uv_b_px : (N, 2)
-        Matched rectified pixels.
+    - `K` (3, 3).
+    - `uv_a_px`, `uv_b_px` (N, 2): matched rectified pixels.
     """
     if len(uv_a_px) < MIN_PIXELS:
         return None

@@ -33,13 +33,8 @@ MIN_NOISE2 = 0.04
 class RelativePoses:
     """The relative poses that two matched views allow, to be asked for in the order of what they cost.
 
-    Parameters
-    ----------
-    uv_a_px, uv_b_px : (N, 2)
-        Matched pixels, undistorted; N > 0.
-    sigma_px : (N,)
-    K : (3, 3)
-    size_px : (width, height)
+    - `sigma_px` (N,), `K` (3, 3), `size_px` (width, height).
+    - `uv_a_px`, `uv_b_px` (N, 2): matched pixels, undistorted; N > 0.
     """
 
     def __init__(

@@ -25,17 +25,11 @@ def passes_unmapped(
 ) -> bool:
     """Whether unmapped content has moved between frame and keyframe by more than a turn does.
 
-    Parameters
-    ----------
-    track : Track
-        Of a frame.
-    keyframe_id : int
-        Of the submap: the last keyframe.
-    parallax_deg : float
-        At which a keyframe is due if what is mapped shows it. At the angle from which on a match could be a landmark,
-        1 degree, keyframes came in turns on the spot as well, and broke maps of `tum_fr1_rpy`.
-    n : int
-        So many matches must show it.
+    - `track`: of a frame.
+    - `keyframe_id`: of the submap: the last keyframe.
+    - `parallax_deg`: at which a keyframe is due if what is mapped shows it. At the angle from which on a match could be
+      a landmark, 1 degree, keyframes came in turns on the spot as well, and broke maps of `tum_fr1_rpy`.
+    - `n`: so many matches must show it.
     """
     features, keyframe = track.view.features, submap.keyframes[keyframe_id].features
     rows = np.flatnonzero(_unmapped(features, track.landmark_ids >= 0))

@@ -70,9 +70,7 @@ class Camera(ABC):
     def read(path: str | Path) -> Camera:
         """Read a calibration from a file of any known format (docs/calibration.md).
 
-        Raises
-        ------
-        InputError
+        Raises `InputError`.
         """
         reader = import_module("dualslam.io.camera_files")  # by name: readers of files stand above this room
         camera: Camera = reader.read_camera_file(path)
@@ -102,9 +100,7 @@ class Camera(ABC):
     def rectify(self, uv: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Take raw pixels to rectified ones.
 
-        Parameters
-        ----------
-        uv : (N, 2)
+        `uv` (N, 2).
 
         Returns
         -------
@@ -159,10 +155,7 @@ class Camera(ABC):
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Return the camera of what `to_dict` gave.
 
-        Raises
-        ------
-        InputError
-            Names the field that is missing, unknown or not a number.
+        Raises `InputError`: names the field that is missing, unknown or not a number.
         """
         names = {f.name: f for f in dataclasses.fields(cls)}
         given = {name: value for name, value in values.items() if name != "model"}
@@ -184,10 +177,7 @@ class Camera(ABC):
     def validate(self) -> None:
         """Check the calibration.
 
-        Raises
-        ------
-        InputError
-            One sentence that names the field.
+        Raises `InputError`: one sentence that names the field.
         """
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)

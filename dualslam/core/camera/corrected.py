@@ -79,10 +79,7 @@ class CorrectedCamera(Camera):
     def of(cls, base: Camera, correction: LensCorrection) -> CorrectedCamera:
         """Correct a camera.
 
-        Raises
-        ------
-        InputError
-            If the correction has no inverse somewhere in the image.
+        Raises `InputError` if the correction has no inverse somewhere in the image.
         """
         return cls(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base, correction)
 

@@ -104,17 +104,10 @@ class MappedCamera(Camera):
 def camera_for_map(known: Camera, camera: Camera) -> Camera:
     """Return the camera by which frames are found in a map.
 
-    Parameters
-    ----------
-    known : Camera
-        Of the map, with what was found out about it.
-    camera : Camera
-        As it was given, of the frames.
+    - `known`: of the map, with what was found out about it.
+    - `camera`: as it was given, of the frames.
 
-    Returns
-    -------
-    Camera
-        `known`, where both are one to less than `SAME_PX`; else `camera`, brought to the map's pixels.
+    Returns Camera: `known`, where both are one to less than `SAME_PX`; else `camera`, brought to the map's pixels.
     """
     if isinstance(camera, MappedCamera):
         return camera

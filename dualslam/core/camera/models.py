@@ -213,10 +213,7 @@ MODELS: dict[str, type[Camera]] = {
 def camera_from_dict(values: Mapping[str, Any]) -> Camera:
     """Return the camera that `Camera.to_dict` described.
 
-    Raises
-    ------
-    InputError
-        Names the field that is missing, unknown or senseless.
+    Raises `InputError`: names the field that is missing, unknown or senseless.
     """
     from dualslam.core.camera.corrected import CorrectedCamera  # they stand on this module
     from dualslam.core.camera.mapped import MappedCamera

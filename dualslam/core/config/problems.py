@@ -28,12 +28,8 @@ _PLAIN_WORDS = {
 def sentence(error: ValidationError, root: type[BaseModel]) -> str:
     """Return what is wrong with the first field that is, and how many more are.
 
-    Parameters
-    ----------
-    error : ValidationError
-        Of pydantic.
-    root : type
-        The model that was to be made.
+    - `error`: of pydantic.
+    - `root`: the model that was to be made.
     """
     problems = error.errors(include_url=False)
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""

@@ -14,11 +14,8 @@ from dualslam.core.errors import ConfigError
 class StrictModel(BaseModel):
     """A frozen section of the config that refuses unknown fields.
 
-    Raises
-    ------
-    ConfigError
-        One sentence: which field, what is wrong with it. (pydantic's own `model_validate` and `model_validate_json`
-        raise pydantic's error.)
+    Raises `ConfigError`: one sentence: which field, what is wrong with it. (pydantic's own `model_validate` and
+    `model_validate_json` raise pydantic's error.)
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)

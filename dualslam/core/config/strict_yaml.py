@@ -72,17 +72,10 @@ def _error(problem: str, node: yaml.Node) -> yaml.MarkedYAMLError:
 def read(path: Path, what: str, source: str = "") -> Any:
     """Read a file of YAML.
 
-    Parameters
-    ----------
-    what : str
-        What the file is, for the error: ``the configuration``.
-    source : str
-        What to call the file there; its path if empty.
+    - `what`: what the file is, for the error: ``the configuration``.
+    - `source`: what to call the file there; its path if empty.
 
-    Raises
-    ------
-    ConfigError
-        It cannot be read, or is no YAML of this kind.
+    Raises `ConfigError`: it cannot be read, or is no YAML of this kind.
     """
     source = source or str(path)
     try:
@@ -98,10 +91,7 @@ def read(path: Path, what: str, source: str = "") -> Any:
 def loads(text: str) -> Any:
     """Read one YAML document.
 
-    Raises
-    ------
-    ValueError
-        In one sentence, with line and column where they are known.
+    Raises `ValueError`: in one sentence, with line and column where they are known.
     """
     try:
         return yaml.load(text, _Loader)

@@ -108,31 +108,18 @@ def estimate_sim3_robust(
 ) -> Sim3Estimate | Failure:
     """Estimate the similarity between two maps from matched points, some of them wrong.
 
-    Parameters
-    ----------
-    src, dst : (N, 3)
-        Matched points, each in its map's frame and unit.
-    cov_src, cov_dst : (N, 3, 3)
-        Their covariances. Pairs with a value that is not finite are never inliers. Nor is a point known no better than
-        to `UNKNOWN` times the extent of all.
-    rng : numpy.random.Generator
-        The only source of randomness.
-    min_inliers : int
-        Fewer are a failure.
-    max_hypotheses : int
-        RANSAC stops here at the latest.
-    confidence : float
-        Of having drawn one clean triplet, at which RANSAC stops early.
-    chi2_gate : float
-        Of the squared Mahalanobis distance under ``cov_dst + s^2 R cov_src R'``.
-    scale_bounds : tuple of float
-        Scales outside are a failure.
+    - `src`, `dst` (N, 3): matched points, each in its map's frame and unit.
+    - `cov_src`, `cov_dst` (N, 3, 3): their covariances. Pairs with a value that is not finite are never inliers. Nor is
+      a point known no better than to `UNKNOWN` times the extent of all.
+    - `rng`: the only source of randomness.
+    - `min_inliers`: fewer are a failure.
+    - `max_hypotheses`: RANSAC stops here at the latest.
+    - `confidence`: of having drawn one clean triplet, at which RANSAC stops early.
+    - `chi2_gate`: of the squared Mahalanobis distance under ``cov_dst + s^2 R cov_src R'``.
+    - `scale_bounds`: scales outside are a failure.
 
-    Returns
-    -------
-    Sim3Estimate or Failure
-        `TOO_FEW_MATCHES`, `TOO_FEW_INLIERS`, `DEGENERATE` (collinear, or a rotation that the covariances leave open)
-        or `SCALE` (out of bounds, or left open).
+    Returns Sim3Estimate or Failure: `TOO_FEW_MATCHES`, `TOO_FEW_INLIERS`, `DEGENERATE` (collinear, or a rotation that
+    the covariances leave open) or `SCALE` (out of bounds, or left open).
     """
     finite = np.isfinite(np.concatenate([src, dst, cov_src.reshape(-1, 9), cov_dst.reshape(-1, 9)], 1)).all(1)
     rows = np.flatnonzero(finite)

@@ -33,13 +33,9 @@ did with 8, and none with this."""
 def project_points(K: FloatArray, T_cam_w: FloatArray, xyz: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Project points into a pinhole image.
 
-    Parameters
-    ----------
-    K : (3, 3)
-        Intrinsics, pixels; zero skew.
-    T_cam_w : (4, 4)
-    xyz : (N, 3)
-        Points in w.
+    - `T_cam_w` (4, 4).
+    - `K` (3, 3): intrinsics, pixels; zero skew.
+    - `xyz` (N, 3): points in w.
 
     Returns
     -------
@@ -199,38 +195,23 @@ def refine_pose(
     point dropped at a bad pose returns at a better one. (The scheme of ORB-SLAM's ``PoseOptimization``.) It ends early
     once a round neither moves the pose nor changes the set of inliers.
 
-    Parameters
-    ----------
-    K : (3, 3)
-        Intrinsics, pixels; zero skew.
-    T_cam_w : (4, 4)
-        Where to start: usually the motion model's prediction.
-    xyz : (N, 3)
-        Points in w; these and the pixels must be finite.
-    uv : (N, 2)
-        Their rectified pixels.
-    sigma : (N,)
-        Standard deviation of each pixel coordinate, pixels.
-    prior_information : (6, 6), optional
-        Inverse covariance of xi of the starting pose; without it the start is only a start.
-    min_inliers : int
-        Fewer are a failure.
-    n_rounds, n_iterations : int
-        Rounds, and steps in each.
-    chi2_gate : float
-        Of the squared whitened residual; its root is the Huber threshold too.
-    tolerance : float
-        Decrease of the summed chi-square promised by a step, under which a round has converged. Unit-free: its root is
-        the length of the step in standard deviations of the pose.
-    counted : (N,) bool, optional
-        Points that the pose is estimated from; the others are only judged by it.
-    consensus : (N,) bool, optional
-        Points that agree with the starting pose. The first round uses these alone; by default it uses all points.
+    - `K` (3, 3): intrinsics, pixels; zero skew.
+    - `T_cam_w` (4, 4): where to start: usually the motion model's prediction.
+    - `xyz` (N, 3): points in w; these and the pixels must be finite.
+    - `uv` (N, 2): their rectified pixels.
+    - `sigma` (N,): standard deviation of each pixel coordinate, pixels.
+    - `prior_information` (6, 6): inverse covariance of xi of the starting pose; without it the start is only a start.
+    - `min_inliers`: fewer are a failure.
+    - `n_rounds`, `n_iterations`: rounds, and steps in each.
+    - `chi2_gate`: of the squared whitened residual; its root is the Huber threshold too.
+    - `tolerance`: decrease of the summed chi-square promised by a step, under which a round has converged. Unit-free:
+      its root is the length of the step in standard deviations of the pose.
+    - `counted` (N,) bool: points that the pose is estimated from; the others are only judged by it.
+    - `consensus` (N,) bool: points that agree with the starting pose. The first round uses these alone; by default it
+      uses all points.
 
-    Returns
-    -------
-    PoseEstimate or Failure
-        `TOO_FEW_MATCHES`, `TOO_FEW_INLIERS`, or `DEGENERATE` where the points do not fix the pose.
+    Returns PoseEstimate or Failure: `TOO_FEW_MATCHES`, `TOO_FEW_INLIERS`, or `DEGENERATE` where the points do not fix
+    the pose.
     """
     n = len(xyz)
     if n < min_inliers:
@@ -285,21 +266,13 @@ def settle_pose(
     Gauss-Newton with the weights of Geman and McClure's loss. From afar that forgets what is right, the nearest points
     first: it begins `WIDE` times as wide, and is half as wide at each step.
 
-    Parameters
-    ----------
-    K, T_cam_w, xyz, uv, sigma, tolerance
-        As in `refine_pose`.
-    shape : float
-        Of the loss, in sigmas: at so much of a residual a quarter of its weight is left.
-    min_inliers : int
-        Fewer points that agree, to within `shape`, are a failure.
-    max_steps : int
-        Of Gauss-Newton; in the first four the loss is wider.
+    - `K`, `T_cam_w`, `xyz`, `uv`, `sigma`, `tolerance`: as in `refine_pose`.
+    - `shape`: of the loss, in sigmas: at so much of a residual a quarter of its weight is left.
+    - `min_inliers`: fewer points that agree, to within `shape`, are a failure.
+    - `max_steps`: of Gauss-Newton; in the first four the loss is wider.
 
-    Returns
-    -------
-    (4, 4) or Failure
-        ``T_cam_w``; `TOO_FEW_MATCHES`, `TOO_FEW_INLIERS`, or `DEGENERATE` where the points do not fix the pose.
+    Returns (4, 4) or Failure: ``T_cam_w``; `TOO_FEW_MATCHES`, `TOO_FEW_INLIERS`, or `DEGENERATE` where the points do
+    not fix the pose.
     """
     n = len(xyz)
     if n < min_inliers:

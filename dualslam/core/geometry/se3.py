@@ -67,16 +67,10 @@ def inverse(T_a_b: ArrayLike) -> FloatArray:
 def act(T_a_b: ArrayLike, p_b: ArrayLike) -> FloatArray:
     """Take points from frame b to frame a.
 
-    Parameters
-    ----------
-    T_a_b : (..., 4, 4)
-        Also any affine matrix with last row 0 0 0 1, such as a Sim(3).
-    p_b : (3,) or (..., N, 3)
-        Its leading dimensions broadcast against those of `T_a_b`.
+    - `T_a_b` (..., 4, 4): also any affine matrix with last row 0 0 0 1, such as a Sim(3).
+    - `p_b` (3,) or (..., N, 3): its leading dimensions broadcast against those of `T_a_b`.
 
-    Returns
-    -------
-    (..., 3) or (..., N, 3) float64
+    Returns (..., 3) or (..., N, 3) float64.
     """
     T, p = np.asarray(T_a_b, np.float64), np.asarray(p_b, np.float64)
     if p.ndim == 1:

@@ -58,13 +58,9 @@ def safe_angle(omega: FloatArray) -> tuple[FloatArray, FloatArray]:
 def hat(omega: ArrayLike) -> FloatArray:
     """Return the skew-symmetric matrix of a vector: ``hat(a) @ b == cross(a, b)``.
 
-    Parameters
-    ----------
-    omega : (..., 3)
+    `omega` (..., 3).
 
-    Returns
-    -------
-    (..., 3, 3) float64
+    Returns (..., 3, 3) float64.
     """
     w = np.asarray(omega, np.float64)
     out = np.zeros((*w.shape, 3))
@@ -78,9 +74,7 @@ def exp(omega: ArrayLike) -> FloatArray:
 
     `omega` (..., 3): axis times angle, radians.
 
-    Returns
-    -------
-    (..., 3, 3) float64
+    Returns (..., 3, 3) float64.
     """
     w = np.asarray(omega, np.float64)
     theta = np.sqrt((w * w).sum(-1))[..., None, None]
@@ -93,13 +87,9 @@ def exp(omega: ArrayLike) -> FloatArray:
 def log(R: ArrayLike) -> FloatArray:
     """Return the rotation vector of a rotation matrix, its norm in [0, pi]; by way of the quaternion, so safe near pi.
 
-    Parameters
-    ----------
-    R : (..., 3, 3)
+    `R` (..., 3, 3).
 
-    Returns
-    -------
-    (..., 3) float64, radians
+    Returns (..., 3) float64, radians.
     """
     q = quat_xyzw_from_matrix(R)
     v, w = q[..., :3], q[..., 3]
@@ -175,13 +165,9 @@ def quat_xyzw_from_matrix(R: ArrayLike) -> FloatArray:
     Bar-Itzhack's symmetric products: every row of 4 q q' is linear in R; the row of largest norm is free of
     cancellation. (S. Shepperd, "Quaternion from rotation matrix", 1978, without its branches.)
 
-    Parameters
-    ----------
-    R : (..., 3, 3)
+    `R` (..., 3, 3).
 
-    Returns
-    -------
-    (..., 4) float64
+    Returns (..., 4) float64.
     """
     m = np.asarray(R, np.float64)
     if m.ndim == 2:

@@ -73,16 +73,10 @@ def triangulate_two_view(
     alpha and beta only. With alpha and beta as observed, view b is linear in rho, which gives the start. Gauss-Newton
     on all three then spreads the error over both views. No loop over points, no decomposition.
 
-    Parameters
-    ----------
-    uv_a, uv_b : (N, 2)
-        Rectified pixels.
-    K : (3, 3)
-        Intrinsics of both, zero skew.
-    T_w_a, T_w_b : (4, 4)
-        Camera poses in w; their centres must differ.
-    n_polish : int
-        Gauss-Newton steps; two reach the minimum to about 1e-3 px even at several px of noise.
+    - `uv_a`, `uv_b` (N, 2): rectified pixels.
+    - `K` (3, 3): intrinsics of both, zero skew.
+    - `T_w_a`, `T_w_b` (4, 4): camera poses in w; their centres must differ.
+    - `n_polish`: Gauss-Newton steps; two reach the minimum to about 1e-3 px even at several px of noise.
     """
     T_b_a = se3.inverse(T_w_b) @ T_w_a
     R, t = T_b_a[:3, :3], T_b_a[:3, 3]
@@ -146,17 +140,11 @@ def triangulate_n_view(
 
     As in `triangulate_two_view` a point is (alpha, beta, 1) / rho, here in the first camera that sees it.
 
-    Parameters
-    ----------
-    uv : (N, V, 2)
-        Rectified pixels; ignored where not visible.
-    K : (3, 3)
-        Intrinsics, zero skew.
-    T_cam_w : (V, 4, 4)
-    visible : (N, V) bool, optional
-        Which views see which point; all by default.
-    n_polish : int
-        Gauss-Newton steps.
+    - `T_cam_w` (V, 4, 4).
+    - `uv` (N, V, 2): rectified pixels; ignored where not visible.
+    - `K` (3, 3): intrinsics, zero skew.
+    - `visible` (N, V) bool: which views see which point; all by default.
+    - `n_polish`: Gauss-Newton steps.
     """
     n, n_views = uv.shape[:2]
     seen = np.ones((n, n_views), bool) if visible is None else np.asarray(visible, bool)
@@ -246,23 +234,14 @@ def point_covariance(
 ) -> FloatArray:
     """Return the covariance of each point given the poses of the cameras that see it: the inverse of sum J'J / sigma^2.
 
-    Parameters
-    ----------
-    xyz : (N, 3)
-        Points in w.
-    K : (3, 3)
-        Intrinsics, zero skew.
-    point_index : (O,)
-        Row of `xyz` that each observation is of; any order.
-    T_cam_w : (O, 4, 4)
-        Pose of the camera of each observation.
-    sigma : (O,)
-        Pixel standard deviation of each observation.
+    - `xyz` (N, 3): points in w.
+    - `K` (3, 3): intrinsics, zero skew.
+    - `point_index` (O,): row of `xyz` that each observation is of; any order.
+    - `T_cam_w` (O, 4, 4): pose of the camera of each observation.
+    - `sigma` (O,): pixel standard deviation of each observation.
 
-    Returns
-    -------
-    (N, 3, 3)
-        In w; NaN where the views do not fix the point (fewer than two, no parallax, a point behind its camera).
+    Returns (N, 3, 3): in w; NaN where the views do not fix the point (fewer than two, no parallax, a point behind its
+    camera).
     """
     T = np.asarray(T_cam_w, np.float64)
     R = T[:, :3, :3]

@@ -61,16 +61,10 @@ def _epipolar_constraint(F: FloatArray, uv_a: FloatArray, uv_b: FloatArray) -> t
 def homography_transfer_error(H_b_a: FloatArray, uv_a: FloatArray, uv_b: FloatArray) -> FloatArray:
     """Return squared transfer errors of a homography in both directions.
 
-    Parameters
-    ----------
-    H_b_a : (3, 3)
-        Pixels of a to pixels of b.
-    uv_a, uv_b : (N, 2)
+    - `uv_a`, `uv_b` (N, 2).
+    - `H_b_a` (3, 3): pixels of a to pixels of b.
 
-    Returns
-    -------
-    (N, 2), px^2
-        In image a (b transferred back), in image b. Infinite where a pixel is sent to infinity.
+    Returns (N, 2), px^2: in image a (b transferred back), in image b. Infinite where a pixel is sent to infinity.
     """
     forward, back = H_b_a @ _homogeneous(uv_a), np.linalg.inv(H_b_a) @ _homogeneous(uv_b)
     errors = []
@@ -97,11 +91,8 @@ def decompose_homography(H_b_a: FloatArray, K: FloatArray) -> HomographyPoses:
     The sign of `H_b_a` makes its determinant positive, as it is when both cameras are on the same side of the plane.
     Two of the four poses are ruled out by the positive depth of the points.
 
-    Parameters
-    ----------
-    H_b_a : (3, 3)
-        Pixels of a to pixels of b, any scale, not singular.
-    K : (3, 3)
+    - `K` (3, 3).
+    - `H_b_a` (3, 3): pixels of a to pixels of b, any scale, not singular.
     """
     H = np.linalg.inv(K) @ H_b_a @ K
     H = H * np.sign(np.linalg.det(H))

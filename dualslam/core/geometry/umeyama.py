@@ -34,19 +34,12 @@ def umeyama(
 ) -> Alignment | Failure:
     """Return the similarity (or pose) that takes `src` nearest to `dst` in the least-squares sense.
 
-    Parameters
-    ----------
-    src, dst : (N, 3)
-        Corresponding points.
-    weights : (N,), optional
-        Non-negative weights.
-    with_scale : bool
-        False holds the scale at 1.
+    - `src`, `dst` (N, 3): corresponding points.
+    - `weights` (N,): non-negative weights.
+    - `with_scale`: false holds the scale at 1.
 
-    Returns
-    -------
-    Alignment or Failure
-        `DEGENERATE` for fewer than three points, or coincident or collinear ones in either set; `SCALE` if s <= 0.
+    Returns Alignment or Failure: `DEGENERATE` for fewer than three points, or coincident or collinear ones in either
+    set; `SCALE` if s <= 0.
     """
     w = np.ones(len(src)) if weights is None else np.asarray(weights, np.float64)
     n_used = int(np.count_nonzero(w))

@@ -19,14 +19,10 @@ def landmark_colours(
 
     Needs memory for one image at a time and 11 bytes an observation.
 
-    Parameters
-    ----------
-    frames : iterable of Frame
-        Colour images (H, W, 3) of keyframes, or grey ones; others are ignored.
-    numbers : mapping of int to int
-        The number in the map of each frame, by its index in the source.
-    before : mapping of int to (N, 3) uint8
-        Colours of a saved map that the run continued; `GREY` where neither knows one.
+    - `frames`: colour images (H, W, 3) of keyframes, or grey ones; others are ignored.
+    - `numbers`: the number in the map of each frame, by its index in the source.
+    - `before` (mapping of int to (N, 3) uint8): colours of a saved map that the run continued; `GREY` where neither
+      knows one.
     """
     colours = {m: padded(before, m, len(submap.landmarks)) for m, submap in atlas.submaps.items()}
     seen: dict[int, list[tuple[IntArray, NDArray[np.uint8]]]] = {m: [] for m in atlas.submaps}

@@ -88,10 +88,7 @@ class ExportedMap:
 def read_stored(run: Path) -> StoredMap:
     """Read the map of a run folder, for `flatten`.
 
-    Raises
-    ------
-    InputError
-        If there is none, or it is damaged, or it has no submap.
+    Raises `InputError` if there is none, or it is damaged, or it has no submap.
     """
     stored = load_atlas(run)
     if not stored.main:
@@ -161,13 +158,9 @@ def flatten(stored: StoredMap) -> ExportedMap:
 def with_frames(exported: ExportedMap, stored: StoredMap, chosen: Iterable[int]) -> ExportedMap:
     """Return the map with more views: posed frames that are no keyframes, which observe no point.
 
-    Parameters
-    ----------
-    exported : ExportedMap
-        That of `flatten`, in the map's unit.
-    chosen : iterable of int
-        Frames, by their number in the map. Those that are views already, have no pose in the main map, or hang on a
-        keyframe that a by-pass has marked invalid are ignored.
+    - `exported`: that of `flatten`, in the map's unit.
+    - `chosen`: frames, by their number in the map. Those that are views already, have no pose in the main map, or hang
+      on a keyframe that a by-pass has marked invalid are ignored.
     """
     atlas, main = stored.atlas, stored.main
     new = sorted(set(chosen) & stored.poses.keys() - set(exported.frame.tolist()))

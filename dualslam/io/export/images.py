@@ -32,23 +32,13 @@ def with_images(
     An image gets a mask (0 is ignored) where pixels are outside the camera's image, or 0 in `mask`. One image is in
     memory at a time.
 
-    Parameters
-    ----------
-    camera : Camera
-        As in the saved map: it knows the lens.
-    frames : iterable of Frame
-        RGB, of the source that the run was made of; those that are no views are ignored.
-    numbers : mapping of int to int
-        Of the run's frames, as `read_numbers` gives them.
-    out : Path
-        Images go into ``out/images``, masks into ``out/masks``.
-    mask : (H, W) uint8, optional
-        0 where the camera's images show nothing of the scene.
+    - `camera`: as in the saved map: it knows the lens.
+    - `frames`: RGB, of the source that the run was made of; those that are no views are ignored.
+    - `numbers`: of the run's frames, as `read_numbers` gives them.
+    - `out`: images go into ``out/images``, masks into ``out/masks``.
+    - `mask` (H, W) uint8: 0 where the camera's images show nothing of the scene.
 
-    Raises
-    ------
-    InputError
-        If there is no image.
+    Raises `InputError` if there is no image.
     """
     has_image = np.zeros(len(exported.frame), bool)
     for v, image, valid in undistorted(exported, camera, frames, numbers, mask):

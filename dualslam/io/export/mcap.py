@@ -36,21 +36,13 @@ def write_mcap(
 ) -> None:
     """Write poses, points and images; one image at a time is in memory.
 
-    Parameters
-    ----------
-    exported : ExportedMap
-        All posed frames are views of it.
-    rows : (N,) int64
-        Views that are frames of the run, by time.
-    images : iterable of (int, array)
-        Some of these views, ascending, and their images without the lens: (H, W) grey or (H, W, 3) RGB.
-    out : Path
-        The file.
+    - `exported`: all posed frames are views of it.
+    - `rows` (N,): views that are frames of the run, by time.
+    - `images` (iterable of (int, array)): some of these views, ascending, and their images without the lens: (H, W)
+      grey or (H, W, 3) RGB.
+    - `out`: the file.
 
-    Raises
-    ------
-    InputError
-        If `rosbags` is not installed, or a time cannot be a stamp of ROS.
+    Raises `InputError` if `rosbags` is not installed, or a time cannot be a stamp of ROS.
     """
     times_s = exported.timestamp_s[rows]
     if not ((times_s >= 0) & (times_s < MAX_STAMP_S)).all():

@@ -54,10 +54,7 @@ def by_distance(exported: ExportedMap, numbers: Mapping[int, int], a: int, b: in
 
     `numbers`: of the run's frames, as `read_numbers` gives them.
 
-    Raises
-    ------
-    InputError
-        If one of them is no frame of the run, or no view, or they do not lie apart.
+    Raises `InputError` if one of them is no frame of the run, or no view, or they do not lie apart.
     """
     row_of = exported.rows_by_index(numbers)
     continued = bool(set(exported.frame.tolist()) - set(numbers.values()))
@@ -87,10 +84,7 @@ def by_height(exported: ExportedMap, metres: float) -> MetricScale:
     In each keyframe a plane is sought among the points that it sees below itself, by RANSAC, level to within
     `MAX_TILT_DEG` of the image's rows: the lowest that enough points lie on, as nothing is seen below the ground.
 
-    Raises
-    ------
-    InputError
-        If hardly any keyframe sees ground.
+    Raises `InputError` if hardly any keyframe sees ground.
     """
     T_cam_world = se3.inverse(exported.T_world_cam)
     heights = []
@@ -158,23 +152,13 @@ def by_marker(
 ) -> MetricScale:
     """Return the scale by markers of a known size, each triangulated from the keyframes that show it.
 
-    Parameters
-    ----------
-    camera : Camera
-        As in the saved map: it knows the lens.
-    frames : iterable of Frame
-        Of the source that the run was made of; those that are no keyframes are passed over.
-    numbers : mapping of int to int
-        Of the run's frames, as `read_numbers` gives them.
-    metres : float
-        Side of the black square. Different markers of one number would be taken for one.
-    dictionary : str
-        One of `DICTIONARIES`.
+    - `camera`: as in the saved map: it knows the lens.
+    - `frames`: of the source that the run was made of; those that are no keyframes are passed over.
+    - `numbers`: of the run's frames, as `read_numbers` gives them.
+    - `metres`: side of the black square. Different markers of one number would be taken for one.
+    - `dictionary`: one of `DICTIONARIES`.
 
-    Raises
-    ------
-    InputError
-        If no marker is seen by enough keyframes.
+    Raises `InputError` if no marker is seen by enough keyframes.
     """
     corners = _marker_corners(exported, camera, frames, numbers, dictionary)
     sides, sigmas, n_views = [], [], 0

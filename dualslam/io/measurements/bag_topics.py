@@ -27,10 +27,7 @@ def read_bag(
 ) -> tuple[list[MeasurementRow], list[tuple[float, float, float, float, float, float]]]:
     """Return rows of odometry and gyroscopes, and fixes: time, latitude, longitude, height, two sigmas.
 
-    Raises
-    ------
-    InputError
-        If the bag has no such topic, or states no sigmas and none is given.
+    Raises `InputError` if the bag has no such topic, or states no sigmas and none is given.
     """
     paths = [path] if path.is_file() else sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
     bag = scan(paths)

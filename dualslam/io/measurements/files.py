@@ -48,21 +48,13 @@ def read_measurements(
 ) -> RowSource:
     """Read a file or folder of measurements.
 
-    Parameters
-    ----------
-    sigma : float, optional
-        For formats that state none: metres of a position, rad/s of a gyroscope, rad of an accelerometer's direction.
-    clock_offset_s : float
-        Added to the times.
-    frame_times_s : (F,), optional
-        Times of the source's images, for measurements that belong to images and not to times.
-    origin : (float, float, float), optional
-        Of east, north and up; the first position if it is not given.
+    - `sigma`: for formats that state none: metres of a position, rad/s of a gyroscope, rad of an accelerometer's
+      direction.
+    - `clock_offset_s`: added to the times.
+    - `frame_times_s` (F,): times of the source's images, for measurements that belong to images and not to times.
+    - `origin` (float, float, float): of east, north and up; the first position if it is not given.
 
-    Raises
-    ------
-    InputError
-        Naming the file and the line.
+    Raises `InputError`: naming the file and the line.
     """
     if not path.exists():
         raise InputError(f"{path} does not exist; give a file of measurements.")
@@ -92,10 +84,7 @@ def _shifted(row: MeasurementRow, offset_s: float) -> MeasurementRow:
 def needed(sigma: float | None, path: Path) -> float:
     """Return a sigma that has to be given.
 
-    Raises
-    ------
-    InputError
-        If it was not.
+    Raises `InputError` if it was not.
     """
     if sigma is None or not sigma > 0:
         raise InputError(f"{path} states no sigmas; give --sigma (metres of a position; rad/s, rad of an IMU).")

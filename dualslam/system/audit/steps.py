@@ -27,12 +27,8 @@ class Steps:
 def measure_steps(times_s: FloatArray, centres: FloatArray) -> Steps:
     """Compare each step of a trajectory with the median of those about it.
 
-    Parameters
-    ----------
-    times_s : (N,)
-        Ascending; some may repeat.
-    centres : (N, 3)
-        Of the camera.
+    - `times_s` (N,): ascending; some may repeat.
+    - `centres` (N, 3): of the camera.
     """
     interval_s = np.diff(times_s)
     least_s = MIN_INTERVAL_SHARE * float(np.median(interval_s[interval_s > 0])) if (interval_s > 0).any() else 1e-9

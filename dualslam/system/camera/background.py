@@ -157,19 +157,11 @@ class Calibrations:
 def merge_calibrated(live: Submap, base: Submap, answer: CalibrationAnswer) -> Submap:
     """Return a copy of a submap changed to another camera as its snapshot was; what has come since follows.
 
-    Parameters
-    ----------
-    live : Submap
-        In its current state: grown, solved again, merged with what a walk found.
-    base : Submap
-        The snapshot.
-    answer : CalibrationAnswer
-        Its `submap` is the snapshot, changed.
+    - `live`: in its current state: grown, solved again, merged with what a walk found.
+    - `base`: the snapshot.
+    - `answer`: its `submap` is the snapshot, changed.
 
-    Raises
-    ------
-    InputError
-        If features have no place in the corrected image.
+    Raises `InputError` if features have no place in the corrected image.
     """
     changed, merged = answer.submap, live.copy()
     if not _same_gauge(live, base):

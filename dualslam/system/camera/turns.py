@@ -46,14 +46,9 @@ def with_turn_of_poses(
 
     Matches to the frame before tell it before there is a pose, and take a part of what the camera has moved for a turn.
 
-    Parameters
-    ----------
-    submap : Submap
-        In which the frame is posed.
-    before : FramePose or None
-        Of the frame before it.
-    camera : Camera
-        That rectified the frame's pixels.
+    - `submap`: in which the frame is posed.
+    - `before`: of the frame before it.
+    - `camera`: that rectified the frame's pixels.
     """
     view = track.view
     if view.turn_rad is None or before is None or before.submap_id != submap.id:

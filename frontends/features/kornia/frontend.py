@@ -38,10 +38,7 @@ class KorniaFrontend(OptionedFrontend):
 
     `n_features`: keypoints per image, at most.
 
-    Raises
-    ------
-    ConfigError
-        There is no such device; a checkpoint is not there or does not fit.
+    Raises `ConfigError`: there is no such device; a checkpoint is not there or does not fit.
     """
 
     name = "kornia"
@@ -73,10 +70,7 @@ class KorniaFrontend(OptionedFrontend):
 
         `image` (H, W) or (H, W, 3) RGB uint8: of any size; a flat or a tiny one has no features.
 
-        Raises
-        ------
-        InputError
-            The array is no such image.
+        Raises `InputError`: the array is no such image.
         """
         grey = to_grey(image)
         # A flat image, too, has a best keypoint, for a network that keeps the best ones whatever they are.
@@ -134,10 +128,7 @@ class KorniaFrontend(OptionedFrontend):
 def choose_device(name: str) -> torch.device:
     """Return the device that the config names; `auto` is CUDA where torch sees it.
 
-    Raises
-    ------
-    ConfigError
-        CUDA is asked for and torch sees none.
+    Raises `ConfigError`: CUDA is asked for and torch sees none.
     """
     if name == "cuda" and not torch.cuda.is_available():
         raise ConfigError(

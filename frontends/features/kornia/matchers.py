@@ -24,10 +24,7 @@ MIN_FEATURES = 2
 def build_matcher(options: KorniaOptions, device: torch.device) -> Matcher:
     """Return the matcher that the options name.
 
-    Raises
-    ------
-    ConfigError
-        LightGlue's checkpoint is not there or does not fit.
+    Raises `ConfigError`: LightGlue's checkpoint is not there or does not fit.
     """
     if options.matcher == "smnn":
         return lambda a, b, of_a, of_b: _to_host(kf.match_smnn(of_a, of_b, options.ratio)[1])

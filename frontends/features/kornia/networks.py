@@ -17,12 +17,8 @@ OPTION = "weights"
 class Network:
     """One of the networks.
 
-    Parameters
-    ----------
-    n_candidates : int
-        Keypoints per image, at most.
-    weights : Path or None
-        See `KorniaOptions`.
+    - `n_candidates`: keypoints per image, at most.
+    - `weights`: see `KorniaOptions`.
     """
 
     def __init__(self, name: str, n_candidates: int, device: torch.device, weights: Path | None) -> None:

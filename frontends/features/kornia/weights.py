@@ -31,10 +31,8 @@ class Checkpoint:
 
         None: the one in torch's cache, or else the one that the extra's package of weights brings.
 
-        Raises
-        ------
-        ConfigError
-            It is not there: the message says where it was sought and where it is published. `option` names it.
+        Raises `ConfigError`: it is not there: the message says where it was sought and where it is published. `option`
+        names it.
         """
         folder = Path(torch.hub.get_dir()) / "checkpoints" if path is None else path
         file = folder / self.file if path is None or path.is_dir() else path
@@ -60,17 +58,10 @@ class Checkpoint:
     ) -> None:
         """Find the file and put it into a module, which is then ready to be used.
 
-        Parameters
-        ----------
-        option, path
-            See `find`.
-        rename : mapping, optional
-            Old starts of the names of the state to new ones, where the publisher called them otherwise.
+        - `option`, `path`: see `find`.
+        - `rename`: old starts of the names of the state to new ones, where the publisher called them otherwise.
 
-        Raises
-        ------
-        ConfigError
-            It is not there, cannot be read, or does not fit.
+        Raises `ConfigError`: it is not there, cannot be read, or does not fit.
         """
         file = self.find(option, path)
         state = self._read(option, file)
