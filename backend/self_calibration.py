@@ -115,19 +115,12 @@ def find_preferred_camera(
 ) -> PreferredCamera | None:
     """Say which camera some keyframes of a submap would rather have, however little they know of it.
 
-    Parameters
-    ----------
-    submap : Submap
-        Is not changed.
-    keyframe_ids : (K,) int64
-        Ascending.
-    camera, config, robust_k, seed, present_covariance
-        As for `estimate_calibration`. Without `CalibrationConfig.refine` the camera is taken at its word.
+    - `submap`: is not changed.
+    - `keyframe_ids` (K,): ascending.
+    - `camera`, `config`, `robust_k`, `seed`, `present_covariance`: as for `estimate_calibration`. Without
+      `CalibrationConfig.refine` the camera is taken at its word.
 
-    Returns
-    -------
-    PreferredCamera or None
-        None where they say nothing.
+    Returns PreferredCamera or None: none where they say nothing.
     """
     problem = _ask(submap, keyframe_ids, camera, config, seed) if config.refine else None
     if problem is None or isinstance(problem, Failure):
@@ -165,18 +158,11 @@ def estimate_correction(
     that of neither alone. It is at most the sum of both, as if each had data of its own, and that is what is asked for:
     what they have in common, systematic errors first of all, does not tell which one is right.
 
-    Parameters
-    ----------
-    problem : BundleProblem
-        In the rectified pixels of the camera as it was given; `fixed` is not looked at.
-    width_px : int
-        Of the image: the prior of the principal point is relative to it.
-    present : LensCorrection
-        That the poses and points were made with.
-    config : CalibrationConfig
-    robust_k : float
-    present_covariance : (5, 5), optional
-        Of `present`, if it was estimated; the calibration that was given is taken at its word.
+    - `problem`: in the rectified pixels of the camera as it was given; `fixed` is not looked at.
+    - `width_px`: of the image: the prior of the principal point is relative to it.
+    - `present`: that the poses and points were made with.
+    - `present_covariance` (5, 5): of `present`, if it was estimated; the calibration that was given is taken at its
+      word.
     """
     start = time.perf_counter()
     answer = _answer(problem, width_px, present, config, robust_k, present_covariance)
@@ -205,28 +191,14 @@ def estimate_correction(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Answer:
-    """A problem's information on its camera, as if pixels erred by `INFLATION` times as much.
+    """A problem's information on its camera, as if pixels erred by `INFLATION` times as much."""
 
-    Attributes
-    ----------
-    best : CalibratedOptimum
-        As they err.
-    prior : (5,)
-        Sigmas.
-    correction : (5,)
-    covariance : (5, 5)
-    off : (5,)
-        The correction less the present one.
-    of_difference : (5, 5)
-        Its covariance.
-    """
-
-    best: CalibratedOptimum
-    prior: FloatArray
-    correction: FloatArray
-    covariance: FloatArray
-    off: FloatArray
-    of_difference: FloatArray
+    best: CalibratedOptimum  # as they err
+    prior: FloatArray  # (5,): sigmas
+    correction: FloatArray  # (5,)
+    covariance: FloatArray  # (5, 5)
+    off: FloatArray  # (5,): the correction less the present one
+    of_difference: FloatArray  # (5, 5): its covariance
 
     @property
     def distance2(self) -> float:

@@ -36,28 +36,17 @@ NEWEST_CHI2_CAP = 625.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """A window to be adjusted. Observations are sorted by point.
+    """A window to be adjusted. Observations are sorted by point."""
 
-    Attributes
-    ----------
-    K : (3, 3)
-    T_submap_kf : (F, 4, 4)
-        The free ones first.
-    n_free : int
-    xyz_mu : (P, 3)
-    pose, point : (R,) int64
-        Rows of `T_submap_kf` and `xyz_mu` of each observation.
-    uv_px : (R, 2), sigma_px : (R,)
-    """
-
-    K: FloatArray
-    T_submap_kf: FloatArray
+    K: FloatArray  # (3, 3)
+    T_submap_kf: FloatArray  # (F, 4, 4): the free ones first
     n_free: int
-    xyz_mu: FloatArray
-    pose: IntArray
-    point: IntArray
-    uv_px: FloatArray
-    sigma_px: FloatArray
+    xyz_mu: FloatArray  # (P, 3)
+    # Rows of `T_submap_kf` and `xyz_mu` of each observation.
+    pose: IntArray  # (R,)
+    point: IntArray  # (R,)
+    uv_px: FloatArray  # (R, 2)
+    sigma_px: FloatArray  # (R,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -74,19 +74,30 @@ def build_system(
 ) -> System:
     """Build a system from its config.
 
-    - `camera`: lens model and size of the images that `System.step` will be given.
-    - `saved`: a map to find frames in and to extend (`load_atlas`); it becomes the system's own. Its camera, as it was
-      found out, is taken as known.
-    - `localise`: find poses in the saved map, and add nothing to it.
-    - `new_graph`: makes the factor graph of a submap, each time anew, instead of `ISam2SubmapGraph`; in one process
-      alone.
-    - `schedule`: when answers of background work are used (`dualslam/core/schedule.py`): `After` so many frames, or as
-      `Recorded` by another run. By default at once without workers, else after `DELAYS`, and in real time as they come.
-    - `in_process`: whether the workers' jobs are done in this process; the schedule is the same. So they are for
-      `Recorded`.
+    Parameters
+    ----------
+    camera : Camera
+        Lens model and size of the images that `System.step` will be given.
+    saved : StoredMap, optional
+        A map to find frames in and to extend (`load_atlas`); it becomes the system's own. Its camera, as it was found
+        out, is taken as known.
+    localise : bool
+        Find poses in the saved map, and add nothing to it.
+    new_graph : callable, optional
+        Makes the factor graph of a submap, each time anew, instead of `ISam2SubmapGraph`; in one process alone.
+    schedule : Policy, optional
+        When answers of background work are used (`dualslam/core/schedule.py`): `After` so many frames, or as
+        `Recorded` by another run. By default at once without workers, else after `DELAYS`, and in real time as they
+        come.
+    in_process : bool
+        Whether the workers' jobs are done in this process; the schedule is the same. So they are for `Recorded`.
 
-    Raises `InputError`: as `check_given`; and where graphs of one's own are to go into other processes.
-    Raises `ConfigError`: as `check_config`, and where an extra or weights that a front end needs are missing.
+    Raises
+    ------
+    InputError
+        As `check_given`; and where graphs of one's own are to go into other processes.
+    ConfigError
+        As `check_config`, and where an extra or weights that a front end needs are missing.
     """
     check_config(config)
     check_given(camera, saved)

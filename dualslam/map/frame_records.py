@@ -13,36 +13,23 @@ from dualslam.core.types import Failure, FloatArray, FrameMethod, FrameStatus
 
 @dataclass(slots=True)
 class FrameRow:
-    """Record of one frame so far: a row of ``frames.csv``. Reverse tracking may still pose it later.
+    """Record of one frame so far: a row of ``frames.csv``. Reverse tracking may still pose it later."""
 
-    Attributes
-    ----------
-    index : int
-        The frame's number inside the system; its index in the source in what a run leaves behind.
-    submap : int or None
-        The one that it is in.
-    in_main_map : bool or None
-        None in `System.rows`: it is known once a run has ended, to `dualslam.frame_rows` and ``frames.csv``.
-    sigma_position_rel, sigma_scale : float or None
-        What the map claims of it (`run/claims.py`), known there as well; None also where it cannot tell.
-    method : FrameMethod or None
-        How its pose was found; None without a pose.
-    doubt : str
-        Empty, or the code of a reason in the run's verdict that is about this frame; known to ``frames.csv``.
-    """
-
-    index: int
+    index: int  # the frame's number inside the system; its index in the source in what a run leaves behind
     timestamp_s: float
     status: FrameStatus
-    submap: int | None = None
+    submap: int | None = None  # the one that it is in
     in_main_map: bool | None = None
+    """None in `System.rows`: it is known once a run has ended, to `dualslam.frame_rows` and ``frames.csv``."""
     n_matches: int = 0
     n_inliers: int = 0
     latency_ms: float = 0.0
+    # What the map claims of it (`run/claims.py`), known there as well; None also where it cannot tell.
     sigma_position_rel: float | None = None
     sigma_scale: float | None = None
-    method: FrameMethod | None = None
+    method: FrameMethod | None = None  # how its pose was found; None without a pose
     doubt: str = ""
+    """Empty, or the code of a reason in the run's verdict that is about this frame; known to ``frames.csv``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -39,24 +39,12 @@ PACKAGES_OF_EXTRAS = ("torch", "kornia")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectories:
-    """All poses of a run.
+    """All poses of a run."""
 
-    Attributes
-    ----------
-    main_submaps : list of int
-        The largest linked set of submaps, by the number of posed frames: the main map.
-    main : Trajectory
-        Frames posed in it.
-    unlinked : dict of int to Trajectory
-        Each other submap, in its own unit.
-    S_world_submap : dict of int to (4, 4) float64
-        Where the main submaps lie.
-    """
-
-    main_submaps: list[int]
-    main: Trajectory
-    unlinked: dict[int, Trajectory]
-    S_world_submap: dict[int, FloatArray]
+    main_submaps: list[int]  # the largest linked set of submaps, by the number of posed frames: the main map
+    main: Trajectory  # frames posed in it
+    unlinked: dict[int, Trajectory]  # each other submap, in its own unit
+    S_world_submap: dict[int, FloatArray]  # dict of int to (4, 4) float64: where the main submaps lie
 
 
 def trajectories_of(system: System) -> Trajectories:

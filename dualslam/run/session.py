@@ -87,12 +87,7 @@ class Watcher(Protocol):
 
 
 class Watchers:
-    """Several who look on, as one: the run waits where any of them wants it to.
-
-    Parameters
-    ----------
-    watchers : sequence of Watcher
-    """
+    """Several who look on, as one: the run waits where any of them wants it to."""
 
     def __init__(self, watchers: Iterable[Watcher]) -> None:
         self._all = tuple(watchers)
@@ -119,23 +114,12 @@ class Watchers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """A run that has been written down.
-
-    Attributes
-    ----------
-    out : Path
-    summary : dict
-        As in ``summary.json``.
-    report : RunReport
-    system : System
-        With the whole map.
-    trajectories : Trajectories
-    """
+    """A run that has been written down."""
 
     out: Path
-    summary: dict[str, Any]
+    summary: dict[str, Any]  # as in ``summary.json``
     report: RunReport
-    system: System
+    system: System  # with the whole map
     trajectories: Trajectories
 
     @property
@@ -311,28 +295,13 @@ def save_system(
 ) -> None:
     """Write the run folder of a finished system that a program fed by itself.
 
-    Parameters
-    ----------
-    system : System
-    config : Config
-    camera : Camera
-        As it was given.
-    report : RunReport
-    out : path
-    overwrite : bool
-    measurements : iterable of MeasurementSource
-    given : mapping, optional
-        What the summary says of the run's origin besides, or instead.
-    colours : mapping of int to (N, 3) uint8, optional
-        Of each submap's landmarks.
-    reasons : iterable of Reason
-        What is known against the run besides.
+    - `camera`: as it was given.
+    - `given`: what the summary says of the run's origin besides, or instead.
+    - `colours` (mapping of int to (N, 3) uint8): of each submap's landmarks.
+    - `reasons`: what is known against the run besides.
 
-    Raises
-    ------
-    InputError
-        If the measurements cannot belong to the map; the folder is written without them.
-    OutputError
+    Raises `InputError` if the measurements cannot belong to the map; the folder is written without them.
+    Raises `OutputError`.
     """
     sequence = _Fed(camera)
     check_out(out, overwrite=overwrite)
@@ -412,9 +381,7 @@ def check_out(
 ) -> None:
     """Refuse a folder that a run must not write to. `run_to_folder` asks too: this is for who computes before it.
 
-    Raises
-    ------
-    InputError, OutputError
+    Raises `InputError`, `OutputError`.
     """
     if replay is not None and Path(out).resolve() == Path(replay).resolve():
         raise InputError(f"{out} holds the run that is to be repeated; give another folder to write to.")

@@ -99,21 +99,12 @@ def open_images_of_run(
 
     Its camera is not the run's: that is in the map.
 
-    Parameters
-    ----------
-    source : path or str
-        As in `open_source`.
-    size_px : (width, height)
-        Of the run's images.
-    topic : str, optional
-        That the run has read, of a bag.
-    pictures : mapping of int to bytes, optional
-        Small JPEGs of the run's frames, by their index in the source.
+    - `source`: as in `open_source`.
+    - `size_px` (width, height): of the run's images.
+    - `topic`: that the run has read, of a bag.
+    - `pictures`: small JPEGs of the run's frames, by their index in the source.
 
-    Raises
-    ------
-    InputError
-        If it cannot be read, is live, or has images of another size, or others than `pictures`.
+    Raises `InputError` if it cannot be read, is live, or has images of another size, or others than `pictures`.
     """
     has_camera = str(source).startswith(SYNTHETIC)  # recordings may have one, and that comes before a field of view
     fov_degrees, unit = (None, None) if has_camera else (ANY_FOV_DEG, "s")  # times do not matter
@@ -194,9 +185,7 @@ def make_world(
 
     `visit`, `backwards`: see `make_sequence`.
 
-    Raises
-    ------
-    InputError
+    Raises `InputError`.
     """
     try:
         return make_sequence(name, n_frames, seed, width, height, events, **visit)
@@ -207,9 +196,7 @@ def make_world(
 def read_script(path: str | Path) -> list[Mapping[str, Any]]:
     """Read a script of disturbances: a YAML list of mappings with `kind`, `start`, `length` and perhaps `strength`.
 
-    Raises
-    ------
-    InputError
+    Raises `InputError`.
     """
     try:
         items = strict_yaml.loads(Path(path).read_text(encoding="utf-8"))
@@ -228,9 +215,7 @@ def read_script(path: str | Path) -> list[Mapping[str, Any]]:
 def parse_world(source: str) -> SyntheticSequence:
     """Make the world that ``synthetic:NAME,key=value,...`` names.
 
-    Raises
-    ------
-    InputError
+    Raises `InputError`.
     """
     name, *pairs = source.removeprefix(SYNTHETIC).split(",")
     numbers, events = dict(WORLD_NUMBERS), None

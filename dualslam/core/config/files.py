@@ -27,20 +27,11 @@ Model = TypeVar("Model", bound=BaseModel)
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """One field set over whatever the file says.
+    """One field set over whatever the file says."""
 
-    Attributes
-    ----------
-    path : tuple of str
-        Names from the root of the config to the field.
-    value : Any
-    source : str
-        What the user wrote, for error messages.
-    """
-
-    path: tuple[str, ...]
+    path: tuple[str, ...]  # names from the root of the config to the field
     value: Any
-    source: str
+    source: str  # what the user wrote, for error messages
 
     def sets(self, field: tuple[str | int, ...]) -> bool:
         """Whether it sets a field, a part of it, or what it is a part of."""
@@ -50,10 +41,7 @@ class Override:
     def parse(cls, text: str) -> Override:
         """Read ``key.path=value``, the value as YAML (``true``, ``null``, ``1e-3``, ``[1, 2]``, a word).
 
-        Raises
-        ------
-        ConfigError
-            Where there is no ``=``, a name is empty or the value is not YAML.
+        Raises `ConfigError`: where there is no ``=``, a name is empty or the value is not YAML.
         """
         key, equals, value = text.partition("=")
         path = tuple(part.strip() for part in key.split("."))
@@ -98,10 +86,7 @@ def load_run_config(folder: str | Path, overrides: Iterable[str | Override] = ()
 
     Fields that this version does not have are left out; a warning names them.
 
-    Raises
-    ------
-    ConfigError
-        As of `load_config`, for all else.
+    Raises `ConfigError`: as of `load_config`, for all else.
     """
     path = Path(folder) / CONFIG
     data = _read(path)
@@ -132,9 +117,7 @@ def _unknown_fields(data: dict[str, Any]) -> list[tuple[int | str, ...]]:
 def config_from_dict(data: Mapping[str, Any], source: str = "config") -> Config:
     """Make the configuration from nested plain values, as strictly as `load_config` does.
 
-    Raises
-    ------
-    ConfigError
+    Raises `ConfigError`.
     """
     if not isinstance(data, Mapping):
         raise ConfigError(
@@ -146,9 +129,7 @@ def config_from_dict(data: Mapping[str, Any], source: str = "config") -> Config:
 def model_from_dict(model: type[Model], data: Mapping[str, Any], source: str) -> Model:
     """Make any strict model from nested plain values, with errors as `load_config` words them.
 
-    Raises
-    ------
-    ConfigError
+    Raises `ConfigError`.
     """
     return _validate(dict(data), source, [], model)
 
@@ -156,10 +137,7 @@ def model_from_dict(model: type[Model], data: Mapping[str, Any], source: str) ->
 def dump_config(config: BaseModel) -> str:
     """Return the whole configuration as YAML, each field under a comment that says what it means.
 
-    Raises
-    ------
-    ConfigError
-        If it is no configuration.
+    Raises `ConfigError` if it is no configuration.
     """
     if not isinstance(config, BaseModel):
         raise ConfigError(f"the configuration is a {type(config).__name__}; load_config or config_from_dict makes one")
