@@ -1,17 +1,6 @@
 """iSAM2 and batch Levenberg-Marquardt behind calls that raise one kind of failure and never hand on a dead solver.
 
-Settings, measured on a corridor of 300 to 400 keyframes with 250 observations each (CPU time, the solver alone).
-chi2 is that of the newest observations, median and 90th percentile over the updates: 0.8 at the optimum.
-
-=========================================================  ===================  ========  ==================
-what                                                       ms per update        chi2      cost over optimum
-=========================================================  ===================  ========  ==================
-default order of elimination, every variable checked       14, 106 at 200       0.8, 0.9  2.5 %
-30 newest poses last, checked down the tree only           12, 20 at 400        1.8, 5.3  4.6 %
-30 newest poses last, every variable checked               12, 34 at 400        0.8, 1.0  1.1 %
-the same, thresholds halved, relinearised each third time  12, flat (p95 30)    1.0, 1.9  0.5 %
-and also after an update whose newest fit badly            12, flat (p95 30)    0.9, 1.6  0.5 %
-=========================================================  ===================  ========  ==================
+The settings were measured on a corridor (`docs/notes/2026-11-28-isam2-newest-poses-last.md`).
 
 By default iSAM2 eliminates last whatever the new factors touch: here the 250 landmarks in view, so that its root is a
 dense block of some 800 columns. Naming the newest poses instead leaves the landmarks to go first, each a clique of its

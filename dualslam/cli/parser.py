@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
@@ -436,33 +437,23 @@ def _positive(text: str) -> int:
     return _integer(text, 1)
 
 
-def _length(text: str) -> float:
+def _number(text: str, low: float, high: float, kind: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        value = 0.0
-    if not SHORTEST_M <= value <= LONGEST_M:
-        raise argparse.ArgumentTypeError(
-            f"must be a length in metres above 0, {SHORTEST_M:g} to {LONGEST_M:g}, not {text!r}"
-        )
+        value = low - 1.0
+    if not low <= value <= high:
+        raise argparse.ArgumentTypeError(f"must be {kind}, not {text!r}")
     return value
+
+
+def _length(text: str) -> float:
+    return _number(text, SHORTEST_M, LONGEST_M, f"a length in metres above 0, {SHORTEST_M:g} to {LONGEST_M:g}")
 
 
 def _rate(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.1 <= value <= 1e4:
-        raise argparse.ArgumentTypeError(f"must be a rate between 0.1 and 10000 Hz, not {text!r}")
-    return value
+    return _number(text, 0.1, 1e4, "a rate between 0.1 and 10000 Hz")
 
 
 def _angle(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 1 <= value < 180:
-        raise argparse.ArgumentTypeError(f"must be an angle between 1 and 180 degrees, not {text!r}")
-    return value
+    return _number(text, 1.0, math.nextafter(180.0, 0.0), "an angle between 1 and 180 degrees")

@@ -21,10 +21,7 @@ class GmsOptions(OrbOptions):
 
 
 class GmsFrontend(OrbFrontend):
-    """ORB with another `match_wide`; all else is ORB's. Implements `Frontend`.
-
-    `n_features`: keypoints per image, at most.
-    """
+    """ORB with another `match_wide`; all else is ORB's. Implements `Frontend`."""
 
     name = "gms"
     options: GmsOptions

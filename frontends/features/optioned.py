@@ -11,12 +11,15 @@ from dualslam.frontends.registry import parse_options
 
 
 class OptionedFrontend:
-    """A front end that is made of a number of features and its own strict options."""
+    """A front end that is made of a number of features and its own strict options.
+
+    `n_features`: keypoints per image, at most.
+    """
 
     name: str
     options_model: ClassVar[type[BaseModel]]  # of its options
 
-    def __init__(self, n_features: int, options: Any = None) -> None:
+    def __init__(self, n_features: int = 1500, options: Any = None) -> None:
         self.n_features = n_features
         self.options = options or self.options_model()
 

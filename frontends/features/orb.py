@@ -1,41 +1,7 @@
 """ORB features (Rublee et al. 2011) on our own pyramid, with well-spread corners and sub-pixel positions.
 
-The numbers below were measured on 25 pairs of KITTI 03 (1 to 6 frames apart) and 7-Scenes (10 and 25 apart), 1500
-features, epipolar geometry fitted to the matches themselves (PoseLib).
-
-Noise. Residuals grow in proportion to the octave's scale, so sigma is a multiple of it. Where the sub-pixel step found
-an extremum, 1.96 sigma covers 95 % of the matches at sigma = 0.20-0.22 (KITTI) and 0.38-0.42 (7-Scenes, whose camera
-is nominal), elsewhere at 0.56-0.65. With 0.45 and 0.65, 98 % (KITTI) and 94-96 % (7-Scenes) lie within 1.96 sigma. The
-tails are heavier than Gaussian: the core alone has a sigma four times smaller on KITTI.
-
-Soft images. In a blurred image noise makes FAST's corners, and places those on its soft edges. Two frames of rendered
-streets had a blur of 5 px and a noise of 2 grey levels. Half of the corners were 2 to 3 pixels of their octave off, at
-a sigma of 0.45, and matched by their surroundings all the same. A map of such corners only repeats its motion model.
-Two measures separate them: the contrast, and the least curvature at the extremum of the sub-pixel step. Both are
-relative to the noise (median error in pixels of the octave):
-
-    ======================  =======  =======  ======  =======  =======  =============
-    contrast                below 4  4 to 6   6 to 8  8 to 12  over 12  sharp streets
-    ======================  =======  =======  ======  =======  =======  =============
-    below 3 sigmas          2.6-3.9  1.6-3.0  1.3-1.7 1.4-2.1  0.9-1.7  0.6-1.6
-    above                   -        -        -       -        0.2-0.5  0.3-0.8
-    ======================  =======  =======  ======  =======  =======  =============
-
-Noise alone makes corners of a contrast of up to 4: less than 5 is no corner. One that noise has placed along an edge of
-a sharp image has a sigma of 1.5. In an image so soft that they are many, they do not count.
-
-Descriptor distances, in bits of 256 (20 pairs: KITTI 1 and 3 frames apart, 7-Scenes 5 and 25; the wrong ones over all):
-
-    ======================================  ====  ====  ====  ====  ====
-    share with a distance of at most          40    50    70    80    90
-    ======================================  ====  ====  ====  ====  ====
-    same point, KITTI 1 frame apart         81 %  89 %  95 %  97 %  97 %
-    same point, 7-Scenes 25 frames apart    65 %  79 %  91 %  93 %  96 %
-    best wrong one within 15 px              3 %   8 %  25 %  38 %  50 %
-    best wrong one of the whole image        4 %  17 %  83 %  99 % 100 %
-    ======================================  ====  ====  ====  ====  ====
-
-So 80 with a guide, beyond which far more wrong ones come in than right ones are gained, and 50 without.
+The defaults of noise and distances were measured on pairs of KITTI and 7-Scenes:
+`docs/notes/2026-11-28-noise-and-distances-of-orb-and-sift.md`.
 """
 
 from __future__ import annotations
@@ -75,7 +41,7 @@ PATCHES_AT_ONCE = 128
 MARGIN_PX = PATCH_RADIUS_PX + 1
 """Rim of each level without corners, so that the orientation sees nothing beyond the image."""
 NOISE_CONTRAST = 5.0
-"""Contrast of a corner, relative to the noise, that noise does not make (module docstring)."""
+"""Contrast of a corner, relative to the noise, that noise does not make (see the note)."""
 SHARP_SHARE = 2 / 3
 """Share of its corners that a sharp image places. At least 76 % in the frames of four recordings (median 94 to 96 %).
 53 % in KITTI's under a blur of 4 px, a tenth in those of rendered streets under one of 5 px."""
@@ -100,13 +66,13 @@ class OrbOptions(StrictModel):
     cell_px: int = Field(32, ge=8)
     """Side of these cells, pixels of the level."""
     sigma_px: float = Field(0.45, gt=0.0)
-    """Noise of a position in pixels of its octave, where the sub-pixel step found an extremum (module docstring)."""
+    """Noise of a position in pixels of its octave, where the sub-pixel step found an extremum (see the note)."""
     sigma_unrefined_px: float = Field(0.65, gt=0.0)
     """The same for the others, about one in ten, which stay at a whole pixel."""
     sigma_unplaced_px: float = Field(1.5, gt=0.0)
-    """The same where it is the image's noise that places the corner, along an edge (module docstring)."""
+    """The same where it is the image's noise that places the corner, along an edge (see the note)."""
     max_distance: float = Field(80.0, gt=0.0, le=256.0)
-    """Differing bits up to which a guided match is believed (module docstring)."""
+    """Differing bits up to which a guided match is believed (see the note)."""
     max_distance_strict: float = Field(50.0, gt=0.0, le=256.0)
     """The same without a guide."""
     ratio: float = Field(0.85, gt=0.0, le=1.0)
@@ -114,10 +80,7 @@ class OrbOptions(StrictModel):
 
 
 class OrbFrontend(OptionedFrontend):
-    """FAST corners, intensity-centroid orientation, rotated BRIEF descriptors of 256 bits. Implements `Frontend`.
-
-    `n_features`: keypoints per image, at most.
-    """
+    """FAST corners, intensity-centroid orientation, rotated BRIEF descriptors of 256 bits. Implements `Frontend`."""
 
     name = "orb"
     options: OrbOptions

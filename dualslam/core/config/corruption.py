@@ -11,35 +11,81 @@ from dualslam.core.config.strict_model import StrictModel
 
 
 class CorruptionKind(StrEnum):
-    """Kinds of corruption; in brackets the meaning of `Corruption.strength`."""
+    """Kinds of corruption: name, default, lowest and highest strength; in brackets what it means."""
 
-    WIPE = "wipe"  # fog, or a blank wall before the lens: texture fades to flat shade (fraction)
-    OCCLUSION = "occlusion"  # something textured moves through the image (fraction of the image that it hides)
-    BLUR = "blur"  # out of focus (standard deviation in pixels of a 640 pixels wide image)
-    MOTION_BLUR = "motion_blur"  # the camera shakes while the shutter is open (pixels of a 640 pixels wide image)
-    BLACKOUT = "blackout"  # the lens is covered (fraction of the light that is lost)
-    EXPOSURE = "exposure"  # too bright or too dark (stops, positive is brighter)
-    NOISE = "noise"  # sensor noise (standard deviation, grey levels)
-    FREEZE = "freeze"  # the camera delivers the last image again and again (without meaning)
-    DROP = "drop"  # the frames do not arrive (without meaning)
-    STRIDE = "stride"  # one frame of so many arrives (their number)
-    FEW_FEATURES = "few_features"  # the detector finds little (fraction of the features that is lost)
-    WRONG_POSE = "wrong_pose"  # a wrong pose goes into the map as a keyframe (degrees; moved by as much of the depth)
-    KILL_WORKER = "kill_worker"  # the first recovery that starts in the frames loses its process (without meaning)
-    SOLVER_ERROR = "solver_error"  # the live graph fails once, at the first keyframe of the frames (without meaning)
-    SHUTTER = "shutter"  # rendered worlds: the shutter stays open (fraction of the time between frames)
-    ROTATION = "rotation"  # rendered worlds: the camera is swung aside and back (degrees, positive to the right)
-    FOCAL = "focal"  # the calibration's focal length is wrong (factor)
-    RESOLUTION = "resolution"  # the calibration is that of images of another size (factor)
-    NO_DISTORTION = "no_distortion"  # the calibration lacks the lens distortion (without meaning)
-    CLOCK_UNIT = "clock_unit"  # times are in another unit than seconds (units a second)
-    CLOCK_JITTER = "clock_jitter"  # times scatter evenly (fraction of the time between frames)
-    CLOCK_REPEAT = "clock_repeat"  # neighbouring frames share the time of their first (their number)
-    CAB = "cab"  # a driver's cab about the windscreen stands still in the image (share of the image)
-    BONNET = "bonnet"  # a car's bonnet stands still at the lower edge (share of the image)
-    BARS = "bars"  # black bars on the left and on the right, as about an upright film (share of the image)
-    LOGO = "logo"  # a logo in the upper right corner (share of the image)
-    CLOCK = "clock"  # a clock in the lower left corner, whose digits change (share of the image)
+    default: float
+    lowest: float
+    highest: float
+
+    def __new__(cls, name: str, default: float, lowest: float, highest: float) -> Self:
+        """Make a kind whose value is its name."""
+        kind = str.__new__(cls, name)
+        kind._value_ = name
+        kind.default, kind.lowest, kind.highest = default, lowest, highest
+        return kind
+
+    WIPE = "wipe", 1.0, 0.0, 1.0  # fog, or a blank wall before the lens: texture fades to flat shade (fraction)
+    OCCLUSION = (
+        "occlusion",
+        0.4,
+        0.0,
+        1.0,
+    )  # something textured moves through the image (fraction that it hides)
+    BLUR = "blur", 5.0, 0.0, 100.0  # out of focus (standard deviation in pixels of a 640 pixels wide image)
+    MOTION_BLUR = (
+        "motion_blur",
+        30.0,
+        0.0,
+        400.0,
+    )  # the camera shakes (pixels of a 640 pixels wide image)
+    BLACKOUT = "blackout", 1.0, 0.0, 1.0  # the lens is covered (fraction of the light that is lost)
+    EXPOSURE = "exposure", 2.5, -8.0, 8.0  # too bright or too dark (stops, positive is brighter)
+    NOISE = "noise", 25.0, 0.0, 200.0  # sensor noise (standard deviation, grey levels)
+    FREEZE = "freeze", 1.0, 0.0, 1.0  # the camera delivers the last image again and again
+    DROP = "drop", 1.0, 0.0, 1.0  # the frames do not arrive
+    STRIDE = "stride", 3.0, 2.0, 1000.0  # one frame of so many arrives (their number)
+    FEW_FEATURES = "few_features", 0.8, 0.0, 1.0  # the detector finds little (fraction of the features that is lost)
+    WRONG_POSE = (
+        "wrong_pose",
+        15.0,
+        0.0,
+        180.0,
+    )  # a wrong keyframe (degrees; moved by as much of the depth)
+    KILL_WORKER = (
+        "kill_worker",
+        1.0,
+        0.0,
+        1.0,
+    )  # the first recovery that starts in the frames loses its process
+    SOLVER_ERROR = (
+        "solver_error",
+        1.0,
+        0.0,
+        1.0,
+    )  # the live graph fails at the first keyframe of the frames
+    SHUTTER = "shutter", 1.0, 0.0, 4.0  # rendered worlds: the shutter stays open (fraction of the time between frames)
+    ROTATION = (
+        "rotation",
+        60.0,
+        -180.0,
+        180.0,
+    )  # rendered worlds: swung aside and back (degrees, positive to the right)
+    FOCAL = "focal", 0.8, 0.1, 10.0  # the calibration's focal length is wrong (factor)
+    RESOLUTION = "resolution", 0.5, 0.1, 10.0  # the calibration is that of images of another size (factor)
+    NO_DISTORTION = "no_distortion", 1.0, 0.0, 1.0  # the calibration lacks the lens distortion
+    CLOCK_UNIT = "clock_unit", 1000.0, 1e-9, 1e9  # times are in another unit than seconds (units a second)
+    CLOCK_JITTER = "clock_jitter", 0.5, 0.0, 0.99  # times scatter evenly (fraction of the time between frames)
+    CLOCK_REPEAT = "clock_repeat", 2.0, 2.0, 1000.0  # neighbouring frames share the time of their first (their number)
+    CAB = "cab", 0.28, 0.01, 0.8  # a driver's cab about the windscreen stands still in the image (share of the image)
+    BONNET = "bonnet", 0.15, 0.01, 0.4  # a car's bonnet stands still at the lower edge (share of the image)
+    BARS = (
+        "bars",
+        0.6,
+        0.01,
+        0.9,
+    )  # black bars left and right, as about an upright film (share of the image)
+    LOGO = "logo", 0.02, 0.001, 0.2  # a logo in the upper right corner (share of the image)
+    CLOCK = "clock", 0.01, 0.001, 0.1  # a clock in the lower left corner, whose digits change (share of the image)
 
 
 class Cause(StrEnum):
@@ -60,37 +106,6 @@ CAMERA_KINDS = frozenset({CorruptionKind.FOCAL, CorruptionKind.RESOLUTION, Corru
 CLOCK_KINDS = frozenset({CorruptionKind.CLOCK_UNIT, CorruptionKind.CLOCK_JITTER, CorruptionKind.CLOCK_REPEAT})
 
 RENDERED_KINDS = frozenset({CorruptionKind.SHUTTER, CorruptionKind.ROTATION})
-
-# kind: (default, lowest, highest strength)
-STRENGTHS: dict[CorruptionKind, tuple[float, float, float]] = {
-    CorruptionKind.WIPE: (1.0, 0.0, 1.0),
-    CorruptionKind.OCCLUSION: (0.4, 0.0, 1.0),
-    CorruptionKind.BLUR: (5.0, 0.0, 100.0),
-    CorruptionKind.MOTION_BLUR: (30.0, 0.0, 400.0),
-    CorruptionKind.BLACKOUT: (1.0, 0.0, 1.0),
-    CorruptionKind.EXPOSURE: (2.5, -8.0, 8.0),
-    CorruptionKind.NOISE: (25.0, 0.0, 200.0),
-    CorruptionKind.FREEZE: (1.0, 0.0, 1.0),
-    CorruptionKind.DROP: (1.0, 0.0, 1.0),
-    CorruptionKind.STRIDE: (3.0, 2.0, 1000.0),
-    CorruptionKind.FEW_FEATURES: (0.8, 0.0, 1.0),
-    CorruptionKind.WRONG_POSE: (15.0, 0.0, 180.0),
-    CorruptionKind.SOLVER_ERROR: (1.0, 0.0, 1.0),
-    CorruptionKind.KILL_WORKER: (1.0, 0.0, 1.0),
-    CorruptionKind.SHUTTER: (1.0, 0.0, 4.0),
-    CorruptionKind.ROTATION: (60.0, -180.0, 180.0),
-    CorruptionKind.FOCAL: (0.8, 0.1, 10.0),
-    CorruptionKind.RESOLUTION: (0.5, 0.1, 10.0),
-    CorruptionKind.NO_DISTORTION: (1.0, 0.0, 1.0),
-    CorruptionKind.CLOCK_UNIT: (1000.0, 1e-9, 1e9),
-    CorruptionKind.CLOCK_JITTER: (0.5, 0.0, 0.99),
-    CorruptionKind.CLOCK_REPEAT: (2.0, 2.0, 1000.0),
-    CorruptionKind.CAB: (0.28, 0.01, 0.8),
-    CorruptionKind.BONNET: (0.15, 0.01, 0.4),
-    CorruptionKind.BARS: (0.6, 0.01, 0.9),
-    CorruptionKind.LOGO: (0.02, 0.001, 0.2),
-    CorruptionKind.CLOCK: (0.01, 0.001, 0.1),
-}
 
 
 class Corruption(StrictModel):
@@ -114,7 +129,7 @@ class Corruption(StrictModel):
 
     @model_validator(mode="after")
     def _check_strength(self) -> Self:
-        _, low, high = STRENGTHS[self.kind]
+        low, high = self.kind.lowest, self.kind.highest
         if not low <= self.level <= high:
             raise ValueError(f"strength of {self.kind} is {self.level:g}; it must lie between {low:g} and {high:g}")
         if self.kind is CorruptionKind.ROTATION and self.length is None:
@@ -126,7 +141,7 @@ class Corruption(StrictModel):
     @property
     def level(self) -> float:
         """The strength, or the kind's default."""
-        return STRENGTHS[self.kind][0] if self.strength is None else self.strength
+        return self.kind.default if self.strength is None else self.strength
 
     @property
     def cause(self) -> Cause:

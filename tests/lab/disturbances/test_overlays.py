@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dualslam.core.config.corruption import STRENGTHS, Corruption, CorruptionKind
+from dualslam.core.config.corruption import Corruption, CorruptionKind
 from dualslam.lab.disturbances import hidden_by
 from dualslam.lab.disturbances.images import corrupt_image
 from dualslam.lab.disturbances.overlays import OVERLAYS, overlay_mask
@@ -20,7 +20,7 @@ def noise(seed: int) -> np.ndarray:
 @pytest.mark.parametrize("kind", OVERLAYS)
 def test_an_overlay_hides_its_share_and_nothing_else(kind: CorruptionKind) -> None:
     mask = overlay_mask(Corruption(kind=kind), (WIDTH, HEIGHT))
-    assert mask.mean() == pytest.approx(STRENGTHS[kind][0], abs=0.005)
+    assert mask.mean() == pytest.approx(kind.default, abs=0.005)
     for index in (0, 5):
         image = noise(index)
         hidden = corrupt_image(image, Corruption(kind=kind), index)
