@@ -26,7 +26,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run files with slow tests first: short tests are left for the end, so that no worker waits long for another."""
-    slow = {item.path for item in items if "slow" in item.keywords}
+    slow = {item.path for item in items if "slow" in item.keywords or item.path.suffix == ".ipynb"}
     items.sort(key=lambda item: item.path not in slow)
 
 

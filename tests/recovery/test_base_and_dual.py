@@ -17,10 +17,10 @@ DARK = {"kind": "blackout", "start": 30, "length": 5}
 def test_while_no_map_is_lost_both_are_the_same() -> None:
     """Also where landmarks are found again in the images, beyond frames that tracking gets over by itself."""
     world = make_sequence("street", N, 3, 320, 240, events=[DARK])
-    runs = []
+    frames, runs = list(world), []
     for enabled in (True, False):
         system = build_system(config_from_dict({"recovery": {"enabled": enabled}}), world.camera)
-        for frame in world:
+        for frame in frames:
             system.step(frame)
         assert not system.events.of_kind(EventKind.FAILED)
         runs.append(dict(system.poses))

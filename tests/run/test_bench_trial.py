@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from dualslam.cli import main
 from dualslam.lab.bench.plan import Trial, plan_trials
-from dualslam.lab.bench.record import FailureKind, TrialOutcome, faults_of, judge
+from dualslam.lab.bench.record import FailureKind, TrialOutcome, TrialRecord, faults_of, judge
 from dualslam.lab.bench.spec import BenchSpec, RightRun, load_spec
 from dualslam.lab.bench.trial_log import TrialLog
 from dualslam.run.bench_trial import describe_source, run_trial
@@ -19,7 +20,8 @@ from tests.lab.bench.dask_cluster import dask_cluster
 
 SPEC = """
 name: tiny
-sequences: [{name: room, source: "synthetic:room,frames=50,seed=2", frames: 40, returns_to_start: true}]
+sequences:
+  - {name: room, source: "synthetic:room,frames=50,seed=2,width=480,height=360", frames: 40, returns_to_start: true}
 variants: [{name: base, set: {recovery.enabled: false}}]
 conditions: [{name: gap, corruptions: [{kind: drop, frames: 3}]}]
 trials: 1
@@ -39,9 +41,18 @@ def trial(spec: BenchSpec) -> Trial:
     return trial
 
 
+@pytest.fixture(scope="module")
+def done(trial: Trial, tmp_path_factory: pytest.TempPathFactory) -> tuple[TrialRecord, Path]:
+    """The trial's line, and the folder of its bench."""
+    out = tmp_path_factory.mktemp("bench")
+    return run_trial(trial, str(out)), out
+
+
 @pytest.mark.slow
-def test_a_trial_is_a_run_folder_and_a_line(spec: BenchSpec, trial: Trial, tmp_path: Path) -> None:
-    record = run_trial(trial, str(tmp_path))
+def test_a_trial_is_a_run_folder_and_a_line(
+    spec: BenchSpec, trial: Trial, done: tuple[TrialRecord, Path], tmp_path: Path
+) -> None:
+    record, out = done
     assert record.outcome is TrialOutcome.DONE, record.error
     assert len(record.status) == 37
     assert record.initialised_at is not None
@@ -54,11 +65,12 @@ def test_a_trial_is_a_run_folder_and_a_line(spec: BenchSpec, trial: Trial, tmp_p
     assert (record.level, record.judged, record.is_still) == ("good", 0, False)
     assert record.n_clear == record.n_clear_posed > 25
     assert faults_of(record, RightRun()) == ()
-    run = tmp_path / "trials" / "room" / "gap" / "base" / "00"
+    run = out / "trials" / "room" / "gap" / "base" / "00"
     assert json.loads((run / "summary.json").read_text())["ate_rmse_m"] == pytest.approx(record.ate_m)
     assert json.loads((run / "trial.json").read_text())["start"] == trial.start
     # The same trial again takes the place of the first, with the same result but for its times.
-    again = run_trial(trial, str(tmp_path))
+    shutil.copytree(out, tmp_path / "again")
+    again = run_trial(trial, str(tmp_path / "again"))
     assert replace(again, wall_s=record.wall_s, cpu_s=record.cpu_s) == record
 
 
@@ -100,17 +112,19 @@ def test_the_command_writes_tables_and_runs_nothing_twice(tmp_path: Path, capsys
 
 
 @pytest.mark.slow
-def test_a_cluster_gives_the_line_that_this_machine_gives(trial: Trial, tmp_path: Path) -> None:
+def test_a_cluster_gives_the_line_that_this_machine_gives(
+    trial: Trial, done: tuple[TrialRecord, Path], tmp_path: Path
+) -> None:
     (tmp_path / "tiny.yaml").write_text(SPEC)
     out = tmp_path / "out"
     with dask_cluster(tmp_path) as cluster:
         command = ["bench", str(tmp_path / "tiny.yaml"), "--out", str(out), "--scheduler", cluster.address]
         assert main([*command, "--quiet"]) == 0
     (line,) = TrialLog(out / "trials.jsonl").records
-    here = run_trial(trial, str(tmp_path / "here"))
+    here, folder = done
     assert here.outcome is TrialOutcome.DONE
     assert replace(here, wall_s=line.wall_s, cpu_s=line.cpu_s) == line
-    runs = [folder / "trials" / trial.key / "trajectory.txt" for folder in (out, tmp_path / "here")]
+    runs = [each / "trials" / trial.key / "trajectory.txt" for each in (out, folder)]
     assert runs[0].read_bytes() == runs[1].read_bytes()
 
 

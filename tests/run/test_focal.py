@@ -16,6 +16,7 @@ from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.camera.models import DivisionCamera, PinholeCamera
 from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
+from dualslam.core.types import FloatArray
 from dualslam.io.map_store import save_atlas
 from dualslam.lab.synthetic import make_sequence
 from dualslam.run.focal import open_without_calibration, with_camera_found, with_camera_of_map, with_prior
@@ -30,17 +31,24 @@ def write(folder: Path, images: list[np.ndarray], exif: Image.Exif | bytes = b""
     return folder
 
 
-@pytest.mark.slow
-def test_the_beginning_tells_the_field_of_view(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def walk() -> tuple[FloatArray, list[np.ndarray]]:
+    """The camera's matrix and the images of a walk through a room."""
     world = make_sequence("room", 70, 3, 320, 240)
-    folder = write(tmp_path / "images", [world.frame(i).image for i in range(70)])
+    return world.camera.K, [frame.image for frame in world]
+
+
+@pytest.mark.slow
+def test_the_beginning_tells_the_field_of_view(walk: tuple[FloatArray, list[np.ndarray]], tmp_path: Path) -> None:
+    K, images = walk
+    folder = write(tmp_path / "images", images)
     config = Config.model_validate({"frontend": {"n_features": 800}})
     opened = open_without_calibration(str(folder), start=0, stride=1, max_frames=None)
     sequence, found = with_camera_found(config, opened)
     assert sequence.camera.K[0, 0] == pytest.approx(found.focal_px)
     low, high = found.range_px
-    assert low <= world.camera.K[0, 0] <= high
-    assert found.focal_px == pytest.approx(world.camera.K[0, 0], rel=0.1)
+    assert low <= K[0, 0] <= high
+    assert found.focal_px == pytest.approx(K[0, 0], rel=0.1)
     assert len(sequence) == 70
 
 
@@ -92,11 +100,12 @@ def test_where_nothing_moves_exif_data_are_taken_at_their_word(tmp_path: Path) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("off", [1.0, 1.6])
-def test_the_frames_are_asked_all_the_same(tmp_path: Path, off: float) -> None:
+def test_the_frames_are_asked_all_the_same(
+    walk: tuple[FloatArray, list[np.ndarray]], tmp_path: Path, off: float
+) -> None:
     """What is told may be of another lens, or of an image that was cropped: the frames have the last word."""
-    world = make_sequence("room", 70, 3, 320, 240)
-    true = world.camera.K[0, 0]
-    folder = write(tmp_path / "images", [world.frame(i).image for i in range(70)], told(off * true / 400 * 43.267))
+    true = walk[0][0, 0]
+    folder = write(tmp_path / "images", walk[1], told(off * true / 400 * 43.267))
     config = Config.model_validate({"frontend": {"n_features": 800}})
     opened = open_without_calibration(str(folder), start=0, stride=1, max_frames=None)
     _, found = with_camera_found(config, opened)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from dualslam.core.config.settings import Config
 from dualslam.core.jobs import JobKind
 from dualslam.core.schedule import After, Recorded
 from dualslam.core.types import Frame
+from dualslam.lab.synthetic import make_sequence, render_to_folder
 from dualslam.run.schedule import as_recorded
 from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import open_source
@@ -22,7 +24,12 @@ from dualslam.system.system import System
 from dualslam.testing.lossy import Lossy
 
 SOURCE = "synthetic:street,frames=46,seed=5"
-LOSS = ["recovery.workers=1", "corruptions=[{kind: blackout, start: 22, length: 6}]", "tracking.max_lost_s=0.1"]
+LOSS = [
+    "recovery.workers=1",
+    "recovery.attempts=[live]",
+    "corruptions=[{kind: blackout, start: 22, length: 6}]",
+    "tracking.max_lost_s=0.1",
+]
 
 
 def test_a_repetition_sees_the_frames_that_the_run_has_seen() -> None:
@@ -49,7 +56,7 @@ def test_what_cannot_be_repeated_is_said(
     assert says in capsys.readouterr().err
 
 
-def lossy_run(folder: Path) -> Outcome:
+def lossy_run(source: str, folder: Path) -> Outcome:
     """A run with a loss, under a schedule of its own, of whose jobs some are lost."""
 
     def build(config: Config, camera: Camera) -> System:
@@ -58,22 +65,24 @@ def lossy_run(folder: Path) -> Outcome:
         system.desk.executor = Lossy([JobKind.GRAPH, JobKind.LOOP], every=5).around(system.desk.executor)
         return system
 
-    return run_to_folder(load_config(None, LOSS), open_source(SOURCE), folder, build=build)
+    return run_to_folder(load_config(None, LOSS), open_source(source), folder, build=build)
 
 
 @pytest.mark.slow
 def test_a_run_is_repeated_to_the_bit_and_another_source_comes_apart(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = tmp_path / "run"
-    lossy_run(run)
+    source, run = render_to_folder(make_sequence("street", 46, 5), tmp_path / "street"), tmp_path / "run"
+    lossy_run(str(source), run)
     rows = [json.loads(line) for line in (run / "schedule.jsonl").read_text().splitlines()]
     assert {"ok", "worker"} <= {row["outcome"] for row in rows if "outcome" in row}
-    assert main(["run", SOURCE, "--replay", str(run), "--out", str(tmp_path / "again")]) == 0
+    assert main(["run", str(source), "--replay", str(run), "--out", str(tmp_path / "again")]) == 0
     assert "the same trajectory, bit for bit" in capsys.readouterr().out
     assert (run / "trajectory.txt").read_bytes() == (tmp_path / "again" / "trajectory.txt").read_bytes()
-    other = SOURCE.replace("seed=5", "seed=6")
-    main(["run", other, "--replay", str(run), "--out", str(tmp_path / "other")])
+    images = sorted((source / "images").iterdir())
+    for image, later in pairwise(images[10:21]):
+        image.write_bytes(later.read_bytes())
+    main(["run", str(source), "--replay", str(run), "--out", str(tmp_path / "other")])
     told = capsys.readouterr()
     assert "another trajectory; it comes apart at frame" in told.out
     replay = json.loads((tmp_path / "other" / "summary.json").read_text())["replay"]

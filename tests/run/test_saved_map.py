@@ -12,29 +12,35 @@ import pytest
 
 from dualslam.cli import main
 from dualslam.core.config.settings import Config
+from dualslam.lab.synthetic import make_sequence, render_to_folder
 from dualslam.report.run_data import read_run
 from dualslam.run.map_camera import camera_that_fits, own_focal_px
 from dualslam.run.sources import open_source
 from dualslam.viewer.playback import play
 
-SOURCE = "synthetic:street,frames=56,seed=3,width=320,height=240"
 SETTINGS = ["--quiet", "--set", "frontend.n_features=500"]
 
 
 @pytest.fixture(scope="module")
-def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def source(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A folder of rendered images."""
+    return str(render_to_folder(make_sequence("street", 56, 3, 320, 240), tmp_path_factory.mktemp("images") / "street"))
+
+
+@pytest.fixture(scope="module")
+def first(source: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of a walk's first part."""
     out = tmp_path_factory.mktemp("first") / "run"
-    assert main(["run", SOURCE, "--max-frames", "40", "--out", str(out), *SETTINGS]) == 0
+    assert main(["run", source, "--max-frames", "40", "--out", str(out), *SETTINGS]) == 0
     return out
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("localise", [False, True], ids=["extended", "localised"])
-def test_a_run_on_a_saved_map_ends_with_all_its_pages(first: Path, localise: bool, tmp_path: Path) -> None:
+def test_a_run_on_a_saved_map_ends_with_all_its_pages(source: str, first: Path, localise: bool, tmp_path: Path) -> None:
     out = tmp_path / "run"
     options = ["--start", "30", "--map", str(first), *(["--localise"] if localise else [])]
-    assert main(["run", SOURCE, *options, "--out", str(out), *SETTINGS]) == 0
+    assert main(["run", source, *options, "--out", str(out), *SETTINGS]) == 0
     assert {path.name for path in out.iterdir()} >= {"map.html", "report.html", "trajectory.txt", "summary.json"}
     run, before = read_run(out), play(read_run(first)).spaces[0]
     assert run.summary["posed"] >= 10
@@ -55,17 +61,17 @@ def test_a_run_on_a_saved_map_ends_with_all_its_pages(first: Path, localise: boo
 
 @pytest.mark.slow
 def test_a_zoomed_camera_that_is_said_to_be_the_maps_is_found_out(
-    first: Path, caplog: pytest.LogCaptureFixture
+    source: str, first: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Its frames fit the map from farther off, metres wrong; the map's points tell the focal length."""
     config = Config.model_validate({"frontend": {"n_features": 500}})
-    source = open_source(SOURCE, start=20, max_frames=30)
-    zoom, (width, height) = 1.25, source.camera.size_px
+    seen = open_source(source, start=20, max_frames=30)
+    zoom, (width, height) = 1.25, seen.camera.size_px
     shift = [0.5 * (1 - zoom) * (width - 1), 0.5 * (1 - zoom) * (height - 1)]
     A = np.array([[zoom, 0, shift[0]], [0, zoom, shift[1]]])
-    frames = [replace(f, image=cv2.warpAffine(f.image, A, (width, height))) for f in source]
+    frames = [replace(f, image=cv2.warpAffine(f.image, A, (width, height))) for f in seen]
     with caplog.at_level(logging.WARNING):
-        found = camera_that_fits(config, frames, source.camera, first)
-    assert own_focal_px(found) == pytest.approx(zoom * source.camera.fx, rel=0.02)
+        found = camera_that_fits(config, frames, seen.camera, first)
+    assert own_focal_px(found) == pytest.approx(zoom * seen.camera.fx, rel=0.02)
     assert "it is taken for theirs" in caplog.text
-    assert camera_that_fits(config, list(source), source.camera, first) is source.camera
+    assert camera_that_fits(config, list(seen), seen.camera, first) is seen.camera

@@ -123,7 +123,7 @@ def clean_to_faulty_deg(clean: System, faulty: System, i: int) -> float:
 
 @pytest.mark.slow
 def test_a_corrupted_run_can_be_made_again_from_its_config(tmp_path: Path) -> None:
-    source = "synthetic:room,frames=45,seed=2"
+    source = "synthetic:room,frames=45,seed=2,width=320,height=240"
     corruptions = (
         "corruptions=[{kind: noise, start: 20, length: 3}, {kind: drop, start: 30, length: 2},"
         " {kind: few_features, start: 34, length: 2, strength: 0.5, seed: 4},"
