@@ -19,13 +19,8 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from dualslam.backend.measurements.base import Mount
-    from dualslam.backend.measurements.direction import Direction
-    from dualslam.backend.measurements.distance import Distance
-    from dualslam.backend.measurements.height import Height
-    from dualslam.backend.measurements.position import Position
-    from dualslam.backend.measurements.relative_pose import RelativePose
+    from dualslam.backend.measurements.kinds import Direction, Distance, Height, Position, RelativePose, SamePlace
     from dualslam.backend.measurements.rotation_rate import RotationRate
-    from dualslam.backend.measurements.same_place import SamePlace
     from dualslam.build import build_system, create_frontend, recovery_parts
     from dualslam.core.camera.base import Camera
     from dualslam.core.config.files import config_from_dict, dump_config, load_config
@@ -52,13 +47,13 @@ if TYPE_CHECKING:
 
 _WHERE = {
     "Mount": "backend.measurements.base",
-    "SamePlace": "backend.measurements.same_place",
-    "Distance": "backend.measurements.distance",
-    "Height": "backend.measurements.height",
-    "Direction": "backend.measurements.direction",
+    "SamePlace": "backend.measurements.kinds",
+    "Distance": "backend.measurements.kinds",
+    "Height": "backend.measurements.kinds",
+    "Direction": "backend.measurements.kinds",
     "RotationRate": "backend.measurements.rotation_rate",
-    "RelativePose": "backend.measurements.relative_pose",
-    "Position": "backend.measurements.position",
+    "RelativePose": "backend.measurements.kinds",
+    "Position": "backend.measurements.kinds",
     "Camera": "core.camera.base",
     "Config": "core.config.settings",
     "ConfigError": "core.errors",

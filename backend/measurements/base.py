@@ -25,10 +25,6 @@ class Gauge(StrEnum):
     SCALE = "scale"
 
 
-def _identity() -> FloatArray:
-    return np.eye(4)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Mount:
     """How a sensor is fixed to the camera.
@@ -41,7 +37,7 @@ class Mount:
         False: the turn of a sensor that measures rotations is estimated; its place is taken to be the camera's.
     """
 
-    T_cam_body: FloatArray = field(default_factory=_identity)
+    T_cam_body: FloatArray = field(default_factory=lambda: np.eye(4))
     is_given: bool = False
 
 
@@ -78,8 +74,8 @@ class Measurement(Protocol):
 
     @property
     def sigmas(self) -> FloatArray:
-        """Standard deviations of the residual."""
-        ...
+        """Standard deviations of the residual: the fields `sigma_m` and `sigma_rad`, by its units."""
+        return np.array([getattr(self, f"sigma_{unit}") for unit in self.units])
 
     def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
         """Compare the reading with poses.

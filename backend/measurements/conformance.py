@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from dualslam.backend.measurements.base import Gauge, Measurement
+from dualslam.core.conformance import NotConforming, expect
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.types import FloatArray
 
@@ -26,15 +27,6 @@ SIGMA = 0.1
 STEP, TOLERANCE = 1e-6, 1e-5
 """Of central differences, and how far a Jacobian may differ from them, relative to its largest number."""
 TIMES_S = (1.0, 2.5)
-
-
-class NotConforming(AssertionError):  # noqa: N818  # as of front ends
-    """A measurement does not keep the protocol."""
-
-
-def _require(holds: bool, problem: str) -> None:
-    if not holds:
-        raise NotConforming(problem)
 
 
 def _poses(seed: int = 0) -> FloatArray:
@@ -52,14 +44,14 @@ def _exact(cls: type[Measurement], T: FloatArray) -> tuple[Any, FloatArray, Floa
 def check_declaration(cls: type[Measurement]) -> None:
     """Check that kind, columns, units and sigmas are there and fit each other."""
     reading, T, shared = _exact(cls, _poses())
-    _require(bool(cls.kind) and "," not in cls.kind, "kind is a word")
+    expect(bool(cls.kind) and "," not in cls.kind, "kind is a word")
     r, J = reading.residual(T, shared)
-    _require(r.shape == (len(cls.units),), f"{len(cls.units)} units for a residual of shape {r.shape}")
-    _require(set(cls.units) <= {"m", "rad"}, "units are m or rad")
-    _require(np.shape(reading.sigmas) == r.shape, "one sigma for each component of the residual")
-    _require(bool((np.asarray(reading.sigmas) > 0).all()), "sigmas are above 0")
-    _require(J.shape == (len(r), 6 * len(T) + len(shared)), f"the Jacobian has shape {J.shape}")
-    _require(1 <= len(reading.times_s) <= 2, "a measurement is about one or two poses")
+    expect(r.shape == (len(cls.units),), f"{len(cls.units)} units for a residual of shape {r.shape}")
+    expect(set(cls.units) <= {"m", "rad"}, "units are m or rad")
+    expect(np.shape(reading.sigmas) == r.shape, "one sigma for each component of the residual")
+    expect(bool((np.asarray(reading.sigmas) > 0).all()), "sigmas are above 0")
+    expect(J.shape == (len(r), 6 * len(T) + len(shared)), f"the Jacobian has shape {J.shape}")
+    expect(1 <= len(reading.times_s) <= 2, "a measurement is about one or two poses")
 
 
 def check_zero_at_truth(cls: type[Measurement]) -> None:
@@ -93,7 +85,7 @@ def check_jacobian(cls: type[Measurement]) -> None:
             ends.append(reading.residual(moved, unknowns)[0])
         numerical[:, i] = (ends[0] - ends[1]) / (2 * STEP)
     off = float(np.abs(J - numerical).max())
-    _require(off < TOLERANCE * max(1.0, float(np.abs(numerical).max())), f"the Jacobian is off by {off:.2g}")
+    expect(off < TOLERANCE * max(1.0, float(np.abs(numerical).max())), f"the Jacobian is off by {off:.2g}")
 
 
 def check_gauge(cls: type[Measurement]) -> None:
@@ -110,9 +102,9 @@ def check_gauge(cls: type[Measurement]) -> None:
             after = [reading.residual(sim3.act_on_pose(S, T), shared)[0] for S in several]
             change = max(float(np.abs(r - before).max()) for r in after)
             if gauge in cls.fixes:
-                _require(change > 1e-6, f"it is said to fix the {gauge}, and does not feel it")
+                expect(change > 1e-6, f"it is said to fix the {gauge}, and does not feel it")
             elif not (gauge is Gauge.SCALE and "m" in cls.units and not cls.fixes):  # lengths that are to be 0
-                _require(change < 1e-9, f"it feels the {gauge}, which it is not said to fix")
+                expect(change < 1e-9, f"it feels the {gauge}, which it is not said to fix")
 
 
 def check_units(cls: type[Measurement]) -> None:
@@ -123,10 +115,10 @@ def check_units(cls: type[Measurement]) -> None:
     change = np.abs(reading.residual(grown, shared)[0] - reading.residual(T, shared)[0])
     for i, unit in enumerate(cls.units):
         if unit == "rad":
-            _require(float(change[i]) < 1e-9, f"component {i} is in rad and depends on lengths")
+            expect(float(change[i]) < 1e-9, f"component {i} is in rad and depends on lengths")
         else:
             by_length = np.abs(J[i, : 6 * len(T)].reshape(len(T), 2, 3)[:, 1]).max()
-            _require(1e-3 < by_length < 10.0, f"component {i} changes by {by_length:.3g} m a metre")
+            expect(1e-3 < by_length < 10.0, f"component {i} changes by {by_length:.3g} m a metre")
 
 
 CHECKS: tuple[Callable[[type[Any]], None], ...] = (

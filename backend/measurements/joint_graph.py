@@ -9,30 +9,30 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import Self
 
 import gtsam
 import numpy as np
 
 from dualslam.backend import convert
 from dualslam.backend.measurements.exports import export_graph
+from dualslam.backend.measurements.misreadings import misreadings
 from dualslam.backend.measurements.path import CameraPath, Term, attach
-from dualslam.backend.measurements.start import MAX_OFFSET_S, find_start
+from dualslam.backend.measurements.start import MAX_OFFSET_S, POSITION, QUANTILE_99, MetricStart, find_start, up_of
 from dualslam.backend.noise import gaussian
 from dualslam.backend.solver import GTSAM_ERRORS, SolverFailure
-from dualslam.core.chi_square import CHI2_99, CHI2_999
+from dualslam.core.chi_square import CHI2_99, CHI2_999, MEDIAN_CHI2
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.geometry import sim3, so3
 from dualslam.core.metric_problem import MeasurementSource, MetricProblem, MetricSolution, pose_by_node
-from dualslam.core.types import FloatArray
+from dualslam.core.types import BoolArray, FloatArray
 
 ODOMETRY = ("within", "rollover")
 LEAST_SIGMAS = np.array([1e-4, 1e-4, 1e-4, 5e-4, 5e-4, 5e-4, 5e-4])
 """As in the atlas' graph: no connection is taken as surer."""
 DRIFTS = (1.0, 2.0, 4.0, 8.0)
 """How many times the map's own sigmas are taken: the smallest at which it agrees with the measurements counts."""
-TOO_MUCH = 2.33
-"""Standard deviations of the joint cost over its expectation: one map in a hundred has more by chance."""
 FEW_REJECTED = 0.125
 """Share of readings that are outvoted at which the map need not be asked whether it bends instead."""
 MAX_REJECTED = 0.4
@@ -43,7 +43,15 @@ GNC_GROWTH, GNC_END = 3.0, 1e3
 CLOCK_SIGMAS = 2.5
 """Below, an offset is chance: one in a hundred."""
 N_SETTLED = 3
-"""Rounds of least squares and hard rejection at the drift that is chosen."""
+"""Rounds of least squares and hard rejection."""
+MISREAD = 2.0 * float(np.log(1000.0))
+"""Difference of costs, twice a logarithm of likelihoods: one file in a thousand is wrong in a given way."""
+UPRIGHT_SIGMA = 0.5
+"""Length of the difference between the camera's up and the sky, of a camera that a person or a vehicle carries."""
+N_BESIDE = 5
+"""Positions on either side of a jump of the clock: the median of five survives two outliers."""
+MAX_RUN = 2
+"""Neighbouring positions that may be outvoted where the map bends: three are chance once in a million."""
 
 
 def solve_metric(
@@ -52,6 +60,8 @@ def solve_metric(
     known_offsets_s: Mapping[str, float] | None = None,
 ) -> MetricSolution:
     """Put a map into the frame of measurements.
+
+    Where they do not fit as they are, and fit far better read otherwise, they are refused.
 
     Parameters
     ----------
@@ -66,30 +76,48 @@ def solve_metric(
         In one sentence, where the measurements cannot belong to the map.
     SolverError
     """
-    path = CameraPath(problem)
-    start = find_start(problem, path, sources, known_offsets_s or {})
-    sources = start.sources
-    cuts = problem.times_s[np.unique(problem.node, return_index=True)[1]]
-    sources = [_integrated(s, np.sort(cuts) - o) for s, o in zip(sources, start.offsets_s, strict=True)]
-    terms, outside = attach(path, sources, start.offsets_s)
-    if not terms:
-        raise InputError(
-            f"{', '.join(s.name for s in sources)}: no measurement falls on a time at which the camera has a pose."
-        )
-    graph = _Joint(problem, sources, terms, start.offsets_s, start.S_metric_world, frozenset(known_offsets_s or {}))
+    known = known_offsets_s or {}
+    names = ", ".join(source.name for source in sources)
     try:
-        solution = graph.solve()
+        joint = _Joint.solved(problem, sources, known, DRIFTS)
+        if not joint.is_plain:
+            read_otherwise = [  # if the file is wrong, the map is right
+                (_Joint.solved(problem, others, known, DRIFTS[:1]).cost + price, words)
+                for words, others, price in misreadings(sources, joint.jumps_s)
+            ]
+            cost, words = min(read_otherwise, default=(np.inf, ""))
+            if cost < joint.cost - MISREAD:
+                raise InputError(f"{names}: {words}; correct the file.")
+        solution = joint.solution()
     except GTSAM_ERRORS as error:
         raise SolverError(
             f"the joint graph of {len(problem.S_world_node)} nodes failed: {SolverFailure.of(error)}"
         ) from error
-    outside_by_kind = Counter(r.kind for r in outside)
-    rejected = Counter(solution.rejected)
-    if start.frozen:
-        rejected["position"] += start.frozen
-    solution = replace(solution, outside=dict(outside_by_kind), rejected=dict(rejected))
-    _check_votes(solution, sources)
+    _check(solution, joint, names)
     return solution
+
+
+def _check(solution: MetricSolution, joint: _Joint, names: str) -> None:
+    """Refuse measurements that are outvoted, that jump where the map bends, or whose clock is far off."""
+    for kind, n in solution.rejected.items():
+        total = n + solution.used.get(kind, 0)
+        if total >= 3 and n > MAX_REJECTED * total:
+            raise InputError(
+                f"{names}: {n} of {total} measurements of {kind} contradict the map and the others: they are of "
+                "another recording, or their sigmas are too small."
+            )
+    run = joint.longest_run()
+    if len(run) > MAX_RUN and joint.drift > 1:
+        raise InputError(
+            f"{names}: the positions from {run[0]:.1f} to {run[-1]:.1f} s contradict the map, and so do those "
+            "before or after: they jump. Remove what is wrong (multipath, a clock that was set)."
+        )
+    for name, offset in solution.clock_offset_s.items() if solution.believed.all() else ():
+        if abs(offset) > MAX_OFFSET_S + QUANTILE_99 * solution.clock_sigma_s[name]:
+            raise InputError(
+                f"{name}: its clock would be {offset:+.1f} s off, more than {MAX_OFFSET_S:.0f} s: give --clock-offset, "
+                "or the file of this recording."
+            )
 
 
 def _integrated(source: MeasurementSource, cuts_s: FloatArray) -> MeasurementSource:
@@ -103,84 +131,110 @@ def _integrated(source: MeasurementSource, cuts_s: FloatArray) -> MeasurementSou
     return replace(source, readings=done)
 
 
-def _check_votes(solution: MetricSolution, sources: Sequence[MeasurementSource]) -> None:
-    for kind, n in solution.rejected.items():
-        total = n + solution.used.get(kind, 0)
-        if total >= 3 and n > MAX_REJECTED * total:
-            raise InputError(
-                f"{', '.join(s.name for s in sources)}: {n} of {total} measurements of {kind} contradict the map and "
-                "the others: they are of another recording, or their sigmas are too small."
-            )
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trial:
+    """A solution at one drift; plain: what counts agrees with the map, and few readings do not count."""
+
+    cost: float
+    drift: float
+    weights: FloatArray
+    values: gtsam.Values
+    is_plain: bool
 
 
-@dataclass(slots=True, eq=False)
 class _Joint:
     """The graph and its weights."""
 
-    problem: MetricProblem
-    sources: Sequence[MeasurementSource]
-    terms: list[Term]
-    offsets_s: Sequence[float]
-    S_start: FloatArray
-    known_clocks: frozenset[str]
-    doubtful: list[int] = field(init=False)
-    link_weights: FloatArray = field(init=False)
-    values: gtsam.Values = field(init=False)
-    drift: float = 1.0
-
-    def __post_init__(self) -> None:
-        n = len(self.problem.S_world_node)
-        edges = self.problem.edges
-        self._held = self._one_of_each_piece()
-        self.doubtful = [i for i, kind in enumerate(edges.kind) if kind not in ODOMETRY]
+    def __init__(self, problem: MetricProblem, start: MetricStart, known: Mapping[str, float]) -> None:
+        self.problem, self.offsets_s, self.n_repeated = problem, start.offsets_s, start.n_repeated
+        cuts = np.sort(problem.times_s[np.unique(problem.node, return_index=True)[1]])
+        self.sources = [_integrated(s, cuts - o) for s, o in zip(start.sources, start.offsets_s, strict=True)]
+        self.terms, self.outside = attach(CameraPath(problem), self.sources, self.offsets_s)
+        if not self.terms:
+            names = ", ".join(s.name for s in self.sources)
+            raise InputError(f"{names}: no measurement falls on a time at which the camera has a pose.")
+        self.S_start, self._held = start.S_metric_world, self._one_of_each_piece()
+        self.doubtful = [i for i, kind in enumerate(problem.edges.kind) if kind not in ODOMETRY]
         self.link_weights = np.ones(len(self.doubtful))
-        self.values = gtsam.Values()
-        for i, S in enumerate(self.S_start @ self.problem.S_world_node):
+        self.drift, self.cost, self.is_plain = 1.0, np.inf, False
+        self.jumps_s: dict[int, float] = {}
+        self.values, n = gtsam.Values(), len(problem.S_world_node)
+        for i, S in enumerate(self.S_start @ problem.S_world_node):
             self.values.insert(i, convert.to_similarity3(S))
-        self._clock = {
-            i: n + i
-            for i, source in enumerate(self.sources)
-            if source.has_clock and source.name not in self.known_clocks
-        }
+        self._clock = {i: n + i for i, s in enumerate(self.sources) if s.has_clock and s.name not in known}
+        self._right_clocks: dict[int, float] = {}
         for key in self._clock.values():
             self.values.insert(key, np.zeros(1))
-        self._shared = {}
-        for term in self.terms:
-            reading = term.reading
+        self._shared: dict[str, int] = {}
+        for reading in (term.reading for term in self.terms):
             if reading.shared_sigmas and reading.kind not in self._shared:
                 self._shared[reading.kind] = n + len(self.sources) + len(self._shared)
                 self.values.insert(self._shared[reading.kind], np.zeros(len(reading.shared_sigmas)))
 
-    _held: list[int] = field(init=False)
-    _clock: dict[int, int] = field(init=False)
-    _shared: dict[str, int] = field(init=False)
-
-    # --- solving
-
-    def solve(self) -> MetricSolution:
+    @classmethod
+    def solved(
+        cls,
+        problem: MetricProblem,
+        sources: Sequence[MeasurementSource],
+        known: Mapping[str, float],
+        drifts: Sequence[float],
+    ) -> Self:
         """Choose how far the map may bend and what counts, and solve.
 
         A stiffer map is preferred: twice the drift must lower the cost by more than chance does. It is not tried where
         the remaining readings agree and few were rejected.
         """
-        chosen: tuple[float, float, FloatArray, gtsam.Values] | None = None
+        self = cls(problem, find_start(problem, CameraPath(problem), sources, known), known)
         start = gtsam.Values(self.values)
-        for i, drift in enumerate(DRIFTS):
-            self.drift, self.values = drift, gtsam.Values(start)
-            self._weigh(np.ones(len(self.terms) + len(self.doubtful)))
-            self._graduate()
-            graph = self._optimise()
-            dof = sum(len(t.reading.sigmas) for t in self.terms)
-            ratio = self._ratios()
-            price = float((ratio > 1).sum()) * CHI2_99[3]
-            cost = 2.0 * float(graph.error(self.values)) + price + i * TOO_MUCH * float(np.sqrt(2.0 * dof))
-            if chosen is None or cost < chosen[0]:
-                chosen = (cost, drift, self._weights(), self.values)
-            if self._excess(graph) <= TOO_MUCH and (ratio > 1).mean() <= FEW_REJECTED:
+        best = self._tried(drifts[0], start)
+        self._take(best)
+        self.jumps_s = self._clock_jumps_s()
+        self.is_plain = best.is_plain and self._tilt() <= CHI2_99[3] and len(self.longest_run()) <= MAX_RUN
+        dof = sum(len(r.sigmas) for r in (*(t.reading for t in self.terms), *self.outside))
+        price = QUANTILE_99 * float(np.sqrt(2.0 * dof))
+        for i, drift in enumerate(drifts[1:], 1):
+            if best.is_plain or best.cost < dof + i * price:  # no cost falls below its expectation but by chance
                 break
-        assert chosen is not None
-        _, self.drift, weights, self.values = chosen
-        self._weigh(weights)
+            tried = self._tried(drift, start, i * price)
+            if tried.cost < best.cost:
+                best = tried
+            if tried.is_plain:
+                break
+        self._take(best)
+        self.cost = best.cost + self._tilt()
+        return self
+
+    def _tried(self, drift: float, start: gtsam.Values, price: float = 0.0) -> _Trial:
+        """Solve at a drift, from two beginnings where the first rejects anything."""
+        self.drift, trials = drift, []
+        price += sum(len(r.sigmas) for r in self.outside)
+        for begin in (self._graduate, self._trust_start):
+            self.values = gtsam.Values(start)
+            begin()
+            graph = self._optimise()
+            wrong = self._ratios() > 1
+            cost = 2.0 * float(graph.error(self.values)) + self._price(wrong) + price
+            is_plain = bool(self._excess(graph) <= QUANTILE_99 and wrong.mean() <= FEW_REJECTED)
+            trials.append(_Trial(cost, drift, self._weights(), self.values, is_plain))
+            if (trials[0].weights > 0.5).all():
+                break
+        return min(trials, key=lambda trial: trial.cost)
+
+    def _price(self, wrong: BoolArray) -> float:
+        """Return what rejections cost: each as much as it would if it were right, and each row of them a quantile more.
+
+        A burst is one event: neighbours do not go wrong independently of each other.
+        """
+        dims = np.array([len(t.reading.sigmas) for t in self.terms] + [7] * len(self.doubtful))
+        n_bursts = int((wrong & ~np.append(False, wrong[:-1])).sum())
+        return float(dims[wrong].sum()) + n_bursts * CHI2_99[3]
+
+    def _take(self, trial: _Trial) -> None:
+        self.drift, self.values = trial.drift, trial.values
+        self._weigh(trial.weights)
+
+    def solution(self) -> MetricSolution:
+        """Refine what was found, and return it."""
         graph = self._optimise()
         if self._set_clocks_right(graph):
             graph = self._optimise()
@@ -189,6 +243,45 @@ class _Joint:
                 break
             graph = self._optimise()
         return self._solution(graph, self._excess(graph))
+
+    def longest_run(self) -> list[float]:
+        """Return the times of the most positions in a row that are outvoted."""
+        runs: list[list[float]] = [[]]
+        for term in self.terms:
+            if term.reading.kind == POSITION:
+                if term.weight > 0.5:
+                    runs.append([])
+                else:
+                    runs[-1].append(term.reading.t_s)
+        return max(runs, key=len)
+
+    def _clock_jumps_s(self) -> dict[int, float]:
+        """Return, by source, where its clock's offset changes most: by medians of positions before and after."""
+        found = {}
+        for source in self._clock:
+            terms = [t for t in self.terms if t.source == source and t.reading.kind == POSITION]
+            late = []
+            for term in terms:
+                r, J = self._evaluate(term, self.values)
+                late.append(float(J[-1][:, 0] @ r) / max(float(J[-1][:, 0] @ J[-1][:, 0]), 1e-9))
+            steps = [
+                abs(np.median(late[i - N_BESIDE : i]) - np.median(late[i : i + N_BESIDE]))
+                for i in range(N_BESIDE, len(late) - N_BESIDE + 1)
+            ]
+            if steps:
+                found[source] = float(terms[N_BESIDE + int(np.argmax(steps))].reading.t_s)
+        return found
+
+    def _tilt(self) -> float:
+        """Return the squared distance of the camera's up from the sky, in sigmas; 0 where the sky is not known."""
+        up = up_of(self.problem)
+        if up is None or all(source.origin is None for source in self.sources):
+            return 0.0
+        middle = len(self.problem.S_world_node) // 2
+        S = convert.from_similarity3(self.values.atSimilarity3(middle)) @ sim3.inverse(
+            self.problem.S_world_node[middle]
+        )
+        return float((((sim3.rotation(S) @ up - [0.0, 0.0, 1.0]) / UPRIGHT_SIGMA) ** 2).sum())
 
     def _set_clocks_right(self, graph: gtsam.NonlinearFactorGraph) -> bool:
         """Take clocks for right whose offset is less than `CLOCK_SIGMAS` of its sigmas; return whether any was.
@@ -199,10 +292,11 @@ class _Joint:
         right = []
         for source, key in self._clock.items():
             sigma = float(np.sqrt(marginals.marginalCovariance(key)[0, 0]))
-            if self.offsets_s[source] == 0 and abs(float(self.values.atVector(key)[0])) < CLOCK_SIGMAS * sigma:
+            if abs(self.offsets_s[source] + float(self.values.atVector(key)[0])) < CLOCK_SIGMAS * sigma:
                 right.append(source)
         for source in right:
             self.values.erase(self._clock.pop(source))
+            self._right_clocks[source] = -self.offsets_s[source]
         return bool(right)
 
     def _graduate(self) -> None:
@@ -223,6 +317,20 @@ class _Joint:
             mu *= GNC_GROWTH
         self._weigh((ratio <= 1.0).astype(float))
         self._optimise(coarsely=True)
+
+    def _trust_start(self) -> None:
+        """Begin with the readings that agree with the robust rigid alignment, then reject and take in by turns."""
+        ratio = self._ratios()
+        kinds = np.array([t.reading.kind for t in self.terms] + [""] * len(self.doubtful))
+        weights = np.ones(len(ratio))
+        for kind in {t.reading.kind for t in self.terms}:
+            of_kind = ratio[kinds == kind]
+            weights[kinds == kind] = of_kind <= np.median(of_kind) * CHI2_999[3] / MEDIAN_CHI2[3]
+        self._weigh(weights)
+        for _ in range(N_SETTLED):
+            self._optimise(coarsely=True)
+            if not self._reject():
+                break
 
     def _reject(self) -> bool:
         """Take out what is beyond its quantile, take in what is within; return whether anything changed."""
@@ -316,7 +424,7 @@ class _Joint:
         """Return residual and Jacobians by `_keys`."""
         clock = self._clock.get(term.source)
         shared_key = self._shared.get(term.reading.kind)
-        tau = float(values.atVector(clock)[0]) if clock is not None else 0.0
+        tau = self._right_clocks.get(term.source, 0.0) if clock is None else float(values.atVector(clock)[0])
         shared = values.atVector(shared_key) if shared_key is not None else np.zeros(0)
         T, J_node, J_tau = np.empty((len(term.nodes), 4, 4)), [], []
         for i, node in enumerate(term.nodes):
@@ -396,7 +504,8 @@ class _Joint:
             believed=believed,
             used=dict(used),
             rejected=dict(rejected),
-            outside={},
+            outside=dict(Counter(r.kind for r in self.outside)),
+            repeated=self.n_repeated,
             normalised={k: float(np.sqrt(sums[k] / dims[k])) for k in used},
             clock_offset_s=offsets,
             clock_sigma_s=sigmas,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dualslam.core.geometry import se3, sim3, so3
+from dualslam.core.geometry import se3, sim3
 from dualslam.core.metric_problem import MeasurementSource, MetricProblem
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 
@@ -112,14 +112,3 @@ def attach(
             else:
                 outside.append(reading)
     return terms, outside
-
-
-def gauge_jacobian(T_metric_cam: FloatArray, centre: FloatArray) -> FloatArray:
-    """Return the derivative (6, 7) of a metric pose's right perturbation by a similarity's about a point."""
-    Rt, c = T_metric_cam[:3, :3].T, T_metric_cam[:3, 3] - centre
-    J = np.zeros((6, 7))
-    J[:3, :3] = Rt
-    J[3:, :3] = -Rt @ so3.hat(c)
-    J[3:, 3:6] = Rt
-    J[3:, 6] = Rt @ c
-    return J

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -20,13 +20,13 @@ ENTRY_POINT_GROUP = "dualslam.measurements"
 """A package offers one by ``[project.entry-points."dualslam.measurements"] kind = "module:Class"``."""
 
 BUILT_IN: Mapping[str, str] = {
-    "position": "position:Position",
-    "relative_pose": "relative_pose:RelativePose",
+    "position": "kinds:Position",
+    "relative_pose": "kinds:RelativePose",
     "rotation_rate": "rotation_rate:RotationRate",
-    "direction": "direction:Direction",
-    "height": "height:Height",
-    "distance": "distance:Distance",
-    "same_place": "same_place:SamePlace",
+    "direction": "kinds:Direction",
+    "height": "kinds:Height",
+    "distance": "kinds:Distance",
+    "same_place": "kinds:SamePlace",
 }
 MOUNT = "mount"
 """The kind of a line that says how the sensor of the lines after it is fixed to the camera."""
@@ -100,12 +100,14 @@ def readings_of(source: RowSource) -> MeasurementSource:
     return MeasurementSource(source.name, readings, source.has_clock, source.origin)
 
 
-def _check(row: MeasurementRow, columns: Iterable[str]) -> None:
-    names = tuple(columns)
-    if len(row.values) != len(names) or not all(map(math.isfinite, row.values)):
+def _check(row: MeasurementRow, columns: Sequence[str]) -> None:
+    if len(row.values) != len(columns):
         raise InputError(
-            f"{row.where}: {row.kind} takes {len(names)} finite numbers ({', '.join(names)}), not {len(row.values)}."
+            f"{row.where}: {row.kind} takes {len(columns)} numbers ({', '.join(columns)}), not {len(row.values)}."
         )
+    for name, value in zip(columns, row.values, strict=True):
+        if not math.isfinite(value):
+            raise InputError(f"{row.where}: {name} of a {row.kind} is {value}; remove the line.")
 
 
 def _mount(row: MeasurementRow) -> Mount:

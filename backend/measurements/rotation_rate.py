@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.random import Generator
 
-from dualslam.backend.measurements.base import Gauge, Mount, Residual, noise
+from dualslam.backend.measurements.base import Gauge, Measurement, Mount, Residual, noise
 from dualslam.core.geometry import so3
 from dualslam.core.types import FloatArray
 
@@ -20,7 +20,7 @@ MAX_GAP_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RotationRate:
+class RotationRate(Measurement):
     """Turn of the body from one time to another, integrated from a gyroscope.
 
     Attributes
@@ -52,11 +52,6 @@ class RotationRate:
     def times_s(self) -> tuple[float, ...]:
         """Times of the two poses."""
         return self.t_a_s, self.t_b_s
-
-    @property
-    def sigmas(self) -> FloatArray:
-        """Of the turn, rad."""
-        return np.full(3, self.sigma_rad)
 
     def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
         """Return the rotation vector of the turn that is left over."""

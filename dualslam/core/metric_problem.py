@@ -66,6 +66,7 @@ class MetricSolution:
     used: Mapping[str, int]
     rejected: Mapping[str, int]
     outside: Mapping[str, int]
+    repeated: int  # positions left out: they repeat the one before to the last digit
     normalised: Mapping[str, float]  # RMS of the residuals that count, in their sigmas, by kind
     # By source: add the offset to the source's times to have the frames'.
     clock_offset_s: Mapping[str, float]

@@ -74,6 +74,7 @@ class Measured:
             "used": dict(s.used),
             "rejected": dict(s.rejected),
             "outside": dict(s.outside),
+            "repeated": s.repeated,
             "normalised_rms": dict(s.normalised),
             "clock_offset_s": dict(s.clock_offset_s),
             "clock_sigma_s": dict(s.clock_sigma_s),

@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.camera.models import PinholeCamera
+from dualslam.core.conformance import NotConforming, expect, run_checks
 from dualslam.core.geometry import se3
 from dualslam.core.interfaces import PixelMatcher
 from dualslam.core.pixels import PixelMatches, PosedImage
 from dualslam.core.types import FloatArray
 from dualslam.frontends.conformance.scene import PrintedPlane, transfer
-from dualslam.frontends.conformance.subject import NotConforming, expect, run_checks
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.registry import PixelMatcherFactory
 

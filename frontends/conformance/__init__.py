@@ -18,8 +18,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from dualslam.core.conformance import NotConforming, run_checks
 from dualslam.frontends.conformance import features, matching
-from dualslam.frontends.conformance.subject import NotConforming, Subject, run_checks
+from dualslam.frontends.conformance.subject import Subject
 from dualslam.frontends.registry import FrontendFactory
 
 __all__ = ["CHECKS", "NotConforming", "Subject", "check_frontend"]

@@ -1,11 +1,11 @@
-"""Subject of the conformance checks, and their complaints."""
+"""Subject of the conformance checks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,37 +17,6 @@ from dualslam.frontends.registry import FrontendFactory
 
 N_FEATURES = 800
 FEATURES_ARRAYS = ("uv_px", "uv_rect_px", "sigma_px", "scale", "octave", "angle_rad", "descriptors")
-
-SubjectT = TypeVar("SubjectT")
-
-
-class NotConforming(AssertionError):  # noqa: N818 (it reads as what is raised: a test's failure, no error of ours)
-    """A front end does not keep the protocol; the message says in what."""
-
-
-def expect(condition: bool | np.bool_, complaint: str) -> None:
-    """Complain unless a condition holds."""
-    if not condition:
-        raise NotConforming(complaint)
-
-
-def run_checks(checks: Sequence[Callable[[SubjectT], None]], subject: SubjectT) -> None:
-    """Run all checks, then raise `NotConforming` with a line for each that failed or raised anything else."""
-    problems = []
-    for check in checks:
-        try:
-            check(subject)
-        except NotConforming as problem:
-            problems.append(f"{check.__name__}: {problem}")
-        except Exception as error:  # theirs, whatever it is: the other checks have more to tell
-            problems.append(f"{check.__name__}: {_kind(error)}: {' '.join(str(error).split())}")
-    if problems:
-        raise NotConforming(f"{len(problems)} of {len(checks)} checks failed\n" + "\n".join(problems))
-
-
-def _kind(error: Exception) -> str:
-    kind = type(error)
-    return kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__name__}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,236 @@
+"""The built-in measurements that need no integration: position, height, direction, distance, motion, known loops."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.random import Generator
+
+from dualslam.backend.measurements.base import Gauge, Measurement, Mount, Residual, between, noise, point_jacobian
+from dualslam.core.geometry import se3, so3
+from dualslam.core.types import FloatArray
+
+Vector = tuple[float, float, float]
+DOWN: Vector = (0.0, 0.0, -1.0)
+MOTION_UNITS = ("rad",) * 3 + ("m",) * 3
+
+
+@dataclass(frozen=True, slots=True)
+class Position(Measurement):
+    """Where an antenna is: GPS, RTK, motion capture.
+
+    Attributes
+    ----------
+    t_s : float
+    xyz_m : (float, float, float)
+    sigma_m : float or (float, float, float)
+    lever_arm_m : (float, float, float)
+        The antenna in the camera's axes: x right, y down, z forward.
+    """
+
+    kind: ClassVar[str] = "position"
+    columns: ClassVar[tuple[str, ...]] = ("t_s", "x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m")
+    units: ClassVar[tuple[str, ...]] = ("m",) * 3
+    fixes: ClassVar[frozenset[Gauge]] = frozenset(Gauge)
+
+    t_s: float
+    xyz_m: Vector
+    sigma_m: float | Vector
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Along the three axes, metres."""
+        return np.broadcast_to(np.asarray(self.sigma_m, np.float64), (3,))
+
+    def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
+        """Return predicted minus measured position, metres."""
+        arm = np.asarray(self.lever_arm_m)
+        return T[0, :3, :3] @ arm + T[0, :3, 3] - np.asarray(self.xyz_m), point_jacobian(T[0], arm)
+
+    @classmethod
+    def of_row(cls, row: Sequence[float], mount: Mount) -> Self:
+        """Make a reading of a line."""
+        x, y, z = mount.T_cam_body[:3, 3].tolist()
+        return cls(row[0], (row[1], row[2], row[3]), (row[4], row[5], row[6]), (x, y, z))
+
+    @classmethod
+    def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:
+        """Make the reading that a true pose gives."""
+        x, y, z = (T[0, :3, 3] + noise(rng, sigma, 3)).tolist()
+        return cls(times_s[0], (x, y, z), sigma)
+
+
+@dataclass(frozen=True, slots=True)
+class Height(Measurement):
+    """Camera's z coordinate: barometer, the floor of a building."""
+
+    kind: ClassVar[str] = "height"
+    columns: ClassVar[tuple[str, ...]] = ("t_s", "z_m", "sigma_m")
+    units: ClassVar[tuple[str, ...]] = ("m",)
+    fixes: ClassVar[frozenset[Gauge]] = frozenset(Gauge)
+
+    t_s: float
+    z_m: float
+    sigma_m: float
+
+    def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
+        """Return predicted minus measured height, metres."""
+        return np.array([T[0, 2, 3] - self.z_m]), point_jacobian(T[0], np.zeros(3))[2:]
+
+    @classmethod
+    def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:
+        """Make the reading that a true pose gives."""
+        return cls(times_s[0], float(T[0, 2, 3] + noise(rng, sigma, 1)[0]), sigma)
+
+
+@dataclass(frozen=True, slots=True)
+class Direction(Measurement):
+    """A direction in the camera's axes, and the same one in the measurements' frame: gravity, north.
+
+    Attributes
+    ----------
+    t_s : float
+    in_camera, in_world : (float, float, float)
+        Of any length. Gravity: down in both.
+    sigma_rad : float
+    """
+
+    kind: ClassVar[str] = "direction"
+    columns: ClassVar[tuple[str, ...]] = ("t_s", "bx", "by", "bz", "wx", "wy", "wz", "sigma_rad")
+    units: ClassVar[tuple[str, ...]] = ("rad",) * 3
+    fixes: ClassVar[frozenset[Gauge]] = frozenset({Gauge.ROTATION})
+
+    t_s: float
+    in_camera: Vector
+    in_world: Vector
+    sigma_rad: float
+
+    def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
+        """Return the difference of the two unit vectors, in the measurements' frame."""
+        R, seen, known = T[0, :3, :3], np.asarray(self.in_camera), np.asarray(self.in_world)
+        d = seen / np.linalg.norm(seen)
+        return R @ d - known / np.linalg.norm(known), np.hstack((-R @ so3.hat(d), np.zeros((3, 3))))
+
+    @classmethod
+    def of_row(cls, row: Sequence[float], mount: Mount) -> Self:
+        """Make a reading of a line."""
+        x, y, z = (mount.T_cam_body[:3, :3] @ np.asarray(row[1:4])).tolist()
+        return cls(row[0], (x, y, z), (row[4], row[5], row[6]), row[7])
+
+    @classmethod
+    def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:
+        """Make the reading of gravity, which points along minus z."""
+        x, y, z = (so3.exp(noise(rng, sigma, 3)) @ T[0, :3, :3].T @ np.asarray(DOWN)).tolist()
+        return cls(times_s[0], (x, y, z), DOWN, sigma)
+
+
+@dataclass(frozen=True, slots=True)
+class Distance(Measurement):
+    """Straight line between two places of the camera: a tape measure, an odometer on a straight way."""
+
+    kind: ClassVar[str] = "distance"
+    columns: ClassVar[tuple[str, ...]] = ("t_a_s", "t_b_s", "distance_m", "sigma_m")
+    units: ClassVar[tuple[str, ...]] = ("m",)
+    fixes: ClassVar[frozenset[Gauge]] = frozenset({Gauge.SCALE})
+
+    t_a_s: float
+    t_b_s: float
+    distance_m: float
+    sigma_m: float
+
+    def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
+        """Return predicted minus measured distance, metres."""
+        d = T[1, :3, 3] - T[0, :3, 3]
+        length = float(np.linalg.norm(d))
+        u = d / max(length, 1e-12)
+        J = np.zeros((1, 12))
+        J[0, 3:6], J[0, 9:12] = -u @ T[0, :3, :3], u @ T[1, :3, :3]
+        return np.array([length - self.distance_m]), J
+
+    @classmethod
+    def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:
+        """Make the reading that two true poses give."""
+        length = float(np.linalg.norm(T[1, :3, 3] - T[0, :3, 3]) + noise(rng, sigma, 1)[0])
+        return cls(times_s[0], times_s[1], length, sigma)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativePose(Measurement):
+    """Motion of the body between two times: wheel odometry, or any other odometry.
+
+    Attributes
+    ----------
+    t_a_s, t_b_s : float
+    T_a_b : (4, 4)
+        The body's second pose in its first, metres.
+    sigma_m, sigma_rad : float
+    mount : Mount
+    """
+
+    kind: ClassVar[str] = "relative_pose"
+    columns: ClassVar[tuple[str, ...]] = (
+        *("t_a_s", "t_b_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "sigma_m", "sigma_rad"),
+    )
+    units: ClassVar[tuple[str, ...]] = MOTION_UNITS
+    fixes: ClassVar[frozenset[Gauge]] = frozenset({Gauge.SCALE})
+
+    t_a_s: float
+    t_b_s: float
+    T_a_b: FloatArray
+    sigma_m: float
+    sigma_rad: float
+    mount: Mount = field(default_factory=Mount)
+
+    @property
+    def turn_rad(self) -> FloatArray:
+        """Rotation vector of the body's motion."""
+        return so3.log(self.T_a_b[:3, :3])
+
+    @property
+    def distance_m(self) -> float:
+        """Length of the motion."""
+        return float(np.linalg.norm(self.T_a_b[:3, 3]))
+
+    def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
+        """Return the logarithm of the motion that is left over."""
+        return between(T, self.mount.T_cam_body, self.T_a_b)
+
+    @classmethod
+    def of_row(cls, row: Sequence[float], mount: Mount) -> Self:
+        """Make a reading of a line."""
+        T = se3.from_parts(so3.matrix_from_quat_xyzw(row[5:9]), row[2:5])
+        return cls(row[0], row[1], T, row[9], row[10], mount)
+
+    @classmethod
+    def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:
+        """Make the reading of a sensor at the camera; `sigma` is that of translation, a tenth of it per radian."""
+        motion = se3.inverse(T[0]) @ T[1] @ se3.exp(np.repeat([0.1, 1.0], 3) * noise(rng, sigma, 6))
+        return cls(times_s[0], times_s[1], motion, sigma, 0.1 * sigma)
+
+
+@dataclass(frozen=True, slots=True)
+class SamePlace(Measurement):
+    """Two times at which the camera had one pose, up to the sigmas: a loop that a person has set."""
+
+    kind: ClassVar[str] = "same_place"
+    columns: ClassVar[tuple[str, ...]] = ("t_a_s", "t_b_s", "sigma_m", "sigma_rad")
+    units: ClassVar[tuple[str, ...]] = MOTION_UNITS
+    fixes: ClassVar[frozenset[Gauge]] = frozenset()
+
+    t_a_s: float
+    t_b_s: float
+    sigma_m: float
+    sigma_rad: float
+
+    def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
+        """Return the logarithm of the motion between the two poses."""
+        return between(T, np.eye(4), np.eye(4))
+
+    @classmethod
+    def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:
+        """Make the reading of two poses that are one; `sigma`: metres, and a tenth of it per radian."""
+        return cls(times_s[0], times_s[1], sigma, 0.1 * sigma)
