@@ -26,7 +26,7 @@ from dualslam.core.chi_square import CHI2_99, CHI2_999, MEDIAN_CHI2
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.geometry import sim3, so3
 from dualslam.core.metric_problem import MeasurementSource, MetricProblem, MetricSolution, pose_by_node
-from dualslam.core.types import BoolArray, FloatArray
+from dualslam.core.types import FloatArray
 
 ODOMETRY = ("within", "rollover")
 LEAST_SIGMAS = np.array([1e-4, 1e-4, 1e-4, 5e-4, 5e-4, 5e-4, 5e-4])
@@ -86,7 +86,7 @@ def solve_metric(
                 for words, others, price in misreadings(sources, joint.jumps_s)
             ]
             cost, words = min(read_otherwise, default=(np.inf, ""))
-            if cost < joint.cost - MISREAD:
+            if cost < joint.cost - joint.rebate() - MISREAD:
                 raise InputError(f"{names}: {words}; correct the file.")
         solution = joint.solution()
     except GTSAM_ERRORS as error:
@@ -213,21 +213,19 @@ class _Joint:
             begin()
             graph = self._optimise()
             wrong = self._ratios() > 1
-            cost = 2.0 * float(graph.error(self.values)) + self._price(wrong) + price
+            cost = 2.0 * float(graph.error(self.values)) + float(wrong.sum()) * CHI2_99[3] + price
             is_plain = bool(self._excess(graph) <= QUANTILE_99 and wrong.mean() <= FEW_REJECTED)
             trials.append(_Trial(cost, drift, self._weights(), self.values, is_plain))
             if (trials[0].weights > 0.5).all():
                 break
         return min(trials, key=lambda trial: trial.cost)
 
-    def _price(self, wrong: BoolArray) -> float:
-        """Return what rejections cost: each as much as it would if it were right, and each row of them a quantile more.
-
-        A burst is one event: neighbours do not go wrong independently of each other.
-        """
+    def rebate(self) -> float:
+        """Return what neighbours that are outvoted cost too much: a burst of them is one event."""
+        wrong = self._weights() < 0.5
         dims = np.array([len(t.reading.sigmas) for t in self.terms] + [7] * len(self.doubtful))
-        n_bursts = int((wrong & ~np.append(False, wrong[:-1])).sum())
-        return float(dims[wrong].sum()) + n_bursts * CHI2_99[3]
+        goes_on = wrong & np.append(False, wrong[:-1])
+        return float(np.maximum(CHI2_99[3] - dims[goes_on], 0.0).sum())
 
     def _take(self, trial: _Trial) -> None:
         self.drift, self.values = trial.drift, trial.values
