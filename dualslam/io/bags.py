@@ -124,7 +124,7 @@ def _camera(bag: Bag, info: Topic, topic: Topic, where: str) -> Camera | None:
         "distortion_model": str(message.distortion_model),
         "binning_x": int(message.binning_x),
         "binning_y": int(message.binning_y),
-        "roi": {"x_offset": int(message.roi.x_offset), "y_offset": int(message.roi.y_offset)},
+        "roi": {name: int(getattr(message.roi, name)) for name in ("x_offset", "y_offset", "width", "height")},
     }
     if "rect" in topic.name.rsplit("/", 2)[-1] + topic.name.rsplit("/", 2)[-2] and P is not None and np.any(P):
         log.info("%s: the images of %s are rectified, so its P is taken", where, topic.name)

@@ -46,7 +46,7 @@ _SAID: dict[str, str] = {
     NONE: "none nodistortion undistorted distortionnone",
     RadTanCamera.model: (
         "radtan radialtangential plumbbob brown brownconrady rationalpolynomial opencv fullopencv frame simpleradial "
-        "radial pinholeradialtangential distortionbrownconrady opencvstandard"
+        "radial pinholeradialtangential opencvstandard"
     ),
     KannalaBrandtCamera.model: (
         "kannalabrandt kannala kannalabrandt8 kannalabrandt4 kb kb4 equidistant equi fisheye opencvfisheye "
@@ -54,7 +54,7 @@ _SAID: dict[str, str] = {
     ),
     FovCamera.model: "fov atan",
     DivisionCamera.model: "division radialdivision simpledivision",
-    OmniCamera.model: "omni omnidirectional mei",
+    OmniCamera.model: "omni omnidirectional mei unifiedprojection",
     EucmCamera.model: "eucm ucm extendedunified",
     DoubleSphereCamera.model: "doublesphere ds",
 }
@@ -77,9 +77,11 @@ def plain(word: object) -> str:
 
 def lens_of(name: str, where: str) -> str:
     """Return the lens that a model's name says, or refuse it by this name."""
-    if plain(name) not in LENSES:
+    # Python prints RealSense's as `distortion.brown_conrady`.
+    word = plain(name.rsplit(".", 1)[-1])
+    if word not in LENSES:
         raise InputError(f"{where}: the camera model {name!r} is not one of those that are read: {KNOWN}.")
-    return LENSES[plain(name)]
+    return LENSES[word]
 
 
 def build_camera(lens: str, numbers: dict[str, float], where: str) -> Camera:

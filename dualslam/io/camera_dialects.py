@@ -18,14 +18,18 @@ STRETCH = "input_horizontal_stretch"
 
 
 def in_common_keys(content: dict[str, Any], where: str) -> dict[str, Any]:
-    """Return a file of Theia or Gyroflow in the keys of other tools, and any other as it is.
+    """Return a file of Theia, Gyroflow, vikit or KITTI in the keys of other tools, and any other as it is.
 
-    Raises `InputError` if its images are stretched.
+    Raises `InputError` if its images are stretched, or its projections are of several cameras.
     """
     if isinstance(content.get("intrinsics"), dict) and "intrinsic_type" in content:
         return _of_theia(content)
     if isinstance(content.get("fisheye_params"), dict) and isinstance(content.get("calib_dimension"), dict):
         return _of_gyroflow(content, where)
+    if "cam_model" in content and "cam_fx" in content:
+        return _of_vikit(content)
+    if "P0" in content and "P1" in content:
+        return _of_kitti(content, where)
     return content
 
 
@@ -49,3 +53,21 @@ def _of_gyroflow(content: dict[str, Any], where: str) -> dict[str, Any]:
     found = {key: lens[key] for key in ("camera_matrix", "distortion_coeffs") if key in lens}
     model = content.get("distortion_model") or "opencv_fisheye"
     return found | {"model": model, "width": size.get("w"), "height": size.get("h")}
+
+
+def _of_vikit(content: dict[str, Any]) -> dict[str, Any]:
+    """Read the settings of rpg_vikit, as SVO and FAST-LIVO have them: ``cam_fx``, and ``cam_d0`` to ``cam_d3``."""
+    found = {str(key).removeprefix("cam_"): value for key, value in content.items() if str(key).startswith("cam_")}
+    lens = [found.pop(f"d{i}") for i in range(len(found)) if f"d{i}" in found]
+    return found | {"distortion_coefficients": lens}
+
+
+def _of_kitti(content: dict[str, Any], where: str) -> dict[str, Any]:
+    """Read KITTI's ``calib.txt``: projections of rectified cameras ``P0`` to ``P3``, which differ by their places."""
+    found = []
+    for name in ("P0", "P1", "P2", "P3"):
+        words = str(content.get(name, content["P0"])).split()
+        found.append([word for i, word in enumerate(words) if i % 4 != 3])
+    if any(matrix != found[0] for matrix in found):
+        raise InputError(f"{where}: P0 to P3 are of cameras that differ; write fx fy cx cy of the one that is meant.")
+    return {"camera_matrix": found[0]}

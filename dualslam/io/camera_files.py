@@ -43,7 +43,7 @@ from dualslam.io.trajectory_files import read_text
 
 log = logging.getLogger(__name__)
 
-CALIB_LINE = "fx fy cx cy [k1 k2 p1 p2 [k3]] width height"
+CALIB_LINE = "fx fy cx cy [k1 k2 p1 p2 [k3]] [width height]"
 COLMAP_MODELS = (
     ("SIMPLE_PINHOLE", "f cx cy"),
     ("PINHOLE", "fx fy cx cy"),
@@ -81,11 +81,13 @@ def read_camera_file(path: str | Path, images_px: Callable[[], Size] | None = No
     if path.suffix.lower() == ".bin":
         return _one_of(path, _colmap_binary(path))
     text = read_text(path)
-    lines = [words for line in text.splitlines() if (words := line.split("#", 1)[0].split())]
+    lines = [words for line in text.splitlines() if (words := line.split("#", 1)[0].replace(",", " ").split())]
     if lines and all(len(words) > 3 and words[1] in COLMAP_NAMES for words in lines):
         return _one_of(path, [_of_colmap(words, f"{path}, camera {words[0]}") for words in lines])
-    if path.suffix.lower() == ".txt" and ":" not in text and "[image]" not in text:
-        return read_calib_line(path) if len(lines) == 1 else read_tum_mono_camera(path)
+    if _are_numbers(lines) or (path.suffix.lower() == ".txt" and ":" not in text and "[image]" not in text):
+        if len(lines) in (3, 4) and all(len(line) == len(lines) for line in lines):
+            return camera_of_mapping({"camera_matrix": [_float(w) for line in lines for w in line]}, str(path), images_px)
+        return _of_line(path, lines[0], images_px) if len(lines) == 1 else read_tum_mono_camera(path)
     return _one_of(path, [_of_mapping(content, str(path), images_px) for content in read_mappings(path, text)])
 
 
@@ -178,16 +180,17 @@ def _listed_camera(
     return build_camera(lens, numbers | dict(zip(COEFFICIENTS.get(lens, ()), distortion, strict=False)), where)
 
 
-def read_calib_line(path: Path) -> Camera:
-    """Read the one line ``fx fy cx cy [k1 k2 p1 p2 [k3]] width height`` of a ``calib.txt``."""
-    words = [word for line in read_text(path).splitlines() for word in line.split("#", 1)[0].split()]
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        raise InputError(f"{path} is not a line of numbers; write `{CALIB_LINE}`.") from None
-    if len(numbers) not in (6, 10, 11):
+def _of_line(path: Path, words: list[str], images_px: Callable[[], Size] | None) -> Camera:
+    """Read a line of ``fx fy cx cy [k1 k2 p1 p2 [k3]]``, with the size of the images or without."""
+    numbers = [number for word in words if (number := _float(word)) is not None]
+    if len(numbers) < len(words):
+        raise InputError(f"{path} is not a line of numbers; write `{CALIB_LINE}`.")
+    if len(numbers) not in (4, 6, 8, 9, 10, 11):
         raise InputError(f"{path} has {len(numbers)} numbers; write `{CALIB_LINE}`.")
     check_numbers(numbers, str(path))
+    if len(numbers) in (4, 8, 9):
+        content = {"model": "radtan", "camera_matrix": numbers[:4], "distortion_coefficients": numbers[4:]}
+        return camera_of_mapping(content, str(path), images_px)
     *intrinsics, width, height = numbers
     return radtan_camera(intrinsics[:4], intrinsics[4:], (width, height), str(path))
 
@@ -198,16 +201,17 @@ _DSO_COUNTS = {"fov": (5,), "pinhole": (4, 5), "radtan": (8,), "kannalabrandt": 
 def read_tum_mono_camera(path: Path) -> Camera:
     """Read a TUM-Mono or DSO ``camera.txt``: ``[Model] fx fy cx cy ...`` and ``width height`` on the next line.
 
-    Without a model's name five numbers are the FOV model (its omega 0: a pinhole). Intrinsics with a principal point
+    Without a model's name five numbers are the FOV model (its omega 0: a pinhole), eight OpenCV's. Intrinsics with a principal point
     below 1 are relative to the image size.
     """
     lines = [line.split() for line in read_text(path).splitlines() if line.split("#", 1)[0].strip()]
     hint = "the first line should be `fx fy cx cy omega` (or `Pinhole`, `RadTan`, `KannalaBrandt`, `FOV` and numbers)"
     if len(lines) < 2:
         raise InputError(f"{path} has {len(lines)} lines; {hint}, the second `width height`.")
-    model = "fov" if _is_number(lines[0][0]) else lines[0][0].lower()
+    named = _float(lines[0][0]) is None
+    model = lines[0][0].lower() if named else "radtan" if len(lines[0]) == 8 else "fov"
     try:
-        numbers = [float(word) for word in (lines[0] if _is_number(lines[0][0]) else lines[0][1:])]
+        numbers = [float(word) for word in lines[0][named:]]
         size = float(lines[1][0]), float(lines[1][1])
     except (ValueError, IndexError):
         raise InputError(f"{path} is no TUM-Mono camera file; {hint}, the second `width height`.") from None
@@ -227,9 +231,16 @@ def read_tum_mono_camera(path: Path) -> Camera:
     return _listed_camera(lens, [fx, fy, cx, cy], numbers[4:], size, str(path))
 
 
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
+def _are_numbers(lines: list[list[str]]) -> bool:
+    """Whether a file is lines of numbers, the first behind the name of a model of DSO or not."""
+    if not lines:
         return False
-    return True
+    named = lines[0][0].lower() in _DSO_COUNTS
+    return None not in [_float(word) for word in lines[0][named:]]
+
+
+def _float(word: str) -> float | None:
+    try:
+        return float(word)
+    except ValueError:
+        return None

@@ -7,7 +7,6 @@ lost.
 from __future__ import annotations
 
 import logging
-import math
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -29,13 +28,13 @@ NAMES: dict[str, tuple[str, ...]] = {
         *("model", "cameramodel", "distortionmodel", "modeltype", "cameratype", "type", "projectiontype", "projection"),
         *("distortiontype", "lensmodel", "lenstype", "projectionmodel", "cameramodeltype", "distmodel", "distortion"),
     ),
-    "fisheye": ("fisheyemodel", "isfisheye", "fisheye"),
+    "fisheye": ("fisheyemodel", "isfisheye", "fisheye", "bfisheye"),
     "matrix": ("cameramatrix", "k", "k1", "m1", "intrinsicmatrix", "intrinsics", "intrinsic", "mtx"),
     "list": ("distortioncoefficients", "distcoeffs", "distcoeff", "distortioncoeffs", "dist", "d", "d1", "distortion",
              "coeffs", "distortionparameters", "distortionparams", "distortioncoeff", "parameters"),
     "width": ("imagewidth", "width", "w", "cols"),
     "height": ("imageheight", "height", "h", "rows"),
-    "resolution": ("resolution", "imagedimension"),
+    "resolution": ("resolution", "imagedimension", "imagesize", "imgsize", "imagersize", "imageresolution"),
     "focals": ("focallength",),
     "principal": ("principalpoint",),
     "fx": ("fx", "flx", "gamma1", "mu"),
@@ -49,14 +48,15 @@ NAMES: dict[str, tuple[str, ...]] = {
     **{name: (name,) for name in ("k1", "k2", "k3", "k4", "p1", "p2", "xi", "alpha", "beta")},
 }  # fmt: skip
 """Parameters and their keys, in small letters without signs. If two are present, they must agree."""
+PARAMETERS = frozenset(word for name, words in NAMES.items() if name not in ("model", "fisheye") for word in words)
 SECTIONS = frozenset({
     "projectionparameters", "mirrorparameters", "distortionparameters", "intrinsics", "intrinsic", "distortion", "lens",
-    "resolution", "intrinsicparameters", "coefficients", "distortioncoefficients", "narrowstereo", "image",
+    "resolution", "imageresolution", "imagesize", "intrinsicparameters", "coefficients", "distortioncoefficients", "narrowstereo", "image",
 })  # fmt: skip
 """Keys that only group others."""
 SUSPECT = re.compile(
     r"^dist(?!ance)|distort|fisheye|lens|^(camera|projection|mirror)?(model|type)$|equirect|spheri|panoram|^omni|mirror|"
-    r"focal|intrinsic|coeff|^principal|^binning|crop|rational|skew|shear"
+    r"focal|intrinsic|coeff|^principal|^binning|crop|rational|skew|shear|^(image|img|frame)(size|shape|dims?|dimensions?)$"
 )
 """Keys that look like a lens, a model, or a cut of the image."""
 SUSPECT_NUMBER = re.compile(
@@ -67,8 +67,8 @@ HARMLESS = re.compile(r"^(sensortype|calibrationtime|focallengthmm|rectification
 RIG = re.compile(r"^(left|right|camera[12]?|cam\d+|frames|value0)$")
 """Where a file has several cameras of one rig, of which the first is meant; elsewhere one must be chosen."""
 SECOND = ("right", "camera2", "cam1")
-SAME_FOCAL = 1e-3
-"""Relative: cameras of one file whose focal lengths differ by less are one."""
+SAME = 1e-3
+"""Relative, and of coefficients: cameras of one file whose numbers differ by less are one."""
 MIDDLE = (0.4, 0.6)
 """Where a principal point lies in its image, as a share of its sides. Outside, the image was of another size."""
 
@@ -118,7 +118,7 @@ class CameraTable:
             above.append(("Camera",))
         mine = [k for k in keys if k.owner == owner]
         chosen = [*mine, *(k for k in keys if k.owner in above and k.owner != owner)]
-        _refuse_other_focals(keys, mine, owner, where)
+        _refuse_other_frames(keys, mine, owner, where)
         rest = [k for k in keys if k.owner not in owners and k not in chosen]
         if others := [o for o in owners if o != owner and not ("frames" in o and not owner)]:
             named = " and ".join(".".join(o) for o in [owner, *others][:3])
@@ -159,7 +159,7 @@ class CameraTable:
         if value is None:
             raise InputError(f"{self.where} has no {name}; add it.")
         try:
-            number = float(value)
+            number = float(value[0] if isinstance(value, list) else value)
         except (TypeError, ValueError):
             raise InputError(f"{self.key(name)} is {value!r}, not a number.") from None
         check_numbers([number], self.key(name))
@@ -187,6 +187,8 @@ class CameraTable:
         check_numbers(numbers, self.key(name))
         if name == "matrix" and len(numbers) == 16:
             numbers = [numbers[i] for i in (0, 1, 2, 4, 5, 6, 8, 9, 10)]
+        if name == "matrix" and not any(numbers):
+            raise InputError(f"{self.key(name)} is all zeros: this camera was not calibrated.")
         return numbers
 
     def pair(self, name: str) -> list[float]:
@@ -229,6 +231,8 @@ class CameraTable:
             raise InputError(f"{self.key('fisheye')} is {flagged!r}; it should be 0 or 1.")
         if flagged in (1, "1", "true") and not set(lenses) & set(BEFORE_FOCAL):
             lenses[KannalaBrandtCamera.model] = self.key("fisheye").removeprefix(f"{self.where}: ")
+        if self.has("xi") and self.has("matrix") and not set(lenses) & set(BEFORE_FOCAL):  # OpenCV's omnidirectional calibration names no model
+            lenses[OmniCamera.model] = "xi"
         said = [lens for lens in lenses if lens != ANY]
         for sphere in set(said) & set(BEFORE_FOCAL):
             fitting = (NONE, RadTanCamera.model) if sphere == OmniCamera.model else (NONE,)
@@ -243,15 +247,16 @@ class CameraTable:
 
     def refuse_rest(self) -> None:
         """Refuse keys that look like a lens or a model, and were not used."""
+        full = {"width": self.take("width"), "height": self.take("height")}
         for key in [*self._keys, *self._others]:
             if key.path in self._used or HARMLESS.match(key.name) or _says_nothing(key):
                 continue
             says_model = isinstance(key.value, str) and LENSES.get(plain(key.value), ANY) not in (ANY, NONE)
-            is_number = not isinstance(key.value, list) and SUSPECT_NUMBER.search(key.name)
-            in_roi = len(key.path) > 1 and plain(key.path[-2]) == "roi"
+            is_number = _is_single(key.value) and SUSPECT_NUMBER.search(key.name)
+            in_roi = len(key.path) > 1 and plain(key.path[-2]) == "roi" and key.value != full.get(key.name)
             if says_model or is_number or in_roi or SUSPECT.search(key.name):
                 raise InputError(
-                    f"{self.where}: {'.'.join(key.path)} looks like a lens or a camera model, and is not read; "
+                    f"{self.where}: {'.'.join(key.path)} looks like a lens, a camera model or a crop, and is not read; "
                     "remove it, or use the keys of docs/calibration.md."
                 )
 
@@ -295,12 +300,16 @@ def _array(value: Any) -> Any:
 
 def _fits(name: str, value: Any) -> bool:
     """Whether a value is of the kind that `name` has: `distortion` may be a word, a list or a number."""
-    is_list = isinstance(value, list)
     if name == "matrix":
-        return is_list or (isinstance(value, str) and not LENSES.get(plain(value)))
+        return isinstance(value, list) or (isinstance(value, str) and not LENSES.get(plain(value)))
     if name in ("list", "resolution", "focals", "principal"):
-        return is_list
-    return not is_list
+        return isinstance(value, list)
+    return _is_single(value)
+
+
+def _is_single(value: Any) -> bool:
+    """Whether a value is a word or a number, by itself or in OpenCV's matrix of one."""
+    return not isinstance(value, list) or (len(value) == 1 and not isinstance(value[0], list))
 
 
 def _says_nothing(key: Key) -> bool:
@@ -311,14 +320,14 @@ def _says_nothing(key: Key) -> bool:
     return plain(key.value) in ("", "none", "false", "no")
 
 
-def _refuse_other_focals(keys: list[Key], mine: list[Key], owner: Path, where: str) -> None:
-    """Refuse frames of nerfstudio or Polycam with intrinsics of their own that differ."""
-    focals = {k.name: k for k in mine if _is_focal(k) and not isinstance(k.value, list)}
+def _refuse_other_frames(keys: list[Key], mine: list[Key], owner: Path, where: str) -> None:
+    """Refuse frames of nerfstudio or Polycam with intrinsics, a lens or a size of their own that differ."""
+    first = {k.name: k for k in mine if k.name in PARAMETERS}
     for key in keys:
-        if key.name in focals and key.owner and key.owner != owner and plain(key.owner[0]) == "frames":
-            this, other = _array(focals[key.name].value), _array(key.value)
-            if len(this) != 1 or len(other) != 1 or not math.isclose(this[0], other[0], rel_tol=SAME_FOCAL):
+        if key.name in first and key.owner and key.owner != owner and plain(key.owner[0]) == "frames":
+            ours, theirs = _array(first[key.name].value), _array(key.value)
+            if np.shape(ours) != np.shape(theirs) or not (ours == theirs or np.allclose(ours, theirs, SAME, SAME)):
                 raise InputError(
-                    f"{where}: {'.'.join(key.path)} is {key.value}, {'.'.join(focals[key.name].path)} "
-                    f"{focals[key.name].value}; one camera is read, so give the images of one."
+                    f"{where}: {'.'.join(key.path)} is {key.value}, {'.'.join(first[key.name].path)} "
+                    f"{first[key.name].value}; one camera is read, so give the images of one."
                 )

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from dualslam.core.types import FloatArray
-from dualslam.io.camera_files import read_calib_line
+from dualslam.io.camera_files import read_camera_file
 from dualslam.io.images import IMAGE_SUFFIXES, ImageFiles, fill_gaps, list_images
-from dualslam.io.sequence import Given, Recording
+from dualslam.io.sequence import Given, Recording, image_size
 from dualslam.io.times import NOMINAL_RATE_HZ, check_count, read_times, resolve_times, times_in_names
 from dualslam.io.trajectory_files import read_tum
 
@@ -41,11 +41,13 @@ def open_recording(folder: Path, given: Given) -> Recording:
         clock, timestamps_s = f"the names of the images in {where}", named
     else:
         timestamps_s = nominal_times(len(paths), given.rate_hz, times_path)
+    name, images = folder.resolve().name, ImageFiles(paths)
+    calibrated = not given.camera and calib_path.exists()
     return Recording(
-        name=folder.resolve().name,
-        images=ImageFiles(paths),
+        name=name,
+        images=images,
         timestamps_s=timestamps_s,
-        camera=None if given.camera or not calib_path.exists() else read_calib_line(calib_path),
+        camera=read_camera_file(calib_path, lambda: image_size(images, name)) if calibrated else None,
         ground_truth=read_tum(truth_path) if truth_path.exists() and clock else None,
         calibration=str(calib_path),
         clock=clock,

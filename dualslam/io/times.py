@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +79,7 @@ def in_seconds(times: FloatArray, where: str, unit: str | None) -> FloatArray:
             f"{where}: its times are {1.0 / rate_hz:.3g} apart: {rate_hz:.3g} Hz as seconds{seem}; {say} "
             f"{likely[0] if likely else 's'}{', or s if they are seconds' if likely else ' if they are seconds'})."
         )
-    if (steps == 1.0).all() and float(times[0]).is_integer():
+    if epoch is None and times[0] < EPOCH_S[0] and (times % 1.0 == 0.0).all():
         raise InputError(f"{where}: its times count frames ({times[0]:.0f}, {times[1]:.0f}, ...); {say} s).")
     return times
 
@@ -86,18 +87,19 @@ def in_seconds(times: FloatArray, where: str, unit: str | None) -> FloatArray:
 def times_in_names(paths: list[Path]) -> FloatArray | None:
     """Return the epoch times, in seconds, by which images are named; None where the names are none.
 
-    Names are a whole number of milli-, micro- or nanoseconds, or seconds with a fraction.
+    Names end in a whole number of milli-, micro- or nanoseconds, or seconds with a fraction.
     """
     found = []
     for path in paths:
-        whole, _, fraction = path.stem.partition(".")
-        unit = epoch_unit(float(whole)) if whole.isdigit() and whole.isascii() else None
+        named = re.search(r"([0-9]+)(?:\.([0-9]+))?$", path.stem)
+        whole, fraction = named.groups() if named else ("0", None)
+        unit = epoch_unit(float(whole))
         if unit is not None and not fraction:
             per_second = round(1.0 / UNITS[unit])
             # Whole numbers first: nanoseconds of an epoch time do not fit a float, its seconds fit to 0.2 microseconds.
             found.append(int(whole) // per_second + int(whole) % per_second * UNITS[unit])
-        elif whole.isdigit() and fraction.isdigit() and EPOCH_S[0] < int(whole) < EPOCH_S[1]:
-            found.append(float(path.stem))
+        elif fraction and EPOCH_S[0] < int(whole) < EPOCH_S[1]:
+            found.append(float(f"{whole}.{fraction}"))
         else:
             return None
     times = np.array(found)

@@ -164,6 +164,7 @@ def test_missing_parts_of_known_layouts(make, tmp_path: Path, layout: str) -> No
         ("0\n5e4\n1e5\n15e4\n2e5\n25e4\n", ["but 20 Hz as microseconds", "--time-unit us"]),
         ("7\n5e7\n1e8\n15e7\n2e8\n25e7\n", ["but 20 Hz as nanoseconds", "--time-unit ns"]),
         ("0\n1\n2\n3\n4\n5\n", ["its times count frames (0, 1, ...)", "--rate HZ", "--time-unit s)"]),
+        ("0\n2\n4\n6\n8\n10\n", ["its times count frames (0, 2, ...)", "--rate HZ", "--time-unit s)"]),
         ("0\n5\n10\n15\n20\n25\n", ["0.2 Hz as seconds, but 200 Hz as milliseconds", "or s if they are seconds"]),
         ("0\n1e-5\n2e-5\n3e-5\n4e-5\n5e-5\n", ["1e+05 Hz as seconds; give", "--time-unit s if they are seconds"]),
         ("1 2\n3 4\n", ["line 1", "2 numbers where 1"]),
@@ -184,7 +185,7 @@ def test_bad_times_of_the_caller(dataset: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("30 30 16 12\n", ["has 4 numbers", "fx fy cx cy"]),
+        ("30 30 16 12 32\n", ["has 5 numbers", "fx fy cx cy"]),
         ("30 nan 16 12 32 24\n", ["not finite"]),
         ("30 x 16 12 32 24\n", ["not a line of numbers"]),
         ("-30 30 16 12 32 24\n", ["fx"]),

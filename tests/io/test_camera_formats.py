@@ -526,6 +526,7 @@ FORMATS = [
     ("opencv.xml", OPENCV_XML, FIVE),
     ("ros1.yaml", ROS1_ECHO * 2, RADTAN),
     ("ros2.yaml", ROS2_ECHO, RADTAN),
+    ("ros2_whole_region.yaml", ROS2_ECHO.replace("  height: 0\n  width: 0", "  height: 480\n  width: 752"), RADTAN),
     ("ros2_binned_by_one.yaml", ROS2_ECHO.replace("binning_x: 0", "binning_x: 1"), RADTAN),
     ("ost.yaml", ROS_CALIBRATOR, FIVE),
     ("ost.txt", ROS_OST, FIVE),
@@ -568,6 +569,16 @@ FORMATS = [
     ("gyroflow.json", json.dumps(GYROFLOW), FISHEYE),
     ("realsense.json", json.dumps(REALSENSE), RADTAN),
     ("dso.txt", "RadTan 458 457 367 248 -0.28 0.07 0.0002 0.00002\n752 480\ncrop\n640 480\n", RADTAN),
+    ("lsd_slam.cfg", "458 457 367 248 -0.28 0.07 0.0002 0.00002\n752 480\ncrop\n640 480\n", RADTAN),
+    ("omnidir.yml", opencv("-0.1, 0.02, 0.0003, 0.0006", 4, "xi: !!opencv-matrix {rows: 1, cols: 1, dt: d, data: [0.9]}\n"),
+     OmniCamera(752, 480, 458.0, 457.0, 367.0, 248.0, xi=0.9, k1=-0.1, k2=0.02, p1=0.0003, p2=0.0006)),
+    ("image_size.yml", opencv("-0.28, 0.07, 0.0002, 0.00002, 0.01", 5).replace("image_width: 752\nimage_height: 480", "image_size: [752, 480]"), FIVE),
+    ("arkit_kit.json", json.dumps({"intrinsics": [[458, 0, 0], [0, 457, 0], [367, 248, 1]], "imageResolution": [752, 480]}), PINHOLE),
+    ("t265.json", json.dumps(REALSENSE | {"fx": 380, "fy": 381, "model": "distortion.kannala_brandt4", "coeffs": [0.003, 0.0007, -0.002, 0.0002, 0]}), FISHEYE),
+    ("vikit.yaml", "cam_model: Pinhole\ncam_width: 752\ncam_height: 480\ncam_fx: 458\ncam_fy: 457\ncam_cx: 367\ncam_cy: 248\n"
+     "cam_d0: -0.28\ncam_d1: 0.07\ncam_d2: 0.0002\ncam_d3: 0.00002\n", RADTAN),
+    ("maplab_unified.yaml", SVO.replace("pinhole", "unified-projection").replace("[458", "[0.9, 458").replace("[-0.28, 0.07, 0.0002, 2.0e-05]", "[0, 0, 0, 0]"),
+     OmniCamera(752, 480, 458.0, 457.0, 367.0, 248.0, xi=0.9)),
     ("dso_equi.txt", "EquiDistant 380 381 367 248 0.003 0.0007 -0.002 0.0002\n752 480\nfull\n640 480\n", FISHEYE),
 ]  # fmt: skip
 
@@ -641,6 +652,12 @@ REFUSED = [
     ("transforms.json", json.dumps(NERFSTUDIO | {"camera_model": "EQUIRECTANGULAR"}), "'EQUIRECTANGULAR'"),
     ("transforms.json", json.dumps(NERFSTUDIO | {"k4": 0.1}), "k4"),
     ("transforms.json", json.dumps(NERFSTUDIO | {"frames": [{"fl_x": 458.0}, {"fl_x": 470.0}]}), "frames.1.fl_x is 470.0"),
+    ("transforms.json", json.dumps({"frames": [NERFSTUDIO, NERFSTUDIO | {"k1": -0.2}]}), "frames.1.k1 is -0.2"),
+    ("transforms.json", json.dumps({"frames": [NERFSTUDIO, NERFSTUDIO | {"w": 1504}]}), "frames.1.w is 1504"),
+    ("ros.yaml", ROS1_ECHO.replace("458.0", "0.0").replace("457.0", "0.0").replace("[0.0, 0.0, 367.0, 0.0, 0.0, 248.0, 0.0, 0.0, 1.0]", str([0] * 9)), "was not calibrated"),
+    ("opencv.yml", opencv("0, 0, 0, 0, 0", 5, "image_shape: [480, 752]\n"), "image_shape looks like"),
+    ("orb.yaml", ORB_SLAM.format(type="PinHole", fx=458.0, fy=4570.0, lens=ORB_RADTAN), "should be nearly equal"),
+    ("kitti.txt", "P0: 7 0 3 0 0 7 2 0 0 0 1 0\nP1: 8 0 3 9 0 8 2 0 0 0 1 0\n", "P0 to P3 are of cameras that differ"),
     ("ros.yaml", ROS1_ECHO.replace("binning_x: 0", "binning_x: 2"), "binning_x"),
     ("ros.yaml", ROS1_ECHO.replace("x_offset: 0", "x_offset: 40"), "roi.x_offset"),
     ("ros.yaml", ROS1_ECHO.replace("plumb_bob", "thin_prism"), "'thin_prism'"),
@@ -702,6 +719,22 @@ def test_blenders_synthetic_scenes_have_an_angle_and_no_size(tmp_path: Path) -> 
     path.write_text(json.dumps({"camera_angle_x": np.pi / 2, "frames": [{"file_path": "./train/r_0"}]}))
     camera = read_camera_file(path, lambda: (800, 800))
     assert camera.to_dict() == pytest.approx(PinholeCamera(800, 800, 400.0, 400.0, 399.5, 399.5).to_dict())
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("droid.txt", "458 457 367 248 -0.28 0.07 0.0002 0.00002\n", RADTAN),
+        ("K.txt", "458 0 367 0\n0 457 248 0\n0 0 1 0\n0 0 0 1\n", PINHOLE),
+        ("camera_matrix.csv", "458.0,0.0,367.0\n0.0,457.0,248.0\n0.0,0.0,1.0\n", PINHOLE),
+        ("calib.txt", "P0: 458 0 367 0 0 457 248 0 0 0 1 0\nP1: 458 0 367 -386.1 0 457 248 0 0 0 1 0\n", PINHOLE),
+    ],
+)
+def test_numbers_without_a_size_are_of_these_images(tmp_path: Path, name: str, text: str, expected) -> None:
+    """A line of DROID-SLAM, ScanNet's matrix, Stray Scanner's, and KITTI's projections."""
+    path = tmp_path / name
+    path.write_text(text)
+    assert read_camera_file(path, lambda: (752, 480)) == expected
 
 
 def test_a_file_that_does_not_say_the_size_of_its_images(tmp_path: Path) -> None:

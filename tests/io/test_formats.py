@@ -112,7 +112,7 @@ def test_counts_are_timed_by_the_rate(dataset: Path) -> None:
     assert open_sequence(dataset, time_unit="s", camera_file=None).frame_timestamps[5] == 5.0
 
 
-@pytest.mark.parametrize("stem", ["{ns}", "{us}", "{ms}", "{s}.{us_of_s:06d}"])
+@pytest.mark.parametrize("stem", ["{ns}", "{us}", "{ms}", "{s}.{us_of_s:06d}", "cam_{ns}"])
 def test_images_named_by_their_times(tmp_path: Path, stem: str) -> None:
     """As EuRoC, TUM-VI and TUM RGB-D name them; a number of another size is a number."""
     times_ns = [1_403_636_579_763_555_584 + i * 50_000_000 for i in range(N)]

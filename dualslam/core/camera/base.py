@@ -27,6 +27,8 @@ MAX_RECTIFIED_ANGLE_RAD = math.radians(80.0)
 FOCAL_OVER_LONGER_SIDE = (0.05, 100.0)
 """What a focal length in pixels may be: a fisheye of 220 degrees has 0.26, a field of half a degree 100. Outside are
 focal lengths in millimetres or of normalised coordinates, and slips of an exponent."""
+MAX_PIXEL_ASPECT = 2.5
+"""Of fx to fy. One field of interlaced video has 2; more is a slip in a digit."""
 
 
 @dataclass(frozen=True)
@@ -193,6 +195,8 @@ class Camera(ABC):
                     f"camera: {name} is {getattr(self, name):g}, for images of {self.width} x {self.height} it must be "
                     f"{low:g} to {high:g} pixels"
                 )
+        if not 1.0 / MAX_PIXEL_ASPECT <= self.fx / self.fy <= MAX_PIXEL_ASPECT:
+            raise InputError(f"camera: fx is {self.fx:g} and fy {self.fy:g}; they should be nearly equal")
         for name, size in (("cx", self.width), ("cy", self.height)):
             if not -0.5 <= getattr(self, name) <= size - 0.5:
                 raise InputError(f"camera: {name} is {getattr(self, name)}, outside of the image of {size} pixels")
