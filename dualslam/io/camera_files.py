@@ -86,7 +86,7 @@ def read_camera_file(path: str | Path, images_px: Callable[[], Size] | None = No
         return _one_of(path, [_of_colmap(words, f"{path}, camera {words[0]}") for words in lines])
     if _are_numbers(lines) or (path.suffix.lower() == ".txt" and ":" not in text and "[image]" not in text):
         if len(lines) in (3, 4) and all(len(line) == len(lines) for line in lines):
-            return camera_of_mapping({"camera_matrix": [_float(w) for line in lines for w in line]}, str(path), images_px)
+            return camera_of_mapping({"camera_matrix": [w for line in lines for w in line]}, str(path), images_px)
         return _of_line(path, lines[0], images_px) if len(lines) == 1 else read_tum_mono_camera(path)
     return _one_of(path, [_of_mapping(content, str(path), images_px) for content in read_mappings(path, text)])
 
@@ -201,8 +201,8 @@ _DSO_COUNTS = {"fov": (5,), "pinhole": (4, 5), "radtan": (8,), "kannalabrandt": 
 def read_tum_mono_camera(path: Path) -> Camera:
     """Read a TUM-Mono or DSO ``camera.txt``: ``[Model] fx fy cx cy ...`` and ``width height`` on the next line.
 
-    Without a model's name five numbers are the FOV model (its omega 0: a pinhole), eight OpenCV's. Intrinsics with a principal point
-    below 1 are relative to the image size.
+    Without a model's name five numbers are the FOV model (its omega 0: a pinhole), eight OpenCV's. Intrinsics with a
+    principal point below 1 are relative to the image size.
     """
     lines = [line.split() for line in read_text(path).splitlines() if line.split("#", 1)[0].strip()]
     hint = "the first line should be `fx fy cx cy omega` (or `Pinhole`, `RadTan`, `KannalaBrandt`, `FOV` and numbers)"

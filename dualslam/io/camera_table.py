@@ -51,7 +51,8 @@ NAMES: dict[str, tuple[str, ...]] = {
 PARAMETERS = frozenset(word for name, words in NAMES.items() if name not in ("model", "fisheye") for word in words)
 SECTIONS = frozenset({
     "projectionparameters", "mirrorparameters", "distortionparameters", "intrinsics", "intrinsic", "distortion", "lens",
-    "resolution", "imageresolution", "imagesize", "intrinsicparameters", "coefficients", "distortioncoefficients", "narrowstereo", "image",
+    "imageresolution", "imagesize",
+    "resolution", "intrinsicparameters", "coefficients", "distortioncoefficients", "narrowstereo", "image",
 })  # fmt: skip
 """Keys that only group others."""
 SUSPECT = re.compile(
@@ -231,7 +232,7 @@ class CameraTable:
             raise InputError(f"{self.key('fisheye')} is {flagged!r}; it should be 0 or 1.")
         if flagged in (1, "1", "true") and not set(lenses) & set(BEFORE_FOCAL):
             lenses[KannalaBrandtCamera.model] = self.key("fisheye").removeprefix(f"{self.where}: ")
-        if self.has("xi") and self.has("matrix") and not set(lenses) & set(BEFORE_FOCAL):  # OpenCV's omnidirectional calibration names no model
+        if self.has("xi") and self.has("matrix") and not set(lenses) & set(BEFORE_FOCAL):  # OpenCV names no model
             lenses[OmniCamera.model] = "xi"
         said = [lens for lens in lenses if lens != ANY]
         for sphere in set(said) & set(BEFORE_FOCAL):
