@@ -17,13 +17,11 @@ import numpy as np
 
 from dualslam.backend import convert
 from dualslam.backend.measurements.exports import export_graph
-from dualslam.backend.measurements.misreadings import misreadings
 from dualslam.backend.measurements.path import CameraPath, Term, attach
 from dualslam.backend.measurements.start import MAX_OFFSET_S, POSITION, QUANTILE_99, MetricStart, find_start, up_of
 from dualslam.backend.noise import gaussian
-from dualslam.backend.solver import GTSAM_ERRORS, SolverFailure
 from dualslam.core.chi_square import CHI2_99, CHI2_999, MEDIAN_CHI2
-from dualslam.core.errors import InputError, SolverError
+from dualslam.core.errors import InputError
 from dualslam.core.geometry import sim3, so3
 from dualslam.core.metric_problem import MeasurementSource, MetricProblem, MetricSolution, pose_by_node
 from dualslam.core.types import FloatArray
@@ -35,8 +33,6 @@ DRIFTS = (1.0, 2.0, 4.0, 8.0)
 """How many times the map's own sigmas are taken: the smallest at which it agrees with the measurements counts."""
 FEW_REJECTED = 0.125
 """Share of readings that are outvoted at which the map need not be asked whether it bends instead."""
-MAX_REJECTED = 0.4
-"""Share of readings of a kind that may be outvoted: beyond, it is not known who is wrong."""
 GAUGE_SIGMAS = np.ones(7)
 """Of a prior on one node of each submap (rad, extents of the map, log-scale): it holds what no measurement fixes."""
 GNC_GROWTH, GNC_END = 3.0, 1e3
@@ -44,80 +40,12 @@ CLOCK_SIGMAS = 2.5
 """Below, an offset is chance: one in a hundred."""
 N_SETTLED = 3
 """Rounds of least squares and hard rejection."""
-MISREAD = 2.0 * float(np.log(1000.0))
-"""Difference of costs, twice a logarithm of likelihoods: one file in a thousand is wrong in a given way."""
 UPRIGHT_SIGMA = 0.5
 """Length of the difference between the camera's up and the sky, of a camera that a person or a vehicle carries."""
 N_BESIDE = 5
 """Positions on either side of a jump of the clock: the median of five survives two outliers."""
 MAX_RUN = 2
 """Neighbouring positions that may be outvoted where the map bends: three are chance once in a million."""
-
-
-def solve_metric(
-    problem: MetricProblem,
-    sources: Sequence[MeasurementSource],
-    known_offsets_s: Mapping[str, float] | None = None,
-) -> MetricSolution:
-    """Put a map into the frame of measurements.
-
-    Where they do not fit as they are, and fit far better read otherwise, they are refused.
-
-    Parameters
-    ----------
-    problem : MetricProblem
-    sources : sequence of MeasurementSource
-    known_offsets_s : mapping of str to float, optional
-        Of clocks, by source, that were estimated with another map: they are not estimated again.
-
-    Raises
-    ------
-    InputError
-        In one sentence, where the measurements cannot belong to the map.
-    SolverError
-    """
-    known = known_offsets_s or {}
-    names = ", ".join(source.name for source in sources)
-    try:
-        joint = _Joint.solved(problem, sources, known, DRIFTS)
-        if not joint.is_plain:
-            read_otherwise = [  # if the file is wrong, the map is right
-                (_Joint.solved(problem, others, known, DRIFTS[:1]).cost + price, words)
-                for words, others, price in misreadings(sources, joint.jumps_s)
-            ]
-            cost, words = min(read_otherwise, default=(np.inf, ""))
-            if cost < joint.cost - joint.rebate() - MISREAD:
-                raise InputError(f"{names}: {words}; correct the file.")
-        solution = joint.solution()
-    except GTSAM_ERRORS as error:
-        raise SolverError(
-            f"the joint graph of {len(problem.S_world_node)} nodes failed: {SolverFailure.of(error)}"
-        ) from error
-    _check(solution, joint, names)
-    return solution
-
-
-def _check(solution: MetricSolution, joint: _Joint, names: str) -> None:
-    """Refuse measurements that are outvoted, that jump where the map bends, or whose clock is far off."""
-    for kind, n in solution.rejected.items():
-        total = n + solution.used.get(kind, 0)
-        if total >= 3 and n > MAX_REJECTED * total:
-            raise InputError(
-                f"{names}: {n} of {total} measurements of {kind} contradict the map and the others: they are of "
-                "another recording, or their sigmas are too small."
-            )
-    run = joint.longest_run()
-    if len(run) > MAX_RUN and joint.drift > 1:
-        raise InputError(
-            f"{names}: the positions from {run[0]:.1f} to {run[-1]:.1f} s contradict the map, and so do those "
-            "before or after: they jump. Remove what is wrong (multipath, a clock that was set)."
-        )
-    for name, offset in solution.clock_offset_s.items() if solution.believed.all() else ():
-        if abs(offset) > MAX_OFFSET_S + QUANTILE_99 * solution.clock_sigma_s[name]:
-            raise InputError(
-                f"{name}: its clock would be {offset:+.1f} s off, more than {MAX_OFFSET_S:.0f} s: give --clock-offset, "
-                "or the file of this recording."
-            )
 
 
 def _integrated(source: MeasurementSource, cuts_s: FloatArray) -> MeasurementSource:
@@ -142,7 +70,7 @@ class _Trial:
     is_plain: bool
 
 
-class _Joint:
+class JointGraph:
     """The graph and its weights."""
 
     def __init__(self, problem: MetricProblem, start: MetricStart, known: Mapping[str, float]) -> None:

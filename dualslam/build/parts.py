@@ -60,12 +60,12 @@ class MetricParts:
 
     covariances: Covariances  # a submap's word on its edges
     solve: Callable[[MetricProblem, Sequence[MeasurementSource], Mapping[str, float] | None], MetricSolution]
-    """`dualslam.backend.measurements.joint_graph.solve_metric`."""
+    """`dualslam.backend.measurements.solve.solve_metric`."""
 
 
 def metric_parts(config: Config) -> MetricParts:
     """Build what puts a map into the frame of measurements."""
-    from dualslam.backend.measurements.joint_graph import solve_metric
+    from dualslam.backend.measurements.solve import solve_metric
 
     return MetricParts(atlas_solver(config).edge_covariances, solve_metric)
 

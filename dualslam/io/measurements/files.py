@@ -27,7 +27,7 @@ from dualslam.io.euroc import body_from_camera
 from dualslam.io.images import list_images
 from dualslam.io.measurements.bag_topics import read_bag
 from dualslam.io.measurements.geodetic import Geodetic, to_enu
-from dualslam.io.trajectory_files import read_text
+from dualslam.io.trajectory_files import read_number_table, read_text
 
 VERTICAL = 2.0
 """A satellite receiver's height is about twice as uncertain as its place."""
@@ -100,7 +100,7 @@ def _text(path: Path, sigma: float | None) -> RowSource:
     if "w_rs_s" in head:
         return RowSource(str(path), _euroc(path, lines, sigma))
     if "timestamp ax ay az" in head:
-        return RowSource(str(path), _tum(path, lines, needed(sigma, path)))
+        return RowSource(str(path), _tum(path, needed(sigma, path)))
     rows = []
     for number, fields in enumerate(csv.reader(lines), 1):
         fields = [field.strip() for field in fields]
@@ -146,19 +146,10 @@ def _mount(T: FloatArray) -> tuple[float, ...]:
     return (*T[:3, 3].tolist(), *so3.quat_xyzw_from_matrix(T[:3, :3]).tolist())
 
 
-def _tum(path: Path, lines: Sequence[str], sigma: float) -> list[MeasurementRow]:
+def _tum(path: Path, sigma: float) -> list[MeasurementRow]:
     """Return gravity from TUM's ``accelerometer.txt``: what it measures at rest points up."""
-    rows = []
-    for number, line in enumerate(lines, 1):
-        words = line.split("#", 1)[0].split()
-        if not words:
-            continue
-        where = f"{path}, line {number}"
-        values = _floats(words, where)
-        if len(values) != 4:
-            raise InputError(f"{where}: {len(values)} numbers; timestamp ax ay az are due.")
-        rows.append(MeasurementRow("direction", (values[0], *(-a for a in values[1:]), *DOWN, sigma), where))
-    return rows
+    table = -read_number_table(path, 4, "TUM's accelerometer.txt (timestamp ax ay az)")
+    return [MeasurementRow("direction", (-t, *down, *DOWN, sigma), str(path)) for t, *down in table.tolist()]
 
 
 # --- latitude, longitude, height
