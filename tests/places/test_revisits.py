@@ -237,7 +237,7 @@ def test_a_believed_place_waits_for_its_covariances_and_is_closed_when_the_run_e
 
 @pytest.mark.slow
 def test_a_lap_that_is_driven_again_and_again_closes_ever_fewer_loops() -> None:
-    n = 4 * N_LAP
+    n = 3 * N_LAP
     system = run(PointWorld(wall(), ring(n)), **ROLLING)
     n_keyframes = sum(len(submap.keyframes) for submap in system.atlas.submaps.values())
     loops = [e.frame for e in system.events.of_kind(EventKind.LOOP_CLOSED)]

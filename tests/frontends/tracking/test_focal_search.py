@@ -49,7 +49,7 @@ def test_a_hand_held_camera_tells_its_focal_length(seed: int) -> None:
 @pytest.mark.slow
 def test_a_lens_is_found_with_the_focal_length() -> None:
     camera = DivisionCamera(*SIZE_PX, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, k=-0.3)
-    found = search(features_of(PointWorld(cloud(), hand_held(60)), camera))
+    found = search(features_of(PointWorld(cloud(), hand_held(40)), camera))
     assert isinstance(found, FocalSearch)
     assert found.focal_px == pytest.approx(CAMERA.fx, rel=0.06)
     assert found.lens == pytest.approx(-0.3 / (2 * CAMERA.fx / CAMERA.width) ** 2, abs=0.04)
@@ -75,7 +75,7 @@ def test_it_does_not_matter_how_a_telephone_was_held() -> None:
 def test_a_straight_drive_does_not_claim_to_know() -> None:
     """It leaves the focal length to what cameras are like, and says so."""
     turning = found_hand_held(0)
-    straight = search(features_of(PointWorld(cloud(length_m=20.0), path(60, np.array([0.0, 0.0, 0.12]), np.zeros(3)))))
+    straight = search(features_of(PointWorld(cloud(length_m=20.0), path(40, np.array([0.0, 0.0, 0.12]), np.zeros(3)))))
     assert isinstance(turning, FocalSearch)
     assert isinstance(straight, FocalSearch)
     assert straight.log_sigma > 2.0 * turning.log_sigma
