@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -165,6 +165,10 @@ class Atlas:
         `sure`: linked by connections whose scale may be relied on.
         """
         return joined(self.submaps, [link for link in self.believed if link.is_sure or not sure])
+
+    def largest(self, n_frames: Mapping[int, int]) -> list[int]:
+        """Return the linked set with most frames, by the number of those that each submap has posed."""
+        return max(self.components(), key=lambda c: sum(n_frames[m] for m in c), default=[])
 
     def component_of(self, submap_id: int, sure: bool = False) -> list[int]:
         """Return the linked set of a submap, ascending; `sure`: as for `components`."""

@@ -28,6 +28,10 @@ from dualslam.map.submap import Submap
 from dualslam.recovery.attempts import Attempt, RecoveryParts
 from dualslam.recovery.job import RecoveryJob
 
+MAX_UNRECOGNISED = 5
+"""Frames in a row that show something and are not recognised, at which an attempt by other features alone ends, if
+another was made before it. That one has tried to cross the gap. This one follows from frame to frame what the live
+features have lost: its crossings of 9 and 14 such frames lost the scale, for seven times the cost a frame."""
 FEATURE_THREADS = 2
 """That find other front ends' features beside reverse tracking, where the tracking waits for it."""
 
@@ -133,14 +137,15 @@ def _attempts(
     """Build the attempts."""
     own = Auxiliary(frontend, OwnFeatures())
     attempts = []
-    for attempt in config.recovery.attempts:
+    for number, attempt in enumerate(config.recovery.attempts):
         if attempt.is_live:
             attempts.append(_attempt_by(lambda camera: (own,), attempt, config, live, camera))
             continue
         others = auxiliaries[auxiliary_config(attempt).model_dump_json()]
         first = (own,) if attempt.tracking == "live" else ()
         made = _attempt_by(partial(_after, first, others, config.camera.model_sigma_px), attempt, config, live, camera)
-        attempts.append(replace(made, find_lack=others.find_lack) if attempt.if_installed else made)
+        made = replace(made, find_lack=others.find_lack) if attempt.if_installed else made
+        attempts.append(made if number == 0 or first else replace(made, max_unrecognised=MAX_UNRECOGNISED))
     return tuple(attempts)
 
 

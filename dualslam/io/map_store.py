@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -59,10 +60,7 @@ class StoredMap:
     @property
     def main(self) -> list[int]:
         """The linked set of submaps with most posed frames: its first one's frame is the world of the saved run."""
-        count = dict.fromkeys(self.atlas.submaps, 0)
-        for pose in self.poses.values():
-            count[pose.submap_id] += 1
-        return max(self.atlas.components(), key=lambda c: sum(count[m] for m in c), default=[])
+        return self.atlas.largest(Counter(pose.submap_id for pose in self.poses.values()))
 
 
 def submap_path(folder: Path, submap_id: int) -> Path:

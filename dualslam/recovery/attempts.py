@@ -21,11 +21,14 @@ class Attempt:
     """One way to track in reverse, by the name of the front end that its poses come from.
 
     `find_lack`: returns why the attempt cannot be made in this installation. It is asked before each attempt.
+    `max_unrecognised`: for an attempt that is only made if those before it leave something to do better. It ends at so
+    many frames in a row that show something and are not recognised.
     """
 
     name: str
     new_odometry: Callable[[RecoveryJob, Submap, SubmapGraph], VisualOdometry]
     find_lack: Callable[[], Failure | None] = lambda: None
+    max_unrecognised: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -54,6 +54,8 @@ class RecoveryJob:
         again, by the keyframes that both hold.
     live_since : int
         The keyframe that the submap's first walk set out from.
+    is_again : bool
+        Whether reverse tracking from this submap is repeated: by the first attempt alone.
     """
 
     submap: Submap
@@ -71,6 +73,7 @@ class RecoveryJob:
     expected: dict[int, FloatArray] = field(default_factory=dict)
     joined: dict[int, Submap] = field(default_factory=dict)
     live_since: int = 0
+    is_again: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,6 +123,8 @@ class RecoveryResult:
     needs_camera : bool
         Whether no later walk does better under this camera: the map's pixels contradict it, or all keyframes of the
         lost maps leave the scale open.
+    stopped_at : int or None
+        The frame at which all attempts have stopped, none of which met a lost map's keyframes.
     tries : LinkTries
         The job's, with the tries of this walk.
     relinked : tuple of FoundLink
@@ -136,6 +141,7 @@ class RecoveryResult:
     cpu_s: float
     looks_alike: bool = False
     needs_camera: bool = False
+    stopped_at: int | None = None
     tries: LinkTries = field(default_factory=LinkTries)
     relinked: tuple[FoundLink, ...] = ()
     failure: Failure | None = None

@@ -204,6 +204,7 @@ class Recoveries:
             notes_rivals=bool(lost),
             joined={m: sound_copy(submaps[m]) for m in joined},
             live_since=self._retries.start_of(submap, newest_id),
+            is_again=now is not None,
         )
         n_live = self._retries.n_live(submap, newest_id if now is None else now.index)
         self._under_way[submap.id] = _UnderWay(time.perf_counter(), n_live, again=now is not None)
@@ -271,7 +272,8 @@ class Recoveries:
             if result.looks_alike:
                 continue
             if unlinked or self._way_to_gaps(self._record.atlas.submaps[job.submap.id]):
-                self._retries.leave_open(job.submap.id, walk.n_live, job.camera, result.needs_camera)
+                left = walk.n_live, job.camera, result.needs_camera, result.stopped_at if job.lost else None
+                self._retries.leave_open(job.submap.id, *left)
 
     def _tighten(
         self, job: RecoveryJob, result: RecoveryResult, walk: _UnderWay, live: VisualOdometry | None, now: FrameStamp

@@ -64,9 +64,12 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Steps[RecoveryRe
     started, cpu_started = time.perf_counter(), time.process_time()
     walks, tries = list[Walk](), job.tries.copy()
     for attempt in parts.attempts if job.lost else (parts.posing,) if job.views or not job.joined else ():
+        made = [walk for walk in walks if walk.problem is None]
+        if attempt.max_unrecognised is not None and made and not any(walk.leaves_open for walk in made):
+            continue
         walks.append((yield from _make_attempt(job, parts, attempt, tries)))
         tries = walks[-1].tries
-        if walks[-1].is_final:
+        if walks[-1].is_final or (job.is_again and walks[-1].problem is None):
             break
     best = _best_of(walks)
     if best is not None and (gap := best.lost_scale_from(parts.max_scale_sigma)) is not None:
@@ -82,6 +85,7 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Steps[RecoveryRe
         cpu_s=time.process_time() - cpu_started,
         looks_alike=any(walk.looks_alike for walk in walks),
         needs_camera=any(walk.needs_camera for walk in walks),
+        stopped_at=_stopped_at(walks),
         tries=tries,
         relinked=relinked,
         failure=None if best or job.joined else walks[-1].problem,
@@ -99,6 +103,12 @@ def _best_of(walks: list[Walk]) -> Walk | None:
             best = walk
     best.link = best.unsure
     return best
+
+
+def _stopped_at(walks: list[Walk]) -> int | None:
+    """Return the frame at which the walks have stopped, where none of them came to try a link."""
+    frames = [walk.stopped_at for walk in walks if walk.problem is None]
+    return None if None in frames else min((frame for frame in frames if frame is not None), default=None)
 
 
 def _relink(job: RecoveryJob, submap: Submap, parts: RecoveryParts, tries: LinkTries) -> tuple[FoundLink, ...]:
@@ -192,7 +202,8 @@ def _walk(job: RecoveryJob, parts: RecoveryParts, attempt: Attempt, tries: LinkT
     views = job.views if job.lost else _there_and_back(job.views, walk)
     unsure_of: int | None = None  # the lost map with which a link would be, but for a loose scale
     trace = WalkTrace(submap.id, attempt.name, job.newest_id, submap.T_submap_kf[job.newest_id][:3, 3])
-    for step in track_in_reverse(reverse_tracker, views, parts.config.health, relinker.keyframe_ids, max_gap_frames):
+    limits = max_gap_frames, attempt.max_unrecognised
+    for step in track_in_reverse(reverse_tracker, views, parts.config.health, relinker.keyframe_ids, *limits):
         trace.note(step.view, step.track)
         walk.out_of_time = bool((yield trace.news()))
         if walk.out_of_time:
@@ -267,6 +278,7 @@ def track_in_reverse(
     health: HealthConfig,
     keyframe_ids: set[int],
     max_gap_frames: int,
+    max_unrecognised: int | None = None,
 ) -> Iterator[ReverseStep]:
     """Pose frames one after the other in the order given, and extend the walker's submap by keyframes.
 
@@ -282,8 +294,10 @@ def track_in_reverse(
         Frames that become keyframes in any case: those that were keyframes of an older submap.
     max_gap_frames : int
         So many frames in a row may be unusable before the walk ends.
+    max_unrecognised : int, optional
+        So many of them may show something.
     """
-    n_failed = 0
+    n_failed, n_unrecognised = 0, 0
     for view in views:
         try:
             track = judge_track(reverse_tracker.track(view), health)
@@ -293,8 +307,11 @@ def track_in_reverse(
             yield ReverseStep(view, Failure(FailureReason.SOLVER, str(error)), None)
             return
         yield step
-        n_failed = 0 if step.track else n_failed + 1
-        if n_failed > max_gap_frames:
+        if not isinstance(step.track, Failure):
+            n_failed, n_unrecognised = 0, 0
+            continue
+        n_failed, n_unrecognised = n_failed + 1, n_unrecognised + (step.track.reason is not FailureReason.NO_TEXTURE)
+        if n_failed > max_gap_frames or (max_unrecognised is not None and n_unrecognised >= max_unrecognised):
             return
 
 

@@ -32,7 +32,8 @@ class RetrySchedule:
     def __init__(self, keyframes: tuple[int, ...]) -> None:
         self._keyframes = keyframes
         self._starts: dict[int, int] = {}
-        self._tried: dict[int, tuple[int, Camera, bool]] = {}
+        self._tried: dict[int, tuple[int, Camera, bool, bool]] = {}
+        self._stopped_at: dict[int, int | None] = {}
 
     def start_of(self, submap: Submap, newest_id: int) -> int:
         """Return the keyframe that the submap's first walk started from: `newest_id`, if this is the first."""
@@ -42,12 +43,17 @@ class RetrySchedule:
         """Count the keyframes from the start to frame `now`: not those that walks have added."""
         return sum(self._starts[submap.id] <= k <= now for k in submap.keyframes)
 
-    def leave_open(self, submap_id: int, n_live: int, camera: Camera, needs_camera: bool = False) -> None:
+    def leave_open(
+        self, submap_id: int, n_live: int, camera: Camera, needs_camera: bool = False, stopped_at: int | None = None
+    ) -> None:
         """Note that a walk which knew so many live keyframes, and this camera, has left something to find.
 
-        `needs_camera`: no later one does better under this camera.
+        `needs_camera`: no later one does better under this camera. `stopped_at`: the frame at which it stopped, before
+        it met a lost map. If the one before it stopped there too, growth changes nothing, not even at the end.
         """
-        self._tried[submap_id] = n_live, camera, needs_camera
+        is_stuck = stopped_at is not None and stopped_at == self._stopped_at.get(submap_id)
+        self._stopped_at[submap_id] = stopped_at
+        self._tried[submap_id] = n_live, camera, needs_camera or is_stuck, is_stuck
 
     def take_if_due(self, submap: Submap, now: int, camera: Camera, last_chance: bool = False) -> bool:
         """Return whether the next walk is due; if so it is off the list, until it too leaves something to find.
@@ -56,11 +62,11 @@ class RetrySchedule:
         """
         if submap.id not in self._tried:
             return False
-        tried_with, tried_camera, needs_camera = self._tried[submap.id]
+        tried_with, tried_camera, needs_camera, is_stuck = self._tried[submap.id]
         n_live = self.n_live(submap, now)
         due = not needs_camera and any(tried_with < n <= n_live for n in self._keyframes)
         due |= camera != tried_camera
-        due |= last_chance and bool(self._keyframes) and n_live >= LAST_GROWTH * tried_with
+        due |= last_chance and not is_stuck and bool(self._keyframes) and n_live >= LAST_GROWTH * tried_with
         if due:
             del self._tried[submap.id]
         return due

@@ -38,6 +38,8 @@ class Walk:
         The link; or else one whose scale is too loose to be relied on.
     n_gaps, n_skipped, n_unusable : int
         Gaps crossed, frames without a pose in these, and frames without a pose at the end.
+    n_unrecognised : int
+        Frames without a pose that show something: others may recognise them.
     needs_camera : bool
         No other walk would do better before the camera is calibrated.
     looks_alike : bool
@@ -46,6 +48,8 @@ class Walk:
         The frame from which the first gap was crossed.
     walk_sigma : float
         Of the scale that the walk hands on, as the last link that was tried says.
+    refused : FailureReason or None
+        Of the last link that was tried.
     rivals : sequence
         Alternative hypotheses for poses beyond gaps.
     choice : Choice or None
@@ -65,6 +69,7 @@ class Walk:
     n_gaps: int = 0
     n_skipped: int = 0
     n_unusable: int = 0
+    n_unrecognised: int = 0
     out_of_time: bool = False
     given_up: bool = False
     needs_camera: bool = False
@@ -73,6 +78,7 @@ class Walk:
     walk_sigma: float = 0.0
     rivals: Sequence[Rival] = ()
     choice: Choice | None = None
+    refused: FailureReason | None = None
     why_unusable: str = ""
     why_not_linked: str = ""
 
@@ -85,6 +91,17 @@ class Walk:
     def is_final(self) -> bool:
         """Whether no other attempt is to be made after this one."""
         return self.link is not None or self.needs_camera or self.looks_alike or self.out_of_time
+
+    @property
+    def leaves_open(self) -> bool:
+        """Whether other features may do better: not where all that shows something was posed, and the scale lost."""
+        return self.n_unrecognised > 0 or self.refused not in (None, FailureReason.SCALE_LOST)
+
+    @property
+    def stopped_at(self) -> int | None:
+        """The frame next to the one at which it has stopped, if no link was tried."""
+        stopped = self.n_unusable > 0 and self.link is None and self.refused is None
+        return min(self.frames, default=self.job.newest_id) if stopped else None
 
     @property
     def verdict(self) -> str:
@@ -107,6 +124,7 @@ class Walk:
     def note_unusable(self, failure: Failure) -> None:
         """Count a frame that was not posed."""
         self.n_unusable += 1
+        self.n_unrecognised += failure.reason is not FailureReason.NO_TEXTURE
         self.looks_alike |= failure.reason is FailureReason.LOOK_ALIKE
         self.why_unusable = failure.detail or str(failure.reason)
 
@@ -122,10 +140,11 @@ class Walk:
         """Count a frame, given before without a pose, that the last one has confirmed."""
         self.frames.setdefault(frame.pose.index, frame)
         self.n_skipped -= 1
+        self.n_unrecognised -= 1
 
     def note_refused(self, found: Failure) -> None:
         """Note why a link was not made, and whether going on, or another walk, could change that."""
-        self.why_not_linked = found.detail
+        self.refused, self.why_not_linked = found.reason, found.detail
         self.walk_sigma = found.walk_sigma if isinstance(found, LinkRefusal) else 0.0
         self.needs_camera |= found.reason is FailureReason.CAMERA
         self.given_up |= found.reason in (FailureReason.CAMERA, FailureReason.SCALE_LOST)

@@ -11,8 +11,6 @@ from dualslam.report.markup import Markup, cards, coordinate, join, number, stre
 from dualslam.report.run_data import RunData
 from dualslam.report.timeline import frame_ticks
 
-LOOSE_SCALE = 0.05
-"""From here on a scale counts as wrong (`linking.wrong_scale`): it may have been lost there."""
 N_BINS = 120
 _HEADS = ("frame", "submap", "what", "outcome")
 _DOUBTS = {
@@ -36,7 +34,7 @@ def trust_section(run: RunData) -> Markup:
             [row.sigma_scale for row in run.rows],
             "sigma of the scale across a frame",
             "Above it the scale may have changed unseen.",
-            LOOSE_SCALE,
+            run.config.get("linking", {}).get("wrong_scale"),
         ),
         _strip(
             run,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -60,14 +61,10 @@ def trajectories_of(system: System) -> Trajectories:
             f"trajectories_of takes a system, not a {type(system).__name__}; "
             "of a run folder, read_run has the trajectories: main and unlinked."
         )
-    count = dict.fromkeys(system.atlas.submaps, 0)
-    for pose in system.poses.values():
-        count[pose.submap_id] += pose.index in system.rows
-    components = system.atlas.components()
-    largest = max(components, key=lambda c: sum(count[m] for m in c), default=[])
-    if system.world is not None:  # the saved map is the main one, whatever this run has besides
-        largest = next(c for c in components if system.world in c)
-    unlinked = {m: _posed(system, _placed(system, [m])) for m in count if m not in largest and count[m]}
+    atlas, count = system.atlas, Counter(p.submap_id for p in system.poses.values() if p.index in system.rows)
+    # A saved map is the main one, whatever this run has besides.
+    largest = atlas.largest(count) if system.world is None else atlas.component_of(system.world)
+    unlinked = {m: _posed(system, _placed(system, [m])) for m in atlas.submaps if m not in largest and count[m]}
     S_world_submap = _placed(system, largest)
     return Trajectories(largest, _posed(system, S_world_submap), unlinked, S_world_submap)
 

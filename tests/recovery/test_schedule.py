@@ -285,6 +285,22 @@ class TestSchedule:
         assert schedule.n_live(submap, 14) == 2
         assert schedule.n_live(submap, 17) == 3
 
+    @pytest.mark.parametrize(("stopped_at", "due"), [((7, 7), False), ((7, 6), True), ((None, None), True)])
+    def test_walks_that_stop_at_one_frame_twice_are_made_again_for_another_camera_alone(
+        self, stopped_at: tuple[int | None, int | None], due: bool
+    ) -> None:
+        schedule = RetrySchedule((3, 5))
+        grown = submap_with(range(10, 20))
+        schedule.start_of(grown, 10)
+        schedule.leave_open(0, 2, CAMERA, stopped_at=stopped_at[0])
+        assert schedule.take_if_due(grown, 12, CAMERA)
+        for last_chance in (False, True):
+            schedule.leave_open(0, 3, CAMERA, stopped_at=stopped_at[0])
+            schedule.leave_open(0, 3, CAMERA, stopped_at=stopped_at[1])
+            assert schedule.take_if_due(grown, 19, CAMERA, last_chance) == due
+        schedule.leave_open(0, 3, CAMERA, stopped_at=stopped_at[1])
+        assert schedule.take_if_due(grown, 19, replace(CAMERA, fx=451.0))
+
     def test_another_camera_is_a_reason(self) -> None:
         schedule = RetrySchedule(())
         submap = submap_with([10, 11])

@@ -172,7 +172,7 @@ class RecoveryConfig(StrictModel):
     null: never. A new map that starts sooner is better linked by reverse tracking, and most start within 2 to 5 frames.
     Where the camera turns in place none can start, but it may come back to the lost map."""
     retry_keyframes: tuple[Annotated[int, Field(ge=1)], ...] = (5, 15)
-    """Keyframes of the new map at which reverse tracking is repeated if it has found no link, or left buffered frames
+    """Keyframes of the new map at which the first attempt is repeated if none has found a link, or left buffered frames
     without a pose. The map then knows depths better, and more of the scene. It is also repeated after a calibration. If
     any number stands here, it is repeated at the end of the run, once the map has grown by half. One for poses alone
     that finds none is the last."""
