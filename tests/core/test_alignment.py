@@ -17,6 +17,7 @@ from dualslam.core.geometry.alignment import (
     umeyama,
     umeyama_batch,
 )
+from dualslam.core.geometry.umeyama import MIN_SPREAD_RATIO
 from dualslam.core.types import Failure, FailureReason
 from dualslam.testing.two_maps import TwoMaps, two_maps
 
@@ -106,6 +107,14 @@ def test_umeyama_accepts_a_nearly_straight_drive() -> None:
     src = np.stack([np.sin(x / 100), np.zeros_like(x), x], 1)
     S = sim3.exp([0.4, -2.0, 0.3, 1.0, 2.0, 3.0, 0.7])
     np.testing.assert_allclose(align(src, sim3.act(S, src)).S_dst_src, S, atol=1e-8)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])
+@pytest.mark.parametrize(("ratio", "spans"), [(0.5 * MIN_SPREAD_RATIO, False), (2.0 * MIN_SPREAD_RATIO, True)])
+def test_what_is_too_straight_depends_on_no_unit(unit: float, ratio: float, spans: bool) -> None:
+    src = unit * np.array([[-1.0, ratio, 0.0], [0.0, -2.0 * ratio, 0.0], [1.0, ratio, 0.0]]) / np.sqrt([1.0, 3.0, 1.0])
+    assert bool(umeyama(src, src)) == spans
+    assert umeyama_batch(src[None], src[None])[1].tolist() == [spans]
 
 
 def test_umeyama_zero_weights_leave_points_out() -> None:
