@@ -22,12 +22,14 @@ ENTRY_POINT_GROUP = "dualslam.frontends"
 """A package offers a front end by ``[project.entry-points."dualslam.frontends"] name = "module:Class"``."""
 
 BUILT_IN: Mapping[str, str] = {
+    "auto": "dualslam.frontends.features.orb:OrbFrontend",
     "orb": "dualslam.frontends.features.orb:OrbFrontend",
     "sift": "dualslam.frontends.features.sift:SiftFrontend",
     "gms": "dualslam.frontends.features.gms:GmsFrontend",
     "kornia": "dualslam.frontends.features.kornia.frontend:KorniaFrontend",
 }
-"""Name to ``module:attribute``; the module is imported only when its name is asked for."""
+"""Name to ``module:attribute``; the module is imported only when its name is asked for. A run replaces `auto` by the
+front end that its first frames ask for; ORB where no frames can be looked at beforehand."""
 
 PIXEL_MATCHERS_GROUP = "dualslam.pixel_matchers"
 """The same for pixel matchers."""

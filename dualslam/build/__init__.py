@@ -5,7 +5,7 @@ tracking), `workers` (background work), `checks` (mistakes in a config, reported
 """
 
 from dualslam.build.checks import check_config, fault_of_frontend
-from dualslam.build.parts import adjust_submap, find_focal, new_initialiser, window_solver
+from dualslam.build.parts import adjust_submap, find_focal, find_frontend, new_initialiser, window_solver
 from dualslam.build.system import LiveParts, build_system
 from dualslam.build.walks import recovery_parts
 from dualslam.build.workers import feature_handlers, graph_handlers, walk_handlers
@@ -20,6 +20,7 @@ __all__ = [
     "fault_of_frontend",
     "feature_handlers",
     "find_focal",
+    "find_frontend",
     "graph_handlers",
     "new_initialiser",
     "recovery_parts",

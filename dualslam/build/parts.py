@@ -16,10 +16,13 @@ from dualslam.core.bundle import BundleAdjuster
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import FocalSearch, ToldFocal
 from dualslam.core.config.settings import Config
+from dualslam.core.estimates import FrontendChoice
 from dualslam.core.interfaces import Frontend, SelfCalibrator, WindowSolver
 from dualslam.core.metric_problem import MeasurementSource, MetricProblem, MetricSolution, RowSource
 from dualslam.core.types import Failure, FloatArray, Frame
 from dualslam.frontends.asking import features_of
+from dualslam.frontends.choice import Candidate, choose_frontend
+from dualslam.frontends.frame_reader import view_of
 from dualslam.frontends.place_matcher import FrontendPlaceMatcher
 from dualslam.frontends.registry import create_frontend
 from dualslam.frontends.tracking.initialiser import Initialiser
@@ -29,6 +32,8 @@ from dualslam.places import FaissRecogniser, PlaceVerifier
 from dualslam.places.sightings import PlaceParts
 
 ADJUST_ITERATIONS = 20
+AUTO = ("orb", "sift")
+"""Front ends that `frontend.name: auto` chooses from."""
 
 
 def graph_maker(config: Config) -> Callable[[], ISam2SubmapGraph]:
@@ -117,6 +122,19 @@ def find_focal(
     frontend = create_frontend(config.frontend)
     features = [features_of(frontend, frame.image) for frame in frames if frame.image is not None]
     return search_focal(frontend, features, size_px, config.seed, told)
+
+
+def find_frontend(config: Config, frames: Iterable[Frame], camera: Camera) -> FrontendChoice:
+    """Choose between ORB and SIFT by frames from a sequence's beginning (`frontend.name: auto`)."""
+
+    def candidate(name: str) -> Candidate:
+        frontend = create_frontend(config.frontend.model_copy(update={"name": name}))
+        starter = new_initialiser(config, frontend, camera.size_px, camera.K)
+        seen = partial(view_of, frontend=frontend, camera=camera, model_sigma_px=config.camera.model_sigma_px)
+        return Candidate(frontend, starter, seen)
+
+    corners, blobs = (candidate(name) for name in AUTO)
+    return choose_frontend(frames, corners, blobs, config.frontend.n_features)
 
 
 def bundle_adjuster(config: Config) -> BundleAdjuster:

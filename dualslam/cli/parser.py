@@ -15,7 +15,7 @@ from dualslam import __version__
 from dualslam.run.interrupts import held_back
 
 WORLDS = (
-    *("street", "room", "circuit", "eight", "terrace", "corridors", "posters"),
+    *("street", "room", "circuit", "eight", "terrace", "ward", "corridors", "posters"),
     *("board", "parked", "takeoff", "standstill", "hover"),
 )
 EXPORTS = ("bal", "colmap", "g2o", "kitti", "mcap", "nerfstudio", "ply", "rerun", "tum")
@@ -30,7 +30,7 @@ SHORTEST_M, LONGEST_M = 1e-6, 1e9
 SOURCE_HELP = (
     "a sequence folder (KITTI, TUM RGB-D, TUM-Mono, EuRoC, ours); a ROS bag or MCAP. A folder of images or a video: "
     "its camera is estimated without --camera or --fov. With one of these: a webcam's number, or the address "
-    "of a stream (rtsp://..., http://...). A rendered world: synthetic:street, room, circuit, eight, terrace, "
+    "of a stream (rtsp://..., http://...). A rendered world: synthetic:street, room, circuit, eight, terrace, ward, "
     "corridors, posters, board, parked, takeoff, standstill, hover, with options as in "
     "synthetic:street,frames=300,seed=1,events=FILE"
 )

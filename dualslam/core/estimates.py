@@ -180,3 +180,15 @@ class ReadoutEstimate:
     sigma_s: float
     n_keyframes: int
     n_observations: int
+
+
+@dataclass(frozen=True, slots=True)
+class FrontendChoice:
+    """The front end that was chosen, and why."""
+
+    name: str
+    why: str
+
+    def as_dict(self) -> dict[str, str]:
+        """Return it as ``summary.json`` has it."""
+        return {"name": self.name, "why": self.why}

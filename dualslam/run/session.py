@@ -41,6 +41,7 @@ from dualslam.lab.disturbances import corrupted
 from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameResult
 from dualslam.report import PlaceAlbum, SampleKeeper, read_run, report_page
+from dualslam.run.front_end import with_frontend_chosen
 from dualslam.run.interrupts import Interrupts
 from dualslam.run.judgement import judge_run
 from dualslam.run.map_camera import camera_that_fits, in_size_of_map
@@ -48,6 +49,7 @@ from dualslam.run.measuring import Measured, measure, write_measured
 from dualslam.run.no_map import StartRefusals
 from dualslam.run.results import Trajectories, frame_rows, summarise, trajectories_of, truth_of_frames
 from dualslam.run.runner import RunReport, run_sequence
+from dualslam.run.sources import WorldSequence
 from dualslam.system.audit.verdict import Reason
 from dualslam.system.system import System
 from dualslam.viewer.map_page import map_page
@@ -192,6 +194,11 @@ def run_to_folder(
         given["focal_search"] = focal.as_dict()
     source, sequence = sequence, corrupted(masked(sequence, config.camera.mask), config.corruptions)
     check_out(out, overwrite=overwrite, saved_map=saved_map, replay=replay)
+    may_look = isinstance(source, RecordedSequence | WorldSequence) and not realtime
+    config, chosen = with_frontend_chosen(config, sequence if may_look else None, saved_map)
+    if chosen is not None:
+        given["frontend_choice"] = chosen.as_dict()
+        log.info("front end %s: %s", chosen.name, chosen.why)
     recorded = None if replay is None else Recorded.read(Path(replay) / SCHEDULE)
     colours: Colours = {}
     if saved_map is not None:

@@ -23,6 +23,7 @@ from dualslam.io.map_store import StoredMap, load_atlas
 from dualslam.io.masks import read_mask
 from dualslam.map.frame_records import FrameResult
 from dualslam.report.run_data import RunData, read_run
+from dualslam.run.front_end import with_frontend_chosen
 from dualslam.run.judgement import judge_run
 from dualslam.run.results import frame_rows, trajectories_of
 from dualslam.run.runner import RunReport
@@ -74,7 +75,8 @@ class Slam:
         if localise and saved_map is None:
             raise InputError("localise finds poses in a saved map: name it with saved_map.")
         self._camera = camera if isinstance(camera, Camera) else Camera.read(camera)
-        self._config = load_config() if config is None else config
+        of_map = saved_map if isinstance(saved_map, str | Path) else None
+        self._config, _ = with_frontend_chosen(load_config() if config is None else config, None, of_map)
         saved = load_atlas(saved_map) if isinstance(saved_map, str | Path) else saved_map
         self.system: System = build_system(self._config, self._camera, saved=saved, localise=localise)
         self._began, self._cpu_began = time.perf_counter(), time.process_time()

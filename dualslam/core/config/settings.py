@@ -15,9 +15,10 @@ from dualslam.core.config.strict_model import StrictModel as StrictModel  # part
 class FrontendConfig(StrictModel):
     """Features and their comparison."""
 
-    name: str = "orb"
-    """Which front end: `orb`, `sift`, `gms`, `kornia` (an extra), or one that another package offers as an entry point
-    of `dualslam.frontends`; or `module:Class`, of what can be imported."""
+    name: str = "auto"
+    """Which front end: `auto`, `orb`, `sift`, `gms`, `kornia` (an extra), or one that another package offers as an
+    entry point of `dualslam.frontends`; or `module:Class`, of what can be imported. `auto` is `sift` where the first
+    images show few corners and it is the first to start a map, else `orb`."""
     n_features: int = Field(1000, ge=50, le=20000)
     """Keypoints per image."""
     options: dict[str, Any] = Field(default_factory=dict)

@@ -22,16 +22,17 @@ from dualslam.lab.synthetic.street import make_street
 from dualslam.lab.synthetic.traps import TRAPS, Place
 from dualslam.lab.synthetic.twins import TWINS
 from dualslam.lab.synthetic.visits import OtherWay, at_another_hour
+from dualslam.lab.synthetic.ward import make_ward
 
 if TYPE_CHECKING:
     from dualslam.core.camera.models import PinholeCamera
 
 # A smear of motion blur is the average of images about three pixels apart, within these bounds on their number.
 _N_SUBFRAMES = (9, 33)
-SCENES = ("street", "room", "circuit", "eight", "terrace", *TWINS, *TRAPS)
+SCENES = ("street", "room", "circuit", "eight", "terrace", "ward", *TWINS, *TRAPS)
 VISITED = ("street", "circuit", "eight")
 """Of these there are later visits."""
-ON_WHEELS = ("street", "circuit", "eight", "terrace", "standstill")
+AT_10_HZ = ("street", "circuit", "eight", "terrace", "standstill", "ward")
 LIMITS = {
     "n_frames": (1, 100_000),
     "seed": (0, 2**63),
@@ -179,7 +180,8 @@ def make_sequence(
     scene : str
         One of `SCENES`. A drive of about 9 m/s between houses, or a hand-held camera in a furnished room. A block of
         houses driven round and round, a figure of eight, and a straight street of identical houses. Two similar
-        corridors, and two rooms with the same posters. `dualslam/lab/synthetic/traps.py` describes the others.
+        corridors, and two rooms with the same posters. A hospital ward with white walls.
+        `dualslam/lab/synthetic/traps.py` describes the others.
     n_frames : int
     seed : int
         Of the world, the path and the noise: the same seed gives the same images, bit for bit.
@@ -188,7 +190,7 @@ def make_sequence(
     events : iterable of Corruption or mapping
         Disturbances of some of the frames.
     rate_hz : float, optional
-        Frames a second: 10 on the street, 30 in the room and in the hand.
+        Frames a second: 10 on the street and in the ward, 30 in the room and in the hand.
     supersampling : float
         Silhouettes are smoother and rendering slower with more.
     visit : int
@@ -203,7 +205,7 @@ def make_sequence(
     """
     if scene not in SCENES:
         raise ConfigError(f"synthetic scene {scene!r} is unknown; use one of {', '.join(SCENES)}")
-    rate_hz = float(rate_hz) if rate_hz is not None else (10.0 if scene in ON_WHEELS else 30.0)
+    rate_hz = float(rate_hz) if rate_hz is not None else (10.0 if scene in AT_10_HZ else 30.0)
     whole = {"n_frames": n_frames, "seed": seed, "visit": visit, "backwards": backwards, "width": width}
     _check(scene, whole | {"height": height}, rate_hz, supersampling)
     script = parse_events(events)
@@ -250,6 +252,8 @@ def _place(scene: str, seed: int, duration_s: float, visit: int, backwards: int)
     if scene in TWINS:
         world, path = TWINS[scene](seed)
         return Place(world, path, in_hand=True)
+    if scene == "ward":
+        return make_ward(seed, duration_s)
     if scene in TRAPS:
         return TRAPS[scene](seed, duration_s)
     if scene == "room":

@@ -59,7 +59,7 @@ def test_last_override_wins_over_the_file(tmp_path: Path) -> None:
     config = load_config(file, ["frontend.n_features=900", "frontend.n_features=1000"])
     assert config.frontend.n_features == 1000
     assert config.seed == 3
-    assert config.frontend.name == "orb"
+    assert config.frontend.name == "auto"
 
 
 def test_an_empty_file_is_the_default(tmp_path: Path) -> None:

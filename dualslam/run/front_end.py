@@ -1,0 +1,46 @@
+"""`frontend.name: auto`: the front end that a sequence's first frames ask for, named before the run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dualslam.build import find_frontend
+from dualslam.core.config.files import CONFIG, load_config
+from dualslam.core.config.settings import Config
+from dualslam.core.estimates import FrontendChoice
+from dualslam.core.interfaces import Sequence
+
+AUTO, ORB = "auto", "orb"
+
+
+def with_frontend_chosen(
+    config: Config, frames: Sequence | None, saved_map: str | Path | None = None
+) -> tuple[Config, FrontendChoice | None]:
+    """Return a config that names its front end, and why; None where it names one already.
+
+    A saved map is continued by the front end that made it. ORB it is where frames cannot be looked at beforehand, and
+    where the config has settings that are ORB's.
+
+    Parameters
+    ----------
+    config : Config
+    frames : Sequence or None
+        None where frames come only once, or must keep to a clock.
+    saved_map : path, optional
+        The run folder that is continued.
+    """
+    if config.frontend.name != AUTO:
+        return config, None
+    made_by = None if saved_map is None else Path(saved_map) / CONFIG
+    if made_by is not None and made_by.is_file():
+        frontend = load_config(made_by).frontend
+        choice = FrontendChoice(frontend.name, "it made the saved map")
+        return config.model_copy(update={"frontend": frontend}), choice
+    if config.frontend.options or config.initialiser.matching == "gms":
+        choice = FrontendChoice(ORB, "the configuration has settings for it")
+    elif frames is None:
+        choice = FrontendChoice(ORB, "frames are not looked at before the run")
+    else:
+        choice = find_frontend(config, frames, frames.camera)
+    frontend = config.frontend.model_copy(update={"name": choice.name})
+    return config.model_copy(update={"frontend": frontend}), choice
