@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dualslam.build import find_frontend
-from dualslam.core.config.files import CONFIG, load_config
+from dualslam.core.config.files import CONFIG, load_run_config
 from dualslam.core.config.settings import Config
 from dualslam.core.estimates import FrontendChoice
 from dualslam.core.interfaces import Sequence
@@ -31,9 +31,8 @@ def with_frontend_chosen(
     """
     if config.frontend.name != AUTO:
         return config, None
-    made_by = None if saved_map is None else Path(saved_map) / CONFIG
-    if made_by is not None and made_by.is_file():
-        frontend = load_config(made_by).frontend
+    if saved_map is not None and (Path(saved_map) / CONFIG).is_file():
+        frontend = load_run_config(saved_map).frontend
         choice = FrontendChoice(frontend.name, "it made the saved map")
         return config.model_copy(update={"frontend": frontend}), choice
     if config.frontend.options or config.initialiser.matching == "gms":
