@@ -263,7 +263,7 @@ def _connect(path: Path) -> sqlite3.Connection:
 
 
 def _scan_sqlite(bag: Bag, number: int) -> None:
-    is_whole = _pad(bag, number)
+    path, is_whole = bag.paths[number], _pad(bag, number)
     database = _connect(bag.paths[number])
     found: list[tuple[Topic | None, int, Place]] = []
     try:
@@ -274,9 +274,9 @@ def _scan_sqlite(bag: Bag, number: int) -> None:
     except sqlite3.DatabaseError as error:
         is_whole = False
         if not found:
-            raise InputError(f"{bag.paths[number]} is no ROS 2 bag that can be read: {error}.") from error
-    while not is_whole and found and not _has_data(database, found[-1][2].start):
-        found.pop()
+            raise InputError(f"{path} is no ROS 2 bag that can be read: {error}.") from error
+    if not is_whole:
+        found = [message for message in found if _has_data(database, message[2].start)]
     database.close()
     for topic, time_ns, place in found:
         _note(bag, topic, time_ns, place)

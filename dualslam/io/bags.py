@@ -15,6 +15,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray
 from dualslam.io.bag_files import Bag, BagReader, Place, Topic, is_bag, scan
+from dualslam.io.bit_depth import WHOLE, depth_of, looked_at, upper_eight
 from dualslam.io.camera_keys import camera_of_mapping
 from dualslam.io.images import ImageReader, UnreadableImageError, decode, natural_key
 from dualslam.io.sequence import Given, Recording
@@ -42,8 +43,8 @@ TO_RGB: dict[str, int | None] = {
 
 
 def recognises(folder: Path) -> bool:
-    """Tell whether `folder` is a bag of ROS 2."""
-    return (folder / "metadata.yaml").is_file() and bool(_files(folder))
+    """Tell whether `folder` is a bag of ROS 2, its `metadata.yaml` there or lost."""
+    return bool(_files(folder))
 
 
 def is_bag_file(path: Path) -> bool:
@@ -150,13 +151,30 @@ class BagImages:
     def __init__(self, bag: Bag, topic: Topic, places: list[Place]) -> None:
         self._bag, self._topic, self._places = bag, topic, places
         self.topic_name = topic.name
+        self._bits: int | None = None
 
     def __len__(self) -> int:
         return len(self._places)
 
     def reader(self, grey: bool) -> ImageReader:
         """Return a reader with its own files."""
-        return _Reader(self._bag.paths, self._topic, self._places, grey)
+        if self._bits is None:
+            self._bits = self._used_bits()
+        return _Reader(self._bag.paths, self._topic, self._places, grey, self._bits)
+
+    def _used_bits(self) -> int:
+        """Return how many bits raw images of 16 use, by some of the whole bag."""
+        reader, brightest = _Reader(self._bag.paths, self._topic, self._places, True), -1
+        for index in looked_at(len(self)) if self._topic.type == IMAGE else []:
+            try:
+                pixels = _pixels(reader.message(index), "")
+            except UnreadableImageError:
+                continue
+            if pixels.dtype != np.uint16:
+                break
+            brightest = max(brightest, int(pixels.max()))
+        reader.close()
+        return depth_of(brightest, self._topic.name)
 
     def told_focal(self) -> None:
         """Return nothing: a bag tells of its camera by `camera_info`."""
@@ -178,27 +196,31 @@ class BagImages:
 
 
 class _Reader:
-    def __init__(self, paths: list[Path], topic: Topic, places: list[Place], grey: bool) -> None:
-        self._bag, self._topic, self._places, self._grey = BagReader(paths), topic, places, grey
+    def __init__(self, paths: list[Path], topic: Topic, places: list[Place], grey: bool, bits: int = WHOLE) -> None:
+        self._bag, self._topic, self._places, self._grey, self._bits = BagReader(paths), topic, places, grey, bits
 
-    def read(self, index: int) -> NDArray[np.uint8]:
-        name = f"image {index} of {self._topic.name}"
+    def message(self, index: int) -> Any:
         try:
-            message = _message(self._bag.read(self._places[index]), self._topic)
+            return _message(self._bag.read(self._places[index]), self._topic)
         except InputError:
             raise
         except Exception as e:  # whatever a broken message makes of the parser
-            raise UnreadableImageError(f"{name} cannot be read: {e}.") from e
+            raise UnreadableImageError(f"image {index} of {self._topic.name} cannot be read: {e}.") from e
+
+    def read(self, index: int) -> NDArray[np.uint8]:
+        name, message = f"image {index} of {self._topic.name}", self.message(index)
         if self._topic.type == COMPRESSED:
             return decode(bytes(message.data), name, self._grey)
-        return _decoded(message, name, self._grey)
+        pixels = _pixels(message, name)
+        eight = upper_eight(pixels, self._bits) if pixels.dtype == np.uint16 else pixels
+        return _converted(eight, TO_RGB[str(message.encoding).lower()], self._grey)
 
     def close(self) -> None:
         self._bag.close()
 
 
-def _decoded(message: Any, name: str, grey: bool) -> NDArray[np.uint8]:
-    """Return (H, W) grey or (H, W, 3) RGB of a raw image."""
+def _pixels(message: Any, name: str) -> NDArray[Any]:
+    """Return the values of a raw image, of 8 or 16 bits, as its encoding has them."""
     encoding = str(message.encoding).lower()
     if encoding not in TO_RGB:
         raise UnreadableImageError(f"{name} is of encoding {encoding!r}, which is not read; take one of 8 or 16 bits.")
@@ -210,11 +232,13 @@ def _decoded(message: Any, name: str, grey: bool) -> NDArray[np.uint8]:
     rows = data[: height * step].reshape(height, step)
     if wide:
         order = ">u2" if message.is_bigendian else "<u2"
-        pixels = (rows[:, : 2 * width].copy().view(order) >> 8).astype(np.uint8)
-    else:
-        n = step // width if encoding not in ("mono8", "8uc1") and not encoding.startswith("bayer") else 1
-        pixels = rows[:, : n * width].reshape(height, width, n) if n > 1 else rows[:, :width]
-    code = TO_RGB[encoding]
+        return rows[:, : 2 * width].copy().view(order).astype(np.uint16)
+    n = step // width if encoding not in ("mono8", "8uc1") and not encoding.startswith("bayer") else 1
+    return rows[:, : n * width].reshape(height, width, n) if n > 1 else rows[:, :width]
+
+
+def _converted(pixels: NDArray[np.uint8], code: int | None, grey: bool) -> NDArray[np.uint8]:
+    """Return (H, W) grey or (H, W, 3) RGB by a conversion of OpenCV."""
     if grey and code == cv2.COLOR_GRAY2RGB:
         return np.ascontiguousarray(pixels, np.uint8)
     rgb = pixels if code is None else cv2.cvtColor(np.ascontiguousarray(pixels), code)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -32,7 +33,7 @@ def used_bits(n: int, read: Callable[[int], bytes | None], name: str) -> int:
     - `name`: of the source, for the message.
     """
     brightest = -1
-    for index in np.linspace(0, n - 1, min(n, N_LOOKED_AT)).astype(int).tolist():
+    for index in looked_at(n):
         data = read(index)
         if not data:
             continue
@@ -44,6 +45,16 @@ def used_bits(n: int, read: Callable[[int], bytes | None], name: str) -> int:
         if image.dtype != np.uint16:
             return WHOLE
         brightest = max(brightest, int(image.max()))
+    return depth_of(brightest, name)
+
+
+def looked_at(n: int) -> list[int]:
+    """Return the indices of `N_LOOKED_AT` of `n` images, evenly from all."""
+    return np.linspace(0, n - 1, min(n, N_LOOKED_AT)).astype(int).tolist()
+
+
+def depth_of(brightest: int, name: str) -> int:
+    """Return the least depth of a camera that has a value as bright, and say so where it is below `WHOLE`."""
     if brightest < 0:
         return WHOLE
     bits = next(depth for depth in DEPTHS if brightest < 1 << depth)
@@ -63,7 +74,12 @@ def decoded(data: bytes, grey: bool, bits: int = WHOLE) -> NDArray[np.uint8] | N
     image = _decoded(data, flags | cv2.IMREAD_ANYDEPTH)
     if image is None or image.dtype != np.uint16:
         return _decoded(data, flags)  # type: ignore[return-value]
-    return np.minimum(image >> (bits - 8), 255).astype(np.uint8)
+    return upper_eight(image, bits)
+
+
+def upper_eight(pixels: NDArray[Any], bits: int) -> NDArray[np.uint8]:
+    """Return the upper eight of the bits that are used; what is brighter is white."""
+    return np.minimum(pixels >> (bits - 8), 255).astype(np.uint8)
 
 
 def other_type(data: bytes) -> str | None:

@@ -38,8 +38,6 @@ def masked(sequence: Sequence, path: str | Path | None) -> Sequence:
     if path is None:
         return sequence
     where = Path(path)
-    if not where.exists():
-        raise InputError(f"mask {where} does not exist; give an image, or a folder with one for each frame.")
     if where.is_dir():
         paths = _by_frame(sequence, where)
         read_mask(paths[min(paths)], sequence.camera.size_px)
@@ -56,6 +54,8 @@ def read_mask(path: Path, size_px: tuple[int, int]) -> BoolArray:
     Raises `InputError` if it cannot be read, is of another size, or hides all.
     """
     width, height = size_px
+    if not path.is_file():
+        raise InputError(f"mask {path} does not exist; give an image, or a folder with one for each frame.")
     data = np.fromfile(path, np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
     if image is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 from typing import Any, Self
@@ -21,6 +22,7 @@ from dualslam.core.types import BoolArray, Frame
 from dualslam.io.export.exported_map import ExportedMap, flatten
 from dualslam.io.map_store import StoredMap, load_atlas
 from dualslam.io.masks import read_mask
+from dualslam.io.times import UNIT_NAMES, epoch_unit
 from dualslam.map.frame_records import FrameResult
 from dualslam.report.run_data import RunData, read_run
 from dualslam.run.front_end import with_frontend_chosen
@@ -74,6 +76,8 @@ class Slam:
     ) -> None:
         if localise and saved_map is None:
             raise InputError("localise finds poses in a saved map: name it with saved_map.")
+        if not isinstance(camera, Camera | str | Path):
+            raise InputError(f"the camera is a {type(camera).__name__}; give a Camera, or the path of its file.")
         self._camera = camera if isinstance(camera, Camera) else Camera.read(camera)
         of_map = saved_map if isinstance(saved_map, str | Path) else None
         self._config, _ = with_frontend_chosen(load_config() if config is None else config, None, of_map)
@@ -81,7 +85,13 @@ class Slam:
         self.system: System = build_system(self._config, self._camera, saved=saved, localise=localise)
         self._began, self._cpu_began = time.perf_counter(), time.process_time()
         self._hidden = read_mask(Path(mask), self._camera.size_px) if isinstance(mask, str | Path) else mask
+        if self._hidden is not None and (
+            self._hidden.dtype != bool or self._hidden.shape[::-1] != self._camera.size_px
+        ):
+            said = f"{self._hidden.shape} {self._hidden.dtype}"
+            raise InputError(f"the mask is {said}; give (H, W) bool of the camera's images, true where no scene is.")
         self._n_frames = 0
+        self._last_s = -math.inf
         self._ended = False
         self._readings: list[Any] = []
 
@@ -103,12 +113,17 @@ class Slam:
         Raises
         ------
         InputError
-            If the image is no such array, or the map has been saved.
+            If the image is no such array, its time is not later in seconds, or the map has been saved.
         """
         error, hidden = ("the camera gave no image", None) if image is None else ("", self._hidden)
         frame = Frame(self._n_frames, timestamp_s, image, error, hidden=hidden)
+        if isinstance(timestamp_s, int | float | np.number):  # others are refused below
+            if timestamp_s <= self._last_s:
+                raise InputError(f"frame {frame.index}: its time {timestamp_s} is not later than {self._last_s}.")
+            if (unit := epoch_unit(timestamp_s)) is not None:
+                raise InputError(f"frame {frame.index}: its time {timestamp_s} is in {UNIT_NAMES[unit]}; give seconds.")
         result = self.system.step(frame)
-        self._n_frames += 1
+        self._n_frames, self._last_s = self._n_frames + 1, timestamp_s
         return result
 
     def add(self, *readings: Any) -> None:

@@ -236,3 +236,27 @@ def test_what_is_no_bag_of_images_says_so(tmp_path: Path) -> None:
         open_sequence(path, fov_degrees=60)
     with pytest.raises(InputError, match="is no bag, and has no topics"):
         open_sequence(tmp_path / "text.txt", topic="/x")
+
+
+@pytest.mark.parametrize("share", [0.5, 0.7, 0.9])
+def test_a_database_cut_anywhere_gives_what_is_before_the_cut(tmp_path: Path, share: float) -> None:
+    data = write_bag(tmp_path / "drive", "db3", raw)
+    whole = next(data.glob("*.db3")).read_bytes()
+    cut = tmp_path / "lost" / "cut.db3"
+    cut.parent.mkdir()
+    cut.write_bytes(whole[: int(share * len(whole))])
+    frames = list(open_sequence(cut.parent, fov_degrees=60))  # its metadata.yaml is lost, too
+    assert 0 < len(frames) <= N
+    for i, frame in enumerate(frames):
+        np.testing.assert_array_equal(frame.image, grey_of(i))
+
+
+def test_raw_images_of_twelve_bits_are_read_by_these(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def fill(writer: Writer) -> None:
+        for i in range(N):
+            writer.image("/camera/image_raw", i, grey_of(i).astype(np.uint16) << 4, "mono16")
+
+    frames = list(open_sequence(write_bag(tmp_path / "drive", "mcap", fill), fov_degrees=60))
+    for i, frame in enumerate(frames):
+        np.testing.assert_array_equal(frame.image, grey_of(i))
+    assert "use 12 of them" in caplog.text

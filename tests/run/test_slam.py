@@ -116,3 +116,20 @@ def test_a_camera_is_read_from_a_file(tmp_path: Path) -> None:
 def test_importing_the_package_loads_nothing_heavy() -> None:
     code = "import sys, dualslam; sys.exit('numpy' in sys.modules or 'cv2' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_slip_is_one_sentence() -> None:
+    """No camera, no mask file, a mask of another size, times that go back or are no seconds."""
+    camera = dualslam.open_source(WORLD).camera
+    small = np.zeros((2, 2), bool)
+    slips = [({"camera": None}, "NoneType"), ({"mask": "no.png"}, "does not exist"), ({"mask": small}, "mask is")]
+    for wrong, words in slips:
+        with pytest.raises(dualslam.InputError, match=words):
+            dualslam.Slam(**({"camera": camera} | wrong))
+    slam = dualslam.Slam(camera)
+    slam.track(None, 1.0)
+    times = [(1.0, "not later than 1.0"), (0.5, "not later"), (np.int64(1_700_000_000 * 10**9), "is in nanoseconds")]
+    for time_s, words in times:
+        with pytest.raises(dualslam.InputError, match=words):
+            slam.track(None, time_s)
+    assert slam.track(None, 1.1).index == 1
