@@ -43,8 +43,9 @@ TO_RGB: dict[str, int | None] = {
 
 
 def recognises(folder: Path) -> bool:
-    """Tell whether `folder` is a bag of ROS 2, its `metadata.yaml` there or lost."""
-    return bool(_files(folder))
+    """Tell whether `folder` is a bag of ROS 2: with its `metadata.yaml`, or of nothing but files of bags."""
+    alone = all(p.suffix.lower().startswith(SUFFIXES) for p in folder.iterdir())
+    return bool(_files(folder)) and (alone or (folder / "metadata.yaml").is_file())
 
 
 def is_bag_file(path: Path) -> bool:

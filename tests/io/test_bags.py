@@ -260,3 +260,9 @@ def test_raw_images_of_twelve_bits_are_read_by_these(tmp_path: Path, caplog: pyt
     for i, frame in enumerate(frames):
         np.testing.assert_array_equal(frame.image, grey_of(i))
     assert "use 12 of them" in caplog.text
+
+
+def test_images_beside_a_bag_are_a_folder_of_images(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "000.png"), PATTERN)
+    write_bag(tmp_path / "drive", "mcap", raw).rename(tmp_path / "drive.mcap")
+    assert open_sequence(tmp_path, fov_degrees=60).image_names == ("000",)
