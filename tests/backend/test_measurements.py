@@ -334,6 +334,27 @@ def test_a_false_join_is_contradicted_by_heights():
     assert right.believed.all()
 
 
+@pytest.mark.parametrize("off_rad", [0.0, 0.1])
+def test_a_gyroscope_contradicts_a_join_whose_turn_is_wrong(off_rad: float):
+    truth = drive(250)
+    rocking = se3.from_parts(so3.exp(0.1 * np.sin(np.outer(truth.timestamps_s, [1.0, 1.3, 0.7]))), np.zeros(3))
+    moving = Trajectory(truth.timestamps_s, truth.T_world_cam @ rocking)
+    problem = drifted(moving, drift=0.5)
+    e, cut = problem.edges, 12
+    kind, doubtful, S = list(e.kind), e.doubtful.copy(), e.S_first_second.copy()
+    kind[cut], doubtful[cut] = "recovery", True
+    S[cut] = S[cut] @ sim3.exp(np.array([0.0, off_rad, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    joined = replace(problem, edges=AtlasEdges(e.first, e.second, S, e.covariance, tuple(kind), doubtful, e.known))
+    p = moving.T_world_cam[:, :3, 3]
+    rows = [
+        MeasurementRow("distance", (a / RATE_HZ, b / RATE_HZ, np.linalg.norm(p[a] - p[b]), 0.2), "")
+        for a, b in ((20, 90), (150, 220))
+    ]
+    gyroscope = Gyroscope(bias_rad_s=(0.01, -0.02, 0.005), seed=4).rates(moving)
+    solution = solve(joined, RowSource("tape", rows, has_clock=False), gyroscope)
+    assert solution.believed[cut] == (off_rad == 0.0)
+
+
 def test_the_joint_graph_is_read_back_by_gtsam(tmp_path):
     truth = drive(200)
     problem = drifted(truth)
