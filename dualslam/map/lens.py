@@ -62,15 +62,6 @@ class CalibrationAnswer:
     numbers: dict[str, float]  # for the event log
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Refinement:
-    """A submap's change to a better calibration."""
-
-    graph: SubmapGraph | None  # made from the changed submap, where one was given
-    before: Submap  # a copy of the submap as it was
-    numbers: dict[str, float]  # for the event log
-
-
 class Calibration:
     """The camera that features are rectified by, from the one that was given to the best one known.
 
@@ -160,12 +151,11 @@ class Calibration:
     def _said_nothing(self, submap_id: int, n: int) -> None:
         self._due_at[submap_id] = n + max(RETRY_KEYFRAMES, int(RETRY_SHARE * n))
 
-    def refine(self, submap: Submap, graph: SubmapGraph | None = None) -> Refinement | Failure:
+    def refine(self, submap: Submap) -> dict[str, float] | Failure:
         """Ask a submap about its camera and, where the answer is clear, change the submap to it.
 
-        - `submap`: keeps its ids. Only where the whole change succeeds, it gets other intrinsics, pixels, poses and
-          points.
-        - `graph`: makes a new graph for the changed submap; without it, the caller solves.
+        The submap keeps its ids. Only where the whole change succeeds, it gets other intrinsics, pixels, poses and
+        points. Its graph is to be made anew. Returns numbers for the event log.
         """
         n = len(submap.keyframes)
         self._asked(submap.id, n)
@@ -179,11 +169,11 @@ class Calibration:
             return Failure(FailureReason.CHI_SQUARE, "no significant change", numbers)
         try:
             camera = correct(self._camera, estimate.correction)
-            before = self._change(submap, camera, graph)
+            self._change(submap, camera, None)
         except (InputError, SolverError) as error:
             return Failure(FailureReason.SOLVER, str(error), numbers)
         self._camera, self._refined_in, self._covariance = camera, submap.id, estimate.covariance
-        return Refinement(graph, before, numbers)
+        return numbers
 
     def update(self, submap: Submap, graph: SubmapGraph) -> Submap | Failure:
         """Change a submap that an earlier camera made to the present one; return a copy of it as it was.
@@ -229,9 +219,9 @@ def answer(
     - `calibration`: one of its own, with the camera and the covariance of the job.
     """
     submap, changed = job.submap.copy(), {}
-    refined = calibration.refine(submap)
-    if isinstance(refined, Failure):
-        return refined
+    numbers = calibration.refine(submap)
+    if isinstance(numbers, Failure):
+        return numbers
     for m, each in job.lost.items():
         lost = each.copy()
         before = calibration.update(lost, new_graph())
@@ -240,7 +230,7 @@ def answer(
         else:
             changed[m] = lost
     assert calibration.covariance is not None
-    return CalibrationAnswer(calibration.camera, calibration.covariance, submap, changed, refined.numbers)
+    return CalibrationAnswer(calibration.camera, calibration.covariance, submap, changed, numbers)
 
 
 def rectified_again(features: Features, camera: Camera) -> Features:

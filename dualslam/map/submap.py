@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.geometry import se3, sim3
+from dualslam.core.geometry import se3
 from dualslam.core.types import BoolArray, FloatArray, IntArray, Keyframe, Start, Track
 from dualslam.map.anchors import Anchor, RelativePose
 from dualslam.map.tables import Table, landmark_table, observation_table
@@ -165,23 +165,11 @@ class Submap:
             n_found=1,
         )
 
-    def copy_landmarks(self, other: Submap, landmark_ids: IntArray, S_self_other: FloatArray | None = None) -> IntArray:
-        """Append copies of another submap's landmarks, without observations; return their ids here.
-
-        Parameters
-        ----------
-        other : Submap
-        landmark_ids : (N,) int64
-        S_self_other : (4, 4), optional
-            Similarity that takes them here; by default they stay where they are.
-        """
+    def copy_landmarks(self, other: Submap, landmark_ids: IntArray) -> IntArray:
+        """Append copies of another submap's landmarks, where they are, without observations; return their ids here."""
         columns = {name: column[landmark_ids] for name, column in other.landmarks.columns().items()}
         columns["replaced_by"] = np.full(len(landmark_ids), NO_LANDMARK)
         columns["condemned"] = np.zeros(len(landmark_ids), bool)
-        if S_self_other is not None:
-            columns["xyz_mu"] = sim3.act(S_self_other, columns["xyz_mu"])
-            columns["normal"] = columns["normal"] @ sim3.rotation(S_self_other).T
-            columns["distance_mu"] = columns["distance_mu"] * float(sim3.scale(S_self_other))
         return self.landmarks.append(len(landmark_ids), **columns)
 
     def remove_landmarks(self, landmark_ids: IntArray) -> None:

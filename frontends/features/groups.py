@@ -14,6 +14,10 @@ from dualslam.core.types import BoolArray, FloatArray, IntArray, Matches
 ROWS_AT_ONCE = 128
 """Of a matrix that is made to be looked through and dropped: with 1,500 columns of four bytes they stay in a core's
 cache, and the whole takes four fifths of the time."""
+TURN_TOLERANCE_RAD = np.radians(30.0)
+"""Greatest departure of a pair from the rotation that most share."""
+MIN_TURNS = 8
+"""With fewer pairs all are kept: there is no majority to ask."""
 NO_MATCHES = Matches(np.empty((0, 2), np.int64), np.empty(0))
 
 
@@ -122,14 +126,12 @@ def _highest(kind: np.dtype[Any]) -> float:
     return float(np.iinfo(kind).max) if np.issubdtype(kind, np.integer) else np.inf
 
 
-def consistent_rotation(turn_rad: FloatArray, tolerance_rad: float = np.radians(30.0), n_min: int = 8) -> BoolArray:
+def consistent_rotation(turn_rad: FloatArray) -> BoolArray:
     """Which pairs agree with the rotation that most of them share.
 
-    - `turn_rad` (M,): orientation in the second image minus that in the first, any winding.
-    - `tolerance_rad`: greatest departure from the shared rotation.
-    - `n_min`: with fewer pairs all are kept: there is no majority to ask.
+    `turn_rad` (M,): orientation in the second image minus that in the first, any winding.
     """
-    if len(turn_rad) < n_min:
+    if len(turn_rad) < MIN_TURNS:
         return np.ones(len(turn_rad), np.bool_)
     bin_rad = 2 * np.pi / 30
     histogram = np.bincount((turn_rad % (2 * np.pi) / bin_rad).astype(np.int64) % 30, minlength=30)
@@ -138,7 +140,7 @@ def consistent_rotation(turn_rad: FloatArray, tolerance_rad: float = np.radians(
     # The mean around the peak, so that the window does not depend on where the bins happen to lie.
     from_peak = _wrapped(turn_rad - (peak + 0.5) * bin_rad)
     centre = from_peak[np.abs(from_peak) <= 1.5 * bin_rad].mean()
-    kept: BoolArray = np.abs(_wrapped(from_peak - centre)) <= tolerance_rad
+    kept: BoolArray = np.abs(_wrapped(from_peak - centre)) <= TURN_TOLERANCE_RAD
     return kept
 
 

@@ -84,7 +84,6 @@ def match_projected(
     descriptors: NDArray[np.generic],
     *,
     octave: IntArray | FloatArray | None = None,
-    octave_tolerance: float = 1.0,
     max_distance: float | None = None,
     ratio: float = 0.9,
     taken: BoolArray | None = None,
@@ -97,8 +96,7 @@ def match_projected(
     - `uv_pred` (M, 2): predicted pixels, rectified; non-finite rows stay unmatched.
     - `radius_px` (M,): search radius.
     - `descriptors` (M, D): of the predicted points.
-    - `octave` (M,): predicted pyramid level, may be fractional; features further than `octave_tolerance` from it are
-      passed over.
+    - `octave` (M,): predicted pyramid level, may be fractional; features more than one from it are passed over.
     - `max_distance`: `frontend.max_distance` by default.
     - `ratio`: greatest best distance over second best, among the candidates of the best one's octave. 1: no test.
     - `taken` (N,) bool: features that may not be chosen.
@@ -110,7 +108,7 @@ def match_projected(
     query, feature = grid.within(uv_pred, np.asarray(radius_px, np.float64))
     usable = np.ones(len(query), np.bool_)
     if octave is not None:
-        usable &= np.abs(features.octave[feature] - octave[query]) <= octave_tolerance
+        usable &= np.abs(features.octave[feature] - octave[query]) <= 1.0
     if taken is not None:
         usable &= ~taken[feature]
     query, feature = query[usable], feature[usable]
@@ -135,10 +133,8 @@ def match_epipolar(
     rows_b: IntArray,
     F_b_a: FloatArray,
     *,
-    pose_sigma_px: float = 0.0,
     epipole_px: float = 10.0,
     octave_tolerance: int = 1,
-    max_distance: float | None = None,
     ratio: float = 0.85,
     check_rotation: bool = True,
 ) -> Matches:
@@ -150,9 +146,7 @@ def match_epipolar(
     - `rows_a` (A,), `rows_b` (B,): features that take part, usually those without a landmark.
     - `F_b_a` (3, 3): fundamental matrix on rectified pixels: the line in b of x_a is ``F_b_a @ x_a``, its sign and
       scale are free.
-    - `pose_sigma_px`: standard deviation of the line's place caused by the relative pose's own error.
     - `epipole_px`: features nearer than this to the epipole of their image are passed over: no parallax there.
-    - `max_distance`: `frontend.max_distance` by default.
     - `ratio`: greatest best distance over second best on the line, in the best one's octave. 1: no test.
     - `check_rotation`: drop pairs that do not share the common change of orientation.
 
@@ -167,20 +161,18 @@ def match_epipolar(
         a.octave[rows_a],
         b.octave[rows_b],
         F_b_a,
-        pose_sigma_px,
         octave_tolerance,
     )
     usable = _off_epipole(uv_a, F_b_a, epipole_px)[first] & _off_epipole(uv_b, F_b_a.T, epipole_px)[second]
     first, second = first[usable], second[usable]
     if len(first) == 0:
         return NO_MATCHES
-    limit = frontend.max_distance if max_distance is None else max_distance
     distance = frontend.distance(a.descriptors.take(rows_a[first], axis=0), b.descriptors.take(rows_b[second], axis=0))
     octave_b = b.octave[rows_b[second]]
     chosen = best_pairs(first, second, distance, octave_b, ratio, len(rows_a), len(rows_b))
     # Best for b among all candidates, not only among those that are some feature's best.
     chosen = np.intersect1d(chosen, best_per_group(second, distance, len(rows_b)), assume_unique=True)
-    chosen = chosen[distance[chosen] <= limit]
+    chosen = chosen[distance[chosen] <= frontend.max_distance]
     index = np.stack([rows_a[first[chosen]], rows_b[second[chosen]]], axis=1)
     kept = np.ones(len(index), np.bool_)
     if check_rotation:
@@ -210,7 +202,6 @@ def _near_lines(
     octave_a: IntArray,
     octave_b: IntArray,
     F_b_a: FloatArray,
-    extra_px: float,
     octave_tolerance: int,
 ) -> tuple[IntArray, IntArray]:
     """Pairs of like octave whose point in b is within the 95 % gate of the line of the point in a, ascending in a.
@@ -225,7 +216,7 @@ def _near_lines(
     lines = lines.astype(np.float32)
     points = np.concatenate([uv_b, np.ones((len(uv_b), 1))], axis=1)[order_b].astype(np.float32).T
     # The noise of a's pixel moves the line by about as much as it moves the pixel.
-    gate_a = (CHI2_95[1] * (sigma_a[order_a] ** 2 + extra_px**2)).astype(np.float32)[:, None]
+    gate_a = (CHI2_95[1] * sigma_a[order_a] ** 2).astype(np.float32)[:, None]
     gate_b = (CHI2_95[1] * sigma_b[order_b] ** 2).astype(np.float32)
     octaves = np.unique(octave_a)
     begin_a, end_a = (np.searchsorted(octave_a[order_a], octaves, side).tolist() for side in ("left", "right"))

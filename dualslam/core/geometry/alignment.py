@@ -25,6 +25,8 @@ COVARIANCE_INFLATION = 1.5
 MAX_ROTATION_SIGMA_RAD = 0.2
 """A rotation known no better is not known: the inliers lie along a line as far as their covariances can tell."""
 MAX_LOG_SCALE_SIGMA = 0.3
+CONFIDENCE = 0.999
+"""Of having drawn one clean triplet, at which RANSAC stops early."""
 UNKNOWN = 100.0
 """A point that is uncertain by so many times the extent of all tells nothing, and its covariance inverts badly."""
 BATCH = 64
@@ -102,7 +104,6 @@ def estimate_sim3_robust(
     *,
     min_inliers: int = 10,
     max_hypotheses: int = 512,
-    confidence: float = 0.999,
     chi2_gate: float = CHI2_99[3],
     scale_bounds: tuple[float, float] = (1e-3, 1e3),
 ) -> Sim3Estimate | Failure:
@@ -114,7 +115,6 @@ def estimate_sim3_robust(
     - `rng`: the only source of randomness.
     - `min_inliers`: fewer are a failure.
     - `max_hypotheses`: RANSAC stops here at the latest.
-    - `confidence`: of having drawn one clean triplet, at which RANSAC stops early.
     - `chi2_gate`: of the squared Mahalanobis distance under ``cov_dst + s^2 R cov_src R'``.
     - `scale_bounds`: scales outside are a failure.
 
@@ -128,7 +128,7 @@ def estimate_sim3_robust(
     if n < max(min_inliers, 3):
         return Failure(FailureReason.TOO_FEW_MATCHES, f"{n} matches, {min_inliers} needed", {"n": float(n)})
     problem = _Sim3Problem(src[rows], dst[rows], cov_src[rows], cov_dst[rows])
-    hypotheses, n_tried = _ransac(problem, rng, chi2_gate, max_hypotheses, confidence, scale_bounds)
+    hypotheses, n_tried = _ransac(problem, rng, chi2_gate, max_hypotheses, scale_bounds)
     if not len(hypotheses):
         return Failure(FailureReason.DEGENERATE, f"no triplet of {n} matches spans a plane", {"n": float(n)})
     S = _best_refined(problem, hypotheses, chi2_gate)
@@ -167,7 +167,6 @@ def _ransac(
     rng: Generator,
     gate: float,
     max_hypotheses: int,
-    confidence: float,
     scale_bounds: tuple[float, float],
 ) -> tuple[FloatArray, int]:
     """Return the best few hypotheses (M, 4, 4), best first, by truncated cost (MSAC), and how many were tried."""
@@ -188,7 +187,7 @@ def _ransac(
             ratio = float((d2 < gate).mean(1).max())
             failing = math.log(max(1.0 - ratio**3, 1e-12)) if ratio > 0 else 0.0
             if failing < 0:
-                needed = min(needed, math.log(1.0 - confidence) / failing)
+                needed = min(needed, math.log(1.0 - CONFIDENCE) / failing)
     return best, n_tried
 
 

@@ -24,6 +24,10 @@ MIN_DEPTH = 1e-6
 MIN_EIGENVALUE = 1e-11
 """Of the Hessian scaled to unit diagonal: below, rounding decides the pose (squared condition of the Jacobian)."""
 
+ROUNDS, STEPS_A_ROUND, MAX_SETTLING_STEPS = 4, 5, 10
+"""Gauss-Newton steps of a refinement, in rounds, and of a pose that settles: in its first four the loss is wider."""
+TOLERANCE = 1e-4
+"""Decrease of the summed chi-square that counts as none: the step is a hundredth of a standard deviation long."""
 WIDE = 16.0
 """How many times as wide as at its end the loss is with which a pose begins to settle: a power of two. Of 900 made-up
 poses, 3 to 15 cm off, with a fifth of outliers, one in twelve ended a centimetre or more off with 1. Two in a hundred
@@ -182,10 +186,8 @@ def refine_pose(
     *,
     prior_information: FloatArray | None = None,
     min_inliers: int = 6,
-    n_rounds: int = 4,
-    n_iterations: int = 5,
     chi2_gate: float = CHI2_95[2],
-    tolerance: float = 1e-4,
+    tolerance: float = TOLERANCE,
     counted: BoolArray | None = None,
     consensus: BoolArray | None = None,
 ) -> PoseEstimate | Failure:
@@ -202,7 +204,6 @@ def refine_pose(
     - `sigma` (N,): standard deviation of each pixel coordinate, pixels.
     - `prior_information` (6, 6): inverse covariance of xi of the starting pose; without it the start is only a start.
     - `min_inliers`: fewer are a failure.
-    - `n_rounds`, `n_iterations`: rounds, and steps in each.
     - `chi2_gate`: of the squared whitened residual; its root is the Huber threshold too.
     - `tolerance`: decrease of the summed chi-square promised by a step, under which a round has converged. Unit-free:
       its root is the length of the step in standard deviations of the pose.
@@ -223,9 +224,9 @@ def refine_pose(
     # Without a consensus the first round relies on Huber's weights. Where most matches are wrong these are not enough.
     inliers = np.isfinite(chi2) if consensus is None else np.isfinite(chi2) & consensus
     n_steps = 0
-    for _ in range(n_rounds):
+    for _ in range(ROUNDS):
         largest_gain = 0.0
-        for _ in range(n_iterations):
+        for _ in range(STEPS_A_ROUND):
             G = problem.normal_equations(huber_weights(chi2, chi2_gate) * (inliers & counted))
             if prior_information is not None:
                 _add_prior(G, T, T_prior, prior_information)
@@ -258,18 +259,15 @@ def settle_pose(
     *,
     shape: float,
     min_inliers: int = 6,
-    max_steps: int = 10,
-    tolerance: float = 1e-4,
 ) -> FloatArray | Failure:
     """Refine a pose against known points under a loss that forgets outliers, to the optimum of those that agree.
 
     Gauss-Newton with the weights of Geman and McClure's loss. From afar that forgets what is right, the nearest points
     first: it begins `WIDE` times as wide, and is half as wide at each step.
 
-    - `K`, `T_cam_w`, `xyz`, `uv`, `sigma`, `tolerance`: as in `refine_pose`.
+    - `K`, `T_cam_w`, `xyz`, `uv`, `sigma`: as in `refine_pose`.
     - `shape`: of the loss, in sigmas: at so much of a residual a quarter of its weight is left.
     - `min_inliers`: fewer points that agree, to within `shape`, are a failure.
-    - `max_steps`: of Gauss-Newton; in the first four the loss is wider.
 
     Returns (4, 4) or Failure: ``T_cam_w``; `TOO_FEW_MATCHES`, `TOO_FEW_INLIERS`, or `DEGENERATE` where the points do
     not fix the pose.
@@ -280,14 +278,14 @@ def settle_pose(
     problem = _PoseProblem(K, np.asarray(xyz), np.asarray(uv), np.asarray(sigma))
     T, width = np.array(T_cam_w, np.float64), WIDE
     chi2 = problem.evaluate(T)
-    for _ in range(max_steps):
+    for _ in range(MAX_SETTLING_STEPS):
         G = problem.normal_equations((1.0 + chi2 / (width * shape) ** 2) ** -2)  # zero behind the camera
         step = _solve(G)
         if step is None:
             return Failure(FailureReason.DEGENERATE, f"{n} points do not fix the pose")
         T = _exp(step.tolist()) @ T
         chi2 = problem.evaluate(T)
-        if width == 1.0 and -float(step @ G[:6, 6]) < tolerance:
+        if width == 1.0 and -float(step @ G[:6, 6]) < TOLERANCE:
             break
         width = max(width / 2, 1.0)
     n_inliers = int(np.count_nonzero(chi2 < shape**2))

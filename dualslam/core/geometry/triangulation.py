@@ -19,6 +19,8 @@ MIN_RELATIVE_DETERMINANT = 1e-13
 """Of a point's 3x3 information, relative to its trace cubed over 27: below, a direction is not observed at all. (Two
 views with 0.001 deg of parallax have 1e-10.)"""
 
+STEPS_TWO_VIEWS, STEPS_MANY_VIEWS = 2, 3
+"""Gauss-Newton steps; two reach the minimum of two views to about 1e-3 px even at several px of noise."""
 MIN_COLUMNS = 4
 """Points with up to so many views are taken together; with twice as many the next ones."""
 
@@ -49,23 +51,17 @@ class NViewPoints:
     min_cos_parallax: FloatArray  # (N,): smallest cosine between any two of the rays: the widest parallax
 
 
-def in_front(*depths: FloatArray, min_depth: float = 0.0) -> BoolArray:
-    """Return the mask of points beyond `min_depth` in every camera (cheirality); NaN counts as not visible there."""
+def in_front(*depths: FloatArray) -> BoolArray:
+    """Return the mask of points in front of every camera (cheirality); NaN counts as not visible there."""
     mask = np.ones(depths[0].shape[0], bool)
     for depth in depths:
-        seen = ~(depth <= min_depth)
+        seen = ~(depth <= 0.0)
         mask &= seen if depth.ndim == 1 else seen.all(1)
     return mask
 
 
 def triangulate_two_view(
-    uv_a: FloatArray,
-    uv_b: FloatArray,
-    K: FloatArray,
-    T_w_a: FloatArray,
-    T_w_b: FloatArray,
-    *,
-    n_polish: int = 2,
+    uv_a: FloatArray, uv_b: FloatArray, K: FloatArray, T_w_a: FloatArray, T_w_b: FloatArray
 ) -> TwoViewPoints:
     """Triangulate matched pixels of two views with minimal reprojection error.
 
@@ -76,7 +72,6 @@ def triangulate_two_view(
     - `uv_a`, `uv_b` (N, 2): rectified pixels.
     - `K` (3, 3): intrinsics of both, zero skew.
     - `T_w_a`, `T_w_b` (4, 4): camera poses in w; their centres must differ.
-    - `n_polish`: Gauss-Newton steps; two reach the minimum to about 1e-3 px even at several px of noise.
     """
     T_b_a = se3.inverse(T_w_b) @ T_w_a
     R, t = T_b_a[:3, :3], T_b_a[:3, 3]
@@ -91,7 +86,7 @@ def triangulate_two_view(
     ray_norms2 = (1.0 + xa * xa + ya * ya) * (1.0 + xb * xb + yb * yb)
     cos_parallax = (xb * rx + yb * ry + rz) / np.sqrt(ray_norms2)
     point = np.stack([xa, ya, rho])
-    for _ in range(n_polish):
+    for _ in range(STEPS_TWO_VIEWS):
         point += _inverse_depth_step(point, np.stack([xa, ya]), np.stack([xb, yb]), R, t, fx, fy)
     smallest = MIN_INVERSE_DEPTH / max(float(np.sqrt(t @ t)), 1e-300)
     rho = np.where(np.abs(point[2]) < smallest, smallest, point[2])
@@ -134,7 +129,7 @@ def _inverse_depth_step(
 
 
 def triangulate_n_view(
-    uv: FloatArray, K: FloatArray, T_cam_w: FloatArray, visible: BoolArray | None = None, *, n_polish: int = 3
+    uv: FloatArray, K: FloatArray, T_cam_w: FloatArray, visible: BoolArray | None = None
 ) -> NViewPoints:
     """Triangulate N points from V views: linear, then Gauss-Newton on the reprojection error.
 
@@ -144,7 +139,6 @@ def triangulate_n_view(
     - `uv` (N, V, 2): rectified pixels; ignored where not visible.
     - `K` (3, 3): intrinsics, zero skew.
     - `visible` (N, V) bool: which views see which point; all by default.
-    - `n_polish`: Gauss-Newton steps.
     """
     n, n_views = uv.shape[:2]
     seen = np.ones((n, n_views), bool) if visible is None else np.asarray(visible, bool)
@@ -153,14 +147,14 @@ def triangulate_n_view(
     width = 2 ** np.ceil(np.log2(seen.sum(1).clip(MIN_COLUMNS))).astype(np.int64)
     for n_columns in np.unique(width).tolist():
         rows = np.flatnonzero(width == n_columns)
-        part = _triangulate_alike(uv[rows], K, T_cam_w, seen[rows], n_columns, n_polish)
+        part = _triangulate_alike(uv[rows], K, T_cam_w, seen[rows], n_columns)
         found.xyz[rows], found.min_cos_parallax[rows] = part.xyz, part.min_cos_parallax
         found.depth[rows], found.error2[rows] = part.depth, part.error2
     return found
 
 
 def _triangulate_alike(
-    uv: FloatArray, K: FloatArray, T_cam_w: FloatArray, seen: BoolArray, n_columns: int, n_polish: int
+    uv: FloatArray, K: FloatArray, T_cam_w: FloatArray, seen: BoolArray, n_columns: int
 ) -> NViewPoints:
     """Triangulate points of which none has more than `n_columns` views."""
     n, n_views = seen.shape
@@ -178,7 +172,7 @@ def _triangulate_alike(
     c = T[..., :3, 2]
     # In each view q = M (alpha, beta, rho) + c is the point up to scale; x q_z = q_x is linear.
     point = _solve_points(M[..., :2, :] - x[..., None] * M[..., 2:, :], x * c[..., 2:] - c[..., :2], w)
-    for _ in range(n_polish):
+    for _ in range(STEPS_MANY_VIEWS):
         q, J = _project_views(point, M, c)
         w_front = w * (q[..., 2:] > 0)
         step = _solve_points(J * focal[:, None], (x - q[..., :2]) * focal, w_front)

@@ -187,14 +187,13 @@ def test_epipolar_matches_agree_with_a_loop(sign: float) -> None:
         ratio=1.0,
         epipole_px=0.0,
         check_rotation=False,
-        pose_sigma_px=0.3,
     )
     cost = np.full((150, 150), np.inf)
     for i in range(150):
         line = F_b_a @ (*a.uv_px[i], 1.0)
         for j in range(150):
             off = line @ (*b.uv_px[j], 1.0) / np.hypot(line[0], line[1])
-            variance = a.sigma_px[i] ** 2 + b.sigma_px[j] ** 2 + 0.3**2
+            variance = a.sigma_px[i] ** 2 + b.sigma_px[j] ** 2
             if off**2 <= CHI2_95[1] * variance and abs(a.octave[i] - b.octave[j]) <= 1:
                 cost[i, j] = FRONTEND.distance(a.descriptors[i : i + 1], b.descriptors[j : j + 1])[0]
     expected = {
