@@ -10,6 +10,7 @@ refinement they would count twice.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -35,11 +36,19 @@ from dualslam.linking.gates import (
     MAX_HYPOTHESES,
     MAX_MISFITS,
     MAX_SCALE,
+    MIN_MAJORITY,
     MIN_PAIRS_PER_KEYFRAME,
+    MINORITY_DEFORMATION,
     PAIR_CHI2,
 )
 from dualslam.linking.pairs import PairModel
-from dualslam.linking.timeline import KeyframeVotes, ask_keyframes, find_discontinuities, leading_run
+from dualslam.linking.timeline import (
+    KeyframeVotes,
+    ask_keyframes,
+    find_discontinuities,
+    leading_run,
+    smallest_share_handed_on,
+)
 from dualslam.map.submap import Submap
 
 
@@ -242,9 +251,14 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
     # How far the maps are bent against each other beyond it: that is part of what is not known.
     S_old_new = consensus.estimate.S_dst_src
     deformation = measure_deformation(model, S_old_new, consensus.inliers, consensus.keyframes, config)
+    # The walk has crossed the images of the newer keyframes, too.
+    newest = max(old.keyframes) if limit is None else limit - 1
+    share = smallest_share_handed_on(old, _look_back(old, int(agreeing[0])), newest)
+    if share < MIN_MAJORITY:
+        deformation = math.hypot(deformation, MINORITY_DEFORMATION)
     covariance = consensus.estimate.covariance + deformation_covariance(model, deformation)
     # The gates.
-    sigmas = verify.sigma_numbers(model, S_old_new, covariance)
+    sigmas = verify.sigma_numbers(model, S_old_new, covariance) | {"handed_on": share}
     evidence = verify.judge_overlap(sigmas, len(agreeing), config)
     refused = evidence.refusal(sigmas)
     if refused is not None:
@@ -252,11 +266,15 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
     link = _link(model, whole, later, consensus, covariance, sigmas, deformation, onset, limit)
     link = replace(link, gates=evidence.comparisons)
     doubt = evidence.doubt(sigmas)
-    return (
-        link
-        if doubt is None
-        else LinkRefusal(doubt.reason, doubt.detail, doubt.numbers, unsure=link, gates=doubt.gates)
-    )
+    if doubt is None:
+        return link
+    reason, detail = doubt.reason, doubt.detail
+    if share < MIN_MAJORITY:  # older keyframes do not cure that
+        reason, detail = (
+            FailureReason.SCALE_LOST,
+            f"the old map hands on {share:.0%} of what it sees, as at an occluder",
+        )
+    return LinkRefusal(reason, detail, doubt.numbers, unsure=link, gates=doubt.gates)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,6 +26,9 @@ TIE_WINDOW = 5
 """Keyframes on either side that are searched for ties."""
 LOOK_BACK = 10
 """Keyframes of the old map, older than the oldest shared one, among which a break is still looked for."""
+MINORITY_DEFORMATION = 0.03
+"""Relative deformation (standard deviation) of a map beyond a place where it hands on fewer than half of what its
+keyframes see. Where an occluder comes in, maps of rendered worlds lost up to 8 % of their scale and claimed 0.9 %."""
 MIN_IMAGE_SPREAD = 0.25
 """Share of the image, along either axis, that the agreeing landmarks must cover (5 % to 95 % of them, against the
 keypoints of the same keyframes)."""

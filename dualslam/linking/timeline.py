@@ -98,16 +98,10 @@ def find_discontinuities(submap: Submap, oldest: int, newest: int) -> IntArray:
     oldest, newest : int
         Keyframe ids; the places after `oldest` up to before `newest` are searched.
     """
-    w = TIE_WINDOW
-    ids = np.array(sorted(submap.keyframes))
-    first, last = int(np.searchsorted(ids, oldest, "right")), int(np.searchsorted(ids, newest, "right"))
-    start = max(first - w, 0)
-    ids = ids[start : last + w]
+    ids, places = _windows(submap, oldest, newest)
     seen, good = _own_agreement(submap, ids, PIXEL_CHI2)
-    places = range(max(first - start, 1), last - start)
     torn, contrast = np.zeros((2, len(ids)), bool), np.zeros(len(ids))
-    for i in places:
-        before, after = slice(max(i - w, 0), i), slice(i, i + w)
+    for i, before, after in places:
         ties = good[:, before].any(1) & good[:, after].any(1)
         torn[0, i] = np.count_nonzero(ties) < MIN_TIES
         followed = (seen[:, before].sum(1) >= 2) & (seen[:, after].sum(1) >= 2)
@@ -121,6 +115,39 @@ def find_discontinuities(submap: Submap, oldest: int, newest: int) -> IntArray:
             torn[1, run] = False
             torn[1, run[np.argmax(contrast[run])]] = True
     return ids[torn.any(0)]
+
+
+def smallest_share_handed_on(submap: Submap, oldest: int, newest: int) -> float:
+    """Return which share of what a map's keyframes see it hands on, at the place where that is least.
+
+    At a place between two keyframes, landmarks seen on both sides are counted, where they agree with their pixels. The
+    share is of what a keyframe sees there. Where an occluder comes in, most landmarks vanish at once. Its own replace
+    them before parallax fixes their depth, and the map stays in agreement with itself.
+
+    Parameters
+    ----------
+    submap : Submap
+    oldest, newest : int
+        Keyframe ids; the places after `oldest` up to before `newest` are searched.
+    """
+    ids, places = _windows(submap, oldest, newest)
+    _, good = _own_agreement(submap, ids, PIXEL_CHI2)
+    n_good = good.sum(0)
+    shares = [1.0]
+    for _, before, after in places:
+        ties = np.count_nonzero(good[:, before].any(1) & good[:, after].any(1))
+        shares.append(ties / max(min(float(np.median(n_good[side])) for side in (before, after)), 1.0))
+    return min(shares)
+
+
+def _windows(submap: Submap, oldest: int, newest: int) -> tuple[IntArray, list[tuple[int, slice, slice]]]:
+    """Return keyframe ids, and of each place between the two given: its row, the rows before it, the rows after it."""
+    w = TIE_WINDOW
+    ids = np.array(sorted(submap.keyframes))
+    first, last = int(np.searchsorted(ids, oldest, "right")), int(np.searchsorted(ids, newest, "right"))
+    start = max(first - w, 0)
+    places = range(max(first - start, 1), last - start)
+    return ids[start : last + w], [(i, slice(max(i - w, 0), i), slice(i, i + w)) for i in places]
 
 
 def _own_agreement(submap: Submap, ids: IntArray, gate: float) -> tuple[BoolArray, BoolArray]:

@@ -110,7 +110,8 @@ def _coverage(system: System, rows: Sequence[FrameRow]) -> list[Reason]:
         first, last = sorted((apart[0].index, apart[-1].index))
         text = (
             f"{len(apart)} frames from {first} to {last} are in maps that could not be joined to the main one. "
-            "Their trajectories are in submaps/, each in its own unit. A recording that returns there would join them."
+            "Their trajectories are in submaps/, each in its own unit. To join them, record the place again with "
+            "something in view that does not repeat, or give measurements (--measurements)."
         )
         return [Reason(ReasonCode.UNJOINED, Level.USABLE, text, first, last)]
     first, last = _longest_run(sorted(row.index for row in unposed))

@@ -13,7 +13,8 @@ from dualslam.core.geometry import se3
 from dualslam.core.types import Failure, FailureReason, FloatArray, IntArray
 from dualslam.linking import DescriptorMatcher, LinkEstimate, estimate, estimate_link, propagate_to_live_end
 from dualslam.linking.correspondences import propose_correspondences
-from dualslam.linking.gates import GATE_SIGMAS, MIN_TIES, PIXEL_CHI2
+from dualslam.linking.estimate import LinkRefusal
+from dualslam.linking.gates import GATE_SIGMAS, MIN_TIES, MINORITY_DEFORMATION, PIXEL_CHI2
 from dualslam.linking.join_test import LinkEvidence
 from dualslam.linking.pairs import PairModel
 from dualslam.linking.scale_observability import scale_sigma_between
@@ -116,6 +117,21 @@ def test_a_walk_that_hangs_by_few_landmarks_carries_no_link() -> None:
         refused = propagate_to_live_end(link, thinned(case.new, 18 * FRAME_STEP, n_ties), int(THERE[0]), CONFIG)
         assert isinstance(refused, Failure)
         assert refused.reason in (FailureReason.SCALE, FailureReason.SCALE_LOST)
+
+
+@pytest.mark.parametrize("place", [5, 8])
+def test_a_link_to_a_map_that_hands_on_a_minority_carries_a_doubt(place: int) -> None:
+    """As where an occluder comes in: what it hides is not seen any more, and what it shows is mapped instead."""
+    case = make_case("street", 2)
+    sure = estimate_link(case.old, case.new, CONFIG, np.random.default_rng(0), None, MATCHER)
+    assert isinstance(sure, LinkEstimate)
+    assert sure.numbers["handed_on"] > 0.7
+    old = thinned(case.old, place * FRAME_STEP, MIN_TIES + 5)
+    refused = estimate_link(old, case.new, CONFIG, np.random.default_rng(0), None, MATCHER)
+    assert isinstance(refused, LinkRefusal)
+    assert refused.reason is FailureReason.SCALE_LOST
+    assert refused.unsure is not None
+    assert refused.unsure.sigma_scale > MINORITY_DEFORMATION > sure.sigma_scale
 
 
 def test_what_more_keyframes_cannot_cure_is_said_to_be_lost() -> None:
