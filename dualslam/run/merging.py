@@ -53,7 +53,7 @@ class _Run:
 
     @classmethod
     def read(cls, path: Path) -> _Run:
-        config, stored = load_run_config(path), read_stored(path)
+        stored, config = read_stored(path), load_run_config(path)
         numbers = read_numbers(path)
         rows = [replace(row, index=numbers[row.index]) for row in read_frames(path / FRAMES)]
         return cls(path, config, stored, rows, read_summary(path))
