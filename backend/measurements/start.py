@@ -8,10 +8,10 @@ from itertools import permutations, product
 from typing import Any
 
 import numpy as np
+from scipy.special import fdtri
 
 from dualslam.backend.measurements.base import Gauge, Mount
 from dualslam.backend.measurements.path import CameraPath, Term, attach
-from dualslam.core.chi_square import CHI2_99
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3, sim3, so3
 from dualslam.core.geometry.umeyama import umeyama
@@ -160,20 +160,24 @@ def up_of(problem: MetricProblem) -> FloatArray | None:
 def _offset(path: CameraPath, source: MeasurementSource, up: FloatArray | None) -> float:
     """Return the offset of a source's clock at which its readings agree best with the map, to a quarter of a second.
 
-    It is 0 where another is not likelier than chance makes it: a path of constant speed and turn shows none.
+    It is 0 where no other fits better than by chance (F-test at 99 %): a path of constant speed and turn shows none.
     """
     if not source.has_clock:
         return 0.0
     grid = np.arange(-MAX_OFFSET_S, MAX_OFFSET_S + 1e-9, OFFSET_STEP_S)
     grid = grid[np.argsort(np.abs(grid), kind="stable")]
-    # The same readings at each offset: those near the ends of the video would come and go.
-    first, last = path.span_s
-    inner = [r for r in source.readings if first + MAX_OFFSET_S <= r.times_s[0] <= last - MAX_OFFSET_S]
+    # The same readings at each offset: those near the ends of the video, or of a gap in it, would come and go.
+    times = np.array([(r.times_s[0], r.times_s[-1]) for r in source.readings])
+    known = path.knows(times[:, :, None] + grid).all(axis=(1, 2))
+    inner = [r for r, is_known in zip(source.readings, known, strict=True) if is_known]
     common = replace(source, readings=inner)
     costs = [_offset_cost(path, common, float(offset), up) for offset in grid]
     best = int(np.argmin(costs))
-    likelier = 2.0 * len(inner) * np.log(max(costs[0], 1e-12) / max(costs[best], 1e-12))
-    return float(grid[best]) if likelier > CHI2_99[1] else 0.0
+    dof = len(inner) - 8 / 3  # a reading counts once; the similarity and the offset take eight of three numbers each
+    if dof <= 0:
+        return 0.0
+    ratio = (costs[0] / max(costs[best], 1e-12)) ** 2
+    return float(grid[best]) if (ratio - 1.0) * dof > fdtri(1.0, dof, 0.99) else 0.0
 
 
 def _offset_cost(path: CameraPath, source: MeasurementSource, offset_s: float, up: FloatArray | None) -> float:
