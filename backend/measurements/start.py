@@ -167,9 +167,9 @@ def _offset(path: CameraPath, source: MeasurementSource, up: FloatArray | None) 
     grid = np.arange(-MAX_OFFSET_S, MAX_OFFSET_S + 1e-9, OFFSET_STEP_S)
     grid = grid[np.argsort(np.abs(grid), kind="stable")]
     # The same readings at each offset: those near the ends of the video, or of a gap in it, would come and go.
-    times = np.array([(r.times_s[0], r.times_s[-1]) for r in source.readings])
+    times = np.array([(r.times_s[0], r.times_s[-1]) for r in source.readings]).reshape(-1, 2)
     known = path.knows(times[:, :, None] + grid).all(axis=(1, 2))
-    inner = [r for r, is_known in zip(source.readings, known, strict=True) if is_known]
+    inner = [source.readings[i] for i in np.flatnonzero(known).tolist()]
     common = replace(source, readings=inner)
     costs = [_offset_cost(path, common, float(offset), up) for offset in grid]
     best = int(np.argmin(costs))
