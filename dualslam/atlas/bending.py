@@ -22,29 +22,16 @@ bend outlast a new solution of the submap."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Move:
-    """Effect of a solution on one submap.
-
-    Attributes
-    ----------
-    submap_id : int
-    warp : Warp
-        Acts from the left, in the submap's frame.
-    S_world_submap : (4, 4)
-        Where the solution puts the frame.
-    bend_mu : float
-        Farthest that a keyframe goes.
-    bent : bool
-        Whether any goes anywhere.
-    steps : (K - 1, 7, 7)
-        Covariances from knot to knot of the warp, as the submap's own factors give them: what is to hold the bend.
-    """
+    """Effect of a solution on one submap."""
 
     submap_id: int
-    warp: Warp
-    S_world_submap: FloatArray
-    bend_mu: float
-    bent: bool
+    warp: Warp  # acts from the left, in the submap's frame
+    S_world_submap: FloatArray  # (4, 4): where the solution puts the frame
+    bend_mu: float  # farthest that a keyframe goes
+    bent: bool  # whether any goes anywhere
     steps: FloatArray
+    """(K - 1, 7, 7): covariances from knot to knot of the warp, as the submap's own factors give them: what is to hold
+    the bend."""
 
 
 def bend_submap(submap: Submap, warp: Warp) -> None:
@@ -106,15 +93,9 @@ def hold(submap: Submap, knots: Sequence[int], covariances: FloatArray, held: fr
     A submap's own graph knows its projections only: solved again, it would straighten itself out. What another front
     end said of a keyframe (a gap relocalisation) is not written over.
 
-    Parameters
-    ----------
-    submap : Submap
-    knots : sequence of int
-        Keyframes, ascending.
-    covariances : (K - 1, 7, 7)
-        Of the similarities between neighbours, as the submap's own factors give them.
-    held : frozenset of int
-        Keyframes that hold an earlier bend so.
+    - `knots`: keyframes, ascending.
+    - `covariances` (K - 1, 7, 7): of the similarities between neighbours, as the submap's own factors give them.
+    - `held`: keyframes that hold an earlier bend so.
     """
     for k in held:
         submap.relative_poses.pop(k, None)

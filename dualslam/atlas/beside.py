@@ -54,36 +54,17 @@ def atlas_handlers(solver: AtlasSolver) -> Handlers:
 
 @dataclass(slots=True, eq=False)
 class AskedSolution:
-    """A request, and the state of the atlas that it is about.
+    """A request, and the state of the atlas that it is about."""
 
-    Attributes
-    ----------
-    touched : set of int
-        Submaps whose linked sets were to be solved.
-    skeletons : list of Skeleton
-    new : list of Link
-        Connections that wait for the solution, in submaps as they were.
-    rows : list of list of int
-        For each skeleton, where the links of the atlas stand in its list that are the first of the skeleton's.
-    changes : dict of int to int
-        By submap, how many times others than its graph had changed it.
-    ends : list of (int, int)
-        The two keyframes of each new connection.
-    T_ends : list of ((4, 4), (4, 4))
-        Their poses.
-    tries : int
-        How many times it was asked before.
-    started_s : float
-    """
-
-    touched: set[int]
+    touched: set[int]  # submaps whose linked sets were to be solved
     skeletons: list[Skeleton]
-    new: list[Link]
+    new: list[Link]  # connections that wait for the solution, in submaps as they were
     rows: list[list[int]]
-    changes: dict[int, int]
-    ends: list[tuple[int, int]]
-    T_ends: list[tuple[FloatArray, FloatArray]]
-    tries: int = 0
+    """For each skeleton, where the links of the atlas stand in its list that are the first of the skeleton's."""
+    changes: dict[int, int]  # by submap, how many times others than its graph had changed it
+    ends: list[tuple[int, int]]  # list of (int, int): the two keyframes of each new connection
+    T_ends: list[tuple[FloatArray, FloatArray]]  # list of ((4, 4), (4, 4)): their poses
+    tries: int = 0  # how many times it was asked before
     started_s: float = field(default_factory=time.perf_counter)
 
     @classmethod

@@ -35,18 +35,10 @@ MAX_TRIES = 3
 class Connections:
     """Joins submaps, solves the atlas, and lets everything follow.
 
-    Parameters
-    ----------
-    record : Record
-    solver : AtlasSolver
-    new_graph : callable
-        Makes an empty graph, for a front end whose submap has been bent.
-    desk : Desk
-        Where solutions are computed, and covariances that they will need.
-    front_ends : callable
-        Gives those that go on, or may go on, in a submap of the atlas.
-    forget_graph : callable, optional
-        Called with each submap that has been bent: what its graph is solving is of before.
+    - `new_graph`: makes an empty graph, for a front end whose submap has been bent.
+    - `desk`: where solutions are computed, and covariances that they will need.
+    - `front_ends`: gives those that go on, or may go on, in a submap of the atlas.
+    - `forget_graph`: called with each submap that has been bent: what its graph is solving is of before.
     """
 
     def __init__(
@@ -81,16 +73,9 @@ class Connections:
         A connection that alone ties two sets contradicts nothing: where its solution is not there at once, the sets
         are joined by it as they are, and move when it comes.
 
-        Parameters
-        ----------
-        links : sequence of Link
-        now : FrameStamp
-            For the event log.
+        `now`: for the event log.
 
-        Returns
-        -------
-        AtlasReport
-            Falsy where the solver failed: the connections are not taken in then.
+        Returns AtlasReport: falsy where the solver failed: the connections are not taken in then.
         """
         touched = {m for link in links for m in (link.a, link.b)}
         if len(links) > 1 or self._are_connected(touched):
@@ -123,10 +108,7 @@ class Connections:
     def connect_later(self, link: Link, now: FrameStamp) -> AtlasReport | None:
         """Take a connection in as soon as the atlas has been solved with it; not while it `is_solving`.
 
-        Returns
-        -------
-        AtlasReport or None
-            As for `connect`. None: `collect` will return it.
+        Returns AtlasReport or None: as for `connect`. None: `collect` will return it.
         """
         if not self._are_connected({link.a, link.b}):
             return self.connect([link], now)
@@ -159,10 +141,7 @@ class Connections:
     def collect(self, now: FrameStamp) -> AtlasReport | None:
         """Take in what has been solved meanwhile, and go on moving what it moves: the live submap first.
 
-        Returns
-        -------
-        AtlasReport or None
-            Of connections that have waited for it.
+        Returns AtlasReport or None: of connections that have waited for it.
         """
         self._mover.step()
         for ended in self._desk.poll(JobKind.ATLAS):
@@ -207,12 +186,8 @@ class Connections:
 
         Frames, culled keyframes and links go along; where the submap lies on a cycle the atlas is solved again.
 
-        Parameters
-        ----------
-        before, after : Submap
-            Two states of it; `after` is the one in the atlas.
-        now : FrameStamp
-            For the event log.
+        - `before`, `after`: two states of it; `after` is the one in the atlas.
+        - `now`: for the event log.
         """
         self.carry(before, after)
         if after.id in self._atlas.placement:

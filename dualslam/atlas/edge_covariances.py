@@ -41,20 +41,11 @@ class _Known:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeQuestion:
-    """Edges of a submap whose covariances are asked for, and a snapshot of it.
-
-    Attributes
-    ----------
-    submap : Submap
-    pairs : tuple of (int, int)
-        Keyframe ids.
-    held : frozenset of int
-        Keyframes whose relative pose is no evidence.
-    """
+    """Edges of a submap whose covariances are asked for, and a snapshot of it."""
 
     submap: Submap
-    pairs: tuple[tuple[int, int], ...]
-    held: frozenset[int]
+    pairs: tuple[tuple[int, int], ...]  # tuple of (int, int): keyframe ids
+    held: frozenset[int]  # keyframes whose relative pose is no evidence
 
 
 def answer_edges(question: EdgeQuestion, compute: Covariances) -> FloatArray | Failure:
@@ -69,12 +60,8 @@ def answer_edges(question: EdgeQuestion, compute: Covariances) -> FloatArray | F
 class EdgeCovariances:
     """Covariances of edges within submaps, remembered as long as the edge's keyframes are much as they were.
 
-    Parameters
-    ----------
-    compute : callable
-        Gives them from a submap's factors, here and now.
-    desk : Desk
-        Computes those that are requested beforehand.
+    - `compute`: gives them from a submap's factors, here and now.
+    - `desk`: computes those that are requested beforehand.
     """
 
     def __init__(self, compute: Covariances, desk: Desk) -> None:

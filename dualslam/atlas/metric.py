@@ -22,23 +22,14 @@ from dualslam.core.types import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MetricMap:
-    """A linked set as a problem, and how its solution comes back to frames and links.
-
-    Attributes
-    ----------
-    problem : MetricProblem
-    skeleton : Skeleton
-    frames : Trajectory
-        In the world, by the frames' numbers.
-    submap, node : (F,) int64
-        Of each frame of `frames`.
-    """
+    """A linked set as a problem, and how its solution comes back to frames and links."""
 
     problem: MetricProblem
     skeleton: Skeleton
-    frames: Trajectory
-    submap: IntArray
-    node: IntArray
+    frames: Trajectory  # in the world, by the frames' numbers
+    # Of each frame of `frames`.
+    submap: IntArray  # (F,)
+    node: IntArray  # (F,)
 
     @classmethod
     def of(
@@ -46,10 +37,7 @@ class MetricMap:
     ) -> MetricMap | None:
         """Make the problem of a linked set; None where it has fewer than two frames.
 
-        Raises
-        ------
-        SolverError
-            If a submap cannot tell its covariances.
+        Raises `SolverError` if a submap cannot tell its covariances.
         """
         of_submap = {p.index: p.submap_id for p in poses if p.submap_id in component}
         S_world = atlas.S_world_submap(component)

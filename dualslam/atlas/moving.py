@@ -29,10 +29,7 @@ class _Points:
 class Mover:
     """Bends submaps with all that lies in them; a submap bends in one step, and its points are made better in others.
 
-    Parameters
-    ----------
-    record, solver, covariances, new_graph, front_ends, forget_graph
-        See `Connections`.
+    `record`, `solver`, `covariances`, `new_graph`, `front_ends`, `forget_graph`: see `Connections`.
     """
 
     def __init__(

@@ -22,34 +22,22 @@ MIN_SHARED, MAX_ACROSS = 30, 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeView:
-    """Cached views of a submap's nodes, and the state of the submap for which they hold.
+    """Cached views of a submap's nodes, and the state of the submap for which they hold."""
 
-    Attributes
-    ----------
-    knots : list of int
-        Keyframes, ascending.
-    observations, n_rows, n_alive : Table, int, int
-        Rows of one table are appended, and die; none is changed otherwise: their numbers tell its state.
-    seen : list of (L,) int64
-        Landmarks that each node sees.
-    across : list of (int, int)
-        Places among the nodes of those that are tied though no neighbours.
-    distance_mu, depth : (M,), (K,) float64
-        Of all landmarks; their median where each node sees any, else 1.
-    warp, unbend : Warp or None, (K, 4, 4) or None
-        How solutions have bent the submap; what takes that out of its nodes.
-    """
-
-    knots: list[int]
+    knots: list[int]  # keyframes, ascending
+    # Rows of one table are appended, and die; none is changed otherwise: their numbers tell its state.
     observations: Table
     n_rows: int
     n_alive: int
-    seen: list[IntArray]
+    seen: list[IntArray]  # list of (L,) int64: landmarks that each node sees
     across: list[tuple[int, int]]
-    distance_mu: FloatArray
-    depth: FloatArray
-    warp: Warp | None
-    unbend: FloatArray | None
+    """list of (int, int): places among the nodes of those that are tied though no neighbours."""
+    # Of all landmarks; their median where each node sees any, else 1.
+    distance_mu: FloatArray  # (M,), (K,) float64
+    depth: FloatArray  # (M,), (K,) float64
+    # How solutions have bent the submap; what takes that out of its nodes.
+    warp: Warp | None  # Warp or None, (K, 4, 4)
+    unbend: FloatArray | None  # Warp or None, (K, 4, 4)
 
     @classmethod
     def of(cls, submap: Submap, knots: list[int], warp: Warp | None) -> NodeView:

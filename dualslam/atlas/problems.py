@@ -17,12 +17,7 @@ from dualslam.core.jobs import Desk
 class AtlasProblems:
     """Makes the problems of the linked sets that connections touch.
 
-    Parameters
-    ----------
-    record : Record
-    solver : AtlasSolver
-    desk : Desk
-        Where covariances are computed that a problem to come will need.
+    `desk`: where covariances are computed that a problem to come will need.
 
     Attributes
     ----------
@@ -61,10 +56,7 @@ class AtlasProblems:
     def now(self, touched: set[int], new: Sequence[Link]) -> list[Skeleton]:
         """Make the problems of all linked sets that are touched, as the submaps are now.
 
-        Raises
-        ------
-        SolverError
-            If a submap cannot tell its covariances.
+        Raises `SolverError` if a submap cannot tell its covariances.
         """
         self._newest = {}
         return self._make(touched, new, self.covariances)
@@ -72,10 +64,7 @@ class AtlasProblems:
     def foreseen(self, touched: set[int], new: Sequence[Link], again: bool) -> list[Skeleton]:
         """Make them with what was prefetched; `again`: with covariances that hold for the current submaps.
 
-        Raises
-        ------
-        SolverError
-            As for `now`.
+        Raises `SolverError`: as for `now`.
         """
         skeletons = self._make(touched, new, self.covariances if again else self.covariances.as_foreseen)
         self._newest = {}

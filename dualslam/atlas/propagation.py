@@ -23,17 +23,10 @@ def propagate_poses(poses: Iterable[FramePose], before: Submap, after: Submap) -
     Each frame is therefore carried by the keyframes before and after it in time, in proportion to its distance from
     them.
 
-    Parameters
-    ----------
-    poses : iterable of FramePose
-        Those of other submaps are passed over.
-    before, after : Submap
-        Two states of the submap, in about the same frame.
+    - `poses`: those of other submaps are passed over.
+    - `before`, `after`: two states of the submap, in about the same frame.
 
-    Returns
-    -------
-    list of FramePose
-        Posed against keyframes of `after`; those that are keyframes there are left out.
+    Returns list of FramePose: posed against keyframes of `after`; those that are keyframes there are left out.
     """
     own = [pose for pose in poses if pose.submap_id == after.id and pose.index not in after.keyframes]
     if not own:
@@ -81,13 +74,9 @@ def follow_keyframes(
 
     What holds is how the two keyframes lie to each other.
 
-    Parameters
-    ----------
-    S_a_b : (4, 4)
-    covariance : (7, 7)
-        In the frame of b.
-    then, now : ((4, 4), (4, 4))
-        Poses of the keyframes, that of a first, in their submaps.
+    - `S_a_b` (4, 4).
+    - `covariance` (7, 7): in the frame of b.
+    - `then`, `now` ((4, 4), (4, 4)): poses of the keyframes, that of a first, in their submaps.
     """
     (a_then, b_then), (a_now, b_now) = then, now
     S = a_now @ se3.inverse(a_then) @ S_a_b @ b_then @ se3.inverse(b_now)

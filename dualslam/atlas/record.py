@@ -37,24 +37,13 @@ class FrameStamp(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Record:
-    """Maps, rows, poses, events and times of a run.
-
-    Attributes
-    ----------
-    atlas : Atlas
-    rows : dict of int to FrameRow
-        Every frame that was given to the system, by its index.
-    poses : dict of int to FramePose
-    observations : dict of int to FrameObservations
-        What they saw of their submaps, of the frames that were posed last.
-    events : EventLog
-    timer : StageTimer
-    """
+    """Maps, rows, poses, events and times of a run."""
 
     atlas: Atlas = field(default_factory=Atlas)
-    rows: dict[int, FrameRow] = field(default_factory=dict)
+    rows: dict[int, FrameRow] = field(default_factory=dict)  # every frame that was given to the system, by its index
     poses: dict[int, FramePose] = field(default_factory=dict)
     observations: dict[int, FrameObservations] = field(default_factory=dict)
+    """What they saw of their submaps, of the frames that were posed last."""
     events: EventLog = field(default_factory=EventLog)
     timer: StageTimer = field(default_factory=StageTimer)
 

@@ -19,14 +19,8 @@ def renumbered(
 ) -> tuple[Atlas, dict[int, FramePose]]:
     """Return an atlas and its frames with offsets added to all ids and times; the submaps given become the new ones.
 
-    Parameters
-    ----------
-    atlas : Atlas
-    poses : mapping of int to FramePose
-    first_submap, first_frame : int
-        Added to ids of submaps, and to those of frames and keyframes.
-    shift_s : float
-        Added to all times.
+    - `first_submap`, `first_frame`: added to ids of submaps, and to those of frames and keyframes.
+    - `shift_s`: added to all times.
     """
     new = Atlas()
     for m, submap in atlas.submaps.items():
@@ -87,12 +81,8 @@ def bring_to_pixels(submap: Submap, K: FloatArray, scale_factor: float) -> None:
 
     Sizes of image patches, and the pyramid levels that they belong to, change with the focal length.
 
-    Parameters
-    ----------
-    submap : Submap
-    K : (3, 3)
-    scale_factor : float
-        Between two levels of the front end's pyramid.
+    - `K` (3, 3).
+    - `scale_factor`: between two levels of the front end's pyramid.
     """
     own = submap.K
     if np.array_equal(own, K):

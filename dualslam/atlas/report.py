@@ -26,43 +26,25 @@ they are, to the bit."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AtlasReport:
-    """Effect of an atlas solution.
+    """Effect of an atlas solution."""
 
-    Attributes
-    ----------
-    rejected : tuple of Link
-        All that are rejected now, in the linked sets that were solved.
-    newly_rejected, readmitted : tuple of Link
-    factors : dict of str to int
-        Edges by kind, rejected ones left out.
-    cost_before, cost_after : float
-        Half the sum of squared whitened residuals.
-    drift : float
-        Errors within submaps over what they claim, as sure connections show (the largest of the linked sets).
-    newest_chi2 : float, optional
-        Of the connection that came last, against all others (7 degrees of freedom); None where nothing else ties its
-        ends.
-    bent : dict of int to float
-        By submap: farthest move of a keyframe within its submap's frame, in the submap's unit; those that moved.
-    placed : dict of int to float
-        By submap: how far its frame's keyframe went in the world.
-    seconds : float
-    failure : Failure, optional
-        The solver's: nothing has changed.
-    """
-
-    rejected: tuple[Link, ...] = ()
+    rejected: tuple[Link, ...] = ()  # all that are rejected now, in the linked sets that were solved
     newly_rejected: tuple[Link, ...] = ()
     readmitted: tuple[Link, ...] = ()
-    factors: dict[str, int] = field(default_factory=dict)
+    factors: dict[str, int] = field(default_factory=dict)  # edges by kind, rejected ones left out
+    # Half the sum of squared whitened residuals.
     cost_before: float = 0.0
     cost_after: float = 0.0
     drift: float = 1.0
+    """Errors within submaps over what they claim, as sure connections show (the largest of the linked sets)."""
     newest_chi2: float | None = None
+    """Of the connection that came last, against all others (7 degrees of freedom); None where nothing else ties its
+    ends."""
     bent: dict[int, float] = field(default_factory=dict)
-    placed: dict[int, float] = field(default_factory=dict)
+    """By submap: farthest move of a keyframe within its submap's frame, in the submap's unit; those that moved."""
+    placed: dict[int, float] = field(default_factory=dict)  # by submap: how far its frame's keyframe went in the world
     seconds: float = 0.0
-    failure: Failure | None = None
+    failure: Failure | None = None  # the solver's: nothing has changed
 
     def __bool__(self) -> bool:
         """Whether there is a solution."""

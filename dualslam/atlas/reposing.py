@@ -21,14 +21,8 @@ from dualslam.map.submap import Submap
 def rows_of_frames(record: Record, submap: Submap, at_most: int, min_inliers: int) -> FrameRows:
     """Return what the frames of a submap that are no keyframes of it have seen.
 
-    Parameters
-    ----------
-    record : Record
-    submap : Submap
-    at_most : int
-        So many frames, spread evenly over those that are kept.
-    min_inliers : int
-        Frames that have seen fewer of its landmarks are left out.
+    - `at_most`: so many frames, spread evenly over those that are kept.
+    - `min_inliers`: frames that have seen fewer of its landmarks are left out.
     """
     own = np.array(sorted(_frames_of(record, submap)), np.int64)
     chosen = own[np.linspace(0, len(own) - 1, min(at_most, len(own))).round().astype(np.int64)]
@@ -47,15 +41,9 @@ def rows_of_frames(record: Record, submap: Submap, at_most: int, min_inliers: in
 def pose_frames_anew(record: Record, submap: Submap, shape: float, min_inliers: int) -> int:
     """Pose the frames of a submap that are no keyframes of it by its landmarks; return how many were.
 
-    Parameters
-    ----------
-    record : Record
-    submap : Submap
-        As it stays.
-    shape : float
-        Of the loss under which it was refined, in the pixels' sigmas.
-    min_inliers : int
-        A frame of which fewer landmarks agree stays where it is.
+    - `submap`: as it stays.
+    - `shape`: of the loss under which it was refined, in the pixels' sigmas.
+    - `min_inliers`: a frame of which fewer landmarks agree stays where it is.
     """
     n_posed = 0
     for i in _frames_of(record, submap):

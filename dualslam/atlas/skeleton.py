@@ -39,38 +39,20 @@ Node = tuple[int, int]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Skeleton:
-    """A connected piece of the atlas as a problem, and what its rows stand for.
+    """A connected piece of the atlas as a problem, and what its rows stand for."""
 
-    Attributes
-    ----------
-    component : list of int
-        Submaps, ascending.
-    problem : AtlasProblem
-    nodes : list of (int, int)
-        Submap and keyframe of each row.
-    rows : dict of int to range
-        Where the nodes of each submap are.
-    reference : dict of int to int
-        For each submap the row of the keyframe that its frame goes by.
-    links : list of Link
-        Those of its edges that are connections, in order; the last edges of the problem.
-    is_tree : bool
-        Whether there is one way only between any two of its submaps, and none was ever bent: nothing to optimise.
-    T_submap_node : (N, 4, 4)
-        Keyframe to submap.
-    steps : dict of int to (K - 1, 7, 7)
-        For each submap the covariances from node to node, as its own factors give them (a tree: of no meaning).
-    """
-
-    component: list[int]
+    component: list[int]  # submaps, ascending
     problem: AtlasProblem
-    nodes: list[Node]
-    rows: dict[int, range]
-    reference: dict[int, int]
-    links: list[Link]
+    nodes: list[Node]  # list of (int, int): submap and keyframe of each row
+    rows: dict[int, range]  # where the nodes of each submap are
+    reference: dict[int, int]  # for each submap the row of the keyframe that its frame goes by
+    links: list[Link]  # those of its edges that are connections, in order; the last edges of the problem
     is_tree: bool
-    T_submap_node: FloatArray
+    """Whether there is one way only between any two of its submaps, and none was ever bent: nothing to optimise."""
+    T_submap_node: FloatArray  # (N, 4, 4): keyframe to submap
     steps: dict[int, FloatArray]
+    """dict of int to (K - 1, 7, 7): for each submap the covariances from node to node, as its own factors give them (a
+    tree: of no meaning)."""
 
     def knots(self, submap_id: int) -> tuple[list[int], list[int]]:
         """Return rows and keyframes of a submap's nodes, ascending."""
@@ -91,25 +73,14 @@ def build_skeleton(
 ) -> Skeleton:
     """Make the problem of a linked set of submaps.
 
-    Parameters
-    ----------
-    atlas : Atlas
-    component : list of int
-        Submaps that `links` join.
-    links : sequence of Link
-        All between them, also those that are rejected so far, in the order in which they arrived.
-    covariances : callable
-        See `EdgeCovariances`.
-    views : NodeViews
-        What is remembered of the submaps.
-    known : callable
-        Whether an earlier solution has believed a link.
-    more_nodes : mapping of int to set of int, optional
-        Keyframes, by submap, that are to be nodes besides.
-    with_covariances : bool
-        Ask for them also where there is nothing to optimise.
-    newest : mapping of int to int, optional
-        By submap, the keyframe after which none is a node unless a link stands there.
+    - `component`: submaps that `links` join.
+    - `links`: all between them, also those that are rejected so far, in the order in which they arrived.
+    - `covariances`: see `EdgeCovariances`.
+    - `views`: what is remembered of the submaps.
+    - `known`: whether an earlier solution has believed a link.
+    - `more_nodes`: keyframes, by submap, that are to be nodes besides.
+    - `with_covariances`: ask for them also where there is nothing to optimise.
+    - `newest`: by submap, the keyframe after which none is a node unless a link stands there.
     """
     knots_of = _knots_of(atlas, component, links, more_nodes or {}, newest or {})
     S_world_submap = _initial(atlas, component, links)
@@ -263,13 +234,9 @@ def _are_torn(own: FloatArray, now: FloatArray, covariances: FloatArray) -> Bool
 def _inflated(T: FloatArray, depth: FloatArray, covariances: FloatArray) -> FloatArray:
     """Return the covariances of edges with what the factors do not know.
 
-    Parameters
-    ----------
-    T : (E, 4, 4)
-        From the second keyframe to the first.
-    depth : (E,)
-        Of the scene at the second.
-    covariances : (E, 7, 7)
+    - `covariances` (E, 7, 7).
+    - `T` (E, 4, 4): from the second keyframe to the first.
+    - `depth` (E,): of the scene at the second.
     """
     motion = np.linalg.norm(so3.log(T[:, :3, :3]), axis=1) + np.linalg.norm(T[:, :3, 3], axis=1) / depth
     units = np.ones((len(T), 7))

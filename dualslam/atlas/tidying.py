@@ -26,11 +26,7 @@ def tidy(atlas: Atlas, poses: Mapping[int, FramePose]) -> dict[int, FramePose]:
 
     No pose and no landmark moves; landmarks have other ids afterwards.
 
-    Parameters
-    ----------
-    atlas : Atlas
-        Between two runs: no graph and no front end knows its rows.
-    poses : mapping of int to FramePose
+    `atlas`: between two runs: no graph and no front end knows its rows.
     """
     newest = sorted(poses)[-MAX_EARLIER_FRAMES:]
     kept = {i: _re_anchored(poses[i], atlas.submaps[poses[i].submap_id]) for i in newest}

@@ -27,23 +27,12 @@ class FramePose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Path:
-    """The way of a camera in a submap, from frame to frame as they came.
+    """The way of a camera in a submap, from frame to frame as they came."""
 
-    Attributes
-    ----------
-    index : (N,) int64
-        Of the frames.
-    times_s : (N,) float64
-        Ascending: negative timestamps where a source is read from its end.
-    T_map_cam : (N, 4, 4) float64
-    refound : (N,) bool
-        Frames that were found again by wide matching, and not by those before them.
-    """
-
-    index: IntArray
-    times_s: FloatArray
-    T_map_cam: FloatArray
-    refound: BoolArray
+    index: IntArray  # (N,): of the frames
+    times_s: FloatArray  # (N,): ascending: negative timestamps where a source is read from its end
+    T_map_cam: FloatArray  # (N, 4, 4)
+    refound: BoolArray  # (N,): frames that were found again by wide matching, and not by those before them
 
     @classmethod
     def of(cls, poses: Iterable[FramePose], submap: Submap) -> Path:
@@ -110,12 +99,7 @@ class Path:
 def compose(poses: Iterable[FramePose], atlas: Atlas, S_world_submap: dict[int, FloatArray]) -> Trajectory:
     """Compose the poses of the frames that stand in the given submaps, in their common frame.
 
-    Parameters
-    ----------
-    poses : iterable of FramePose
-    atlas : Atlas
-    S_world_submap : dict of int to (4, 4) float64
-        The submaps to take in; frames of others are left out.
+    `S_world_submap` (dict of int to (4, 4)): the submaps to take in; frames of others are left out.
     """
     kept = sorted((p for p in poses if p.submap_id in S_world_submap), key=lambda p: p.index)
     T_world_cam = np.empty((len(kept), 4, 4))

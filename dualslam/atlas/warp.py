@@ -17,16 +17,10 @@ class Warp:
 
     Between two knots the similarity runs along the one-parameter subgroup that joins theirs; before the first and
     after the last knot it stays.
-
-    Attributes
-    ----------
-    index : (K,) int64
-        Frames of the knots, ascending, at least one.
-    S : (K, 4, 4) float64
     """
 
-    index: IntArray
-    S: FloatArray
+    index: IntArray  # (K,): frames of the knots, ascending, at least one
+    S: FloatArray  # (K, 4, 4)
 
     def at(self, index: ArrayLike) -> FloatArray:
         """Return (N, 4, 4) similarities of frames."""

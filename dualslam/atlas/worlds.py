@@ -10,11 +10,7 @@ from dualslam.core.types import FloatArray
 class Worlds:
     """The linked sets of an atlas, each with one world; composed anew only where a connection has come or moved.
 
-    Parameters
-    ----------
-    atlas : Atlas
-    saved : int or None
-        The submap whose frame is the world of the saved map that a run continues.
+    `saved`: the submap whose frame is the world of the saved map that a run continues.
     """
 
     def __init__(self, atlas: Atlas, saved: int | None = None) -> None:

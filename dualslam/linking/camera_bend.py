@@ -34,20 +34,11 @@ MIN_PLACE = 5
 
 @dataclass(frozen=True, slots=True)
 class Bend:
-    """How one end of a map would lie to the other under another camera.
+    """How one end of a map would lie to the other under another camera."""
 
-    Attributes
-    ----------
-    log_scale : float
-        Logarithm of its scale there over the current one.
-    rotation_rad : float
-    doubt : Failure or None
-        Why a link is not to be relied on with it.
-    """
-
-    log_scale: float = 0.0
+    log_scale: float = 0.0  # logarithm of its scale there over the current one
     rotation_rad: float = 0.0
-    doubt: Failure | None = None
+    doubt: Failure | None = None  # why a link is not to be relied on with it
 
     def beyond_chance(self, distance2: float) -> Bend:
         """Return what counts of it, if the pixels ask for the other camera by this squared distance."""
@@ -61,12 +52,8 @@ NO_BEND = Bend()
 def measure_bend(T_now: FloatArray, T_other: FloatArray, here: IntArray, there: IntArray) -> Bend:
     """Return by what a place of a map turns and grows relative to another, between two states of its poses.
 
-    Parameters
-    ----------
-    T_now, T_other : (K, 4, 4)
-        Each in a frame and unit of its own.
-    here, there : (A,), (B,) int64
-        Rows of the two places, two at least in each.
+    - `T_now`, `T_other` (K, 4, 4): each in a frame and unit of its own.
+    - `here`, `there` (A,), (B,): rows of the two places, two at least in each.
     """
     log_scale = _log_spread(T_other, there) - _log_spread(T_now, there)
     log_scale -= _log_spread(T_other, here) - _log_spread(T_now, here)
@@ -83,24 +70,14 @@ def check_camera(
 ) -> Bend | Failure:
     """Return the bend that the camera may have made in a new map, none where its pixels say nothing of it.
 
-    Parameters
-    ----------
-    submap : Submap
-        As the walk has left it.
-    link : LinkEstimate
-        Carried to the live end.
-    live_since : int
-        The keyframe that the walk set out from.
-    find : callable
-        Asks keyframes of the submap about the camera.
-    config : LinkingConfig
+    - `submap`: as the walk has left it.
+    - `link`: carried to the live end.
+    - `live_since`: the keyframe that the walk set out from.
+    - `find`: asks keyframes of the submap about the camera.
 
-    Returns
-    -------
-    Bend or Failure
-        A failure if the link with this bend is too unsure to join the maps. A bend with a `doubt` if it joins them, but
-        is too unsure to rely on. The reason is the camera if it is contradicted beyond chance. Otherwise it is the
-        scale, which more keyframes may decide.
+    Returns Bend or Failure: a failure if the link with this bend is too unsure to join the maps. A bend with a `doubt`
+    if it joins them, but is too unsure to rely on. The reason is the camera if it is contradicted beyond chance.
+    Otherwise it is the scale, which more keyframes may decide.
     """
     ids = np.array(sorted(submap.keyframes), np.int64)
     here, there = _places(ids, link.agreeing_keyframes, live_since)

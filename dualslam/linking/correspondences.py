@@ -17,56 +17,36 @@ from dualslam.map.submap import Submap
 
 @dataclass(frozen=True, slots=True)
 class DescriptorMatcher:
-    """How descriptors of the live front end are compared.
-
-    Attributes
-    ----------
-    distance : callable
-        Of paired descriptors (N, D), (N, D) -> (N,).
-    max_distance : float
-        Above it two features are not views of the same point.
-    radius_px : float
-        Pixels within which two keypoints of one image may be the same point, at the finest octave.
-    """
+    """How descriptors of the live front end are compared."""
 
     distance: Callable[[NDArray[np.generic], NDArray[np.generic]], FloatArray]
-    max_distance: float
-    radius_px: float = 3.0
+    """Of paired descriptors (N, D), (N, D) -> (N,)."""
+    max_distance: float  # above it two features are not views of the same point
+    radius_px: float = 3.0  # pixels within which two keypoints of one image may be the same point, at the finest octave
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correspondences:
-    """M pairs of landmarks, one to one, and their V views: a view is a shared keyframe in which the pair was matched.
+    """M pairs of landmarks, one to one, and their V views: shared keyframes in which the pair was matched."""
 
-    Attributes
-    ----------
-    landmark_old, landmark_new : (M,) int64
-    xyz_old, xyz_new : (M, 3)
-        Each in its submap's frame and unit.
-    covariance_old, covariance_new : (M, 3, 3)
-        Of the points given the poses, from all observations of each landmark in its map; finite for every pair.
-    shared_pixel : (M,) bool
-        Whether both maps use the same keypoint of the same frame somewhere. The two points then share part of their
-        noise. With C their cross-covariance the residual's covariance is ``P_old + A P_new A' - C A' - A C'``;
-        the same pixel moves both points the same way, so C is positive, and omitting it inflates the covariance.
-        Distances come out small, sigmas large. (With C, pairs with all pixels in common would outweigh all others,
-        though they are no independent evidence.)
-    keyframes : (K,) int64
-        Shared keyframes with views, ascending: in order of time.
-    view_pair, view_keyframe : (V,) int64
-        Row of the pair, row of `keyframes`.
-    """
-
-    landmark_old: IntArray
-    landmark_new: IntArray
-    xyz_old: FloatArray
-    xyz_new: FloatArray
-    covariance_old: FloatArray
-    covariance_new: FloatArray
+    landmark_old: IntArray  # (M,)
+    landmark_new: IntArray  # (M,)
+    # Each in its submap's frame and unit.
+    xyz_old: FloatArray  # (M, 3)
+    xyz_new: FloatArray  # (M, 3)
+    # Of the points given the poses, from all observations of each landmark in its map; finite for every pair.
+    covariance_old: FloatArray  # (M, 3, 3)
+    covariance_new: FloatArray  # (M, 3, 3)
     shared_pixel: BoolArray
-    keyframes: IntArray
-    view_pair: IntArray
-    view_keyframe: IntArray
+    """(M,): whether both maps use the same keypoint of the same frame somewhere. The two points then share part of
+    their noise. With C their cross-covariance the residual's covariance is ``P_old + A P_new A' - C A' - A C'``; the
+    same pixel moves both points the same way, so C is positive, and omitting it inflates the covariance. Distances come
+    out small, sigmas large. (With C, pairs with all pixels in common would outweigh all others, though they are no
+    independent evidence.)"""
+    keyframes: IntArray  # (K,): shared keyframes with views, ascending: in order of time
+    # Row of the pair, row of `keyframes`.
+    view_pair: IntArray  # (V,)
+    view_keyframe: IntArray  # (V,)
 
     def __len__(self) -> int:
         return len(self.landmark_old)
@@ -122,19 +102,11 @@ def propose_correspondences(
     keyframes for the same pair are its views; a landmark with several proposals keeps the one with the most keyframes
     (identity first). Pairs whose points are not fixed by their views are left out.
 
-    Parameters
-    ----------
-    old, new : Submap
-    matcher : DescriptorMatcher, optional
-        Without it pairs come from identity alone.
-    old_before : int, optional
-        The old map's keyframes from this one on are not believed: its points are placed anew by what the older ones
-        saw of them, and those that these do not fix are left out.
+    - `matcher`: without it pairs come from identity alone.
+    - `old_before`: the old map's keyframes from this one on are not believed: its points are placed anew by what the
+      older ones saw of them, and those that these do not fix are left out.
 
-    Returns
-    -------
-    Correspondences
-        Possibly empty.
+    Returns Correspondences: possibly empty.
     """
     return place_pairs(old, new, match_landmarks(old, new, matcher), old_before)
 

@@ -27,15 +27,9 @@ def measure_deformation(
     The older and the newer half of the pairs, and the cameras' path, are each compared with the whole. Where drift is a
     random walk, the mean over the overlap is off by about half of what its ends differ.
 
-    Parameters
-    ----------
-    model : PairModel
-    S_old_new : (4, 4)
-    inliers : (M,) bool
-        Pairs that agree with it.
-    keyframes : (K,) bool
-        Keyframes that do.
-    config : LinkingConfig
+    - `S_old_new` (4, 4).
+    - `inliers` (M,) bool: pairs that agree with it.
+    - `keyframes` (K,) bool: keyframes that do.
     """
     c = model.pairs
     views = inliers[c.view_pair] & keyframes[c.view_keyframe]

@@ -28,27 +28,13 @@ NEARLY_AS_MUCH = 0.5
 
 @dataclass(frozen=True, slots=True)
 class JoinGate:
-    """One condition of a join: comparisons all of which must hold, and what a refusal says.
+    """One condition of a join: comparisons all of which must hold, and what a refusal says."""
 
-    Attributes
-    ----------
-    compared : tuple of Gate
-        By their names in the event log.
-    reason : FailureReason
-        Of a refusal.
-    detail : str
-        What a refusal says.
-    sure : bool
-        Whether the join may be relied on, as far as this gate goes.
-    logged : dict
-        What else was measured, for the event log alone.
-    """
-
-    compared: tuple[Gate, ...]
-    reason: FailureReason
-    detail: str
-    sure: bool = True
-    logged: dict[str, float] = field(default_factory=dict)
+    compared: tuple[Gate, ...]  # by their names in the event log
+    reason: FailureReason  # of a refusal
+    detail: str  # what a refusal says
+    sure: bool = True  # whether the join may be relied on, as far as this gate goes
+    logged: dict[str, float] = field(default_factory=dict)  # what else was measured, for the event log alone
 
     @classmethod
     def at_most(
@@ -70,12 +56,7 @@ class JoinGate:
 
 @dataclass(frozen=True, slots=True)
 class LinkEvidence:
-    """All gates of a join, in the order in which they were asked.
-
-    Attributes
-    ----------
-    gates : tuple of JoinGate
-    """
+    """All gates of a join, in the order in which they were asked."""
 
     gates: tuple[JoinGate, ...]
 
@@ -176,14 +157,9 @@ def parting_gate(log_scale: float, sigma_old: float, sigma_new: float, n_parted:
     looser one by far. If the scales differ by more than the variances allow, one map is broken without knowing it
     (HoloLens, a gap of 24 frames: 47 % off, where the old map left 3 % open and the new one 0.7 %).
 
-    Parameters
-    ----------
-    log_scale : float
-        By which they part.
-    sigma_old, sigma_new : float
-        How well each holds the scale from where they agree to where they part.
-    n_parted : int
-        Keyframes there.
+    - `log_scale`: by which they part.
+    - `sigma_old`, `sigma_new`: how well each holds the scale from where they agree to where they part.
+    - `n_parted`: keyframes there.
     """
     sigma = math.hypot(sigma_old, sigma_new)
     possible = Gate("log_scale", abs(log_scale), "<=", GATE_SIGMAS * sigma)
@@ -200,12 +176,8 @@ def drift_gate(share_of_way: float, turn_deg: float, log_scale: float) -> JoinGa
 
     A lost turn or scale displaces what comes after it: at most by as much as if all was lost at the beginning.
 
-    Parameters
-    ----------
-    share_of_way : float
-        Distance between where the map and where the pixels put a place, over the length of the way.
-    turn_deg, log_scale : float
-        Between the two, as well.
+    - `share_of_way`: distance between where the map and where the pixels put a place, over the length of the way.
+    - `turn_deg`, `log_scale`: between the two, as well.
     """
     limit = min(MAX_DRIFT, MAX_SLIP + math.radians(turn_deg) + math.expm1(abs(log_scale)))
     compared = (

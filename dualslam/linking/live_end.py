@@ -32,22 +32,12 @@ def propagate_to_live_end(
 
     So does what the map may be bent by its camera.
 
-    Parameters
-    ----------
-    link : LinkEstimate
-    new : Submap
-        As the walk has left it.
-    live_since : int
-        The keyframe that the walk set out from: it and those after it are the live end.
-    config : LinkingConfig
-    bend : Bend, optional
-        Of the new map, under the camera that its pixels ask for.
+    - `new`: as the walk has left it.
+    - `live_since`: the keyframe that the walk set out from: it and those after it are the live end.
+    - `bend`: of the new map, under the camera that its pixels ask for.
 
-    Returns
-    -------
-    LinkEstimate or Failure
-        With its `sigma_scale` at the live end. The numbers have the walk's share of it, `sigma_scale_reverse`, and the
-        camera's, `sigma_scale_camera`, where there is one.
+    Returns LinkEstimate or Failure: with its `sigma_scale` at the live end. The numbers have the walk's share of it,
+    `sigma_scale_reverse`, and the camera's, `sigma_scale_camera`, where there is one.
     """
     live = np.array([k for k in new.keyframes if k >= live_since], np.int64)
     walk = scale_sigma_between(new, link.agreeing_keyframes, live, PIXEL_CHI2)

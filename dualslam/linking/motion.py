@@ -52,31 +52,17 @@ Slack = Callable[[int, int], float]
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """The displacement across a gap or a seam, against its prediction. Lengths are in the unit of the map.
-
-    Attributes
-    ----------
-    off_mu : float
-        Distance between the displacement and its prediction; the nearest one, where the camera may have stood still.
-    usual_mu : float
-        The usual error of such predictions over the same time.
-    change_mu : float
-        Error that the change of velocity across the gap explains. The change may have come at any moment between the
-        middles of the two windows that measured the velocities.
-    slack_mu : float
-        What the join of two maps leaves open there.
-    n_asked : int
-        Places at which the usual error was measured.
-    n_sides : int
-        Sides on which a velocity is known.
-    """
+    """The displacement across a gap or a seam, against its prediction. Lengths are in the unit of the map."""
 
     off_mu: float
-    usual_mu: float
-    n_asked: int
-    n_sides: int = 2
+    """Distance between the displacement and its prediction; the nearest one, where the camera may have stood still."""
+    usual_mu: float  # the usual error of such predictions over the same time
+    n_asked: int  # places at which the usual error was measured
+    n_sides: int = 2  # sides on which a velocity is known
     change_mu: float = 0.0
-    slack_mu: float = 0.0
+    """Error that the change of velocity across the gap explains. The change may have come at any moment between the
+    middles of the two windows that measured the velocities."""
+    slack_mu: float = 0.0  # what the join of two maps leaves open there
 
     @property
     def allowed_mu(self) -> float:
@@ -94,20 +80,11 @@ class Motion:
 def measure_motion(path: Path, last_before: int, known: Path, slack_mu: float = 0.0) -> Motion | None:
     """Compare the displacement behind a frame of a path with what its velocities predict.
 
-    Parameters
-    ----------
-    path : Path
-    last_before : int
-        Row of the last frame before the gap, or before the seam.
-    known : Path
-        The camera's path where the usual error is measured, in the unit of `path`.
-    slack_mu : float, optional
-        What the join of two maps leaves open.
+    - `last_before`: row of the last frame before the gap, or before the seam.
+    - `known`: the camera's path where the usual error is measured, in the unit of `path`.
+    - `slack_mu`: what the join of two maps leaves open.
 
-    Returns
-    -------
-    Motion or None
-        None where neither side has a velocity.
+    Returns Motion or None: none where neither side has a velocity.
     """
     return _measure(_Fits.of(path), last_before, _Fits.of(known), slack_mu)
 
@@ -126,12 +103,8 @@ def seam_motions(old: Path, new: Path, slack: Slack = lambda i, j: 0.0) -> Itera
     corrupted: a refused seam is measured once more without the old map's last frames. It is left out if only these
     contradict it.
 
-    Parameters
-    ----------
-    old, new : Path
-        Of different frames, in the same coordinates.
-    slack : callable, optional
-        What the join leaves open between a frame of one map and one of the other, given by their indices.
+    - `old`, `new`: of different frames, in the same coordinates.
+    - `slack`: what the join leaves open between a frame of one map and one of the other, given by their indices.
     """
     known = next((fits for fits in map(_Fits.of, (old, new)) if fits.can_be_asked), None)
     if known is None:
@@ -152,13 +125,9 @@ def seam_motions(old: Path, new: Path, slack: Slack = lambda i, j: 0.0) -> Itera
 def join_slack(S_old_new: FloatArray, covariance: FloatArray, place: FloatArray) -> float:
     """Return how far the similarity that joins two maps may displace a place, in the unit of the old map.
 
-    Parameters
-    ----------
-    S_old_new : (4, 4)
-    covariance : (7, 7)
-        Of xi in ``S_old_new @ exp(xi)``.
-    place : (3,)
-        In the old map.
+    - `S_old_new` (4, 4).
+    - `covariance` (7, 7): of xi in ``S_old_new @ exp(xi)``.
+    - `place` (3,): in the old map.
     """
     J = S_old_new[:3, :3] @ sim3.displacement(sim3.act(sim3.inverse(S_old_new), place[None])[0])
     return JOIN_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(J @ covariance @ J.T)[-1]))

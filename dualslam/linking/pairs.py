@@ -15,8 +15,6 @@ class PairModel:
 
     Attributes
     ----------
-    covariance_old, covariance_new : (M, 3, 3)
-        With the deformation's share, half of it in either map.
     centre_new, centre_old : (3,)
         Medians of the points.
     """
@@ -36,8 +34,9 @@ class PairModel:
         self.T_new_kf = new.keyframe_poses(pairs.keyframes)
         self.T_kf_old, self.T_kf_new = se3.inverse(self.T_old_kf), se3.inverse(self.T_new_kf)
 
-    covariance_old: FloatArray
-    covariance_new: FloatArray
+    # With the deformation's share, half of it in either map.
+    covariance_old: FloatArray  # (M, 3, 3)
+    covariance_new: FloatArray  # (M, 3, 3)
 
     def mahalanobis2(self, S_old_new: FloatArray) -> FloatArray:
         """Return the squared Mahalanobis distance of each pair, (M,)."""

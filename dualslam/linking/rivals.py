@@ -21,21 +21,11 @@ from dualslam.linking.motion import Motion, gaps_of, measure_motion
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Choice:
-    """The decision by velocities among the poses of a walk beyond gaps and their alternatives.
+    """The decision by velocities among the poses of a walk beyond gaps and their alternatives."""
 
-    Attributes
-    ----------
-    refusal : Failure or None
-        Why the walk is refused, if it is.
-    better : tuple of Rival
-        The poses to use instead, if known: of several frames, all at one place.
-    is_measured : bool
-        Whether the walk was far enough beyond the gap.
-    """
-
-    refusal: Failure | None
-    better: tuple[Rival, ...] = ()
-    is_measured: bool = True
+    refusal: Failure | None  # why the walk is refused, if it is
+    better: tuple[Rival, ...] = ()  # the poses to use instead, if known: of several frames, all at one place
+    is_measured: bool = True  # whether the walk was far enough beyond the gap
 
 
 def choose_by_velocity(walked: Path, known: Path, rivals: Sequence[Rival]) -> Choice:
@@ -46,13 +36,8 @@ def choose_by_velocity(walked: Path, known: Path, rivals: Sequence[Rival]) -> Ch
     test must also refuse a further pose that was not found, as far off as these lie from each other. All frames must
     agree.
 
-    Parameters
-    ----------
-    walked : Path
-        Of the frames of the walk and those that it set out from.
-    known : Path
-        The lost map's, as far as it is sound, in the coordinates of the walk.
-    rivals : sequence of Rival
+    - `walked`: of the frames of the walk and those that it set out from.
+    - `known`: the lost map's, as far as it is sound, in the coordinates of the walk.
     """
     refusal: Failure | None = None
     better: list[Rival] = []

@@ -35,19 +35,14 @@ NO_TIE = 1e-7
 def scale_sigma_between(submap: Submap, here: IntArray, there: IntArray, pixel_chi2: float) -> float:
     """Return the standard deviation of the log of the scale at one place relative to another.
 
-    Parameters
-    ----------
-    submap : Submap
-        Solved. Its keyframes from the first to the last of those given, and some around, count with what they saw.
-    here, there : IntArray
-        Keyframe ids of the two places, which may overlap; those that the submap does not hold are passed over.
-    pixel_chi2 : float
-        Observations that are off by more than this tell nothing.
+    - `submap`: solved. Its keyframes from the first to the last of those given, and some around, count with what they
+      saw.
+    - `here`, `there`: keyframe ids of the two places, which may overlap; those that the submap does not hold are passed
+      over.
+    - `pixel_chi2`: observations that are off by more than this tell nothing.
 
-    Returns
-    -------
-    float
-        Inflated as the links' own covariances are. Infinite where the places do not hang together, or one is empty.
+    Returns float: inflated as the links' own covariances are. Infinite where the places do not hang together, or one is
+    empty.
     """
     return scale_sigmas_between(submap, [(here, there)], pixel_chi2)[0]
 
@@ -64,33 +59,19 @@ def scale_sigmas_between(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleQuestion:
-    """All that `scale_sigmas_between` needs of a submap: arrays of its own. It can be pickled.
+    """All that `scale_sigmas_between` needs of a submap: arrays of its own. It can be pickled."""
 
-    Attributes
-    ----------
-    places : sequence of (IntArray, IntArray)
-        Keyframe ids of the pairs of places.
-    pixel_chi2 : float
-    K : (3, 3)
-    ids : (F,) int64
-        Keyframes that count; none where there is no place.
-    T_submap_kf : (F, 4, 4)
-    xyz : (N, 3)
-    kf, point : (R,) int64
-        Rows of `ids` and `xyz` of each observation.
-    uv_px : (R, 2), sigma_px : (R,)
-    """
-
-    places: Sequence[tuple[IntArray, IntArray]]
+    places: Sequence[tuple[IntArray, IntArray]]  # sequence of (IntArray, IntArray): keyframe ids of the pairs of places
     pixel_chi2: float
-    K: FloatArray
-    ids: IntArray
-    T_submap_kf: FloatArray
-    xyz: FloatArray
-    kf: IntArray
-    point: IntArray
-    uv_px: FloatArray
-    sigma_px: FloatArray
+    K: FloatArray  # (3, 3)
+    ids: IntArray  # (F,): keyframes that count; none where there is no place
+    T_submap_kf: FloatArray  # (F, 4, 4)
+    xyz: FloatArray  # (N, 3)
+    # Rows of `ids` and `xyz` of each observation.
+    kf: IntArray  # (R,)
+    point: IntArray  # (R,)
+    uv_px: FloatArray  # (R, 2)
+    sigma_px: FloatArray  # (R,)
 
 
 def ask_scale(
@@ -143,30 +124,17 @@ def _sigma(problem: _Problem, values: FloatArray, vectors: FloatArray, here: Int
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """The normal equations of F keyframes and N points, the points' blocks inverted.
+    """The normal equations of F keyframes and N points, the points' blocks inverted."""
 
-    Attributes
-    ----------
-    ids : (F,) int64
-    T_cam_submap : (F, 4, 4)
-    xyz : (N, 3)
-    kf, point : (R,) int64
-        Rows of each observation.
-    inverse : (N, 3, 3)
-        Covariances of the points, given the poses.
-    H_cross : (6 F, 3 N) sparse
-    reduced : (6 F, 6 F)
-        Of the poses, the points eliminated.
-    """
-
-    ids: IntArray
-    T_cam_submap: FloatArray
-    xyz: FloatArray
-    kf: IntArray
-    point: IntArray
-    inverse: FloatArray
-    H_cross: sparse.bsr_array
-    reduced: FloatArray
+    ids: IntArray  # (F,)
+    T_cam_submap: FloatArray  # (F, 4, 4)
+    xyz: FloatArray  # (N, 3)
+    # Rows of each observation.
+    kf: IntArray  # (R,)
+    point: IntArray  # (R,)
+    inverse: FloatArray  # (N, 3, 3): covariances of the points, given the poses
+    H_cross: sparse.bsr_array  # (6 F, 3 N) sparse
+    reduced: FloatArray  # (6 F, 6 F): of the poses, the points eliminated
 
 
 def _linearise(question: ScaleQuestion) -> _Problem | None:

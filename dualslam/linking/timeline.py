@@ -28,22 +28,14 @@ from dualslam.map.submap import Submap
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeVotes:
-    """How each of the K shared keyframes stands to a similarity.
+    """How each of the K shared keyframes stands to a similarity."""
 
-    Attributes
-    ----------
-    rotation_rad : (K,)
-        Angle between the camera's orientations in the two maps.
-    centre : (K,)
-        Distance between its centres, relative to the distance of the landmarks it sees (or of the centre of the
-        overlap, if that is more).
-    agrees, can_vote : (K,) bool
-    """
-
-    rotation_rad: FloatArray
+    rotation_rad: FloatArray  # (K,): angle between the camera's orientations in the two maps
     centre: FloatArray
-    agrees: BoolArray
-    can_vote: BoolArray
+    """(K,): distance between its centres, relative to the distance of the landmarks it sees (or of the centre of the
+    overlap, if that is more)."""
+    agrees: BoolArray  # (K,)
+    can_vote: BoolArray  # (K,)
 
 
 def ask_keyframes(model: PairModel, S_old_new: FloatArray, config: LinkingConfig) -> KeyframeVotes:
@@ -92,11 +84,7 @@ def find_discontinuities(submap: Submap, oldest: int, newest: int) -> IntArray:
     most observations of landmarks followed across it disagree. These are seen twice on either side, since a single
     camera cannot detect a change of scale about itself.
 
-    Parameters
-    ----------
-    submap : Submap
-    oldest, newest : int
-        Keyframe ids; the places after `oldest` up to before `newest` are searched.
+    `oldest`, `newest`: keyframe ids; the places after `oldest` up to before `newest` are searched.
     """
     ids, places = _windows(submap, oldest, newest)
     seen, good = _own_agreement(submap, ids, PIXEL_CHI2)
@@ -124,11 +112,7 @@ def smallest_share_handed_on(submap: Submap, oldest: int, newest: int) -> float:
     share is of what a keyframe sees there. Where an occluder comes in, most landmarks vanish at once. Its own replace
     them before parallax fixes their depth, and the map stays in agreement with itself.
 
-    Parameters
-    ----------
-    submap : Submap
-    oldest, newest : int
-        Keyframe ids; the places after `oldest` up to before `newest` are searched.
+    `oldest`, `newest`: keyframe ids; the places after `oldest` up to before `newest` are searched.
     """
     ids, places = _windows(submap, oldest, newest)
     _, good = _own_agreement(submap, ids, PIXEL_CHI2)

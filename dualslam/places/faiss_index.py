@@ -34,11 +34,8 @@ class FaissRecogniser:
 
     Binary descriptors of 32 bytes go into the cells that are shipped; others, and floats, are searched exhaustively.
 
-    Parameters
-    ----------
-    max_distance : float
-        Between the descriptors of two views of one point, as the front end measures it: bits, or the norm of the
-        difference (`Frontend.max_distance_strict`).
+    `max_distance`: between the descriptors of two views of one point, as the front end measures it: bits, or the norm
+    of the difference (`Frontend.max_distance_strict`).
     """
 
     def __init__(self, max_distance: float) -> None:

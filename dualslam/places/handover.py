@@ -20,12 +20,7 @@ from dualslam.places.sightings import SAME_WITHIN, Relocalised, Search, Sighting
 class Handover:
     """Looks, where a keyframe is due, whether another submap has the place already.
 
-    Parameters
-    ----------
-    record : Record
-    sightings : Sightings
-    earlier : set of int
-        The submaps that earlier runs have left.
+    `earlier`: the submaps that earlier runs have left.
     """
 
     def __init__(self, record: Record, sightings: Sightings, earlier: Set[int]) -> None:
@@ -41,17 +36,11 @@ class Handover:
 
         The keyframe waits then for `follow` to be sure of it. It is asked once for each keyframe of the live map.
 
-        Parameters
-        ----------
-        track : Track
-            Of the frame, in the live map.
-        live : VisualOdometry
-        K : (3, 3)
-            Intrinsics of the frame.
-        in_parts : bool
-            Each call asks the index, or poses the frame by one of up to three keyframes that it has named. The keyframe
-            waits meanwhile. For real time, where all at once takes longer than a frame (median 36 ms, up to 70, in a
-            map of 7-Scenes). The caller adds the submaps to the index.
+        - `track`: of the frame, in the live map.
+        - `K` (3, 3): intrinsics of the frame.
+        - `in_parts`: each call asks the index, or poses the frame by one of up to three keyframes that it has named.
+          The keyframe waits meanwhile. For real time, where all at once takes longer than a frame (median 36 ms, up to
+          70, in a map of 7-Scenes). The caller adds the submaps to the index.
         """
         self._forget_another(live)
         if self._sighting is None and self._search is not None:

@@ -12,18 +12,11 @@ from dualslam.map.submap import Submap
 
 @dataclass(frozen=True, slots=True)
 class PlaceCandidate:
-    """A keyframe that may show what an image shows, by descriptors alone.
-
-    Attributes
-    ----------
-    submap_id, keyframe_id : int
-    n_votes : int
-        Features of the image of which a landmark that the keyframe sees is among the nearest.
-    """
+    """A keyframe that may show what an image shows, by descriptors alone."""
 
     submap_id: int
     keyframe_id: int
-    n_votes: int
+    n_votes: int  # features of the image of which a landmark that the keyframe sees is among the nearest
 
 
 class PlaceRecogniser(Protocol):
@@ -55,14 +48,8 @@ class PlaceRecogniser(Protocol):
     ) -> list[PlaceCandidate]:
         """Return the keyframes that an image resembles most, best first, each of another place.
 
-        Parameters
-        ----------
-        features : Features
-            Of the image.
-        submaps : mapping of int to Submap
-            The current submaps of the index: culled and merged landmarks are followed there.
-        may_be : callable
-            Whether a keyframe (submap id, keyframe id) may be returned; called for keyframes with votes only.
-        at_most : int
+        - `features`: of the image.
+        - `submaps`: the current submaps of the index: culled and merged landmarks are followed there.
+        - `may_be`: whether a keyframe (submap id, keyframe id) may be returned; called for keyframes with votes only.
         """
         ...

@@ -72,19 +72,9 @@ class _Closing:
 class Revisits:
     """Searches for places, keyframe by keyframe, and links those that are revisited.
 
-    Parameters
-    ----------
-    record : Record
-    parts : PlaceParts
-    connections : Connections
-    desk : Desk
-        Where places are verified.
-    new_graph : callable
-    new_relocaliser : callable
-        Makes a front end of an archived submap.
-    config : Config
-    merges : bool
-        Whether maps that are not joined yet may be.
+    - `desk`: where places are verified.
+    - `new_relocaliser`: makes a front end of an archived submap.
+    - `merges`: whether maps that are not joined yet may be.
     """
 
     def __init__(
@@ -155,10 +145,7 @@ class Revisits:
     def take_solution(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
         """Let the maps follow what has been solved meanwhile.
 
-        Returns
-        -------
-        AtlasReport or None
-            Of the link that has waited for it.
+        Returns AtlasReport or None: of the link that has waited for it.
         """
         return self._closed(self._connections.collect(now), live, now)
 
@@ -171,10 +158,7 @@ class Revisits:
     def collect(self, live: VisualOdometry | None, now: FrameStamp) -> AtlasReport | None:
         """Take in the places found meanwhile, and link those that are sure.
 
-        Returns
-        -------
-        AtlasReport or None
-            Of the link that was made.
+        Returns AtlasReport or None: of the link that was made.
         """
         self._take_answers(self._desk.poll(JobKind.LOOP), live, now)
         waits = self._connections.foreseeing or self._connections.is_solving

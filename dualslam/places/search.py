@@ -20,22 +20,13 @@ from dualslam.places.verification import PlaceMatch, PlaceVerifier
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceSearch:
-    """A keyframe, and the places that it may show.
+    """A keyframe, and the places that it may show."""
 
-    Attributes
-    ----------
-    submap_id, keyframe_id : int
-        Of the keyframe that asks.
-    candidates : tuple of PlaceCandidate
-        The most likely first.
-    submaps : mapping of int to Submap
-        Snapshots of those that are named.
-    """
-
+    # Of the keyframe that asks.
     submap_id: int
     keyframe_id: int
-    candidates: tuple[PlaceCandidate, ...]
-    submaps: Mapping[int, Submap]
+    candidates: tuple[PlaceCandidate, ...]  # the most likely first
+    submaps: Mapping[int, Submap]  # snapshots of those that are named
 
 
 def search_places(search: PlaceSearch, verifier: PlaceVerifier) -> list[PlaceMatch | Failure]:

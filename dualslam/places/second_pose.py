@@ -27,16 +27,10 @@ distinguished."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SecondSimilarity:
-    """Another similarity, and how many landmarks it explains.
+    """Another similarity, and how many landmarks it explains."""
 
-    Attributes
-    ----------
-    S_dst_src : (4, 4)
-    support, first_support : int
-        Landmarks of src that the second and the first one explain.
-    """
-
-    S_dst_src: FloatArray
+    S_dst_src: FloatArray  # (4, 4)
+    # Landmarks of src that the second and the first one explain.
     support: int
     first_support: int
 
@@ -44,11 +38,7 @@ class SecondSimilarity:
 def alike(a: NDArray[np.generic], b: NDArray[np.generic], matcher: PlaceMatcher) -> tuple[IntArray, IntArray]:
     """Return all pairs of rows that look alike: for each of a the `N_ALIKE` nearest of b that are near enough.
 
-    Parameters
-    ----------
-    a, b : (N, D), (M, D)
-        Descriptors.
-    matcher : PlaceMatcher
+    `a`, `b` (N, D), (M, D): descriptors.
     """
     if not len(a) or not len(b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -77,25 +67,12 @@ def find_second_pose(
 ) -> SecondSimilarity | None:
     """Look for another similarity among the pairs that the first one leaves over.
 
-    Parameters
-    ----------
-    src, dst : (P, 3)
-        All pairs that look alike; a point may stand in several.
-    cov_src, cov_dst : (P, 3, 3)
-    point : (P,) int64
-        Which point of src a pair is of: each counts once.
-    S_first : (4, 4)
-    explained : (P,) bool
-        Whether the first similarity agrees with the pair.
-    rng : numpy.random.Generator
-    min_support : int
-        Fewer points are no second pose.
-    chi2_gate, max_hypotheses
-        As for `estimate_sim3_robust`.
-
-    Returns
-    -------
-    SecondSimilarity or None
+    - `cov_src`, `cov_dst` (P, 3, 3), `S_first` (4, 4).
+    - `src`, `dst` (P, 3): all pairs that look alike; a point may stand in several.
+    - `point` (P,): which point of src a pair is of: each counts once.
+    - `explained` (P,) bool: whether the first similarity agrees with the pair.
+    - `min_support`: fewer points are no second pose.
+    - `chi2_gate`, `max_hypotheses`: as for `estimate_sim3_robust`.
     """
     first_support = len(np.unique(point[explained]))
     rest = np.flatnonzero(~explained)

@@ -58,36 +58,20 @@ class Search:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Relocalised:
-    """The map in which frames without a map were found.
+    """The map in which frames without a map were found."""
 
-    Attributes
-    ----------
-    odometry : VisualOdometry
-        Goes on there.
-    earlier : list of (Track, (4, 4))
-        The frames before the newest that it has posed, with their poses relative to the keyframe `reference`.
-    track : Track
-        The newest frame's.
-    reference : int
-    """
-
-    odometry: Seeker
+    odometry: Seeker  # goes on there
     earlier: list[tuple[Track, FloatArray]]
-    track: Track
+    """list of (Track, (4, 4)): the frames before the newest that it has posed, with their poses relative to the
+    keyframe `reference`."""
+    track: Track  # the newest frame's
     reference: int
 
 
 class Sightings:
     """Shows frames to submaps that are not being tracked.
 
-    Parameters
-    ----------
-    record : Record
-    parts : PlaceParts
-    new_graph : callable
-    new_relocaliser : callable
-        Makes a front end of an archived submap.
-    config : Config
+    `new_relocaliser`: makes a front end of an archived submap.
     """
 
     def __init__(

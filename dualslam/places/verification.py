@@ -66,29 +66,15 @@ the place's own keyframes show. Images that show something else come to 0.01 to 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceMatch:
-    """Two places that are one, as the pixels say.
+    """Two places that are one, as the pixels say."""
 
-    Attributes
-    ----------
-    place, query : (int, int)
-        Submap and keyframe on either side.
-    S_place_query : (4, 4)
-        ``p_place = S_place_query @ p_query``, in the submaps' frames.
-    covariance : (7, 7)
-        Of ``S_place_query @ exp(xi)``, in the query's frame and unit.
-    landmark_pairs : (I, 2) int64
-        Landmarks of the place and of the query that are one.
-    keyframes_place, keyframes_query : tuple of int
-        Those that see the agreeing landmarks.
-    n_matches, n_inliers : int
-    numbers : dict
-    """
-
+    # Submap and keyframe on either side.
     place: tuple[int, int]
     query: tuple[int, int]
-    S_place_query: FloatArray
-    covariance: FloatArray
-    landmark_pairs: IntArray
+    S_place_query: FloatArray  # (4, 4): ``p_place = S_place_query @ p_query``, in the submaps' frames
+    covariance: FloatArray  # (7, 7): of ``S_place_query @ exp(xi)``, in the query's frame and unit
+    landmark_pairs: IntArray  # (I, 2): landmarks of the place and of the query that are one
+    # Those that see the agreeing landmarks.
     keyframes_place: tuple[int, ...]
     keyframes_query: tuple[int, ...]
     n_matches: int
@@ -99,13 +85,8 @@ class PlaceMatch:
 class PlaceVerifier:
     """Verifies candidates.
 
-    Parameters
-    ----------
-    matcher : PlaceMatcher
-    config : LinkingConfig
-        The gates of links: those of places are the same.
-    seed : int
-        The random choices depend on it and on the two keyframes alone, not on what was asked before.
+    - `config`: the gates of links: those of places are the same.
+    - `seed`: the random choices depend on it and on the two keyframes alone, not on what was asked before.
     """
 
     def __init__(self, matcher: PlaceMatcher, config: LinkingConfig, seed: int) -> None:
@@ -116,10 +97,7 @@ class PlaceVerifier:
     def verify(self, query: tuple[Submap, int], place: tuple[Submap, int]) -> PlaceMatch | Failure:
         """Ask whether two keyframes, each with its submap, show one place.
 
-        Parameters
-        ----------
-        query, place : (Submap, int)
-            The submaps may be one.
+        `query`, `place` (Submap, int): the submaps may be one.
         """
         rng = np.random.default_rng([self._seed, query[1], place[0].id, place[1]])
         sides = self._sides(query, place)
@@ -147,14 +125,9 @@ class PlaceVerifier:
     ) -> Failure | None:
         """Refuse a frame's pose where the image does not show what the place, seen from there, should show.
 
-        Parameters
-        ----------
-        submap : Submap
-        keyframe_id : int
-            By which the place was recognised.
-        T_cam_submap : (4, 4)
-        features : Features
-            Of the frame.
+        - `T_cam_submap` (4, 4).
+        - `keyframe_id`: by which the place was recognised.
+        - `features`: of the frame.
         """
         place = side_of(submap, keyframe_id)
         look = self._matcher.look(submap, place.landmarks, T_cam_submap, submap.K, features, SEARCH_RADIUS_PX)

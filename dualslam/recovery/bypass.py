@@ -23,18 +23,11 @@ from dualslam.recovery.merge import Merged
 
 @dataclass(frozen=True, slots=True)
 class Absorption:
-    """Effect on the lost maps of which a walk has posed every frame.
+    """Effect on the lost maps of which a walk has posed every frame."""
 
-    Attributes
-    ----------
-    gone : list of int
-        The submaps that have gone.
-    outgrown_at : int or None
-        The smallest number of frames of those that hold no fewer than the new map, and stay; None where none does.
-    """
-
-    gone: list[int]
+    gone: list[int]  # the submaps that have gone
     outgrown_at: int | None
+    """The smallest number of frames of those that hold no fewer than the new map, and stay; None where none does."""
 
 
 def pose_frames(
@@ -46,17 +39,10 @@ def pose_frames(
 ) -> list[RecoveredFrame]:
     """Carry the frames of a walk into the submap that has taken it in, and enter those that had no pose.
 
-    Parameters
-    ----------
-    record : Record
-    frames : sequence of RecoveredFrame
-        As the walk posed them.
-    merged : Merged
-        The submap with what the walk added, in its unit, not solved.
-    submap : Submap
-        The same, solved.
-    change : callable, optional
-        See `merge_recovery`.
+    - `frames`: as the walk posed them.
+    - `merged`: the submap with what the walk added, in its unit, not solved.
+    - `submap`: the same, solved.
+    - `change`: see `merge_recovery`.
     """
     scale = float(sim3.scale(merged.S_live_grown))
     scaled = [replace(frame.pose, T_kf_cam=_scaled(frame.pose.T_kf_cam, scale)) for frame in frames]
@@ -76,14 +62,8 @@ def pose_frames(
 def bypass(record: Record, recovered_frames: Collection[RecoveredFrame], new_id: int, handover: int) -> int:
     """Let the newest part of a linked old map take its poses from the new one; return of how many frames.
 
-    Parameters
-    ----------
-    record : Record
-    recovered_frames : collection of RecoveredFrame
-    new_id : int
-        The submap that walked.
-    handover : int
-        The newest keyframe that agrees in both maps: what is beyond it changes.
+    - `new_id`: the submap that walked.
+    - `handover`: the newest keyframe that agrees in both maps: what is beyond it changes.
     """
     poses, n_bypassed = record.poses, 0
     for frame in recovered_frames:
@@ -139,21 +119,9 @@ def absorb(
     the new one stays until the end of the run: until then a link may still join it. A map whose frames would move as
     the camera does not stays for good (`linking/motion.py`).
 
-    Parameters
-    ----------
-    record : Record
-    recovered_frames : collection of RecoveredFrame
-    new_id : int
-        The submap that walked.
-    lost : collection of int
-        Submaps that wait for a link; with those that they are linked to they go or stay.
-    now : FrameStamp
-    at_end : bool
-        No link can join a lost map any more.
-
-    Returns
-    -------
-    Absorption
+    - `new_id`: the submap that walked.
+    - `lost`: submaps that wait for a link; with those that they are linked to they go or stay.
+    - `at_end`: no link can join a lost map any more.
     """
     found = {frame.pose.index: frame for frame in recovered_frames}
     n_own, gone, n_stay = n_frames(record, new_id), list[int](), list[int]()

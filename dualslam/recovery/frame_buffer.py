@@ -31,12 +31,8 @@ SLOW_HZ = 5.0
 class FrameBuffer:
     """Views of the last `duration_s` seconds of video, and of all frames since a live submap was last there.
 
-    Parameters
-    ----------
-    duration_s : float
-        Video time that is kept (the paper's k frames); at least as many frames as `SLOW_HZ` gives in it.
-    max_mb : float
-        Hard bound on the memory of features and images, mebibytes, also while frozen.
+    - `duration_s`: video time that is kept (the paper's k frames); at least as many frames as `SLOW_HZ` gives in it.
+    - `max_mb`: hard bound on the memory of features and images, mebibytes, also while frozen.
 
     Attributes
     ----------

@@ -18,62 +18,32 @@ from dualslam.map.submap import Submap
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecoveryJob:
-    """Everything that reverse tracking needs, as it was when the new submap started. It can be pickled.
+    """Everything that reverse tracking needs, as it was when the new submap started. It can be pickled."""
 
-    Attributes
-    ----------
-    submap : Submap
-        The new one, a copy.
-    newest_id : int
-        The keyframe of it to start from.
-    lost : dict of int to Submap
-        Copies of the lost submaps that it may link to. With none the walk only poses the frames before the start.
-    onsets : dict of int to int
-        For each of them, and of `joined`, the frame from which on it is suspected to be corrupted.
-    views : tuple of View
-        What is buffered, latest first, from the frame before `newest_id` on. Where a walk is made again for the sake of
-        frames without a pose: those, and what leads to them.
-    own : tuple of View
-        Buffered views of the new submap's keyframes, `newest_id` included: for attempts that need their images.
-    camera : Camera
-        The one that rectified them.
-    camera_covariance : (5, 5) or None
-        Of the correction that it has, if it was estimated.
-    tries : LinkTries
-        What earlier walks have tried in vain.
-    poses : tuple of FramePose
-        Of the frames that the new submap has posed.
-    paths : dict of int to Path
-        For each lost submap the camera's path in it.
-    notes_rivals : bool
-        Whether an ambiguous pose beyond a gap is used. The velocities must then decide.
-    expected : dict of int to (4, 4)
-        ``T_cam_submap`` of frames beyond a gap, decided by the velocities.
-    joined : dict of int to Submap
-        Copies of lost submaps that are joined with it by a scale too loose to be relied on: these links are measured
-        again, by the keyframes that both hold.
-    live_since : int
-        The keyframe that the submap's first walk set out from.
-    is_again : bool
-        Whether reverse tracking from this submap is repeated: by the first attempt alone.
-    """
-
-    submap: Submap
-    newest_id: int
+    submap: Submap  # the new one, a copy
+    newest_id: int  # the keyframe of it to start from
     lost: dict[int, Submap]
-    onsets: dict[int, int]
+    """Copies of the lost submaps that it may link to. With none the walk only poses the frames before the start."""
+    onsets: dict[int, int]  # for each of them, and of `joined`, the frame from which on it is suspected to be corrupted
     views: tuple[View, ...]
+    """What is buffered, latest first, from the frame before `newest_id` on. Where a walk is made again for the sake of
+    frames without a pose: those, and what leads to them."""
     own: tuple[View, ...]
-    camera: Camera
-    camera_covariance: FloatArray | None
-    tries: LinkTries = field(default_factory=LinkTries)
-    poses: tuple[FramePose, ...] = ()
-    paths: dict[int, Path] = field(default_factory=dict)
+    """Buffered views of the new submap's keyframes, `newest_id` included: for attempts that need their images."""
+    camera: Camera  # the one that rectified them
+    camera_covariance: FloatArray | None  # (5, 5): of the correction that it has, if it was estimated
+    tries: LinkTries = field(default_factory=LinkTries)  # what earlier walks have tried in vain
+    poses: tuple[FramePose, ...] = ()  # of the frames that the new submap has posed
+    paths: dict[int, Path] = field(default_factory=dict)  # for each lost submap the camera's path in it
     notes_rivals: bool = False
+    """Whether an ambiguous pose beyond a gap is used. The velocities must then decide."""
     expected: dict[int, FloatArray] = field(default_factory=dict)
+    """dict of int to (4, 4): ``T_cam_submap`` of frames beyond a gap, decided by the velocities."""
     joined: dict[int, Submap] = field(default_factory=dict)
-    live_since: int = 0
-    is_again: bool = False
+    """Copies of lost submaps that are joined with it by a scale too loose to be relied on: these links are measured
+    again, by the keyframes that both hold."""
+    live_since: int = 0  # the keyframe that the submap's first walk set out from
+    is_again: bool = False  # whether reverse tracking from this submap is repeated: by the first attempt alone
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,46 +75,26 @@ class FoundLink:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecoveryResult:
-    """The result of a recovery: of the attempt that led to a link, or else of the first one that posed a frame.
+    """The result of a recovery: of the attempt that led to a link, or else of the first one that posed a frame."""
 
-    Attributes
-    ----------
-    submap : Submap
-        The job's, grown at its early end.
-    frames : tuple of RecoveredFrame
-        In the order of the walk.
-    link : FoundLink or None
-    events : tuple of Event
-        Of all attempts, in order.
-    seconds, cpu_s : float
-        Wall time of all attempts, and CPU time of the process, whose threads find features beside the walk.
-    looks_alike : bool
-        Whether beyond a gap two poses explained as much: no later walk over it would tell them apart.
-    needs_camera : bool
-        Whether no later walk does better under this camera: the map's pixels contradict it, or all keyframes of the
-        lost maps leave the scale open.
-    stopped_at : int or None
-        The frame at which all attempts have stopped, none of which met a lost map's keyframes.
-    tries : LinkTries
-        The job's, with the tries of this walk.
-    relinked : tuple of FoundLink
-        The links with `joined` submaps, measured again.
-    failure : Failure or None
-        Why no walk was made, or why its result is lost: then there is nothing to take over.
-    """
-
-    submap: Submap
-    frames: tuple[RecoveredFrame, ...]
+    submap: Submap  # the job's, grown at its early end
+    frames: tuple[RecoveredFrame, ...]  # in the order of the walk
     link: FoundLink | None
-    events: tuple[Event, ...]
+    events: tuple[Event, ...]  # of all attempts, in order
+    # Wall time of all attempts, and CPU time of the process, whose threads find features beside the walk.
     seconds: float
     cpu_s: float
     looks_alike: bool = False
+    """Whether beyond a gap two poses explained as much: no later walk over it would tell them apart."""
     needs_camera: bool = False
+    """Whether no later walk does better under this camera: the map's pixels contradict it, or all keyframes of the lost
+    maps leave the scale open."""
     stopped_at: int | None = None
-    tries: LinkTries = field(default_factory=LinkTries)
-    relinked: tuple[FoundLink, ...] = ()
+    """The frame at which all attempts have stopped, none of which met a lost map's keyframes."""
+    tries: LinkTries = field(default_factory=LinkTries)  # the job's, with the tries of this walk
+    relinked: tuple[FoundLink, ...] = ()  # the links with `joined` submaps, measured again
     failure: Failure | None = None
+    """Why no walk was made, or why its result is lost: then there is nothing to take over."""
 
     @classmethod
     def of(cls, job: RecoveryJob, outcome: RecoveryResult | Failure) -> RecoveryResult:

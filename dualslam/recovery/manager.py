@@ -63,18 +63,8 @@ class _UnderWay:
 class Recoveries:
     """Starts reverse tracking for each new submap, and merges what it found at a frame boundary.
 
-    Parameters
-    ----------
-    record : Record
-    buffer : FrameBuffer
-    desk : Desk
-        Where the walks are made.
-    new_graph : callable
-    calibration : Calibration
-    connections : Connections
-    config : RecoveryConfig
-    front_ends : callable
-        Gives those that go on, or may go on, in a submap of the atlas.
+    - `desk`: where the walks are made.
+    - `front_ends`: gives those that go on, or may go on, in a submap of the atlas.
     """
 
     def __init__(

@@ -25,35 +25,19 @@ from dualslam.map.submap_change import change_of_frame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Merged:
-    """A submap with what reverse tracking added, not solved yet.
+    """A submap with what reverse tracking added, not solved yet."""
 
-    Attributes
-    ----------
-    submap : Submap
-        A copy of the live one with the additions.
-    moved : Submap
-        The walk's own state of it, in the frame and unit of the live one.
-    S_live_grown : (4, 4)
-        From the frame in which the walk has ended to the live one's.
-    id_of : (L,) int64
-        Of each landmark of the walk's own state the one that it is in the submap, or `NO_LANDMARK`.
-    """
-
-    submap: Submap
-    moved: Submap
-    S_live_grown: FloatArray
-    id_of: IntArray
+    submap: Submap  # a copy of the live one with the additions
+    moved: Submap  # the walk's own state of it, in the frame and unit of the live one
+    S_live_grown: FloatArray  # (4, 4): from the frame in which the walk has ended to the live one's
+    id_of: IntArray  # (L,): of each landmark of the walk's own state the one that it is in the submap, or `NO_LANDMARK`
 
 
 def merge_recovery(live: Submap, base: Submap, grown: Submap, change: Change | None = None) -> Merged:
     """Put the additions of reverse tracking into a copy of the live submap.
 
-    Parameters
-    ----------
-    live, base, grown : Submap
-        Three states of one submap, see above. The keyframes of its gauge stand in all of them.
-    change : callable, optional
-        Gives features of the walk the pixels of the camera that the live submap has now, if it is another.
+    - `live`, `base`, `grown`: three states of one submap, see above. The keyframes of its gauge stand in all of them.
+    - `change`: gives features of the walk the pixels of the camera that the live submap has now, if it is another.
     """
     S_live_grown = change_of_frame(grown, live, base.keyframes, len(base.landmarks))
     moved = grown.copy()

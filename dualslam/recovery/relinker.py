@@ -44,15 +44,8 @@ class LinkTry:
 class Relinker:
     """Tries, at new keyframes of a walk, to link the growing submap with those that it has come to overlap.
 
-    Parameters
-    ----------
-    submap : Submap
-        The growing one.
-    lost : dict of int to Submap
-    onsets : dict of int to int
-        For each lost submap the frame from which on it is suspected to be corrupted.
-    linker : callable
-    max_shared : int
+    - `submap`: the growing one.
+    - `onsets`: for each lost submap the frame from which on it is suspected to be corrupted.
 
     Attributes
     ----------

@@ -14,11 +14,7 @@ from dualslam.map.submap import Submap
 class Relocaliser:
     """Shows each frame without a map to a front end that finds its submap again wherever it is seen.
 
-    Parameters
-    ----------
-    new_relocaliser : callable
-        Makes that front end of a submap and its graph.
-    config : Config
+    `new_relocaliser`: makes that front end of a submap and its graph.
     """
 
     def __init__(self, new_relocaliser: Callable[[Submap, SubmapGraph], Seeker], config: Config) -> None:

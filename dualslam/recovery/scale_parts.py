@@ -31,21 +31,11 @@ little from each to the next."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Loss:
-    """Where a map does not hand its scale on, seen from a place outward.
+    """Where a map does not hand its scale on, seen from a place outward."""
 
-    Attributes
-    ----------
-    between : (N,) int64
-        Keyframes that may be of either scale.
-    beyond : (M,) int64
-        Those of another one.
-    sigma : float
-        Standard deviation of its logarithm.
-    """
-
-    between: IntArray
-    beyond: IntArray
-    sigma: float
+    between: IntArray  # (N,): keyframes that may be of either scale
+    beyond: IntArray  # (M,): those of another one
+    sigma: float  # standard deviation of its logarithm
 
 
 def part_what_lost_its_scale(record: Record, submap_id: int, config: LinkingConfig, now: FrameStamp) -> None:
@@ -54,15 +44,9 @@ def part_what_lost_its_scale(record: Record, submap_id: int, config: LinkingConf
     A map without a link is left as it is: nothing says which of its parts is the right one. So is what lies between
     two links: each end has a scale that is known.
 
-    Parameters
-    ----------
-    record : Record
-    submap_id : int
-        Of a map that is archived.
-    config : LinkingConfig
-        Says by how much a scale must be off to be wrong.
-    now : FrameStamp
-        For the event log.
+    - `submap_id`: of a map that is archived.
+    - `config`: says by how much a scale must be off to be wrong.
+    - `now`: for the event log.
     """
     submap = record.atlas.submaps[submap_id]
     held = _where_links_stand(record.atlas, submap_id) - submap.condemned
@@ -98,12 +82,8 @@ class _Scales:
     def first_loss(self, outward: IntArray, max_sigma: float) -> _Loss | None:
         """Return the first place at which the scale is lost.
 
-        Parameters
-        ----------
-        outward : (G,) int64
-            Keyframes from a group of those that have the right scale on.
-        max_sigma : float
-            Of the logarithm of the scale, from which on it is lost.
+        - `outward` (G,): keyframes from a group of those that have the right scale on.
+        - `max_sigma`: of the logarithm of the scale, from which on it is lost.
         """
         groups = [outward[begin : begin + GROUP] for begin in range(0, len(outward), GROUP)]
         for n in range(1, len(groups)):

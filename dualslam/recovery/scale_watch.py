@@ -44,21 +44,11 @@ has moved since. Far ones may be off by half their depth."""
 
 @dataclass(frozen=True, slots=True)
 class ScaleLoss:
-    """A place in a map across which the scale is not handed on.
+    """A place in a map across which the scale is not handed on."""
 
-    Attributes
-    ----------
-    since : int
-        The first keyframe that may be of either scale.
-    first : int
-        The first one of the map that begins there: where the fewest landmarks are seen from both sides.
-    sigma : float
-        Standard deviation of the logarithm of the scale, after against before.
-    """
-
-    since: int
-    first: int
-    sigma: float
+    since: int  # the first keyframe that may be of either scale
+    first: int  # the first one of the map that begins there: where the fewest landmarks are seen from both sides
+    sigma: float  # standard deviation of the logarithm of the scale, after against before
 
     @property
     def detail(self) -> str:
@@ -94,12 +84,8 @@ class ScaleWatch:
 
     What the map held when it was first seen is not tested: a link has gates of its own.
 
-    Parameters
-    ----------
-    config : LinkingConfig
-        Says by how much a scale must be off to be wrong.
-    desk : Desk, optional
-        Where the normal equations are solved; by default here and now.
+    - `config`: says by how much a scale must be off to be wrong.
+    - `desk`: where the normal equations are solved; by default here and now.
     """
 
     def __init__(self, config: LinkingConfig, desk: Desk | None = None) -> None:
@@ -110,12 +96,8 @@ class ScaleWatch:
     def judge(self, submap: Submap, links: Iterable[Link]) -> ScaleLoss | None:
         """Return where a map has lost its scale, if its newest keyframes show that.
 
-        Parameters
-        ----------
-        submap : Submap
-            At each new keyframe.
-        links : iterable of Link
-            Those that are believed: what one of them holds is not lost.
+        - `submap`: at each new keyframe.
+        - `links`: those that are believed: what one of them holds is not lost.
         """
         self._ask_if_due(submap)
         for ended in self._desk.poll(JobKind.SCALE):
@@ -160,16 +142,10 @@ def question_about(
 ) -> ScaleQuestion:
     """Ask what the map claims of its scale at one place, against that at an earlier one.
 
-    Parameters
-    ----------
-    submap : Submap
-    ids : (F,) int64
-        Its keyframes, ascending.
-    before, after : (P,) int64
-        Keyframes of the two places.
-    n_around : int, optional
-        Keyframes before and after them that count as well. By default few, and all where others than those just before
-        have seen the same as those after: they may hold the places together.
+    - `ids` (F,): its keyframes, ascending.
+    - `before`, `after` (P,): keyframes of the two places.
+    - `n_around`: keyframes before and after them that count as well. By default few, and all where others than those
+      just before have seen the same as those after: they may hold the places together.
     """
     if n_around is None:
         seen = submap.covisible(submap.landmarks_of_keyframes(ids[ids >= after[0]]))[0]

@@ -23,10 +23,7 @@ class RetrySchedule:
     another camera: in two clips, five that were made after mere growth were refused so again, and three after the
     calibration were linked. So does one that held all keyframes of the lost maps, and these left the scale open.
 
-    Parameters
-    ----------
-    keyframes : tuple of int
-        Live keyframes at which a walk is made again, see `RecoveryConfig.retry_keyframes`.
+    `keyframes`: live keyframes at which a walk is made again, see `RecoveryConfig.retry_keyframes`.
     """
 
     def __init__(self, keyframes: tuple[int, ...]) -> None:
@@ -80,14 +77,8 @@ def as_far_as_it_leads(
     What another map has posed, and all that is older, is not this one's to pose. Not so where the two are linked, as
     far as this one has keyframes there as well.
 
-    Parameters
-    ----------
-    views : iterable of View
-    poses : mapping of int to FramePose
-    submap : Submap
-        The one that the walk sets out from.
-    linked : collection of int
-        Submaps that are one map with it.
+    - `submap`: the one that the walk sets out from.
+    - `linked`: submaps that are one map with it.
     """
     oldest = min(submap.keyframes)
 
@@ -104,13 +95,8 @@ def way_to_gaps(views: Sequence[View], posed: Collection[int], keyframe_ids: Col
     It begins with the last keyframe before the first of them, and ends with the last of them. Between gaps it goes by
     the keyframes, and by the last frame before each gap.
 
-    Parameters
-    ----------
-    views : sequence of View
-    posed : collection of int
-        Frames that have a pose.
-    keyframe_ids : collection of int
-        The submap's.
+    - `posed`: frames that have a pose.
+    - `keyframe_ids`: the submap's.
     """
     lacking = [view.index not in posed and view.index not in keyframe_ids for view in views]
     places = [i for i, view in enumerate(views) if view.index in keyframe_ids]

@@ -19,66 +19,33 @@ from dualslam.recovery.job import FoundLink, RecoveredFrame, RecoveryJob, path_o
 
 @dataclass(slots=True, eq=False)
 class Walk:
-    """One attempt: what it has posed, the link that it has led to, and why it ends.
-
-    Attributes
-    ----------
-    job : RecoveryJob
-    attempt : str
-        Its name.
-    submap : Submap
-        A copy of the job's, which grows.
-    tries : LinkTries
-        What it and earlier walks have tried in vain.
-    problem : Failure or None
-        Why it was not made.
-    frames : dict of int to RecoveredFrame
-        In the order in which they were posed first.
-    link, unsure : FoundLink or None
-        The link; or else one whose scale is too loose to be relied on.
-    n_gaps, n_skipped, n_unusable : int
-        Gaps crossed, frames without a pose in these, and frames without a pose at the end.
-    n_unrecognised : int
-        Frames without a pose that show something: others may recognise them.
-    needs_camera : bool
-        No other walk would do better before the camera is calibrated.
-    looks_alike : bool
-        Several poses are alike beyond a gap: another front end may not even notice.
-    before_gap : int or None
-        The frame from which the first gap was crossed.
-    walk_sigma : float
-        Of the scale that the walk hands on, as the last link that was tried says.
-    refused : FailureReason or None
-        Of the last link that was tried.
-    rivals : sequence
-        Alternative hypotheses for poses beyond gaps.
-    choice : Choice or None
-        What the velocities say of these.
-    """
+    """One attempt: what it has posed, the link that it has led to, and why it ends."""
 
     job: RecoveryJob
-    attempt: str
-    submap: Submap
-    tries: LinkTries
-    problem: Failure | None = None
-    frames: dict[int, RecoveredFrame] = field(default_factory=dict)
+    attempt: str  # its name
+    submap: Submap  # a copy of the job's, which grows
+    tries: LinkTries  # what it and earlier walks have tried in vain
+    problem: Failure | None = None  # why it was not made
+    frames: dict[int, RecoveredFrame] = field(default_factory=dict)  # in the order in which they were posed first
     events: list[Event] = field(default_factory=list)
+    # The link; or else one whose scale is too loose to be relied on.
     link: FoundLink | None = None
     unsure: FoundLink | None = None
     n_keyframes: int = 0
+    # Gaps crossed, frames without a pose in these, and frames without a pose at the end.
     n_gaps: int = 0
     n_skipped: int = 0
     n_unusable: int = 0
-    n_unrecognised: int = 0
+    n_unrecognised: int = 0  # frames without a pose that show something: others may recognise them
     out_of_time: bool = False
     given_up: bool = False
-    needs_camera: bool = False
-    looks_alike: bool = False
-    before_gap: int | None = None
-    walk_sigma: float = 0.0
-    rivals: Sequence[Rival] = ()
-    choice: Choice | None = None
-    refused: FailureReason | None = None
+    needs_camera: bool = False  # no other walk would do better before the camera is calibrated
+    looks_alike: bool = False  # several poses are alike beyond a gap: another front end may not even notice
+    before_gap: int | None = None  # the frame from which the first gap was crossed
+    walk_sigma: float = 0.0  # of the scale that the walk hands on, as the last link that was tried says
+    rivals: Sequence[Rival] = ()  # alternative hypotheses for poses beyond gaps
+    choice: Choice | None = None  # what the velocities say of these
+    refused: FailureReason | None = None  # of the last link that was tried
     why_unusable: str = ""
     why_not_linked: str = ""
 
