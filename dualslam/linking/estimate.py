@@ -268,13 +268,7 @@ def _link_over(overlap: _Overlap, before: IntArray, rng: Generator) -> LinkEstim
     doubt = evidence.doubt(sigmas)
     if doubt is None:
         return link
-    reason, detail = doubt.reason, doubt.detail
-    if share < MIN_MAJORITY:  # older keyframes do not cure that
-        reason, detail = (
-            FailureReason.SCALE_LOST,
-            f"the old map hands on {share:.0%} of what it sees, as at an occluder",
-        )
-    return LinkRefusal(reason, detail, doubt.numbers, unsure=link, gates=doubt.gates)
+    return LinkRefusal(doubt.reason, doubt.detail, doubt.numbers, unsure=link, gates=doubt.gates)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from dualslam.build import find_frontend
@@ -9,6 +12,7 @@ from dualslam.core.config.files import CONFIG, load_run_config
 from dualslam.core.config.settings import Config
 from dualslam.core.estimates import FrontendChoice
 from dualslam.core.interfaces import Sequence
+from dualslam.io import sequence
 
 AUTO, ORB = "auto", "orb"
 
@@ -40,6 +44,18 @@ def with_frontend_chosen(
     elif frames is None:
         choice = FrontendChoice(ORB, "frames are not looked at before the run")
     else:
-        choice = find_frontend(config, frames, frames.camera)
+        with _faults_unreported():
+            choice = find_frontend(config, frames, frames.camera)
     frontend = config.frontend.model_copy(update={"name": choice.name})
     return config.model_copy(update={"frontend": frontend}), choice
+
+
+@contextmanager
+def _faults_unreported() -> Iterator[None]:
+    """Leave damaged images to the run, which reads them again and reports them then."""
+    log = logging.getLogger(sequence.__name__)
+    log.disabled = True
+    try:
+        yield
+    finally:
+        log.disabled = False

@@ -38,10 +38,6 @@ from dualslam.map.submap import Submap
 
 Pose = GivenPose | Crossing | Track
 
-EACH_FRAME = 8
-"""Frames beyond a gap that are all looked at, if they show something. Of the next as many every second is, then every
-fourth: the wider the gap, the less does one frame differ from the next in what it shares with those before the gap."""
-
 
 class PnpOdometry:
     """Implements `VisualOdometry` on the live front end's submap with other front ends' poses.
@@ -78,8 +74,6 @@ class PnpOdometry:
         self._tracks_live = tracks_live
         self._following = False  # whether the last frame that was given has a pose
         self._relocalised: int | None = None  # the last frame that a gap relocalisation has posed
-        self._n_beyond = 0  # frames beyond the gap at hand that show something
-        self._not_recognised: Failure | None = None  # why the last of them was not that was looked at
         self._crossing: Crossing | None = None  # of the frame that was given last
         self._rivals: tuple[Rival, ...] = ()
 
@@ -163,11 +157,9 @@ class PnpOdometry:
         if lack is not None:
             self._following = False
             return lack
-        if self._not_recognised is not None and self._is_passed_over():
-            return self._not_recognised
         found = self._find(view)
         if isinstance(found, Failure):
-            self._following, self._not_recognised = False, found
+            self._following = False
             return found
         if isinstance(found, Crossing):
             self._relocalised, self._crossing = view.index, found
@@ -186,15 +178,8 @@ class PnpOdometry:
         n = int((self.submap.landmark_of[view.index] >= 0).sum())
         return self._live.track_at(view, GivenPose(T_cam_submap, n, n, 1.0, np.zeros((6, 6)), wide=False))
 
-    def _is_passed_over(self) -> bool:
-        """Count a frame beyond a gap; return whether it is not looked at. One that may confirm another always is."""
-        self._n_beyond += 1
-        stride = 2 ** (self._n_beyond // EACH_FRAME)
-        return self._n_beyond % stride != 0 and not any(finder.waits for finder in self._finders)
-
     def _end_gap(self) -> None:
         self._following = True
-        self._n_beyond = 0
         for finder in self._finders:
             finder.end_gap()
 

@@ -75,7 +75,7 @@ def test_it_is_known_by_its_name_and_refuses_unknown_options() -> None:
 
 
 def test_it_is_gone_without_its_package() -> None:
-    with pytest.raises(ConfigError, match=r"'patches'; known: gms, "):
+    with pytest.raises(ConfigError, match=r"'patches'; known: auto, gms, "):
         registry.create_frontend(FrontendConfig(name="patches"))
 
 

@@ -15,7 +15,7 @@ from dualslam.core.types import Failure, FailureReason, Features, FloatArray, Tr
 from dualslam.frontends.features.orb import OrbFrontend
 from dualslam.frontends.gap.auxiliary_features import Auxiliary
 from dualslam.frontends.gap.auxiliary_map import AuxiliaryMap, TrackViews, triangulate
-from dualslam.frontends.gap.pnp_odometry import EACH_FRAME, PnpOdometry
+from dualslam.frontends.gap.pnp_odometry import PnpOdometry
 from dualslam.frontends.gap.relocalisation import GapPose, relocalise_across_gap
 from dualslam.frontends.gap.route import Route
 from dualslam.frontends.gap.second_pose import SecondPose
@@ -140,25 +140,6 @@ class TestFollowing:
 
 class TestGapRelocalisation:
     covered = range(22, 40)
-
-    @pytest.fixture(autouse=True)
-    def _each_frame_is_looked_at(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("dualslam.frontends.gap.pnp_odometry.EACH_FRAME", len(DRIVE))
-
-    def test_far_beyond_a_gap_not_each_frame_is_looked_at(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("dualslam.frontends.gap.pnp_odometry.EACH_FRAME", EACH_FRAME)
-        live, auxiliary = worlds(self.covered)
-        features = WorldFeatures(auxiliary)
-        reverse_tracker = odometry(live, features)
-        steps, looked_at = {}, []
-        for i in range(39, 9, -1):
-            features.asked = []
-            steps[i] = reverse_tracker.track(live.view(i))
-            looked_at += [i] if i in features.asked else []
-        # Frame 21 shows the scene again. The first that is looked at from there on is 19, and the next one confirms it.
-        assert looked_at[:16] == [*range(39, 30, -1), 29, 27, 25, 23, 19, 18, 17]
-        assert not any(steps[i] for i in range(39, 18, -1))
-        assert all(steps[i] for i in range(18, 9, -1))
 
     def test_it_leaps_a_gap_and_a_second_frame_confirms(self) -> None:
         live, auxiliary = worlds(self.covered)
