@@ -29,8 +29,8 @@ from dualslam.recovery.attempts import Attempt, RecoveryParts
 from dualslam.recovery.job import RecoveryJob
 
 MAX_UNRECOGNISED = 5
-"""Frames in a row that show something and are not recognised, at which an attempt by other features alone ends, if
-another was made before it. That one has tried to cross the gap. This one follows from frame to frame what the live
+"""An attempt by other features alone, after another one, ends at so many frames in a row that show something and are
+not recognised. That one has tried to cross the gap. This one follows from frame to frame what the live
 features have lost: its crossings of 9 and 14 such frames lost the scale, for seven times the cost a frame."""
 FEATURE_THREADS = 2
 """That find other front ends' features beside reverse tracking, where the tracking waits for it."""
