@@ -32,7 +32,7 @@ from dualslam.places import FaissRecogniser, PlaceVerifier
 from dualslam.places.sightings import PlaceParts
 
 ADJUST_ITERATIONS = 20
-AUTO = ("orb", "sift")
+CORNERS_AND_BLOBS = ("orb", "sift")
 """Front ends that `frontend.name: auto` chooses from."""
 
 
@@ -133,7 +133,7 @@ def find_frontend(config: Config, frames: Iterable[Frame], camera: Camera) -> Fr
         seen = partial(view_of, frontend=frontend, camera=camera, model_sigma_px=config.camera.model_sigma_px)
         return Candidate(frontend, starter, seen)
 
-    corners, blobs = (candidate(name) for name in AUTO)
+    corners, blobs = (candidate(name) for name in CORNERS_AND_BLOBS)
     return choose_frontend(frames, corners, blobs, config.frontend.n_features)
 
 

@@ -75,10 +75,7 @@ def load_config(path: str | Path | None = None, overrides: Iterable[str | Overri
         raise ConfigError('overrides is a list of texts, such as ["seed=1", "frontend.n_features=2000"]')
     if path is not None:
         data = _read(Path(path))
-    parsed = [Override.parse(o) if isinstance(o, str) else o for o in overrides]
-    for override in parsed:
-        _set(data, override)
-    return _validate(data, str(path) if path is not None else "config", parsed, Config)
+    return _overridden(data, overrides, str(path) if path is not None else "config")
 
 
 def load_run_config(folder: str | Path, overrides: Iterable[str | Override] = ()) -> Config:
@@ -98,10 +95,15 @@ def load_run_config(folder: str | Path, overrides: Iterable[str | Override] = ()
         del owner[field]
     if gone:
         log.warning("%s: this version of dualslam has no %s; left out", path, ", ".join(map(written, gone)))
+    return _overridden(data, overrides, str(path))
+
+
+def _overridden(data: dict[str, Any], overrides: Iterable[str | Override], source: str) -> Config:
+    """Make the configuration of what a file says, with overrides."""
     parsed = [Override.parse(o) if isinstance(o, str) else o for o in overrides]
     for override in parsed:
         _set(data, override)
-    return _validate(data, str(path), parsed, Config)
+    return _validate(data, source, parsed, Config)
 
 
 def _unknown_fields(data: dict[str, Any]) -> list[tuple[int | str, ...]]:
