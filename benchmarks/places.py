@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from dualslam.core.config.settings import Config
 from dualslam.core.memory import peak_rss_mb
 from dualslam.core.types import Features, Keyframe
+from dualslam.frontends.features.hamming import hamming_distance
 from dualslam.frontends.registry import create_frontend
 from dualslam.lab.synthetic import make_sequence
 from dualslam.map.submap import Submap
@@ -81,7 +82,7 @@ def main() -> None:
     n_keyframes = parser.parse_args().keyframes
     rng = np.random.default_rng(0)
     pool = descriptor_pool()
-    index, submaps = FaissRecogniser(MAX_DISTANCE), dict[int, Submap]()
+    index, submaps = FaissRecogniser(hamming_distance, MAX_DISTANCE), dict[int, Submap]()
     insertion: list[float] = []
     for k in range(n_keyframes):
         m = k // PER_SUBMAP

@@ -50,7 +50,8 @@ def place_parts(config: Config, frontend: Frontend, camera: Camera) -> PlacePart
     """Build what recognises places and verifies them; `camera`: as it was given."""
     matcher = FrontendPlaceMatcher(frontend, camera)
     return PlaceParts(
-        FaissRecogniser(frontend.max_distance_strict), PlaceVerifier(matcher, config.linking, config.seed)
+        FaissRecogniser(frontend.distance, frontend.max_distance_strict),
+        PlaceVerifier(matcher, config.linking, config.seed),
     )
 
 

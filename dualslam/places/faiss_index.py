@@ -13,7 +13,7 @@ import faiss
 import numpy as np
 from numpy.typing import NDArray
 
-from dualslam.core.types import Features, IntArray
+from dualslam.core.types import Features, FloatArray, IntArray
 from dualslam.map.submap import Submap
 from dualslam.places.cells import shipped_cells
 from dualslam.places.recogniser import PlaceCandidate
@@ -32,14 +32,20 @@ SAME_PLACE = 0.3
 class FaissRecogniser:
     """An index over the landmarks of all submaps.
 
-    Binary descriptors of 32 bytes go into the cells that are shipped; others, and floats, are searched exhaustively.
+    Descriptors of 256 bits go into the cells that are shipped. Others, and vectors of numbers, are searched
+    exhaustively.
 
-    `max_distance`: between the descriptors of two views of one point, as the front end measures it: bits, or the norm
-    of the difference (`Frontend.max_distance_strict`).
+    - `distance`: between paired descriptors, as the front end measures it (`Frontend.distance`): a count of differing
+      bits, or the norm of the difference.
+    - `max_distance`: between two views of one point (`Frontend.max_distance_strict`).
     """
 
-    def __init__(self, max_distance: float) -> None:
+    def __init__(
+        self, distance: Callable[[NDArray[np.generic], NDArray[np.generic]], FloatArray], max_distance: float
+    ) -> None:
+        self._distance = distance
         self._max_distance = max_distance
+        self._limit = max_distance  # in the unit of the index
         self._index: Any = None
         self._quantizer: Any = None  # FAISS holds no reference to it
         self._submap_of: list[NDArray[np.int64]] = []
@@ -118,11 +124,12 @@ class FaissRecogniser:
     def _add(self, descriptors: NDArray[Any]) -> None:
         if self._index is None:
             self._index = self._make(descriptors)
-        self._index.add(descriptors if descriptors.dtype == np.uint8 else descriptors.astype(np.float32))
+        self._index.add(self._as_asked(descriptors))
 
     def _make(self, descriptors: NDArray[Any]) -> Any:
         n = descriptors.shape[1]
-        if descriptors.dtype != np.uint8:
+        if (step := self._step(descriptors[:1])) is not None:
+            self._limit = (self._max_distance / step) ** 2
             return faiss.IndexFlatL2(n)
         cells = shipped_cells()
         if n != cells.shape[1]:
@@ -133,13 +140,23 @@ class FaissRecogniser:
         index.nprobe = N_PROBED
         return index
 
+    def _step(self, like: NDArray[Any]) -> float | None:
+        """Return the distance that one step of one number makes; None where descriptors are strings of bits."""
+        zero, one = np.zeros_like(like), np.zeros_like(like)
+        one[0, 0] = 1
+        step = float(self._distance(zero, one)[0])
+        if like.dtype != np.uint8:
+            return step
+        one[0, 0] = 255  # eight bits, or 255 steps
+        return None if float(self._distance(zero, one)[0]) == 8 * step else step
+
+    def _as_asked(self, descriptors: NDArray[Any]) -> NDArray[Any]:
+        return descriptors if isinstance(self._index, faiss.IndexBinary) else descriptors.astype(np.float32)
+
     def _nearest(self, descriptors: NDArray[Any]) -> tuple[IntArray, IntArray]:
         """Return pairs (feature, row of the index) of descriptors that are near enough."""
-        binary = descriptors.dtype == np.uint8
-        asked = descriptors if binary else descriptors.astype(np.float32)
-        distance, row = self._index.search(asked, min(N_NEAREST, len(self)))
-        limit = self._max_distance if binary else self._max_distance**2
-        feature, column = np.nonzero((row >= 0) & (distance <= limit))
+        distance, row = self._index.search(self._as_asked(descriptors), min(N_NEAREST, len(self)))
+        feature, column = np.nonzero((row >= 0) & (distance <= self._limit))
         return feature, row[feature, column]
 
     def _rows(self) -> tuple[IntArray, IntArray]:
