@@ -15,9 +15,9 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray
 from dualslam.io.bag_files import Bag, BagReader, Place, Topic, is_bag, scan
-from dualslam.io.bit_depth import WHOLE, depth_of, looked_at, upper_eight
 from dualslam.io.camera_keys import camera_of_mapping
-from dualslam.io.images import ImageReader, UnreadableImageError, decode, natural_key
+from dualslam.io.decoding import WHOLE, UnreadableImageError, decode, upper_eight, used_bits
+from dualslam.io.images import ImageReader, natural_key
 from dualslam.io.sequence import Given, Recording
 from dualslam.io.times import checked_times, resolve_times
 
@@ -159,23 +159,11 @@ class BagImages:
 
     def reader(self, grey: bool) -> ImageReader:
         """Return a reader with its own files."""
-        if self._bits is None:
-            self._bits = self._used_bits()
-        return _Reader(self._bag.paths, self._topic, self._places, grey, self._bits)
-
-    def _used_bits(self) -> int:
-        """Return how many bits raw images of 16 use, by some of the whole bag."""
-        reader, brightest = _Reader(self._bag.paths, self._topic, self._places, True), -1
-        for index in looked_at(len(self)) if self._topic.type == IMAGE else []:
-            try:
-                pixels = _pixels(reader.message(index), "")
-            except UnreadableImageError:
-                continue
-            if pixels.dtype != np.uint16:
-                break
-            brightest = max(brightest, int(pixels.max()))
-        reader.close()
-        return depth_of(brightest, self._topic.name)
+        if self._bits is None and self._topic.type == IMAGE:
+            raw = _Reader(self._bag.paths, self._topic, self._places, True)
+            self._bits = used_bits(len(self), lambda i: _pixels(raw.message(i), ""), self._topic.name)
+            raw.close()
+        return _Reader(self._bag.paths, self._topic, self._places, grey, self._bits or WHOLE)
 
     def told_focal(self) -> None:
         """Return nothing: a bag tells of its camera by `camera_info`."""

@@ -14,8 +14,8 @@ from dualslam.io.camera_keys import camera_of_mapping
 from dualslam.io.camera_text import parse_yaml
 from dualslam.io.images import ImageFiles
 from dualslam.io.sequence import Given, Recording
-from dualslam.io.times import checked_times, resolve_times
-from dualslam.io.trajectory_files import Trajectory, read_text
+from dualslam.io.times import checked_times, listed_times, needed_file
+from dualslam.io.trajectory_files import Trajectory, numbered_lines, read_text
 
 
 def recognises(folder: Path) -> bool:
@@ -33,19 +33,15 @@ def open_recording(folder: Path, given: Given) -> Recording:
     sensor_path = mav0 / "cam0" / "sensor.yaml"
     truth_path = mav0 / "state_groundtruth_estimate0" / "data.csv"
     sensor: dict[str, Any] = {}
-    if sensor_path.exists():
-        sensor = parse_yaml(sensor_path, read_text(sensor_path))
-    elif not given.camera:
-        raise InputError(f"{sensor_path} does not exist; it belongs to the sequence: fetch it, or give a camera file.")
+    if sensor_path.exists() or not given.camera:
+        sensor = parse_yaml(needed_file(sensor_path, "a camera file"), read_text(sensor_path))
     truth = None
     if truth_path.exists() and sensor:
         truth = _read_truth(truth_path, body_from_camera(sensor, sensor_path))
     return Recording(
         name=mav0.resolve().parent.name,
         images=ImageFiles(paths),
-        timestamps_s=checked_times(times, str(listing))
-        if given.times is None
-        else resolve_times(given.times, len(paths), listing),
+        timestamps_s=listed_times(given.times, times, listing),
         camera=None if given.camera else camera_of_mapping(sensor, str(sensor_path)),
         ground_truth=truth,
         calibration=str(sensor_path),
@@ -62,10 +58,8 @@ def _mav0(folder: Path) -> Path | None:
 
 def _read_listing(listing: Path) -> tuple[FloatArray, list[Path]]:
     times, paths = [], []
-    for number, line in enumerate(read_text(listing).splitlines(), 1):
-        words = [word.strip() for word in line.split("#", 1)[0].split(",")]
-        if words == [""]:
-            continue
+    for number, line in numbered_lines(listing):
+        words = [word.strip() for word in line.split(",")]
         if len(words) != 2 or not words[0].isdigit():
             raise InputError(f"{listing}, line {number}: {line[:60]!r} is not `timestamp in nanoseconds,filename`.")
         times.append(_seconds(words[0]))
@@ -97,14 +91,12 @@ def body_from_camera(sensor: dict[str, Any], where: Path) -> FloatArray:
 def _read_truth(path: Path, T_body_cam: FloatArray) -> Trajectory:
     """Read ``timestamp [ns], p (3), q w x y z, ...`` of the body and return the camera's poses."""
     times, rows = [], []
-    for number, line in enumerate(read_text(path).splitlines(), 1):
-        words = line.split("#", 1)[0].replace(",", " ").split()
-        if not words:
-            continue
+    for number, line in numbered_lines(path):
+        words = line.replace(",", " ").split()
         try:
             times.append(_seconds(words[0]))
             rows.append([float(word) for word in words[1:8]])
-        except ValueError:
+        except (ValueError, IndexError):
             raise InputError(f"{path}, line {number}: {line[:60]!r} is not a line of the ground truth.") from None
         if len(rows[-1]) != 7:
             raise InputError(f"{path}, line {number}: {len(words)} fields; timestamp, position and quaternion are due.")

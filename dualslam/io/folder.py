@@ -9,9 +9,9 @@ import numpy as np
 
 from dualslam.core.types import FloatArray
 from dualslam.io.camera_files import read_camera_file
-from dualslam.io.images import IMAGE_SUFFIXES, ImageFiles, fill_gaps, list_images
+from dualslam.io.images import IMAGE_SUFFIXES, ImageFiles, list_images
 from dualslam.io.sequence import Given, Recording, image_size
-from dualslam.io.times import NOMINAL_RATE_HZ, check_count, read_times, resolve_times, times_in_names
+from dualslam.io.times import NOMINAL_RATE_HZ, recorded_times, resolve_times, times_in_names
 from dualslam.io.trajectory_files import read_tum
 
 log = logging.getLogger(__name__)
@@ -33,9 +33,7 @@ def open_recording(folder: Path, given: Given) -> Recording:
         timestamps_s = resolve_times(given.times, len(paths), where)
     elif times_path.exists():
         clock = str(times_path)
-        timestamps_s = read_times(times_path)
-        paths = fill_gaps(paths, len(timestamps_s))
-        check_count(len(timestamps_s), times_path, len(paths), where)
+        timestamps_s, paths = recorded_times(None, times_path, paths)
     elif given.rate_hz is None and (named := times_in_names(paths)) is not None:
         log.warning("%s: its images are named by their times, which are taken", where)
         clock, timestamps_s = f"the names of the images in {where}", named

@@ -6,35 +6,24 @@ import logging
 import re
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dualslam.core.camera.focal import ToldFocal
 from dualslam.core.errors import InputError
 from dualslam.io import exif
-from dualslam.io.bit_depth import WHOLE, decoded, other_type, used_bits
+from dualslam.io.decoding import UnreadableImageError, decode, file_values, used_bits
 
 log = logging.getLogger(__name__)
 
 SHARE_OF_DEPTH = 0.5
 """Depth images for each other one: a few names with the word mean something else."""
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
-# How the files of a format end; a file without its ending was cut off, which decoders fill with grey and do not tell.
-_ENDINGS = {b"\xff\xd8\xff": b"\xff\xd9", b"\x89PNG": b"IEND\xaeB`\x82"}
-_TAIL_BYTES = 1024
 _TORN = (zipfile.BadZipFile, zlib.error, OSError, EOFError, NotImplementedError, RuntimeError)  # what zipfile raises
-# A JPEG's thumbnail, which has an ending of its own, is in its first 64 KiB. Behind the image there may be more: phones
-# append a film.
-_HEAD_BYTES = 1 << 16
-
-
-class UnreadableImageError(Exception):
-    """One image of a sequence cannot be had. Its message is the sentence that the frame carries; reading goes on."""
 
 
 class ImageReader(Protocol):
@@ -110,22 +99,17 @@ def fill_gaps(paths: Sequence[Path], expected: int) -> list[Path]:
     return [by_number.get(n, template.with_stem(f"{n:0{width}d}")) for n in range(first, last + 1)]
 
 
-def decode(data: bytes, name: str, grey: bool, bits: int = WHOLE) -> NDArray[np.uint8]:
-    """Decode a file's bytes to (H, W) grey or (H, W, 3) RGB.
+class _EncodedReader:
+    """Decodes the files whose bytes `fetch` gives."""
 
-    `name` is for the message of `UnreadableImageError`; `bits`: how many of 16 the source uses (`used_bits`).
-    """
-    if not data:
-        raise UnreadableImageError(f"{name} is empty.")
-    for start, end in _ENDINGS.items():
-        if data.startswith(start) and end not in data[-_TAIL_BYTES:] and data.find(end, _HEAD_BYTES) < 0:
-            raise UnreadableImageError(f"{name} is cut off: its end is missing.")
-    image = decoded(data, grey, bits)
-    if image is None and (found := other_type(data)) is not None:
-        raise UnreadableImageError(f"{name} has values of type {found}; write it as an image of 8 or 16 bits.")
-    if image is None:
-        raise UnreadableImageError(f"{name} cannot be decoded: it is damaged or no image.")
-    return np.asarray(image if grey else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+    def __init__(
+        self, fetch: Callable[[int], bytes], names: Sequence[str], grey: bool, bits: int, close: Callable[[], None]
+    ) -> None:
+        self._fetch, self._names, self._grey, self._bits = fetch, names, grey, bits
+        self.close = close
+
+    def read(self, index: int) -> NDArray[np.uint8]:
+        return decode(self._fetch(index), self._names[index], self._grey, self._bits)
 
 
 class ImageFiles:
@@ -133,54 +117,33 @@ class ImageFiles:
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self.paths = list(paths)
+        self.names = tuple(path.stem for path in self.paths)
         self._bits: int | None = None
 
     def __len__(self) -> int:
         return len(self.paths)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Return the files' names without suffix."""
-        return tuple(path.stem for path in self.paths)
-
     def reader(self, grey: bool) -> ImageReader:
         """Return a reader of these files."""
         if self._bits is None:
-            self._bits = used_bits(len(self), lambda i: _bytes_of(self.paths[i]), str(self.paths[0].parent))
-        return _FileReader(self.paths, grey, self._bits)
+            self._bits = used_bits(len(self), lambda i: file_values(self._fetch(i)), str(self.paths[0].parent))
+        return _EncodedReader(self._fetch, [str(path) for path in self.paths], grey, self._bits, lambda: None)
+
+    def _fetch(self, index: int) -> bytes:
+        path = self.paths[index]
+        try:
+            return path.read_bytes()
+        except FileNotFoundError:
+            raise UnreadableImageError(f"{path} does not exist.") from None
+        except OSError as e:
+            raise UnreadableImageError(f"{path} cannot be read: {e.strerror or e}.") from e
+        except ValueError as e:  # a name of a damaged list may be none (NUL)
+            raise UnreadableImageError(f"{str(path)!r} is no name of a file: {e}.") from e
 
     def told_focal(self) -> ToldFocal | None:
         """Return what the EXIF data of the first image tell."""
         ratio = exif.focal_over_longer_side(self.paths[0])
         return None if ratio is None else ToldFocal(ratio, exif.SIGMA)
-
-
-def _bytes_of(path: Path) -> bytes | None:
-    try:
-        return path.read_bytes()
-    except (OSError, ValueError):  # a name of a damaged list may be none (NUL)
-        return None  # reported where the frame is read
-
-
-class _FileReader:
-    def __init__(self, paths: list[Path], grey: bool, bits: int) -> None:
-        self._paths = paths
-        self._grey, self._bits = grey, bits
-
-    def read(self, index: int) -> NDArray[np.uint8]:
-        path = self._paths[index]
-        try:
-            data = path.read_bytes()
-        except FileNotFoundError:
-            raise UnreadableImageError(f"{path} does not exist.") from None
-        except OSError as e:
-            raise UnreadableImageError(f"{path} cannot be read: {e.strerror or e}.") from e
-        except ValueError as e:
-            raise UnreadableImageError(f"{str(path)!r} is no name of a file: {e}.") from e
-        return decode(data, str(path), self._grey, self._bits)
-
-    def close(self) -> None:
-        pass
 
 
 class ZippedImages:
@@ -204,36 +167,17 @@ class ZippedImages:
 
     def reader(self, grey: bool) -> ImageReader:
         """Return a reader with its own handle of the archive."""
-        reader = _ZipReader(self.archive, self.names, grey)
+        opened, named = zipfile.ZipFile(self.archive), [f"{name} in {self.archive}" for name in self.names]
+
+        def fetch(index: int) -> bytes:
+            try:
+                return opened.read(self.names[index])
+            except _TORN as e:
+                raise UnreadableImageError(f"{named[index]} cannot be read: {e}.") from e
+
         if self._bits is None:
-            self._bits = used_bits(len(self), reader.bytes_of, str(self.archive))
-        reader.bits = self._bits
-        return reader
+            self._bits = used_bits(len(self), lambda i: file_values(fetch(i)), str(self.archive))
+        return _EncodedReader(fetch, named, grey, self._bits, opened.close)
 
     def told_focal(self) -> None:
         """Return nothing: recordings in archives have a calibration."""
-
-
-class _ZipReader:
-    def __init__(self, archive: Path, names: list[str], grey: bool) -> None:
-        self._zip = zipfile.ZipFile(archive)
-        self._names = names
-        self._grey = grey
-        self.bits = WHOLE
-
-    def read(self, index: int) -> NDArray[np.uint8]:
-        where = f"{self._names[index]} in {self._zip.filename}"
-        try:
-            data = self._zip.read(self._names[index])
-        except _TORN as e:
-            raise UnreadableImageError(f"{where} cannot be read: {e}.") from e
-        return decode(data, where, self._grey, self.bits)
-
-    def bytes_of(self, index: int) -> bytes | None:
-        try:
-            return self._zip.read(self._names[index])
-        except _TORN:
-            return None  # reported where the frame is read
-
-    def close(self) -> None:
-        self._zip.close()

@@ -10,10 +10,10 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray
 from dualslam.io.camera_files import radtan_camera
-from dualslam.io.images import ImageFiles, ImageStore, fill_gaps, list_images
+from dualslam.io.images import ImageFiles, ImageStore, list_images
 from dualslam.io.sequence import Given, Recording, image_size
-from dualslam.io.times import check_count, read_times, resolve_times
-from dualslam.io.trajectory_files import Trajectory, read_kitti, read_text
+from dualslam.io.times import needed_file, recorded_times
+from dualslam.io.trajectory_files import Trajectory, numbered_lines, read_kitti
 
 _CAMERAS = (0, 2)
 
@@ -26,20 +26,11 @@ def recognises(folder: Path) -> bool:
 def open_recording(folder: Path, given: Given) -> Recording:
     """Open a sequence folder; the left grey camera (``image_0``) goes before the left colour one (``image_2``)."""
     number = next(c for c in _CAMERAS if (folder / f"image_{c}").is_dir())
-    image_folder = folder / f"image_{number}"
-    paths = list_images(image_folder)
     times_path, calib_path = folder / "times.txt", folder / "calib.txt"
-    if given.times is not None:
-        timestamps_s = resolve_times(given.times, len(paths), image_folder)
-    elif times_path.exists():
-        timestamps_s = read_times(times_path)
-        paths = fill_gaps(paths, len(timestamps_s))
-        check_count(len(timestamps_s), times_path, len(paths), image_folder)
-    else:
-        raise InputError(f"{times_path} does not exist; it belongs to the sequence: fetch it, or give a file of times.")
+    timestamps_s, paths = recorded_times(given.times, times_path, list_images(folder / f"image_{number}"))
     images = ImageFiles(paths)
-    if not calib_path.exists() and not given.camera:
-        raise InputError(f"{calib_path} does not exist; it belongs to the sequence: fetch it, or give a camera file.")
+    if not given.camera:
+        needed_file(calib_path, "a camera file")
     P = read_projection(calib_path, number) if calib_path.exists() else None
     name = folder.resolve().name
     return Recording(
@@ -55,11 +46,11 @@ def open_recording(folder: Path, given: Given) -> Recording:
 
 def read_projection(path: Path, camera: int) -> FloatArray:
     """Return the (3, 4) projection matrix ``P<camera>`` of a ``calib.txt``."""
-    for line in read_text(path).splitlines():
-        words = line.replace(":", " ").split()
-        if words and words[0] == f"P{camera}":
+    for _, line in numbered_lines(path):
+        name, *words = line.replace(":", " ").split() or [""]
+        if name == f"P{camera}":
             try:
-                P = np.array([float(w) for w in words[1:]])
+                P = np.array([float(w) for w in words])
             except ValueError:
                 P = np.zeros(0)
             if P.shape != (12,) or not np.isfinite(P).all():

@@ -15,7 +15,8 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import ToldFocal
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, Frame, IntArray
-from dualslam.io.images import ImageReader, ImageStore, UnreadableImageError
+from dualslam.io.decoding import UnreadableImageError
+from dualslam.io.images import ImageReader, ImageStore
 from dualslam.io.read_ahead import read_ahead
 from dualslam.io.times import NOMINAL_RATE_HZ
 from dualslam.io.trajectory_files import Trajectory

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray
+from dualslam.io.images import fill_gaps
 from dualslam.io.trajectory_files import read_number_table
 
 log = logging.getLogger(__name__)
@@ -104,6 +105,37 @@ def times_in_names(paths: list[Path]) -> FloatArray | None:
             return None
     times = np.array(found)
     return times if len(times) > 1 and (np.diff(times) > 0).all() else None
+
+
+def recorded_times(
+    given: str | Path | ArrayLike | None, path: Path, paths: list[Path]
+) -> tuple[FloatArray, list[Path]]:
+    """Return the times of a sequence's images, and the images with those that are lost.
+
+    - `given`: the caller's own times; None: those of the sequence, a file of seconds.
+    - `path`: that file; its sequence cannot do without one.
+    """
+    folder = paths[0].parent
+    if given is not None:
+        return resolve_times(given, len(paths), folder), paths
+    times_s = read_times(needed_file(path, "a file of times"))
+    paths = fill_gaps(paths, len(times_s))
+    check_count(len(times_s), path, len(paths), folder)
+    return times_s, paths
+
+
+def needed_file(path: Path, instead: str) -> Path:
+    """Return the path of a file that a sequence must have, or refuse it with what can be given `instead`."""
+    if not path.exists():
+        raise InputError(f"{path} does not exist; it belongs to the sequence: fetch it, or give {instead}.")
+    return path
+
+
+def listed_times(given: str | Path | ArrayLike | None, times_s: list[float] | FloatArray, listing: Path) -> FloatArray:
+    """Return the caller's own times if there are any, else those that a listing of images has."""
+    if given is None:
+        return checked_times(times_s, str(listing))
+    return resolve_times(given, len(times_s), listing)
 
 
 def resolve_times(times: str | Path | ArrayLike, n_images: int, images: Path) -> FloatArray:

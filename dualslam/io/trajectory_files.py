@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -32,13 +33,9 @@ def read_tum(path: str | Path, *, skip_nan: bool = False, allow_empty: bool = Fa
     Raises `InputError` if the file is missing, empty or holds a line that is no pose.
     """
     table = read_number_table(path, 8, "a TUM trajectory (t tx ty tz qx qy qz qw)", allow_empty)
-    finite = np.isfinite(table).all(axis=1)
     if skip_nan:
-        table = table[finite]
-    elif not finite.all():
-        raise InputError(
-            f"{path}: pose {int(np.argmin(finite)) + 1} holds a value that is not finite; remove the line."
-        )
+        table = table[np.isfinite(table).all(axis=1)]
+    _refuse_not_finite(path, table)
     norm = np.linalg.norm(table[:, 4:8], axis=1)
     if (norm < 0.5).any():
         bad = int(np.argmax(norm < 0.5)) + 1
@@ -69,11 +66,7 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
 def read_kitti(path: str | Path) -> FloatArray:
     """Read KITTI poses: one line of 12 numbers (a 3x4 matrix by rows, camera to world) each. Returns (N, 4, 4)."""
     table = read_number_table(path, 12, "a KITTI pose file (12 numbers a line)")
-    finite = np.isfinite(table).all(axis=1)
-    if not finite.all():
-        raise InputError(
-            f"{path}: pose {int(np.argmin(finite)) + 1} holds a value that is not finite; remove the line."
-        )
+    _refuse_not_finite(path, table)
     T_world_cam = np.tile(np.eye(4), (len(table), 1, 1))
     T_world_cam[:, :3, :] = table.reshape(-1, 3, 4)
     return T_world_cam
@@ -128,20 +121,25 @@ def read_number_table(path: str | Path, columns: int, what: str, allow_empty: bo
     Raises `InputError`: naming the file and the line that is not `what`.
     """
     rows: list[list[float]] = []
-    for number, line in enumerate(read_text(path).splitlines(), 1):
-        words = line.split("#", 1)[0].replace(",", " ").split()
-        if not words:
-            continue
+    for number, line in numbered_lines(path):
+        words = line.replace(",", " ").split()
         try:
             row = [float(word) for word in words]
         except ValueError:
-            raise InputError(f"{path}, line {number}: {line.strip()[:60]!r} is not a line of {what}.") from None
+            raise InputError(f"{path}, line {number}: {line[:60]!r} is not a line of {what}.") from None
         if len(row) != columns:
             raise InputError(f"{path}, line {number}: {len(row)} numbers where {columns} are due in {what}.")
         rows.append(row)
     if not rows and not allow_empty:
         raise InputError(f"{path} is empty: it should be {what}.")
     return np.array(rows).reshape(-1, columns)
+
+
+def numbered_lines(path: str | Path) -> Iterator[tuple[int, str]]:
+    """Yield the number and the text of each line that has any; ``#`` starts a comment."""
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        if content := line.split("#", 1)[0].strip():
+            yield number, content
 
 
 def read_text(path: str | Path) -> str:
@@ -159,6 +157,13 @@ def read_text(path: str | Path) -> str:
 def _exact(x: float, min_digits: int | None = None) -> str:
     # The shortest decimal that parses back to the same float; plain decimals, as some readers know no exponents.
     return np.format_float_positional(x, unique=True, trim="k" if min_digits else "0", min_digits=min_digits)
+
+
+def _refuse_not_finite(path: str | Path, table: FloatArray) -> None:
+    finite = np.isfinite(table).all(axis=1)
+    if not finite.all():
+        bad = int(np.argmin(finite)) + 1
+        raise InputError(f"{path}: pose {bad} holds a value that is not finite; remove the line.")
 
 
 def _check_finite(path: str | Path, *arrays: FloatArray) -> None:

@@ -12,8 +12,8 @@ from dualslam.core.types import FloatArray
 from dualslam.io.camera_files import read_tum_mono_camera
 from dualslam.io.images import ImageFiles, ImageStore, ZippedImages, list_images
 from dualslam.io.sequence import Given, Recording
-from dualslam.io.times import check_count, checked_times, resolve_times
-from dualslam.io.trajectory_files import Trajectory, read_text, read_tum
+from dualslam.io.times import check_count, checked_times, needed_file, resolve_times
+from dualslam.io.trajectory_files import Trajectory, numbered_lines, read_tum
 
 log = logging.getLogger(__name__)
 
@@ -35,13 +35,11 @@ def open_recording(folder: Path, given: Given) -> Recording:
     exposure_s: FloatArray | None = None
     if given.times is not None:
         timestamps_s = resolve_times(given.times, len(images), where)
-    elif times_path.exists():
-        timestamps_s, exposure_s = read_times_with_exposure(times_path)
-        check_count(len(timestamps_s), times_path, len(images), where)
     else:
-        raise InputError(f"{times_path} does not exist; it belongs to the sequence: fetch it, or give a file of times.")
-    if not given.camera and not camera_path.exists():
-        raise InputError(f"{camera_path} does not exist; it belongs to the sequence: fetch it, or give a camera file.")
+        timestamps_s, exposure_s = read_times_with_exposure(needed_file(times_path, "a file of times"))
+        check_count(len(timestamps_s), times_path, len(images), where)
+    if not given.camera:
+        needed_file(camera_path, "a camera file")
     return Recording(
         name=folder.resolve().name,
         images=images,
@@ -67,8 +65,7 @@ def _ground_truth(path: Path) -> Trajectory | None:
 
 def read_times_with_exposure(path: Path) -> tuple[FloatArray, FloatArray | None]:
     """Read lines ``id seconds [exposure in milliseconds]``; returns seconds, both."""
-    rows = [line.split("#", 1)[0].split() for line in read_text(path).splitlines()]
-    rows = [row for row in rows if row]
+    rows = [line.split() for _, line in numbered_lines(path)]
     if not rows:
         raise InputError(f"{path} is empty; each line should be `id seconds exposure_ms`.")
     bad = next((i for i, row in enumerate(rows) if len(row) not in (2, 3) or len(row) != len(rows[0])), None)

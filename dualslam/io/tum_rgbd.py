@@ -10,8 +10,8 @@ from dualslam.core.errors import InputError
 from dualslam.io.camera_files import radtan_camera
 from dualslam.io.images import ImageFiles
 from dualslam.io.sequence import Given, Recording
-from dualslam.io.times import checked_times, resolve_times
-from dualslam.io.trajectory_files import read_text, read_tum
+from dualslam.io.times import listed_times
+from dualslam.io.trajectory_files import numbered_lines, read_tum
 
 # fx fy cx cy k1 k2 p1 p2 k3 of the colour cameras, 640 x 480, as the benchmark publishes them.
 INTRINSICS = {
@@ -30,12 +30,9 @@ def open_recording(folder: Path, given: Given) -> Recording:
     """Open a sequence folder; the camera is known by ``fr1``, ``fr2`` or ``fr3`` in its name."""
     listing = folder / "rgb.txt"
     times, paths = [], []
-    for number, line in enumerate(read_text(listing).splitlines(), 1):
-        words = line.split("#", 1)[0].split()
-        if not words:
-            continue
+    for number, line in numbered_lines(listing):
         try:
-            time, name = words
+            time, name = line.split()
             times.append(float(time))
         except ValueError:
             raise InputError(f"{listing}, line {number}: {line[:60]!r} is not `timestamp filename`.") from None
@@ -46,9 +43,7 @@ def open_recording(folder: Path, given: Given) -> Recording:
     return Recording(
         name=folder.resolve().name,
         images=ImageFiles(paths),
-        timestamps_s=checked_times(times, str(listing))
-        if given.times is None
-        else resolve_times(given.times, len(paths), listing),
+        timestamps_s=listed_times(given.times, times, listing),
         camera=None if given.camera else _camera(folder),
         ground_truth=read_tum(truth_path) if truth_path.exists() else None,
         calibration="the benchmark's calibration",

@@ -22,8 +22,9 @@ from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, Frame
 from dualslam.io.camera_build import make_camera
 from dualslam.io.container import edited_s, equivalent_focal_mm
+from dualslam.io.decoding import UnreadableImageError
 from dualslam.io.exif import is_likely, over_longer_side
-from dualslam.io.images import ImageReader, UnreadableImageError
+from dualslam.io.images import ImageReader
 from dualslam.io.read_ahead import read_ahead
 from dualslam.io.sequence import Given, Recording, Selection, camera_of_size
 from dualslam.io.times import NOMINAL_RATE_HZ, resolve_times

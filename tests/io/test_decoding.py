@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dualslam.core.errors import InputError
-from dualslam.io.bit_depth import N_LOOKED_AT
+from dualslam.io.decoding import N_LOOKED_AT
 from dualslam.io.images import ZippedImages
 from dualslam.io.open_sequence import open_sequence
 
