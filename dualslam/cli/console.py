@@ -114,9 +114,7 @@ def stage_table(outcome: Outcome) -> str:
     """Return CPU and wall time of each stage, of the background processes, and of the whole."""
     n_frames = max(len(outcome.report.latencies_ms), 1)
     total_s, system = outcome.report.cpu_s, outcome.system
-    lines = [
-        f"{'stage':<28}{'calls':>8}{'CPU s':>10}{'ms/frame':>10}{'share':>8}{'wall s':>10}{'longest ms':>12}",
-    ]
+    lines = [f"{'stage':<28}{'calls':>8}{'CPU s':>10}{'ms/frame':>10}{'share':>8}{'wall s':>10}{'longest ms':>12}"]
 
     def add(name: str, calls: int, seconds: float, wall_s: float | None = None, longest_s: float | None = None) -> None:
         share = 100 * seconds / total_s if total_s else 0.0

@@ -12,11 +12,7 @@ from numpy.typing import NDArray
 
 from dualslam.core.bundle import FrameRows
 from dualslam.core.decisions import Ruling
-from dualslam.core.estimates import (
-    CalibrationEstimate,
-    GraphEstimate,
-    KeyframeReport,
-)
+from dualslam.core.estimates import CalibrationEstimate, GraphEstimate, KeyframeReport
 from dualslam.core.pixels import PixelMatches, PosedImage
 from dualslam.core.types import (
     BoolArray,
@@ -122,11 +118,7 @@ class PixelMatcher(Protocol):
     name: str
 
     def find(
-        self,
-        references: tuple[PosedImage, ...],
-        image: NDArray[np.uint8],
-        camera: Camera,
-        T_cam_submap: FloatArray,
+        self, references: tuple[PosedImage, ...], image: NDArray[np.uint8], camera: Camera, T_cam_submap: FloatArray
     ) -> PixelMatches:
         """Find landmarks of the references in an image.
 

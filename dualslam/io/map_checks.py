@@ -35,12 +35,7 @@ FRAME_ROWS: Rows = {
     "T_kf_cam": ("f", (4, 4)),
 }
 _SUBMAP_ROWS: tuple[Rows, ...] = (
-    {
-        "kf_id": ("i", ()),
-        "kf_timestamp_s": ("f", ()),
-        "kf_n_features": ("i", ()),
-        "kf_T_submap_kf": ("f", (4, 4)),
-    },
+    {"kf_id": ("i", ()), "kf_timestamp_s": ("f", ()), "kf_n_features": ("i", ()), "kf_T_submap_kf": ("f", (4, 4))},
     {"anchor_id": ("i", ()), "anchor_kf": ("i", ()), "anchor_T_kf_cam": ("f", (4, 4))},
     {
         "relative_id": ("i", ()),

@@ -13,14 +13,7 @@ from typing import Any
 
 from dualslam.core.errors import InputError
 from dualslam.core.types import FrameMethod, FrameStatus
-from dualslam.io.run_folder import (
-    FRAME_COLUMNS,
-    FRAMES,
-    SAMPLE_NAME,
-    SAMPLES,
-    SUMMARY,
-    files_named,
-)
+from dualslam.io.run_folder import FRAME_COLUMNS, FRAMES, SAMPLE_NAME, SAMPLES, SUMMARY, files_named
 from dualslam.io.trajectory_files import read_text
 from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameRow

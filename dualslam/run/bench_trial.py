@@ -19,13 +19,7 @@ from dualslam.io.atomic import write_text
 from dualslam.io.run_reading import read_frames
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.lab.audits.link_audit import audit_links
-from dualslam.lab.bench.measure import (
-    breakages,
-    end_point_error,
-    initialisation,
-    status_letters,
-    trajectory_error,
-)
+from dualslam.lab.bench.measure import breakages, end_point_error, initialisation, status_letters, trajectory_error
 from dualslam.lab.bench.plan import SourceInfo, Trial
 from dualslam.lab.bench.record import LinkError, TrialOutcome, TrialRecord, blank_record
 from dualslam.lab.bench.run import trial_folder

@@ -380,11 +380,7 @@ def _compared(folder: RunFolder, replay: Path, recorded: Recorded) -> dict[str, 
 
 
 def check_out(
-    out: str | Path,
-    *,
-    overwrite: bool = False,
-    saved_map: str | Path | None = None,
-    replay: str | Path | None = None,
+    out: str | Path, *, overwrite: bool = False, saved_map: str | Path | None = None, replay: str | Path | None = None
 ) -> None:
     """Refuse a folder that a run must not write to. `run_to_folder` asks too: this is for who computes before it.
 
@@ -497,12 +493,7 @@ class _Watched:
     """A system whose frames are looked at: for sample pictures, and by who watches the run."""
 
     def __init__(
-        self,
-        system: System,
-        samples: SampleKeeper,
-        album: PlaceAlbum,
-        watcher: Watcher | None,
-        faults: ImageFaults,
+        self, system: System, samples: SampleKeeper, album: PlaceAlbum, watcher: Watcher | None, faults: ImageFaults
     ) -> None:
         self._system, self._samples, self._album, self._watcher = system, samples, album, watcher
         self._faults = faults

@@ -90,10 +90,7 @@ def open_source(
 
 
 def open_images_of_run(
-    source: str | Path,
-    size_px: tuple[int, int],
-    topic: str | None = None,
-    pictures: Mapping[int, bytes] | None = None,
+    source: str | Path, size_px: tuple[int, int], topic: str | None = None, pictures: Mapping[int, bytes] | None = None
 ) -> RecordedSequence | WorldSequence:
     """Open what a run was made of, in the size in which the run has read it.
 

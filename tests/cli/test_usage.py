@@ -82,10 +82,7 @@ def one_sentence(capsys: pytest.CaptureFixture[str]) -> str:
         ("config --frontend sift --set initialiser.matching=gms", "initialiser.matching: gms takes a front end with"),
         ("config --frontend obr", "--frontend obr: frontend.name: no front end is called 'obr', did you mean 'orb'?"),
         ("config --config typo.yaml", "typo.yaml: frontend.name: no front end is called 'obr'"),
-        (
-            "config --config typo.yaml --frontend orb --set recovery.attempts=[orbb]",
-            "--set recovery.attempts=[orbb]: ",
-        ),
+        ("config --config typo.yaml --frontend orb --set recovery.attempts=[orbb]", "--set recovery.attempts=[orbb]: "),
         ("config --config two.yaml", "two.yaml: line 2, column 1: a second document begins here"),
         ("config --set corruptions=[{kind:bluur}]", "corruptions[0]"),
         ("run synthetic:street,size=3 --fov 70 --out there", "no option 'size'"),

@@ -174,10 +174,7 @@ def test_fov_follows_its_formula() -> None:
     """r_d = atan(2 r tan(omega / 2)) / omega, written out."""
     p = np.array([[0.3, -0.4, 1.0]])
     radius = math.atan(2 * 0.5 * math.tan(0.5 * TUMMONO.omega)) / TUMMONO.omega
-    expected = [
-        TUMMONO.fx * 0.3 / 0.5 * radius + TUMMONO.cx,
-        TUMMONO.fy * -0.4 / 0.5 * radius + TUMMONO.cy,
-    ]
+    expected = [TUMMONO.fx * 0.3 / 0.5 * radius + TUMMONO.cx, TUMMONO.fy * -0.4 / 0.5 * radius + TUMMONO.cy]
     np.testing.assert_allclose(TUMMONO.project(p)[0], expected, atol=1e-9)
 
 

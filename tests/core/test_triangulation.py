@@ -8,12 +8,7 @@ from scipy.optimize import least_squares
 
 from dualslam.core.geometry import se3
 from dualslam.core.geometry.projection import project_points, projection_jacobians
-from dualslam.core.geometry.triangulation import (
-    in_front,
-    point_covariance,
-    triangulate_n_view,
-    triangulate_two_view,
-)
+from dualslam.core.geometry.triangulation import in_front, point_covariance, triangulate_n_view, triangulate_two_view
 from dualslam.testing.two_maps import K, two_views
 
 EXACT = 1e-9

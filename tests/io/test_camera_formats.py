@@ -12,13 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from dualslam.core.camera.models import (
-    DivisionCamera,
-    FovCamera,
-    KannalaBrandtCamera,
-    PinholeCamera,
-    RadTanCamera,
-)
+from dualslam.core.camera.models import DivisionCamera, FovCamera, KannalaBrandtCamera, PinholeCamera, RadTanCamera
 from dualslam.core.camera.sphere import DoubleSphereCamera, EucmCamera, OmniCamera
 from dualslam.core.errors import InputError
 from dualslam.io import read_camera_file

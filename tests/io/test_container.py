@@ -101,8 +101,7 @@ def test_what_is_no_focal_length_is_none(tmp_path: Path, value: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    "value",
-    [data(1, b"wide"), data(23, b"\0"), data(22, b"\xff" * 200), data(21, bytes(2**20)), box(b"data", b"\0\0")],
+    "value", [data(1, b"wide"), data(23, b"\0"), data(22, b"\xff" * 200), data(21, bytes(2**20)), box(b"data", b"\0\0")]
 )
 def test_one_that_cannot_be_read_is_passed_over(tmp_path: Path, value: bytes) -> None:
     """In the film, in a track, or beside another value of the same name."""

@@ -220,14 +220,8 @@ def change_array(path: Path, name: str, change: Callable[[NDArray[Any]], NDArray
         ),
         (lambda at: change_json(at / "map.json", lambda d: d["metadata"].update(link_keyframes=[[[]]])), "damaged"),
         (lambda at: change_json(at / "map.json", lambda d: d["metadata"].pop("link_kinds")), "'link_kinds' is missing"),
-        (
-            lambda at: change_array(at / "links.npz", "ab", lambda a: a + 5),
-            "submaps 9 and 10, of which one",
-        ),
-        (
-            lambda at: change_array(at / "links.npz", "S_a_b", np.zeros_like),
-            "a matrix that is no transform",
-        ),
+        (lambda at: change_array(at / "links.npz", "ab", lambda a: a + 5), "submaps 9 and 10, of which one"),
+        (lambda at: change_array(at / "links.npz", "S_a_b", np.zeros_like), "a matrix that is no transform"),
         (lambda at: change_array(at / "links.npz", "S_a_b", lambda a: a[None]), "S_a_b is of shape"),
         (lambda at: change_array(at / "frames.npz", "index", lambda a: a.astype(str)), "index is of type"),
         (lambda at: change_array(at / "frames.npz", "T_kf_cam", lambda a: a * np.nan), "number that is not finite"),
@@ -239,10 +233,7 @@ def change_array(path: Path, name: str, change: Callable[[NDArray[Any]], NDArray
             lambda at: change_array(at / "submap_04.npz", "kf_n_features", lambda a: a * np.nan),
             "kf_n_features is of type",
         ),
-        (
-            lambda at: (at / "submap_05.npz").write_bytes(b"x" * 400),
-            "submap_05.npz is no map file",
-        ),
+        (lambda at: (at / "submap_05.npz").write_bytes(b"x" * 400), "submap_05.npz is no map file"),
     ],
 )
 def test_a_saved_map_that_was_edited_is_refused_in_one_sentence(

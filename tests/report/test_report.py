@@ -353,20 +353,10 @@ def test_a_folder_that_is_no_run_is_bad_input(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "old", "new", "words"),
     [
-        (
-            "frames.csv",
-            r"(?s)(submap,.*?\n)(.*\n){5}",
-            r"\1",
-            r"trajectory\.txt has a pose at .* has no frame",
-        ),
+        ("frames.csv", r"(?s)(submap,.*?\n)(.*\n){5}", r"\1", r"trajectory\.txt has a pose at .* has no frame"),
         ("frames.csv", r"(?s)\n.*", "\n", r"frames\.csv has no frame"),
         ("frames.csv", r",\d+\.\d{3},", ",inf,", "line 2: not a row of frames.csv .inf is no finite number"),
-        (
-            "summary.json",
-            r'"coverage": [\d.]+',
-            '"coverage": "all"',
-            "coverage is not a number",
-        ),
+        ("summary.json", r'"coverage": [\d.]+', '"coverage": "all"', "coverage is not a number"),
         ("summary.json", r'"first_id": \d+', '"first_id": null', "first_id is not a whole number"),
         ("events.jsonl", r'"frame": \d+', '"frame": []', "line 1: frame is not a whole number"),
         ("events.jsonl", r'"frame": \d+, ', "", "an event has no frame or no time"),

@@ -123,11 +123,7 @@ class CorrectedCamera(Camera):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers and names, for YAML or JSON."""
-        return {
-            "model": self.model,
-            "base": self.base.to_dict(),
-            "correction": dataclasses.asdict(self.correction),
-        }
+        return {"model": self.model, "base": self.base.to_dict(), "correction": dataclasses.asdict(self.correction)}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:

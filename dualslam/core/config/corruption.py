@@ -25,19 +25,9 @@ class CorruptionKind(StrEnum):
         return kind
 
     WIPE = "wipe", 1.0, 0.0, 1.0  # fog, or a blank wall before the lens: texture fades to flat shade (fraction)
-    OCCLUSION = (
-        "occlusion",
-        0.4,
-        0.0,
-        1.0,
-    )  # something textured moves through the image (fraction that it hides)
+    OCCLUSION = "occlusion", 0.4, 0.0, 1.0  # something textured moves through the image (fraction that it hides)
     BLUR = "blur", 5.0, 0.0, 100.0  # out of focus (standard deviation in pixels of a 640 pixels wide image)
-    MOTION_BLUR = (
-        "motion_blur",
-        30.0,
-        0.0,
-        400.0,
-    )  # the camera shakes (pixels of a 640 pixels wide image)
+    MOTION_BLUR = "motion_blur", 30.0, 0.0, 400.0  # the camera shakes (pixels of a 640 pixels wide image)
     BLACKOUT = "blackout", 1.0, 0.0, 1.0  # the lens is covered (fraction of the light that is lost)
     EXPOSURE = "exposure", 2.5, -8.0, 8.0  # too bright or too dark (stops, positive is brighter)
     NOISE = "noise", 25.0, 0.0, 200.0  # sensor noise (standard deviation, grey levels)
@@ -45,31 +35,11 @@ class CorruptionKind(StrEnum):
     DROP = "drop", 1.0, 0.0, 1.0  # the frames do not arrive
     STRIDE = "stride", 3.0, 2.0, 1000.0  # one frame of so many arrives (their number)
     FEW_FEATURES = "few_features", 0.8, 0.0, 1.0  # the detector finds little (fraction of the features that is lost)
-    WRONG_POSE = (
-        "wrong_pose",
-        15.0,
-        0.0,
-        180.0,
-    )  # a wrong keyframe (degrees; moved by as much of the depth)
-    KILL_WORKER = (
-        "kill_worker",
-        1.0,
-        0.0,
-        1.0,
-    )  # the first recovery that starts in the frames loses its process
-    SOLVER_ERROR = (
-        "solver_error",
-        1.0,
-        0.0,
-        1.0,
-    )  # the live graph fails at the first keyframe of the frames
+    WRONG_POSE = "wrong_pose", 15.0, 0.0, 180.0  # a wrong keyframe (degrees; moved by as much of the depth)
+    KILL_WORKER = "kill_worker", 1.0, 0.0, 1.0  # the first recovery that starts in the frames loses its process
+    SOLVER_ERROR = "solver_error", 1.0, 0.0, 1.0  # the live graph fails at the first keyframe of the frames
     SHUTTER = "shutter", 1.0, 0.0, 4.0  # rendered worlds: the shutter stays open (fraction of the time between frames)
-    ROTATION = (
-        "rotation",
-        60.0,
-        -180.0,
-        180.0,
-    )  # rendered worlds: swung aside and back (degrees, positive to the right)
+    ROTATION = "rotation", 60.0, -180.0, 180.0  # rendered worlds: swung aside and back (degrees, right is +)
     FOCAL = "focal", 0.8, 0.1, 10.0  # the calibration's focal length is wrong (factor)
     RESOLUTION = "resolution", 0.5, 0.1, 10.0  # the calibration is that of images of another size (factor)
     NO_DISTORTION = "no_distortion", 1.0, 0.0, 1.0  # the calibration lacks the lens distortion
@@ -78,12 +48,7 @@ class CorruptionKind(StrEnum):
     CLOCK_REPEAT = "clock_repeat", 2.0, 2.0, 1000.0  # neighbouring frames share the time of their first (their number)
     CAB = "cab", 0.28, 0.01, 0.8  # a driver's cab about the windscreen stands still in the image (share of the image)
     BONNET = "bonnet", 0.15, 0.01, 0.4  # a car's bonnet stands still at the lower edge (share of the image)
-    BARS = (
-        "bars",
-        0.6,
-        0.01,
-        0.9,
-    )  # black bars left and right, as about an upright film (share of the image)
+    BARS = "bars", 0.6, 0.01, 0.9  # black bars left and right, as about an upright film (share of the image)
     LOGO = "logo", 0.02, 0.001, 0.2  # a logo in the upper right corner (share of the image)
     CLOCK = "clock", 0.01, 0.001, 0.1  # a clock in the lower left corner, whose digits change (share of the image)
 

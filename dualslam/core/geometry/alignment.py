@@ -163,11 +163,7 @@ def _best_refined(problem: _Sim3Problem, hypotheses: FloatArray, gate: float) ->
 
 
 def _ransac(
-    problem: _Sim3Problem,
-    rng: Generator,
-    gate: float,
-    max_hypotheses: int,
-    scale_bounds: tuple[float, float],
+    problem: _Sim3Problem, rng: Generator, gate: float, max_hypotheses: int, scale_bounds: tuple[float, float]
 ) -> tuple[FloatArray, int]:
     """Return the best few hypotheses (M, 4, 4), best first, by truncated cost (MSAC), and how many were tried."""
     n = len(problem.src)
