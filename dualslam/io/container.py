@@ -15,7 +15,7 @@ from typing import BinaryIO
 KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 PARENTS = (b"moov", b"trak", b"udta")
 """Boxes in which there may be a `meta`, within each other."""
-EDITS = (b"trak", b"edts", b"elst")
+HEAD, EDITS = (b"moov", b"mvhd"), (b"moov", b"trak", b"edts", b"elst")
 MAX_BOXES, MAX_DEPTH = 10_000, 4
 """In one file, and within each other: a broken one may hold any number."""
 MAX_BYTES = 2**20
@@ -33,12 +33,14 @@ def equivalent_focal_mm(path: Path) -> float | None:
     """
     try:
         with path.open("rb") as file:
-            size = file.seek(0, 2)
-            for found in _in_parents(_Boxes(file), 0, size):
-                if math.isfinite(found) and found > 0:
-                    return found
+            boxes = _Boxes(file)
+            for names, start, stop in boxes.walk(PARENTS):
+                if names[-1] == b"meta":
+                    for found in _in_meta(boxes, start, stop):
+                        if math.isfinite(found) and found > 0:
+                            return found
     except (OSError, struct.error):
-        return None
+        pass
     return None
 
 
@@ -50,24 +52,13 @@ def edited_s(path: Path) -> float | None:
     try:
         with path.open("rb") as file:
             boxes = _Boxes(file)
-            films = list(_inside(boxes, 0, file.seek(0, 2), (b"moov",)))
-            heads = [boxes.content(*at) for film in films for at in _inside(boxes, *film, (b"mvhd",))]
-            lists = [boxes.content(*at) for film in films for at in _inside(boxes, *film, EDITS)]
+            found = list(boxes.walk((b"moov", b"trak", b"edts")))
+            heads = [boxes.content(*at) for names, *at in found if names == HEAD]
+            lengths = [_edited_units(boxes.content(*at)) for names, *at in found if names == EDITS]
             units_s = struct.unpack_from(">I", heads[0], 20 if heads[0][0] else 12)[0] if heads else 0
-            lengths = [_edited_units(content) for content in lists]
     except (OSError, struct.error, IndexError):
         return None
     return max(lengths) / units_s if lengths and units_s else None
-
-
-def _inside(boxes: _Boxes, start: int, stop: int, names: tuple[bytes, ...]) -> Iterator[tuple[int, int]]:
-    """Yield where the content of each box is that lies in boxes of these names, one within the other."""
-    for name, first, end in boxes.within(start, stop):
-        if name == names[0]:
-            if len(names) == 1:
-                yield first, end
-            else:
-                yield from _inside(boxes, first, end, names[1:])
 
 
 def _edited_units(content: bytes) -> int:
@@ -82,8 +73,20 @@ class _Boxes:
     """The boxes of a file, of which none reaches out of the one that it is in."""
 
     def __init__(self, file: BinaryIO) -> None:
-        self.file = file
+        self._file = file
         self._left = MAX_BOXES
+
+    def walk(self, parents: tuple[bytes, ...]) -> Iterator[tuple[tuple[bytes, ...], int, int]]:
+        """Yield the names that lead to each box, and where its content is; only `parents` are looked into."""
+        yield from self._below((), 0, self._file.seek(0, 2), parents)
+
+    def _below(
+        self, above: tuple[bytes, ...], start: int, stop: int, parents: tuple[bytes, ...]
+    ) -> Iterator[tuple[tuple[bytes, ...], int, int]]:
+        for name, first, end in self.within(start, stop):
+            yield (*above, name), first, end
+            if name in parents and len(above) < MAX_DEPTH:
+                yield from self._below((*above, name), first, end, parents)
 
     def within(self, start: int, stop: int) -> Iterator[tuple[bytes, int, int]]:
         """Yield each box's name, and where its content starts and stops."""
@@ -105,16 +108,8 @@ class _Boxes:
         return self._read(start, stop - start) if 0 <= stop - start <= MAX_BYTES else b""
 
     def _read(self, start: int, size: int) -> bytes:
-        self.file.seek(start)
-        return self.file.read(size)
-
-
-def _in_parents(boxes: _Boxes, start: int, stop: int, depth: int = 0) -> Iterator[float]:
-    for name, inner, end in boxes.within(start, stop):
-        if name in PARENTS and depth < MAX_DEPTH:
-            yield from _in_parents(boxes, inner, end, depth + 1)
-        elif name == b"meta":
-            yield from _in_meta(boxes, inner, end)
+        self._file.seek(start)
+        return self._file.read(size)
 
 
 def _in_meta(boxes: _Boxes, start: int, stop: int) -> Iterator[float]:

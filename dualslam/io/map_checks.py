@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -64,7 +64,7 @@ def check_rows(arrays: Arrays, *groups: Rows) -> None:
             found = arrays[name]
             if found.dtype.kind != kind:
                 raise ValueError(f"{name} is of type {found.dtype}")
-            _check_shape(arrays, [name], (n, *shape))
+            _check_shape(arrays, name, (n, *shape))
             if not np.isfinite(found).all():
                 raise ValueError(f"{name} holds a number that is not finite")
             # By its volume: a similarity keeps the sense of turning, and its scale is above 0.
@@ -82,12 +82,13 @@ def check_submap(arrays: Arrays) -> None:
     fresh = Submap(0, np.eye(3), np.zeros_like(arrays["landmarks_descriptor"][:0]).reshape(-1)[:0])
     n_landmarks = _check_table(arrays, "landmarks_", fresh.landmarks, but="descriptor")
     _check_table(arrays, "observations_", fresh.observations)
-    _check_shape(arrays, ["K"], (3, 3))
+    _check_shape(arrays, "K", (3, 3))
     n_features = np.asarray(arrays["kf_n_features"], np.int64)
     if (n_features < 0).any():
         raise ValueError("kf_n_features is negative")
     features = [name for name in arrays if name.startswith("features_")]
-    _check_length(arrays, ["kf_landmark_of", *features], int(n_features.sum()))
+    for name in ("kf_landmark_of", *features):
+        _check_length(arrays, name, int(n_features.sum()))
     alive = np.asarray(arrays["landmarks_alive"], bool)
     for name, values in (
         *((name, arrays[name]) for name in features if name != "features_descriptors"),
@@ -121,24 +122,22 @@ def _check_table(arrays: Arrays, prefix: str, like: Table, but: str = "") -> int
     for name, column in columns.items():
         found = arrays[prefix + name]
         if name == but:
-            _check_length(arrays, [prefix + name], n)
+            _check_length(arrays, prefix + name, n)
         elif found.dtype.kind != column.dtype.kind:
             raise ValueError(f"{prefix + name} is of type {found.dtype}")
         else:
-            _check_shape(arrays, [prefix + name], (n, *column.shape[1:]))
+            _check_shape(arrays, prefix + name, (n, *column.shape[1:]))
     return n
 
 
-def _check_shape(arrays: Arrays, names: Iterable[str], shape: tuple[int, ...]) -> None:
-    for name in names:
-        if arrays[name].shape != shape:
-            raise ValueError(f"{name} is of shape {arrays[name].shape} where {shape} is due")
+def _check_shape(arrays: Arrays, name: str, shape: tuple[int, ...]) -> None:
+    if arrays[name].shape != shape:
+        raise ValueError(f"{name} is of shape {arrays[name].shape} where {shape} is due")
 
 
-def _check_length(arrays: Arrays, names: Iterable[str], n: int) -> None:
-    for name in names:
-        if arrays[name].ndim == 0 or len(arrays[name]) != n:
-            raise ValueError(f"{name} has {arrays[name].shape} entries where {n} are due")
+def _check_length(arrays: Arrays, name: str, n: int) -> None:
+    if arrays[name].ndim == 0 or len(arrays[name]) != n:
+        raise ValueError(f"{name} has {arrays[name].shape} entries where {n} are due")
 
 
 def _check_index(name: str, index: NDArray[Any], low: int, end: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,6 @@ LINKS, FRAMES, SUBMAP, SOLUTION = "links", "frames", "submap_", "solution"
 _OTHER = (LINKS, FRAMES, SOLUTION)
 _EARLIER_SURE = 0.025
 """Standard deviation of the scale up to which versions that did not save `is_sure` relied on a link."""
-_DAMAGE = (KeyError, ValueError, IndexError, TypeError, OverflowError)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,7 +123,7 @@ def load_atlas(folder: str | Path) -> StoredMap:
     """
     folder = _map_folder(folder)
     groups, metadata = load_map(folder)
-    try:
+    with _naming_damage(folder):
         atlas = Atlas()
         for name in sorted(groups.keys() - set(_OTHER)):
             atlas.add(submap_from_arrays(groups[name]))
@@ -136,8 +136,6 @@ def load_atlas(folder: str | Path) -> StoredMap:
         _check_frames(frames, atlas)
         poses = {index: FramePose(index, t, m, k, T_kf_cam) for index, t, m, k, T_kf_cam in rows}
         camera = _camera(metadata)
-    except _DAMAGE as error:
-        raise InputError(_damaged(folder, error)) from error
     return StoredMap(atlas, poses, camera, load_colours(folder))
 
 
@@ -148,10 +146,8 @@ def load_camera(folder: str | Path) -> Camera | None:
     """
     folder = _map_folder(folder)
     _, metadata = load_metadata(folder)
-    try:
+    with _naming_damage(folder):
         return _camera(metadata)
-    except _DAMAGE as error:
-        raise InputError(_damaged(folder, error)) from error
 
 
 def load_joints(folder: str | Path) -> tuple[list[int], Atlas]:
@@ -163,15 +159,13 @@ def load_joints(folder: str | Path) -> tuple[list[int], Atlas]:
     """
     folder = Path(folder)
     groups, metadata = load_metadata(folder)
-    try:
+    with _naming_damage(folder):
         ids = sorted(int(name.removeprefix(SUBMAP)) for name in groups if name not in _OTHER)
         files = array_files(folder)
         solution = load_arrays(files[SOLUTION]) if SOLUTION in groups else None
         atlas = Atlas()
         _join(atlas, ids, load_arrays(files[LINKS]), solution, metadata)
         return ids, atlas
-    except _DAMAGE as error:
-        raise InputError(_damaged(folder, error)) from error
 
 
 def _solution_arrays(atlas: Atlas) -> dict[str, NDArray[Any]]:
@@ -246,9 +240,16 @@ def _map_folder(folder: str | Path) -> Path:
     return own
 
 
-def _damaged(folder: Path, error: Exception) -> str:
-    problem = f"{error} is missing" if isinstance(error, KeyError) else str(error).rstrip(".")
-    return f"{folder} is no map of this version, or is damaged: {problem}. Give another map, or make it again."
+@contextmanager
+def _naming_damage(folder: Path) -> Iterator[None]:
+    """Say of arrays or metadata that do not fit together in which folder they are."""
+    try:
+        yield
+    except (KeyError, ValueError, IndexError, TypeError, OverflowError) as error:
+        problem = f"{error} is missing" if isinstance(error, KeyError) else str(error).rstrip(".")
+        raise InputError(
+            f"{folder} is no map of this version, or is damaged: {problem}. Give another map, or make it again."
+        ) from error
 
 
 def _camera(metadata: Mapping[str, Any]) -> Camera | None:

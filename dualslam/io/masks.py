@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from dualslam.core.errors import InputError
 from dualslam.core.interfaces import Sequence
-from dualslam.core.types import BoolArray, Frame
+from dualslam.core.types import BoolArray
+from dualslam.io.changed_frames import ChangedFrames
 from dualslam.io.images import list_images
 
 log = logging.getLogger(__name__)
@@ -41,11 +42,12 @@ def masked(sequence: Sequence, path: str | Path | None) -> Sequence:
     if where.is_dir():
         paths = _by_frame(sequence, where)
         read_mask(paths[min(paths)], sequence.camera.size_px)
-        return MaskedSequence(sequence, lambda index: read_mask(paths[index], sequence.camera.size_px))
+        size_px = sequence.camera.size_px
+        return ChangedFrames(sequence, lambda frame: replace(frame, hidden=read_mask(paths[frame.index], size_px)))
     mask = read_mask(where, sequence.camera.size_px)
     if not LIKELY[0] < mask.mean() < LIKELY[1]:
         log.warning("mask %s hides %.0f %% of the image: black is hidden, white is scene", where, 100 * mask.mean())
-    return MaskedSequence(sequence, lambda index: mask, mask)
+    return ChangedFrames(sequence, lambda frame: replace(frame, hidden=mask), hidden=mask)
 
 
 def read_mask(path: Path, size_px: tuple[int, int]) -> BoolArray:
@@ -108,39 +110,3 @@ def hidden_pixels(sequence: Sequence, found: BoolArray | None) -> BoolArray | No
     if given is None or found is None:
         return found if given is None else given
     return given | found
-
-
-class MaskedSequence:
-    """Frames of another sequence with their masks. All else about it is that sequence's.
-
-    - `mask_of`: returns what is hidden in the frame of an index.
-    - `hidden` (H, W) bool or None: the same, where it is the same in all frames.
-    """
-
-    def __init__(
-        self, sequence: Sequence, mask_of: Callable[[int], BoolArray], hidden: BoolArray | None = None
-    ) -> None:
-        self.hidden = hidden
-        self._sequence = sequence
-        self._mask_of = mask_of
-        self.name = sequence.name
-        self.camera = sequence.camera
-        self.rate_hz = sequence.rate_hz
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        return getattr(self._sequence, name)
-
-    def __len__(self) -> int:
-        return len(self._sequence)
-
-    def __iter__(self) -> Iterator[Frame]:
-        frames = iter(self._sequence)
-        try:
-            for frame in frames:
-                yield frame if frame.image is None else replace(frame, hidden=self._mask_of(frame.index))
-        finally:
-            close = getattr(frames, "close", None)
-            if close is not None:
-                close()

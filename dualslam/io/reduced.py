@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,6 +12,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import ToldFocal
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import Frame
+from dualslam.io.changed_frames import ChangedFrames
 from dualslam.io.decoding import UnreadableImageError
 from dualslam.io.images import ImageReader, ImageStore
 
@@ -83,28 +82,15 @@ class _ReducedReader:
         self._reader.close()
 
 
-class ResizedFrames:
-    """The frames of a sequence, whole and in another size. What else it has is the sequence's.
+def resized_frames(sequence: Sequence, size_px: tuple[int, int]) -> Sequence:
+    """Return a sequence with its images, whole, in another size (width, height)."""
+    camera = sequence.camera.resized(*size_px)
 
-    `size_px` (width, height).
-    """
+    def resized(frame: Frame) -> Frame:
+        assert frame.image is not None
+        shrinks = frame.image.shape[1] > camera.width
+        interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+        image = cv2.resize(frame.image, camera.size_px, interpolation=interpolation)
+        return replace(frame, image=np.asarray(image, np.uint8))
 
-    def __init__(self, sequence: Sequence, size_px: tuple[int, int]) -> None:
-        self._sequence = sequence
-        self.camera = sequence.camera.resized(*size_px)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._sequence, name)
-
-    def __len__(self) -> int:
-        return len(self._sequence)
-
-    def __iter__(self) -> Iterator[Frame]:
-        for frame in self._sequence:
-            if frame.image is None:
-                yield frame
-                continue
-            shrinks = frame.image.shape[1] > self.camera.width
-            interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
-            image = cv2.resize(frame.image, self.camera.size_px, interpolation=interpolation)
-            yield replace(frame, image=np.asarray(image, np.uint8))
+    return ChangedFrames(sequence, resized, camera)

@@ -54,36 +54,12 @@ FRAME_COLUMNS = (
     *("sigma_position_rel", "sigma_scale", "method", "doubt"),
 )
 _FILES = (
-    TRAJECTORY,
-    TRAJECTORY_KITTI,
-    TRAJECTORY_KITTI_FRAMES,
-    FRAMES,
-    EVENTS,
-    DECISIONS,
-    SCHEDULE,
-    SUMMARY,
-    CONFIG,
-    REPORT,
-    MAP_PAGE,
-    GROUND_TRUTH,
-    MASK,
-    *METRIC_FILES,
-    *TRAJECTORIES_MERGED,
+    *(TRAJECTORY, TRAJECTORY_KITTI, TRAJECTORY_KITTI_FRAMES, FRAMES, EVENTS, DECISIONS, SCHEDULE, SUMMARY, CONFIG),
+    *(REPORT, MAP_PAGE, GROUND_TRUTH, MASK, *METRIC_FILES, *TRAJECTORIES_MERGED),
 )
 _RESULTS = (
-    CONFIG,
-    EVENTS,
-    DECISIONS,
-    SCHEDULE,
-    FRAMES,
-    TRAJECTORY,
-    f"{SUBMAPS}/",
-    SUMMARY,
-    GROUND_TRUTH,
-    MASK,
-    f"{MAP}/",
-    MAP_PAGE,
-    REPORT,
+    *(CONFIG, EVENTS, DECISIONS, SCHEDULE, FRAMES, TRAJECTORY, f"{SUBMAPS}/", SUMMARY, GROUND_TRUTH, MASK, f"{MAP}/"),
+    *(MAP_PAGE, REPORT),
 )
 """In the order in which they are listed for a person."""
 _NOT_OF_EVERY_RUN = frozenset({f"{SUBMAPS}/", GROUND_TRUTH, MASK, MAP_PAGE, DECISIONS})
@@ -123,8 +99,8 @@ class RunFolder:
 
     def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
         self.path = Path(path)
-        self._events: IO[str] | None = None
         self._lines: dict[str, IO[str]] = {}
+        """Files of lines that are open; the events' is as long as the folder is."""
         self._config: str | None = None
         self.n_events = 0
         check_vacant(self.path, overwrite=overwrite)
@@ -137,7 +113,7 @@ class RunFolder:
                 for file in _run_files(self.path):
                     if file.name != EVENTS:  # by which the next one knows that this is a run's folder
                         file.unlink()
-                self._events = self._open_events()
+                self._open(EVENTS)
             except OSError as e:
                 raise _not_writable(self.path, e) from e
             undo.pop_all()
@@ -161,26 +137,24 @@ class RunFolder:
         if self._config is not None and not (self.path / CONFIG).exists():
             log.warning("%s was removed while the run went on; its results are written again", self.path / CONFIG)
             write_text(self.path / CONFIG, self._config)
-        if self._events is not None and not (self.path / EVENTS).exists():
+        if EVENTS in self._lines and not (self.path / EVENTS).exists():
             with suppress(OSError):  # of the file that is gone
-                self._events.close()
+                self._lines[EVENTS].close()
             try:
                 self.path.mkdir(parents=True, exist_ok=True)
-                self._events, self.n_events = self._open_events(), 0
+                self._open(EVENTS)
             except OSError as e:
                 raise _not_writable(self.path, e) from e
-
-    def _open_events(self) -> IO[str]:
-        return (self.path / EVENTS).open("w", encoding="utf-8", newline="\n")
+            self.n_events = 0
 
     def append_event(self, event: Event) -> None:
         """Append an event to ``events.jsonl`` and flush it, so that a crash of the process cannot take it back."""
-        if self._events is None:
+        if EVENTS not in self._lines:
             raise OutputError(f"{self.path / EVENTS} is closed; events come before the end of the run.")
+        self._append(EVENTS, event.as_dict())
+        self.n_events += 1  # from here on it is in the buffer, and goes with the next one where the disk is full
         try:
-            self._events.write(json.dumps(to_plain(event.as_dict()), allow_nan=False) + "\n")
-            self.n_events += 1  # from here on it is in the buffer, and goes with the next one where the disk is full
-            self._events.flush()
+            self._lines[EVENTS].flush()
         except OSError as e:
             raise OutputError(f"{self.path / EVENTS} cannot be written: {e.strerror or e}.") from e
 
@@ -193,14 +167,17 @@ class RunFolder:
         self._append(DECISIONS, row)
 
     def _append(self, name: str, row: Mapping[str, Any]) -> None:
-        if self._events is None:
+        if EVENTS not in self._lines:
             return
         try:
-            if name not in self._lines:
-                self._lines[name] = (self.path / name).open("w", encoding="utf-8", newline="\n")
-            self._lines[name].write(json.dumps(to_plain(row), allow_nan=False) + "\n")
+            file = self._lines[name] if name in self._lines else self._open(name)
+            file.write(json.dumps(to_plain(row), allow_nan=False) + "\n")
         except OSError as e:
             raise OutputError(f"{self.path / name} cannot be written: {e.strerror or e}.") from e
+
+    def _open(self, name: str) -> IO[str]:
+        self._lines[name] = (self.path / name).open("w", encoding="utf-8", newline="\n")
+        return self._lines[name]
 
     def write_truth(self, truth: Trajectory) -> None:
         """Write the true poses that belong to the run's frames, so that the folder can be judged by itself."""
@@ -231,7 +208,13 @@ class RunFolder:
         main = record.main.in_time_order()
         write_tum(self.path / TRAJECTORY, main)
         write_kitti(self.path / TRAJECTORY_KITTI, main.T_world_cam, main.index, self.path / TRAJECTORY_KITTI_FRAMES)
-        self._write_unlinked(record.unlinked)
+        for submap_id, frames in record.unlinked.items():
+            write_tum(self.path / SUBMAPS / _submap_name(submap_id), frames.in_time_order())
+        # A submap that was written earlier in the run may be linked by now.
+        kept = set(map(_submap_name, record.unlinked))
+        for file in files_named(self.path / SUBMAPS, _SUBMAP_NAME):
+            if file.name not in kept:
+                file.unlink()
         self.write_summary(record.summary)
 
     def write_frames(self, rows: Iterable[FrameRow]) -> None:
@@ -253,17 +236,6 @@ class RunFolder:
         """Write ``summary.json``."""
         write_summary(self.path, summary)
 
-    def _write_unlinked(self, unlinked: Mapping[int, Trajectory]) -> None:
-        folder = self.path / SUBMAPS
-        for submap_id, frames in unlinked.items():
-            ordered = frames.in_time_order()
-            write_tum(folder / f"{submap_id:02d}.txt", ordered)
-        # A submap that was written earlier in the run may be linked by now.
-        kept = {f"{submap_id:02d}.txt" for submap_id in unlinked}
-        for file in files_named(folder, _SUBMAP_NAME):
-            if file.name not in kept:
-                file.unlink()
-
     def what_is_there(self) -> str:
         """Return a sentence on which results are written, and which are not: of a run that was cut off there."""
         is_there = {name: (self.path / name).exists() for name in _RESULTS}
@@ -276,8 +248,7 @@ class RunFolder:
 
     def close(self) -> None:
         """Close the files and let another run in; more than once does no harm."""
-        files = [file for file in (self._events, *self._lines.values()) if file is not None]
-        self._events, self._lines = None, {}
+        files, self._lines = list(self._lines.values()), {}
         try:
             for file in files:
                 file.close()
@@ -321,6 +292,10 @@ def check_vacant(path: Path, *, overwrite: bool) -> None:
 
 def _not_writable(path: Path, error: OSError) -> OutputError:
     return OutputError(f"{path} cannot be written to: {error.strerror or error}; choose another folder.")
+
+
+def _submap_name(submap_id: int) -> str:
+    return f"{submap_id:02d}.txt"
 
 
 def unlinked_submaps(run: str | Path) -> dict[int, Path]:

@@ -22,7 +22,7 @@ from dualslam.core.geometry.so3 import exp
 from dualslam.core.interfaces import Sequence
 from dualslam.core.types import FloatArray, Frame, Track
 from dualslam.io.map_store import StoredMap, load_atlas, load_camera
-from dualslam.io.reduced import ResizedFrames
+from dualslam.io.reduced import resized_frames
 
 log = logging.getLogger(__name__)
 
@@ -99,7 +99,7 @@ def in_size_of_map(sequence: Sequence, saved_map: str | Path) -> Sequence:
     if (width, height) == was or width * was[1] != height * was[0]:
         return sequence
     log.warning("%s: its images are resized to those of the map, %d x %d", sequence.name, width, height)
-    return ResizedFrames(sequence, (width, height))
+    return resized_frames(sequence, (width, height))
 
 
 def own_focal_px(camera: Camera) -> float:

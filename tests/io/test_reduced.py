@@ -13,7 +13,7 @@ import pytest
 from dualslam.core.camera.models import PinholeCamera, camera_from_fov
 from dualslam.core.types import Frame
 from dualslam.io import open_sequence
-from dualslam.io.reduced import MAX_SIDE_PX, ResizedFrames, reduced_camera, reduction
+from dualslam.io.reduced import MAX_SIDE_PX, reduced_camera, reduction, resized_frames
 
 CALIB = "50 52 20.5 14.5 43 31\n"
 
@@ -85,9 +85,10 @@ def test_frames_resized_show_the_same_rays(tmp_path: Path) -> None:
     frames = [Frame(0, 0.0, image), Frame(1, 0.1, None, "torn")]
     source = SimpleNamespace(name="walk", rate_hz=10.0, camera=camera_from_fov(32, 24, 60.0))
     source_class = type("Source", (SimpleNamespace,), {"__iter__": lambda _: iter(frames), "__len__": lambda _: 2})
-    sequence = ResizedFrames(source_class(**vars(source)), (64, 48))
+    sequence = resized_frames(source_class(**vars(source)), (64, 48))
     first, second = sequence
     assert (len(sequence), sequence.name, sequence.rate_hz) == (2, "walk", 10.0)
+    assert first.image is not None
     assert first.image.shape == (48, 64)
     assert first.image[20:28, 20:28].min() == 200
     assert second is frames[1]

@@ -183,9 +183,8 @@ class _Full(io.FileIO):
     def __init__(self, run: RunFolder) -> None:
         super().__init__(run.path / "events.jsonl", "w")
         self.full = True
-        assert run._events is not None
-        run._events.close()
-        run._events = io.TextIOWrapper(io.BufferedWriter(self), encoding="utf-8")
+        run._lines["events.jsonl"].close()
+        run._lines["events.jsonl"] = io.TextIOWrapper(io.BufferedWriter(self), encoding="utf-8")
 
     def write(self, data: Any, /) -> int:
         if self.full:
