@@ -12,6 +12,7 @@ from types import ModuleType
 
 import pytest
 
+import dualslam
 from dualslam.core.config.problems import all_paths
 from dualslam.core.config.settings import Config
 
@@ -46,6 +47,21 @@ def test_it_builds_and_asks_for_nothing_outside(site: Path) -> None:
     for page in pages:
         fetched = re.findall(r"<(?:script|link|img|iframe)\b[^>]*(?:src|href)=\"?([^\s\">]+)", page.read_text())
         assert not [url for url in fetched if re.match(r"(https?:)?//", url)]
+
+
+@pytest.mark.slow
+def test_the_script_of_the_dark_mode_finds_its_elements(site: Path) -> None:
+    named = re.findall(r"getElementById\('([\w-]+)'\)", (site / "js" / "darkmode.js").read_text())
+    assert named
+    page = (site / "index.html").read_text()
+    assert [name for name in named if not re.search(rf'id="?{name}\b', page)] == []
+
+
+def test_every_public_name_is_on_one_reference_page() -> None:
+    pages = [page.read_text() for page in (ROOT / "docs" / "reference").glob("*.md")]
+    shown = [name for page in pages for name in re.findall(r"^::: dualslam\.(\w+)$", page, re.MULTILINE)]
+    elsewhere = {"Config", "__version__"}  # the page of all settings; a string
+    assert sorted(shown) == sorted({*dualslam.__all__} - elsewhere)
 
 
 @pytest.mark.slow

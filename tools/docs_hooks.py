@@ -58,6 +58,11 @@ def on_post_build(config: Any, **_: Any) -> None:
     (folder / "search_index.js").write_text(f"const searchIndex = {index};\n", encoding="utf-8")
 
 
+def on_post_page(output: str, **_: Any) -> str:
+    """Add the two style sheets that the theme's dark mode switches: it fails without, and its own would be fetched."""
+    return output.replace("</head>", '<style id="hljs-light"></style><style id="hljs-dark"></style></head>', 1)
+
+
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Put the configuration in, and tokens instead of equations, which Markdown must not touch."""
     page.meta["equations"] = equations = []

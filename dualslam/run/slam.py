@@ -37,11 +37,6 @@ from dualslam.system.system import System
 class Slam:
     """Monocular SLAM, fed image by image.
 
-    >>> slam = dualslam.Slam(dualslam.Camera.read("calib.yaml"))  # doctest: +SKIP
-    >>> for image, t in frames:  # doctest: +SKIP
-    ...     r = slam.track(image, t)
-    >>> slam.save("runs/walk")  # doctest: +SKIP
-
     Parameters
     ----------
     camera : Camera, or path
@@ -63,6 +58,13 @@ class Slam:
     Raises
     ------
     InputError, ConfigError
+
+    Examples
+    --------
+    >>> slam = dualslam.Slam(dualslam.Camera.read("calib.yaml"))
+    >>> for image, t in frames:
+    ...     r = slam.track(image, t)
+    >>> slam.save("runs/walk")
     """
 
     def __init__(
