@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -50,27 +50,24 @@ def take_selection(args: argparse.Namespace) -> None:
 
 
 def _overrides(args: argparse.Namespace) -> list[Override]:
-    overrides = []
-    if getattr(args, "realtime", False):  # before --set, which may say otherwise
-        overrides.append(Override(("recovery", "workers"), 1, "--realtime"))
-    overrides += [Override.parse(text) for text in args.set]
-    if args.frontend is not None:
-        overrides.append(Override(("frontend", "name"), args.frontend, f"--frontend {args.frontend}"))
-    if args.seed is not None:
-        overrides.append(Override(("seed",), args.seed, f"--seed {args.seed}"))
-    if getattr(args, "inline", False):
-        overrides.append(Override(("recovery", "workers"), 0, "--inline"))
-    elif getattr(args, "workers", None) is not None:
-        overrides.append(Override(("recovery", "workers"), args.workers, f"--workers {args.workers}"))
-    mask: Path | None = getattr(args, "mask", None)
-    if mask is not None:
-        overrides.append(Override(("camera", "mask"), str(mask), f"--mask {mask}"))
-    corrupt: Path | None = getattr(args, "corrupt", None)
-    if corrupt is not None:
-        overrides.append(Override(("corruptions",), _read_corruptions(corrupt), f"--corrupt {corrupt}"))
-    if getattr(args, "no_recovery", False):
-        overrides.append(Override(("recovery", "enabled"), False, "--no-recovery"))
-    return overrides
+    def option(name: str, *path: str, value: Callable[[Any], Any] = lambda given: given) -> list[Override]:
+        given = getattr(args, name, None)
+        if given is None or given is False:
+            return []
+        words = f"--{name.replace('_', '-')}{'' if given is True else f' {given}'}"
+        return [Override(path, value(given), words)]
+
+    workers = "recovery", "workers"
+    return [
+        *option("realtime", *workers, value=lambda _: 1),  # before --set, which may say otherwise
+        *map(Override.parse, args.set),
+        *option("frontend", "frontend", "name"),
+        *option("seed", "seed"),
+        *(option("inline", *workers, value=lambda _: 0) or option("workers", *workers)),
+        *option("mask", "camera", "mask", value=str),
+        *option("corrupt", "corruptions", value=_read_corruptions),
+        *option("no_recovery", "recovery", "enabled", value=lambda _: False),
+    ]
 
 
 @contextmanager

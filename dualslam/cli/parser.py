@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn, TypeAlias
 
 from dualslam import __version__
 from dualslam.run.interrupts import held_back
@@ -74,6 +74,9 @@ class _Parser(argparse.ArgumentParser):
         return self
 
 
+Commands: TypeAlias = "argparse._SubParsersAction[_Parser]"
+
+
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Parse a command line; the result's `execute` is the function to call with it.
 
@@ -89,25 +92,15 @@ def _build_parser() -> _Parser:
     )
     parser.add_argument("--version", action="version", version=f"dualslam {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
-    _add_run(commands)
-    _add_eval(commands)
-    _add_compare(commands)
-    _add_explain(commands)
-    _add_view(commands)
-    _add_export(commands)
-    _add_scale(commands)
-    _add_measure(commands)
-    _add_merge(commands)
-    _add_render(commands)
-    _add_config(commands)
-    _add_demo(commands)
-    _add_bench(commands)
+    for add in (
+        *(_add_run, _add_eval, _add_compare, _add_explain, _add_view, _add_export, _add_scale, _add_measure),
+        *(_add_merge, _add_render, _add_config, _add_demo, _add_bench),
+    ):
+        add(commands)
     return parser
 
 
-def _command(
-    commands: argparse._SubParsersAction[_Parser], name: str, help_text: str
-) -> tuple[_Parser, argparse._ArgumentGroup]:
+def _command(commands: Commands, name: str, help_text: str) -> tuple[_Parser, argparse._ArgumentGroup]:
     parser = commands.add_parser(name, help=help_text, description=help_text, allow_abbrev=False)
     parser.set_defaults(execute=_late(name))
     talk = parser.add_argument_group("talk")
@@ -131,190 +124,188 @@ def _late(name: str) -> Callable[[argparse.Namespace], int]:
     return execute
 
 
-def _add_run(commands: argparse._SubParsersAction[_Parser]) -> None:
+def _value(
+    group: argparse._ActionsContainer,
+    name: str,
+    metavar: str,
+    help_text: str,
+    kind: Callable[[str], object] = str,
+    **options: Any,
+) -> None:
+    """Add an option or a positional that takes a value."""
+    group.add_argument(name, metavar=metavar, type=kind, help=help_text, **options)
+
+
+def _flag(group: argparse._ActionsContainer, name: str, help_text: str) -> None:
+    group.add_argument(name, action="store_true", help=help_text)
+
+
+def _add_run(commands: Commands) -> None:
     parser, talk = _command(commands, "run", "Run on a source of frames and write a run folder.")
-    parser.add_argument("source", metavar="SOURCE", type=_source, help=SOURCE_HELP)
-    parser.add_argument("--topic", metavar="NAME", help="topic of the images, where SOURCE is a bag of several")
+    _value(parser, "source", "SOURCE", SOURCE_HELP, _source)
+    _value(parser, "--topic", "NAME", "topic of the images, where SOURCE is a bag of several")
     _add_output(parser)
-    parser.add_argument("--decisions", action="store_true", help="write decisions.jsonl, which dualslam explain prints")
-    talk.add_argument("--profile", action="store_true", help="print where the time went, stage by stage")
+    _flag(parser, "--decisions", "write decisions.jsonl, which dualslam explain prints")
+    _flag(talk, "--profile", "print where the time went, stage by stage")
     _add_configuration(parser)
     _add_selection(parser)
-    parser.add_argument_group("failure lab").add_argument(
-        "--corrupt",
-        metavar="FILE",
-        type=_path,
-        help="YAML list of corruptions and faults for this run (corruptions), as - {kind: blur, start: 50, length: 9}",
-    )
+    lab = parser.add_argument_group("failure lab")
+    spoilt = "YAML list of corruptions and faults for this run (corruptions), as - {kind: blur, start: 50, length: 9}"
+    _value(lab, "--corrupt", "FILE", spoilt, _path)
     images = parser.add_argument_group("camera")
     camera = images.add_mutually_exclusive_group()
-    camera.add_argument("--camera", metavar="FILE", type=_path, help="calibration, instead of the source's own")
-    camera.add_argument(
-        "--fov",
-        metavar="DEGREES",
-        type=_angle,
-        help="field of view along the longer side of the images, without a calibration",
+    _value(camera, "--camera", "FILE", "calibration, instead of the source's own", _path)
+    _value(
+        camera, "--fov", "DEGREES", "field of view along the longer side of the images, without a calibration", _angle
     )
-    images.add_argument(
-        "--mask",
-        metavar="FILE",
-        type=_path,
-        help="image whose black pixels show no scene; or a folder with one for each frame (camera.mask)",
-    )
-    images.add_argument("--full-size", action="store_true", help="read images of more than 2048 pixels as they are")
+    mask = "image whose black pixels show no scene; or a folder with one for each frame (camera.mask)"
+    _value(images, "--mask", "FILE", mask, _path)
+    _flag(images, "--full-size", "read images of more than 2048 pixels as they are")
     clock = parser.add_argument_group("clock").add_mutually_exclusive_group()
-    clock.add_argument("--rate", metavar="HZ", type=_rate, help="frames a second, instead of the source's own times")
+    _value(clock, "--rate", "HZ", "frames a second, instead of the source's own times", _rate)
     clock.add_argument("--time-unit", choices=TIME_UNITS, help="unit of the source's own times; by default seconds")
     _add_measurements(parser)
     saved = parser.add_argument_group("saved map")
-    saved.add_argument(
-        "--map", metavar="DIR", type=_path, help="run folder whose map this run finds its frames in, and extends"
-    )
-    saved.add_argument("--localise", action="store_true", help="find poses in the map of --map, and add nothing to it")
+    _value(saved, "--map", "DIR", "run folder whose map this run finds its frames in, and extends", _path)
+    _flag(saved, "--localise", "find poses in the map of --map, and add nothing to it")
     mode = parser.add_argument_group("mode")
-    mode.add_argument(
-        "--realtime",
-        action="store_true",
-        help="frames come at the source's rate and are dropped when late; otherwise every frame, as fast as it goes",
-    )
-    mode.add_argument(
-        "--replay",
-        metavar="RUN",
-        type=_path,
-        help="repeat a run in one process, to the bit, by the schedule in its folder; SOURCE and --map as it had them",
-    )
-    mode.add_argument(
-        "--live",
-        metavar="PORT",
-        type=_port,
-        nargs="?",
-        const=0,
-        help="watch the run in a browser, on a port of this machine (a free one without a number)",
-    )
+    realtime = "frames come at the source's rate and are dropped when late; otherwise every frame, as fast as it goes"
+    _flag(mode, "--realtime", realtime)
+    replay = "repeat a run in one process, to the bit, by the schedule in its folder; SOURCE and --map as it had them"
+    _value(mode, "--replay", "RUN", replay, _path)
+    live = "watch the run in a browser, on a port of this machine (a free one without a number)"
+    _value(mode, "--live", "PORT", live, _port, nargs="?", const=0)
     processes = mode.add_mutually_exclusive_group()
-    processes.add_argument("--inline", action="store_true", help="one process, deterministic: --workers 0, the default")
-    processes.add_argument(
-        "--workers",
-        metavar="N",
-        type=_count,
-        help="processes for long background work, and one for its graph; --realtime: 1, and one for features",
-    )
+    _flag(processes, "--inline", "one process, deterministic: --workers 0, the default")
+    workers = "processes for long background work, and one for its graph; --realtime: 1, and one for features"
+    _value(processes, "--workers", "N", workers, _count)
 
 
-def _add_eval(commands: argparse._SubParsersAction[_Parser]) -> None:
+def _add_eval(commands: Commands) -> None:
     parser, _ = _command(commands, "eval", "Score a run against ground truth: coverage first, then ATE and RPE.")
-    parser.add_argument("run", metavar="RUN", type=_path, help="a run folder, or a trajectory in TUM format")
-    parser.add_argument("sequence", metavar="SEQUENCE", type=_source, help="the sequence with its ground truth")
-    parser.add_argument("--keyframes-only", action="store_true", help="the error of keyframes, besides all frames'")
-    parser.add_argument(
-        "--returns", action="store_true", help="the sequence ends where it began: an error that needs no ground truth"
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    _add_run_folder(parser, "a run folder, or a trajectory in TUM format")
+    _value(parser, "sequence", "SEQUENCE", "the sequence with its ground truth", _source)
+    _flag(parser, "--keyframes-only", "the error of keyframes, besides all frames'")
+    _flag(parser, "--returns", "the sequence ends where it began: an error that needs no ground truth")
+    _flag(parser, "--json", "print one JSON object")
     parser.add_argument("--time-unit", choices=TIME_UNITS, help="unit of the sequence's own times, as the run had it")
 
 
-def _add_compare(commands: argparse._SubParsersAction[_Parser]) -> None:
+def _add_compare(commands: Commands) -> None:
     parser, _ = _command(commands, "compare", "Put runs side by side: a table here, and a page with their pictures.")
-    parser.add_argument("runs", metavar="RUN", type=_path, nargs="+", help="run folders")
-    parser.add_argument(
-        "--out", metavar="FILE", type=_path, default=Path("compare.html"), help="page to write (default: compare.html)"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace the page that is there")
+    _value(parser, "runs", "RUN", "run folders", _path, nargs="+")
+    page = Path("compare.html")
+    _value(parser, "--out", "FILE", f"page to write (default: {page})", _path, default=page)
+    _flag(parser, "--overwrite", "replace the page that is there")
 
 
-def _add_explain(commands: argparse._SubParsersAction[_Parser]) -> None:
+def _add_explain(commands: Commands) -> None:
     parser, _ = _command(commands, "explain", "Print the decisions about a frame, with their numbers and thresholds.")
-    parser.add_argument("run", metavar="RUN", type=_path, help="a run folder; all decisions: of run --decisions")
-    parser.add_argument("--frame", metavar="N", type=_count, required=True, help="index of the frame in the source")
+    _add_run_folder(parser, "a run folder; all decisions: of run --decisions")
+    _value(parser, "--frame", "N", "index of the frame in the source", _count, required=True)
 
 
-def _add_view(commands: argparse._SubParsersAction[_Parser]) -> None:
+def _add_view(commands: Commands) -> None:
     parser, _ = _command(commands, "view", "Play a run in the Rerun viewer: camera, map, statuses, numbers, events.")
-    parser.add_argument("run", metavar="RUN", type=_path, help="a run folder")
-    parser.add_argument("--save", metavar="FILE", type=_path, help="write the recording (.rrd) instead of opening it")
-    parser.add_argument("--overwrite", action="store_true", help="replace the recording that is there")
+    _add_run_folder(parser)
+    _value(parser, "--save", "FILE", "write the recording (.rrd) instead of opening it", _path)
+    _flag(parser, "--overwrite", "replace the recording that is there")
 
 
-def _add_export(commands: argparse._SubParsersAction[_Parser]) -> None:
+def _add_export(commands: Commands) -> None:
     parser, _ = _command(commands, "export", "Write the map of a run in the format of another program.")
-    parser.add_argument("run", metavar="RUN", type=_path, help="a run folder")
-    parser.add_argument(
-        "--to", choices=EXPORTS, required=True, help="colmap and nerfstudio are folders, the others a file"
-    )
-    parser.add_argument("--out", metavar="PATH", type=_path, required=True, help="folder or file to write")
-    parser.add_argument("--overwrite", action="store_true", help="replace what is there")
-    parser.add_argument(
-        "--distance",
-        metavar=("FRAME", "FRAME", "METRES"),
-        nargs=3,
-        action=_Distance,
-        help="true distance between two frames: the export is in metres",
-    )
+    _add_run_folder(parser)
+    formats = "colmap and nerfstudio are folders, the others a file"
+    parser.add_argument("--to", choices=EXPORTS, required=True, help=formats)
+    _add_output(parser, "PATH", "folder or file to write")
+    _add_distance(parser, "true distance between two frames: the export is in metres")
     images = parser.add_argument_group("images")
-    images.add_argument("--images", metavar="SOURCE", help="what the run was made of, if it has moved since")
-    images.add_argument(
-        "--every", metavar="N", type=_positive, help="besides keyframes, every N-th frame that has a pose"
-    )
+    _value(images, "--images", "SOURCE", "what the run was made of, if it has moved since")
+    _value(images, "--every", "N", "besides keyframes, every N-th frame that has a pose", _positive)
 
 
-def _add_scale(commands: argparse._SubParsersAction[_Parser]) -> None:
+def _add_scale(commands: Commands) -> None:
     parser, _ = _command(commands, "scale", "Tell a map how long its unit is: its exports are in metres from then on.")
-    parser.add_argument("run", metavar="RUN", type=_path, help="a run folder")
+    _add_run_folder(parser)
     known = parser.add_mutually_exclusive_group(required=True)
-    known.add_argument(
-        "--distance",
-        metavar=("FRAME", "FRAME", "METRES"),
-        nargs=3,
-        action=_Distance,
-        help="true distance between two frames",
-    )
-    known.add_argument(
-        "--height", metavar="METRES", type=_length, help="of a level camera over the ground that it sees"
-    )
-    known.add_argument("--marker", metavar="METRES", type=_length, help="side of the black square of a marker")
-    parser.add_argument("--images", metavar="SOURCE", help="what the run was made of, to look for markers")
-    parser.add_argument(
-        "--dictionary", choices=DICTIONARIES, default=DICTIONARIES[0], help=f"of markers (default: {DICTIONARIES[0]})"
-    )
+    _add_distance(known, "true distance between two frames")
+    _value(known, "--height", "METRES", "of a level camera over the ground that it sees", _length)
+    _value(known, "--marker", "METRES", "side of the black square of a marker", _length)
+    _value(parser, "--images", "SOURCE", "what the run was made of, to look for markers")
+    usual = DICTIONARIES[0]
+    parser.add_argument("--dictionary", choices=DICTIONARIES, default=usual, help=f"of markers (default: {usual})")
 
 
-def _add_measurements(parser: argparse.ArgumentParser, required: bool = False) -> None:
-    group = parser.add_argument_group("measurements")
-    group.add_argument(
-        "--measurements",
-        metavar="FILE",
-        type=_path,
-        action="append",
-        default=[],
-        required=required,
-        help="GPS, odometry, gyroscope, ...: CSV, GPX, SRT, bag, folder of images with EXIF, oxts or imu0; repeatable",
-    )
-    group.add_argument("--sigma", metavar="X", type=_length, help="of files without sigmas: metres, or rad of an IMU")
-    group.add_argument(
-        "--clock-offset", metavar="SECONDS", type=float, default=0.0, help="added to the measurements' times"
-    )
-
-
-def _add_measure(commands: argparse._SubParsersAction[_Parser]) -> None:
+def _add_measure(commands: Commands) -> None:
     parser, _ = _command(commands, "measure", "Put the map of a run into the frame of measurements, in metres.")
-    parser.add_argument("run", metavar="RUN", type=_path, help="a run folder")
+    _add_run_folder(parser)
     _add_measurements(parser, required=True)
 
 
-def _add_merge(commands: argparse._SubParsersAction[_Parser]) -> None:
+def _add_merge(commands: Commands) -> None:
     parser, _ = _command(commands, "merge", "Join the maps of two runs that saw the same places.")
-    parser.add_argument("run_a", metavar="RUN_A", type=_path, help="a run folder")
-    parser.add_argument("run_b", metavar="RUN_B", type=_path, help="a run folder; it may be of another camera")
+    _value(parser, "run_a", "RUN_A", "a run folder", _path)
+    _value(parser, "run_b", "RUN_B", "a run folder; it may be of another camera", _path)
     _add_output(parser)
     _add_measurements(parser)
-    parser.add_argument(
-        "--measurements-b",
-        metavar="FILE",
-        type=_path,
-        action="append",
-        default=[],
-        help="as --measurements, on the clock of RUN_B; repeatable",
-    )
+    of_b = "as --measurements, on the clock of RUN_B; repeatable"
+    _value(parser, "--measurements-b", "FILE", of_b, _path, action="append", default=[])
+
+
+def _add_render(commands: Commands) -> None:
+    parser, _ = _command(commands, "render", "Render a synthetic world as a sequence folder with ground truth.")
+    parser.add_argument("world", metavar="WORLD", choices=WORLDS, help=", ".join(WORLDS))
+    _add_output(parser)
+    _value(parser, "--frames", "N", "how many (default: 300)", _positive, default=300)
+    _value(parser, "--seed", "N", "which world and path (default: 0)", _count, default=0)
+    _value(parser, "--events", "FILE", "YAML list of blur, black-out, ... to inject", _path)
+
+
+def _add_config(commands: Commands) -> None:
+    parser, _ = _command(commands, "config", "Print the resolved configuration with the meaning of every field.")
+    _add_configuration(parser)
+
+
+def _add_demo(commands: Commands) -> None:
+    parser, talk = _command(commands, "demo", "Lose track in a synthetic street: recovery off against on.")
+    _value(parser, "--out", "DIR", "default: runs/demo", _path, default=Path("runs/demo"))
+    _flag(parser, "--overwrite", "replace the runs that are there")
+    _value(parser, "--frames", "N", "how long a drive (default: 170)", _positive, default=170)
+    _flag(talk, "--profile", "print where the time went, stage by stage")
+    _add_fields(parser)
+
+
+def _add_bench(commands: Commands) -> None:
+    parser, _ = _command(commands, "bench", "Run trials of sequences, variants and corruptions, and write the tables.")
+    _value(parser, "spec", "SPEC", "YAML file, such as benchmarks/kitti.yaml", _path)
+    _value(parser, "--out", "DIR", "folder; a bench goes on there (default: runs/NAME)", _path)
+    _value(parser, "--data", "DIR", "folder in which the sequences of the bench are", _path)
+    _value(parser, "--only", "SEQUENCE", "this sequence; repeatable", action="append", default=[])
+    _value(parser, "--part", "PART", "this part; repeatable", action="append", default=[])
+    _value(parser, "--trials", "N", "of each sequence and condition, over the spec's", _positive)
+    _value(parser, "--limit", "N", "run N trials at most (0: only write the tables)", _count)
+    half = "trials to choose settings on, or trials to publish; they share no seed (default: the spec's, reporting)"
+    parser.add_argument("--half", choices=("development", "reporting"), help=half)
+    where = parser.add_mutually_exclusive_group()
+    _value(where, "--jobs", "N", "trials at the same time (default: one a CPU)", _positive)
+    _value(where, "--scheduler", "ADDRESS", "run the trials on the workers of this Dask scheduler")
+
+
+# --- what several commands have
+
+
+def _add_run_folder(parser: argparse.ArgumentParser, help_text: str = "a run folder") -> None:
+    _value(parser, "run", "RUN", help_text, _path)
+
+
+def _add_output(parser: argparse.ArgumentParser, metavar: str = "DIR", help_text: str = "folder to write") -> None:
+    _value(parser, "--out", metavar, help_text, _path, required=True)
+    _flag(parser, "--overwrite", "replace what is there")
+
+
+def _add_distance(group: argparse._ActionsContainer, help_text: str) -> None:
+    names = ("FRAME", "FRAME", "METRES")
+    group.add_argument("--distance", metavar=names, nargs=3, action=_Distance, help=help_text)
 
 
 class _Distance(argparse.Action):
@@ -327,92 +318,54 @@ class _Distance(argparse.Action):
             parser.error(f"argument {option_string}: give two frames and a distance in metres, as 10 250 3.2")
 
 
-def _add_render(commands: argparse._SubParsersAction[_Parser]) -> None:
-    parser, _ = _command(commands, "render", "Render a synthetic world as a sequence folder with ground truth.")
-    parser.add_argument("world", metavar="WORLD", choices=WORLDS, help=", ".join(WORLDS))
-    _add_output(parser)
-    parser.add_argument("--frames", metavar="N", type=_positive, default=300, help="how many (default: 300)")
-    parser.add_argument("--seed", metavar="N", type=_count, default=0, help="which world and path (default: 0)")
-    parser.add_argument("--events", metavar="FILE", type=_path, help="YAML list of blur, black-out, ... to inject")
-
-
-def _add_config(commands: argparse._SubParsersAction[_Parser]) -> None:
-    parser, _ = _command(commands, "config", "Print the resolved configuration with the meaning of every field.")
-    _add_configuration(parser)
-
-
-def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> None:
-    parser, talk = _command(commands, "demo", "Lose track in a synthetic street: recovery off against on.")
-    parser.add_argument("--out", metavar="DIR", type=_path, default=Path("runs/demo"), help="default: runs/demo")
-    parser.add_argument("--overwrite", action="store_true", help="replace the runs that are there")
-    parser.add_argument("--frames", metavar="N", type=_positive, default=170, help="how long a drive (default: 170)")
-    talk.add_argument("--profile", action="store_true", help="print where the time went, stage by stage")
-    _add_fields(parser)
-
-
-def _add_bench(commands: argparse._SubParsersAction[_Parser]) -> None:
-    parser, _ = _command(commands, "bench", "Run trials of sequences, variants and corruptions, and write the tables.")
-    parser.add_argument("spec", metavar="SPEC", type=_path, help="YAML file, such as benchmarks/kitti.yaml")
-    parser.add_argument("--out", metavar="DIR", type=_path, help="folder; a bench goes on there (default: runs/NAME)")
-    parser.add_argument("--data", metavar="DIR", type=_path, help="folder in which the sequences of the bench are")
-    parser.add_argument("--only", metavar="SEQUENCE", action="append", default=[], help="this sequence; repeatable")
-    parser.add_argument("--part", metavar="PART", action="append", default=[], help="this part; repeatable")
-    parser.add_argument("--trials", metavar="N", type=_positive, help="of each sequence and condition, over the spec's")
-    parser.add_argument("--limit", metavar="N", type=_count, help="run N trials at most (0: only write the tables)")
-    parser.add_argument(
-        "--half",
-        choices=("development", "reporting"),
-        help="trials to choose settings on, or trials to publish; they share no seed (default: the spec's, reporting)",
-    )
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--jobs", metavar="N", type=_positive, help="trials at the same time (default: one a CPU)")
-    where.add_argument("--scheduler", metavar="ADDRESS", help="run the trials on the workers of this Dask scheduler")
-
-
-def _add_output(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", metavar="DIR", type=_path, required=True, help="folder to write")
-    parser.add_argument("--overwrite", action="store_true", help="replace what is there")
+def _add_measurements(parser: argparse.ArgumentParser, required: bool = False) -> None:
+    group = parser.add_argument_group("measurements")
+    files = "GPS, odometry, gyroscope, ...: CSV, GPX, SRT, bag, folder of images with EXIF, oxts or imu0; repeatable"
+    _value(group, "--measurements", "FILE", files, _path, action="append", default=[], required=required)
+    _value(group, "--sigma", "X", "of files without sigmas: metres, or rad of an IMU", _length)
+    _value(group, "--clock-offset", "SECONDS", "added to the measurements' times", float, default=0.0)
 
 
 def _add_configuration(parser: argparse.ArgumentParser) -> None:
-    group = _add_fields(parser)
-    group.add_argument("--no-recovery", action="store_true", help="do not link the maps before and after a failure")
+    _flag(_add_fields(parser), "--no-recovery", "do not link the maps before and after a failure")
 
 
 def _add_fields(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     group = parser.add_argument_group("configuration")
-    group.add_argument(
-        "--config", metavar="FILE", type=_path, help="YAML file; what it does not name keeps its default"
-    )
-    group.add_argument(
-        "--set", metavar="KEY.PATH=VALUE", action="append", default=[], help="set one field, over the file; repeatable"
-    )
-    group.add_argument("--frontend", metavar="NAME", help="which front end (frontend.name)")
-    group.add_argument("--seed", metavar="N", type=_count, help="seed of every random choice (seed)")
+    _value(group, "--config", "FILE", "YAML file; what it does not name keeps its default", _path)
+    set_help = "set one field, over the file; repeatable"
+    _value(group, "--set", "KEY.PATH=VALUE", set_help, action="append", default=[])
+    _value(group, "--frontend", "NAME", "which front end (frontend.name)")
+    _value(group, "--seed", "N", "seed of every random choice (seed)", _count)
     return group
 
 
 def _add_selection(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("which frames")
-    group.add_argument("--start", metavar="N", type=_count, default=0, help="first frame, counted from 0")
-    group.add_argument("--stride", metavar="N", type=_positive, default=1, help="take every N-th frame")
-    group.add_argument("--max-frames", metavar="N", type=_positive, help="at most so many")
-    group.add_argument("--reverse", action="store_true", help="read the same frames last to first")
+    _value(group, "--start", "N", "first frame, counted from 0", _count, default=0)
+    _value(group, "--stride", "N", "take every N-th frame", _positive, default=1)
+    _value(group, "--max-frames", "N", "at most so many", _positive)
+    _flag(group, "--reverse", "read the same frames last to first")
+
+
+# --- values
 
 
 def _path(text: str) -> Path:
-    if not text:
-        raise argparse.ArgumentTypeError("is empty; name a file or a folder")
-    return Path(text)
+    return Path(_named(text, "a file or a folder"))
 
 
 def _source(text: str) -> str:
+    return _named(text, "a folder, a video file or another source")
+
+
+def _named(text: str, what: str) -> str:
     if not text:
-        raise argparse.ArgumentTypeError("is empty; name a folder, a video file or another source")
+        raise argparse.ArgumentTypeError(f"is empty; name {what}")
     return text
 
 
-def _integer(text: str, at_least: int) -> int:
+def _count(text: str, at_least: int = 0) -> int:
     try:
         value = int(text)
     except ValueError:
@@ -422,19 +375,15 @@ def _integer(text: str, at_least: int) -> int:
     return value
 
 
-def _count(text: str) -> int:
-    return _integer(text, 0)
+def _positive(text: str) -> int:
+    return _count(text, 1)
 
 
 def _port(text: str) -> int:
-    port = _integer(text, 0)
+    port = _count(text)
     if port > MAX_PORT:
         raise argparse.ArgumentTypeError(f"{text!r} is no port: they end at {MAX_PORT}")
     return port
-
-
-def _positive(text: str) -> int:
-    return _integer(text, 1)
 
 
 def _number(text: str, low: float, high: float, kind: str) -> float:
