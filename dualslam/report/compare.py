@@ -14,7 +14,7 @@ from dualslam.core.types import Failure, FloatArray, FrameStatus
 from dualslam.report.canvas import Canvas
 from dualslam.report.markup import Markup, document, join, number, number_row, stretched, table, tag
 from dualslam.report.page import headline
-from dualslam.report.placement import Placed, align, extent, place, plane_from_above
+from dualslam.report.placement import Placed, align, extent, plane_from_above, position_errors
 from dualslam.report.run_data import PosedRows, RunData, read_run
 from dualslam.report.statuses import MEANING, WITHOUT_POSE, count, span, stretches
 from dualslam.report.timeline import curve, frame_ticks, lane, lane_values
@@ -39,20 +39,18 @@ def comparison_page(runs: Sequence[RunData | str | Path]) -> str:
 
     Raises `InputError` if a folder cannot be read as a run's (`read_run`).
     """
-    return _page([run if isinstance(run, RunData) else read_run(run) for run in runs])
-
-
-def _page(runs: Sequence[RunData]) -> str:
-    names = run_names(runs)
+    read = [run if isinstance(run, RunData) else read_run(run) for run in runs]
+    names = run_names(read)
     title = ", ".join(names)
-    leads = [tag("li", tag("b", name), f": {headline(run)}") for name, run in zip(names, runs, strict=True)]
+    leads = [tag("li", tag("b", name), f": {headline(run)}") for name, run in zip(names, read, strict=True)]
+    numbers, *rows = comparison_table(read)
     body = [
         tag("header", tag("h1", "Runs compared"), tag("ul", leads)),
-        tag("section", tag("h2", "Trajectories"), _overlay(runs, names)),
-        tag("section", tag("h2", "Every frame"), _strips(runs, names)),
-        _errors(runs, names),
-        tag("section", tag("h2", "Numbers"), _number_table(runs)),
-        tag("section", tag("h2", "Configuration"), _config_table(runs, names)),
+        tag("section", tag("h2", "Trajectories"), _overlay(read, names)),
+        tag("section", tag("h2", "Every frame"), _strips(read, names)),
+        _errors(read, names),
+        tag("section", tag("h2", "Numbers"), _side_by_side(numbers, rows)),
+        tag("section", tag("h2", "Configuration"), _config_table(read, names)),
     ]
     return document(f"{title} - dualslam comparison", body)
 
@@ -76,10 +74,6 @@ def run_names(runs: Sequence[RunData]) -> list[str]:
     return [f"{i} {run.name}" for i, run in enumerate(runs, 1)]
 
 
-def _share(s: dict[str, Any]) -> str:
-    return f"{100 * s.get('coverage', 0):.1f} %"
-
-
 def _plain(key: str) -> Callable[[dict[str, Any]], str]:
     return lambda s: str(s.get(key, "-"))
 
@@ -101,7 +95,7 @@ def _median_recovery(s: dict[str, Any]) -> str:
 
 MEASURES: tuple[Measure, ...] = (
     ("frames", _plain("frames")),
-    ("coverage", _share),
+    ("coverage", lambda s: f"{100 * s.get('coverage', 0):.1f} %"),
     ("failures", _plain("failures")),
     ("recoveries", _plain("recoveries")),
     ("recovery time (median)", _median_recovery),
@@ -152,7 +146,7 @@ def _overlay(runs: Sequence[RunData], names: Sequence[str]) -> Markup:
             canvas.line(placed.xyz[piece.start : piece.stop] @ axes.T, f"way run{i % N_STYLES}", names[i])
             for piece in stretches(np.cumsum(broken).tolist())
         ]
-    keys = [_run_key(i, names[i]) for i in overlay.placed]
+    keys = [tag("li", _sample(f"way run{i % N_STYLES}"), f" {names[i]}") for i in overlay.placed]
     if len(overlay.truth):
         keys.append(tag("li", _sample("truth"), " true path"))
     missing = [names[i] for i in range(len(runs)) if i not in overlay.placed]
@@ -210,12 +204,7 @@ def _on_rows_of(reference: RunData, run: RunData) -> PosedRows:
 
 def _errors(runs: Sequence[RunData], names: Sequence[str]) -> Markup | None:
     """Draw each run's position error over its frames, all to one scale; None where no run has a truth."""
-    errors = []
-    for run in runs:
-        error = np.full(len(run.rows), np.nan)
-        for placed in place(run).placed:
-            error[placed.row] = placed.error
-        errors.append(error)
+    errors = [position_errors(run) for run in runs]
     known = [error for error in errors if np.isfinite(error).any()]
     if not known:
         return None
@@ -266,11 +255,6 @@ def _strip_sample(status: FrameStatus) -> Markup:
     return tag("svg", rect, viewBox="0 0 30 14", aria_hidden="true")
 
 
-def _number_table(runs: Sequence[RunData]) -> Markup:
-    head, *rows = comparison_table(runs)
-    return _side_by_side(head, rows)
-
-
 def _config_table(runs: Sequence[RunData], names: Sequence[str]) -> Markup:
     flat = [dict(_flat(run.config)) for run in runs]
     fields = list(dict.fromkeys(name for config in flat for name in config))
@@ -294,10 +278,6 @@ def _flat(config: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     for name, value in config.items():
         found += _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else [(prefix + name, value)]
     return found
-
-
-def _run_key(i: int, name: str) -> Markup:
-    return tag("li", _sample(f"way run{i % N_STYLES}"), f" {name}")
 
 
 def _sample(cls: str) -> Markup:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from typing import Any
 
 from dualslam.core.types import FailureReason
 from dualslam.report.attempts import attempt_table, link_table
-from dualslam.report.markup import Markup, join, number, tag
+from dualslam.report.markup import Markup, join, number, picture, tag
 from dualslam.report.placement import PlacedRun, place
 from dualslam.report.run_data import RunData
 from dualslam.report.statuses import count
@@ -244,8 +243,7 @@ def _pictures(run: RunData, indices: Sequence[int], words: Mapping[int, str]) ->
         seen = f"{row.n_inliers} of {row.n_matches} landmarks agree" if row.n_matches else "no landmark matched"
         if role == "still no map" and row.submap is not None:
             seen = f"posed later ({row.status}): {seen}"
-        data = base64.b64encode(run.samples[i]).decode()
-        image = tag("img", src=f"data:image/jpeg;base64,{data}", alt=f"Frame {i}: {role or 'sample'}, {seen}")
+        image = picture(run.samples[i], f"Frame {i}: {role or 'sample'}, {seen}")
         figures.append(tag("figure", image, tag("figcaption", tag("b", f"{i} {role}"), " ", seen)))
     return tag("div", figures, cls="samples")
 

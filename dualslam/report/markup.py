@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import html
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
@@ -84,6 +85,12 @@ def stretched(width: float, height: float, shapes: object, description: str) -> 
         role="img",
         aria_label=description,
     )
+
+
+def picture(content: bytes, description: str, kind: str = "jpeg", **attributes: object) -> Markup:
+    """Return an image that is part of the page."""
+    source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+    return tag("img", src=source, alt=description, **attributes)
 
 
 def document(title: str, body: object) -> Markup:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +14,7 @@ from dualslam.report.atlas_table import atlas_section
 from dualslam.report.charts import beside_table, latency_histogram, pace_words, stage_table
 from dualslam.report.event_words import event_words
 from dualslam.report.failures import failures_section, stories, verdict
-from dualslam.report.markup import Markup, cards, document, duration, join, number, table, tag
+from dualslam.report.markup import Markup, cards, document, duration, join, number, picture, table, tag
 from dualslam.report.next_steps import camera_words, next_steps
 from dualslam.report.places import places_section
 from dualslam.report.run_data import RunData, read_run
@@ -42,19 +41,22 @@ def report_page(run: RunData | str | Path) -> str:
     if not isinstance(run, RunData):
         run = read_run(run)
     sequence = run.summary.get("sequence", run.name)
+    map_link = tag("p", tag("a", "Turn the map in three dimensions", href=MAP_PAGE), ", frame by frame.")
+    versions = ", ".join(f"{name} {version}" for name, version in (run.summary.get("versions") or {}).items())
+    footer = f"Run folder {run.name}, seed {run.summary.get('seed', 'to')}. {versions}."
     body = [
         _header(run, str(sequence)),
-        _section("Trajectory", [top_view(run), _map_link(run)]),
+        _section("Trajectory", [top_view(run), map_link if (run.path / MAP_PAGE).is_file() else None]),
         _section("What to do next", next_steps(run)),
         _section("Every frame", timeline(run)),
         _section("Failures and recoveries", failures_section(run)),
         _section("Trust", trust_section(run)),
-        _where_told("Places seen again", places_section(run)),
-        _where_told("Connections between submaps", atlas_section(run)),
+        _section("Places seen again", places_section(run)),
+        _section("Connections between submaps", atlas_section(run)),
         _section("Time", [pace_words(run), latency_histogram(run), stage_table(run), beside_table(run)]),
         _section("Configuration", _configuration(run)),
         _section("All events", _events(run)),
-        _footer(run),
+        tag("footer", tag("p", footer)),
     ]
     return document(f"{sequence} - dualslam report", body)
 
@@ -80,16 +82,6 @@ def _verdict(run: RunData) -> Markup | None:
     words = tag("p", tag("strong", f"Verdict: {told['level']}."), f" {VERDICTS[told['level']]}", cls="lead")
     reasons = [tag("p", f"⚠ {reason['text']}", cls="warning") for reason in told["reasons"]]
     return join([words, *reasons])
-
-
-def _map_link(run: RunData) -> Markup | None:
-    if not (run.path / MAP_PAGE).is_file():
-        return None
-    return tag("p", tag("a", "Turn the map in three dimensions", href=MAP_PAGE), ", frame by frame.")
-
-
-def _where_told(title: str, content: Markup | None) -> Markup | None:
-    return None if content is None else _section(title, content)
 
 
 def headline(run: RunData) -> str:
@@ -134,17 +126,15 @@ def _mask(run: RunData) -> Markup | None:
     words = (
         f"{share} of the image shows no scene and was left out (black): it stands still, or the run was given a mask."
     )
-    source = f"data:image/png;base64,{base64.b64encode(run.mask).decode()}"
-    image = tag("img", src=source, alt=f"Mask: {share} of the image is left out", width="240")
+    image = picture(run.mask, f"Mask: {share} of the image is left out", "png", width="240")
     return tag("figure", image, tag("figcaption", f"{words} {MASK} is ready for --mask.", cls="note"))
 
 
 def _warnings(run: RunData) -> Markup:
-    words = []
-    if run.summary.get("interrupted"):
-        words.append("This run was interrupted: the page shows what it had found by then.")
-    if run.summary.get("crashed"):
-        words.append("This run crashed: the page shows what it had found by then.")
+    ends = {"interrupted": "was interrupted", "crashed": "crashed"}
+    words = [
+        f"This run {end}: the page shows what it had found by then." for k, end in ends.items() if run.summary.get(k)
+    ]
     if run.events_of("camera_stands"):
         words.append("The camera stood still for a while, as something moved before it: no map was started of that.")
     unreadable, dropped = run.count(FrameStatus.UNREADABLE), run.count(FrameStatus.DROPPED)
@@ -201,8 +191,8 @@ def _tile(name: str, value: str, words: str) -> Markup:
     return tag("div", tag("dt", name), tag("dd", value), tag("dd", words, cls="note"))
 
 
-def _section(title: str, content: object) -> Markup:
-    return tag("section", tag("h2", title), content)
+def _section(title: str, content: object) -> Markup | None:
+    return None if content is None else tag("section", tag("h2", title), content)
 
 
 def _configuration(run: RunData) -> Markup:
@@ -246,9 +236,3 @@ def _events(run: RunData) -> Markup:
     if len(run.events) > MAX_EVENTS:
         words += f", of which the first {MAX_EVENTS} are here and all in {EVENTS}"
     return tag("details", tag("summary", words), cards(tuple(_EVENT_COLUMNS), rows, _EVENT_COLUMNS))
-
-
-def _footer(run: RunData) -> Markup:
-    versions = run.summary.get("versions") or {}
-    words = ", ".join(f"{name} {version}" for name, version in versions.items())
-    return tag("footer", tag("p", f"Run folder {run.name}, seed {run.summary.get('seed', 'to')}. {words}."))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -31,13 +31,13 @@ class PlacedRun:
     """All that one drawing shows, in one frame."""
 
     placed: list[Placed]  # the main map first, where there is one
-    apart: list[Placed]  # submaps that nothing places in this frame: each has a frame and a unit of its own
-    truth_row: IntArray  # (T,)
-    truth_xyz: FloatArray  # (T, 3)
-    points: FloatArray  # (P, 3)
-    unit: str  # ``m``, or empty where a monocular map's own unit is all there is
     down: FloatArray  # (3,): mean of the cameras' downward axes (as unit vectors)
-    note: str  # what was done to bring it all together
+    note: str = ""  # what was done to bring it all together
+    apart: Sequence[Placed] = ()  # submaps that nothing places in this frame: each has a frame and a unit of its own
+    truth_row: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))  # (T,)
+    truth_xyz: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (T, 3)
+    points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (P, 3)
+    unit: str = ""  # ``m``, or empty where a monocular map's own unit is all there is
 
 
 def place(run: RunData) -> PlacedRun:
@@ -48,7 +48,7 @@ def place(run: RunData) -> PlacedRun:
         apart = [_unplaced(m, posed) for m, posed in maps[1:]]
         placed = [_unplaced(m, posed) for m, posed in maps[:1]]
         down = run.main.T_map_cam[:, :3, 1].mean(axis=0) if len(run.main) else np.zeros(3)
-        return PlacedRun(placed, apart, *_no_truth(), run.points, "", down, "No ground truth: in the map's own unit.")
+        return PlacedRun(placed, down, "No ground truth: in the map's own unit.", apart, points=run.points)
     placed, apart, points = [], [], np.zeros((0, 3))
     for m, posed in maps:
         S_truth_map = align(posed, run.truth)
@@ -62,7 +62,15 @@ def place(run: RunData) -> PlacedRun:
     if apart:
         note += " A map with too little motion to be aligned is drawn apart."
     down = run.truth.T_map_cam[:, :3, 1].mean(axis=0)
-    return PlacedRun(placed, apart, run.truth.row, run.truth.xyz, points, "m", down, note)
+    return PlacedRun(placed, down, note, apart, run.truth.row, run.truth.xyz, points, "m")
+
+
+def position_errors(run: RunData) -> FloatArray:
+    """Return each row's distance (N,) from the true position, NaN where there is none."""
+    error = np.full(len(run.rows), np.nan)
+    for placed in place(run).placed:
+        error[placed.row] = placed.error
+    return error
 
 
 def align(posed: PosedRows, truth: PosedRows) -> FloatArray | Failure:
@@ -104,10 +112,6 @@ def _placed(submap: int | None, posed: PosedRows, S_truth_map: FloatArray, truth
 
 def _unplaced(submap: int | None, posed: PosedRows) -> Placed:
     return Placed(submap, posed.row, posed.xyz, np.full(len(posed), np.nan))
-
-
-def _no_truth() -> tuple[IntArray, FloatArray]:
-    return np.zeros(0, np.int64), np.zeros((0, 3))
 
 
 def extent(parts: Sequence[FloatArray]) -> FloatArray:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections import Counter
 from typing import Any
 
-from dualslam.report.markup import Markup, cards, join, number, tag
+from dualslam.report.markup import Markup, cards, join, number, picture, tag
 from dualslam.report.run_data import RunData
 from dualslam.report.samples import MAX_PLACES
 from dualslam.report.statuses import count
@@ -74,8 +73,7 @@ def _pictures(run: RunData, wanted: list[tuple[int, str]]) -> Markup:
         if nearest is None or abs(nearest - index) > NEAR_FRAMES:
             continue
         words = f"{nearest}" if nearest == index else f"{nearest}, near {index}"
-        data = base64.b64encode(run.samples[nearest]).decode()
-        image = tag("img", src=f"data:image/jpeg;base64,{data}", alt=f"Frame {words}: {role}")
+        image = picture(run.samples[nearest], f"Frame {words}: {role}")
         figures.append(tag("figure", image, tag("figcaption", tag("b", f"{words} {role}"))))
     return tag("div", figures, cls="samples") if figures else join(None)
 

@@ -99,6 +99,13 @@ class RunData:
         """Where each frame stands among the rows, by its index in the source."""
         return {row.index: i for i, row in enumerate(self.rows)}
 
+    @property
+    def losses(self) -> list[tuple[int, int, int]]:
+        """Number of each failure from 1 on, frame since which track was lost, and that frame's row if it has one."""
+        row_of = self.row_of
+        since = [event.get("lost_since", event["frame"]) for event in self.events_of("failed")]
+        return [(i, frame, row_of[frame]) for i, frame in enumerate(since, 1) if frame in row_of]
+
     def events_of(self, *kinds: str) -> list[dict[str, Any]]:
         """Return the events of some kinds, in order."""
         return [event for event in self.events if event.get("event") in kinds]

@@ -14,7 +14,7 @@ import numpy as np
 from dualslam.core.types import FloatArray, FrameStatus
 from dualslam.report.canvas import ticks
 from dualslam.report.markup import ROUNDING, Markup, coordinate, duration, number, stretched, tag
-from dualslam.report.placement import PlacedRun, place
+from dualslam.report.placement import position_errors
 from dualslam.report.run_data import RunData
 from dualslam.report.statuses import MEANING, count, span, stretches
 from dualslam.report.top_view import failure_letter
@@ -41,8 +41,7 @@ def timeline(run: RunData) -> Markup:
     if not run.rows:
         return tag("p", "The source gave no frame.", cls="empty")
     lanes = [*_status_lanes(run), _submap_lane(run), _event_lane(run), _inlier_lane(run)]
-    error = _error_lane(run, place(run))
-    lanes += [each for each in (error, _latency_lane(run), _axis(run)) if each is not None]
+    lanes += [each for each in (_error_lane(run), _latency_lane(run), _axis(run)) if each is not None]
     return tag("div", lanes, cls="lanes")
 
 
@@ -73,18 +72,21 @@ def _submap_lane(run: RunData) -> Markup:
         submap, in_main = owners[stretch.start]
         if submap is None:
             continue
-        where = "in the main map" if in_main else "not linked to the main map"
+        where, cls = ("in the main map", "owner") if in_main else ("not linked to the main map", "owner apart")
         frames = span(run.rows[stretch.start].index, run.rows[stretch.stop - 1].index)
-        shapes.append(_block(stretch.start, len(stretch), f"{frames}: submap {submap}, {where}", _owner_class(in_main)))
+        shapes.append(
+            _block(
+                stretch.start,
+                len(stretch),
+                f"{frames}: submap {submap}, {where}",
+                "owner" if in_main else "owner apart",
+            )
+        )
         if 100 * len(stretch) / n >= MIN_LABEL_PERCENT:
             centre = stretch.start + len(stretch) / 2
             words.append(_at(100 * centre / n, str(submap) if in_main else f"({submap})", "on-block"))
     note = "in brackets: not linked"
     return lane("submap", note if run.unlinked else "", stretched(n, 1, shapes, "Submap of each frame"), words)
-
-
-def _owner_class(in_main: bool) -> str:
-    return "owner" if in_main else "owner apart"
 
 
 def _event_lane(run: RunData) -> Markup:
@@ -95,10 +97,8 @@ def _event_lane(run: RunData) -> Markup:
             continue
         sign, cls, words = _MARKS[kind]
         marks.append(_at(_percent(run, row), sign, cls, f"frame {event['frame']}: {words}"))
-    for i, event in enumerate(run.events_of("failed"), 1):
-        row = row_of.get(event.get("lost_since", event["frame"]))
-        if row is not None:
-            marks.append(_at(_percent(run, row), failure_letter(i), "break", f"failure {i}, lost since here"))
+    for i, _, row in run.losses:
+        marks.append(_at(_percent(run, row), failure_letter(i), "break", f"failure {i}, lost since here"))
     return lane("events", "A failure, ○ new map, ◆ link, ↺ found again", tag("div", cls="empty-lane"), marks)
 
 
@@ -117,11 +117,9 @@ def _inlier_lane(run: RunData) -> Markup:
     return lane("landmarks", note, drawing, lane_values(number(top), "0"))
 
 
-def _error_lane(run: RunData, scene: PlacedRun) -> Markup | None:
+def _error_lane(run: RunData) -> Markup | None:
     """Draw the distance from the true position, where there is a truth."""
-    error = np.full(len(run.rows), np.nan)
-    for placed in scene.placed:
-        error[placed.row] = placed.error
+    error = position_errors(run)
     if not np.isfinite(error).any():
         return None
     top = float(np.nanmax(error))

@@ -31,14 +31,10 @@ def top_view(run: RunData) -> Markup:
         else []
     )
     for placed in scene.apart:
-        alone = PlacedRun([placed], [], *_nothing(), np.zeros((0, 3)), "", scene.down * 0, "")
+        alone = PlacedRun([placed], scene.down * 0)
         words = f"Submap {placed.submap}, not linked, in its own frame and unit: {count(len(placed.row), 'frame')}."
         parts.append(tag("figure", _drawing(run, alone, _axes(alone)), tag("figcaption", tag("p", words)), cls="apart"))
     return join(parts)
-
-
-def _nothing() -> tuple[np.ndarray, FloatArray]:
-    return np.zeros(0, np.int64), np.zeros((0, 3))
 
 
 def close_up(run: RunData, scene: PlacedRun, rows: tuple[int, int], marked: Sequence[int]) -> Markup | None:
@@ -161,14 +157,13 @@ def _breakages(run: RunData, scene: PlacedRun, canvas: Canvas, axes: FloatArray)
     xyz = np.concatenate([p.xyz for p in scene.placed])
     if len(scene.truth_row):  # there the loss itself has a place
         rows, xyz = scene.truth_row, scene.truth_xyz
-    marks, row_of = [], run.row_of
-    for i, event in enumerate(run.events_of("failed"), 1):
-        onset = row_of.get(event.get("lost_since", event["frame"]))
-        before = np.flatnonzero(rows <= onset) if onset is not None else np.zeros(0, np.int64)
+    marks = []
+    for i, frame, onset in run.losses:
+        before = np.flatnonzero(rows <= onset)
         if not len(before):
             continue
         at = before[np.argmax(rows[before])]
-        title = f"failure {i}: track lost at frame {event.get('lost_since', event['frame'])}"
+        title = f"failure {i}: track lost at frame {frame}"
         marks.append(canvas.label(xyz[at] @ axes.T, failure_letter(i), "break", title))
     return marks
 

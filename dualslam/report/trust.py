@@ -25,7 +25,11 @@ _DOUBTS = {
 
 def trust_section(run: RunData) -> Markup:
     """Return the words, the table of verdicts, and the strips of what is claimed."""
-    rows = [_row(event, *told) for event in run.events if (told := _told(event)) is not None]
+    rows = [
+        (str(event["frame"]), "-" if event.get("submap") is None else str(event["submap"]), *told)
+        for event in run.events
+        if (told := _told(event)) is not None
+    ]
     words = "A map is split where it loses its scale. Links, gaps and places with two explanations are not believed."
     verdicts = cards(_HEADS, rows) if rows else tag("p", "Nothing was doubted.", cls="empty")
     strips = (
@@ -60,11 +64,6 @@ def _told(event: dict[str, Any]) -> tuple[str, str] | None:
     if kind == "linked" and event.get("tries", 1) > 1:
         return "a link", f"believed at try {int(event['tries'])}"
     return None
-
-
-def _row(event: dict[str, Any], what: str, outcome: str) -> tuple[str, ...]:
-    submap = event.get("submap")
-    return str(event["frame"]), "-" if submap is None else str(submap), what, outcome
 
 
 def _strip(run: RunData, sigmas: list[float | None], name: str, note: str, threshold: float | None = None) -> Markup:
