@@ -74,14 +74,7 @@ def _submap_lane(run: RunData) -> Markup:
             continue
         where, cls = ("in the main map", "owner") if in_main else ("not linked to the main map", "owner apart")
         frames = span(run.rows[stretch.start].index, run.rows[stretch.stop - 1].index)
-        shapes.append(
-            _block(
-                stretch.start,
-                len(stretch),
-                f"{frames}: submap {submap}, {where}",
-                "owner" if in_main else "owner apart",
-            )
-        )
+        shapes.append(_block(stretch.start, len(stretch), f"{frames}: submap {submap}, {where}", cls))
         if 100 * len(stretch) / n >= MIN_LABEL_PERCENT:
             centre = stretch.start + len(stretch) / 2
             words.append(_at(100 * centre / n, str(submap) if in_main else f"({submap})", "on-block"))
