@@ -6,7 +6,7 @@ Nothing is recorded unless a run asks for it. `dualslam explain` prints the reco
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
@@ -44,13 +44,7 @@ class Gate:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the object that ``decisions.jsonl`` holds."""
-        return {
-            "name": self.name,
-            "value": self.value,
-            "sign": self.sign,
-            "threshold": self.threshold,
-            "passed": self.passed,
-        }
+        return {**asdict(self), "passed": self.passed}
 
 
 @dataclass(frozen=True, slots=True)

@@ -188,7 +188,3 @@ class FrontendChoice:
 
     name: str
     why: str
-
-    def as_dict(self) -> dict[str, str]:
-        """Return it as ``summary.json`` has it."""
-        return {"name": self.name, "why": self.why}

@@ -31,7 +31,11 @@ def keep_freed_memory() -> bool:
     return bool(mallopt(M_MMAP_THRESHOLD, LARGEST_BYTES) and mallopt(M_TRIM_THRESHOLD, KEPT_BYTES))
 
 
-def peak_rss_mb() -> float:
-    """Return the highest resident memory of this process since it started, mebibytes."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+def peak_rss_mb(with_children: bool = False) -> float:
+    """Return the highest resident memory of this process since it started, mebibytes.
+
+    `with_children`: and that of the largest of its children that have ended.
+    """
+    whose = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN) if with_children else (resource.RUSAGE_SELF,)
+    peak = sum(resource.getrusage(who).ru_maxrss for who in whose)
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10

@@ -9,10 +9,6 @@ import numpy as np
 from dualslam.core.types import BoolArray, FloatArray, IntArray
 
 
-def _no_index() -> IntArray:
-    return np.zeros(0, np.int64)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
     """Poses in time, N of them.
@@ -28,7 +24,7 @@ class Trajectory:
 
     timestamps_s: FloatArray
     T_world_cam: FloatArray
-    index: IntArray = field(default_factory=_no_index)
+    index: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
         if len(self.index) != len(self.timestamps_s):
@@ -37,11 +33,10 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.timestamps_s)
 
-    def take(self, rows: BoolArray) -> Trajectory:
-        """Return some of the poses."""
+    def take(self, rows: BoolArray | IntArray) -> Trajectory:
+        """Return some of the poses, by a mask or by their places in the list."""
         return Trajectory(self.timestamps_s[rows], self.T_world_cam[rows], self.index[rows])
 
     def in_time_order(self) -> Trajectory:
         """Return the same poses, ascending in time (a run may have read its frames backwards)."""
-        order = self.timestamps_s.argsort(kind="stable")
-        return Trajectory(self.timestamps_s[order], self.T_world_cam[order], self.index[order])
+        return self.take(self.timestamps_s.argsort(kind="stable"))

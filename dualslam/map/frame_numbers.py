@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
+from dualslam.core.decisions import Decision
 from dualslam.core.errors import InputError
+from dualslam.core.events import Event
 from dualslam.core.types import Frame
 
 FRAMES_IN_EVENTS = (
@@ -28,6 +30,9 @@ FRAMES_IN_EVENTS = (
     "torn",
 )
 """Fields of events, or of a part of one, that hold frames: one or a list. A number below 0 is a mark."""
+
+
+Told = TypeVar("Told", Event, Decision)
 
 
 class FrameNumbers:
@@ -85,6 +90,10 @@ class FrameNumbers:
     def index_of(self, number: int) -> int:
         """Return the index in the source of a frame; for one of a saved map what its number says, below 0."""
         return self._index_of.get(number, number - self.first_id)
+
+    def told(self, record: Told) -> Told:
+        """Return an event or a decision with all its frames by their index."""
+        return replace(record, frame=self.index_of(record.frame), data=self.in_source(record.data))
 
     def in_source(self, data: Mapping[str, Any]) -> dict[str, Any]:
         """Return an event's data with its frames by their index."""

@@ -7,14 +7,14 @@ import time
 import traceback
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Any
 
 from dualslam.core.config.files import config_from_dict
 from dualslam.core.errors import DualSlamError
 from dualslam.core.interfaces import Sequence
 from dualslam.core.memory import keep_freed_memory
 from dualslam.core.threads import limit_threads
-from dualslam.core.types import Failure, FloatArray, IntArray
+from dualslam.core.types import Failure
 from dualslam.io.atomic import write_text
 from dualslam.io.run_reading import read_frames
 from dualslam.io.trajectory_files import Trajectory
@@ -30,16 +30,6 @@ from dualslam.run.session import Outcome, run_to_folder
 from dualslam.run.sources import SYNTHETIC, open_source
 
 ERROR_LOG, TRIAL = "error.log", "trial.json"
-
-
-class _Recorded(Protocol):
-    """Ground truth of a sequence's frames."""
-
-    @property
-    def source_indices(self) -> IntArray: ...
-
-    @property
-    def frame_timestamps(self) -> FloatArray: ...
 
 
 class _TimedOutError(Exception):
@@ -119,7 +109,7 @@ def _measure(trial: Trial, folder: Path, sequence: Sequence, outcome: Outcome) -
     if truth is None:
         return record
     corruptions = config_from_dict(trial.config, trial.key).corruptions
-    source = cast(_Recorded, sequence)
+    source: Any = sequence  # recorded or rendered: it knows its frames
     frames = true_frames(source.source_indices, source.frame_timestamps, truth, corruptions)
     main = outcome.trajectories.main
     on_true_clock, known = frames.on_true_clock(main), frames.truth

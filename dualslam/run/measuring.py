@@ -15,6 +15,7 @@ from dualslam.atlas.atlas import Atlas, Link
 from dualslam.atlas.metric import MetricMap
 from dualslam.atlas.trajectory import FramePose
 from dualslam.build.parts import MetricParts
+from dualslam.core.columns import concatenate
 from dualslam.core.errors import InputError, SolverError
 from dualslam.core.metric_problem import MeasurementSource, MetricSolution, RowSource
 from dualslam.core.trajectory import Trajectory
@@ -155,7 +156,7 @@ def measure(
             covariance.append(placed[1])
             alone += component
     origin = next((s.origin for s in sources if s.origin is not None), None)
-    return Measured(_together(frames), np.concatenate(covariance), solution, alone, undone, origin)
+    return Measured(concatenate(frames), np.concatenate(covariance), solution, alone, undone, origin)
 
 
 def _place_alone(
@@ -179,14 +180,6 @@ def _place_alone(
     if solution.scale_sigma > MAX_SCALE_SIGMA or solution.rotation_sigma_rad > MAX_TURN_RAD:
         return None
     return metric.placed(solution), metric.covariances(solution)
-
-
-def _together(frames: Sequence[Trajectory]) -> Trajectory:
-    return Trajectory(
-        np.concatenate([t.timestamps_s for t in frames]),
-        np.concatenate([t.T_world_cam for t in frames]),
-        np.concatenate([t.index for t in frames]),
-    )
 
 
 def write_measured(folder: Path, measured: Measured, index_of: Mapping[int, int]) -> None:

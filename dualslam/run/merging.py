@@ -87,16 +87,12 @@ class _Run:
     def reasons(self) -> list[Reason]:
         """What its verdict says that cannot be judged without its images; about all of its frames."""
         verdict = self.summary.get("verdict") or {"reasons": []}
+        indices = [row.index for row in self.rows]
         return [
-            Reason(code, Level(verdict["level"]), f"{self.path.name}: {reason['text']}", *self._span)
+            Reason(code, Level(verdict["level"]), f"{self.path.name}: {reason['text']}", min(indices), max(indices))
             for reason in verdict["reasons"]
             if (code := ReasonCode(reason["code"])) not in JUDGED_ANEW
         ]
-
-    @property
-    def _span(self) -> tuple[int, int]:
-        indices = [row.index for row in self.rows]
-        return min(indices), max(indices)
 
     @property
     def n_frames(self) -> int:
@@ -167,7 +163,11 @@ def merge_runs(
         )
     finally:  # measurements that are refused leave the folder without them
         if (out / TRAJECTORY).is_file():
-            _write_apart(out, system, b.rows[0].index, shift_s)
+            main = trajectories_of(system).main
+            of_b = main.index >= b.rows[0].index
+            for name, rows, shift in zip(TRAJECTORIES_MERGED, (~of_b, of_b), (0.0, shift_s), strict=True):
+                own = main.take(rows)
+                write_tum(out / name, replace(own, timestamps_s=own.timestamps_s - shift).in_time_order())
     return system
 
 
@@ -201,15 +201,6 @@ def _check_joined(system: System, a: _Run, b: _Run) -> None:
     )
 
 
-def _write_apart(folder: Path, system: System, first_of_b: int, shift_s: float) -> None:
-    """Write the trajectories of both runs, each on its own clock."""
-    main = trajectories_of(system).main
-    of_b = main.index >= first_of_b
-    for name, rows, shift in zip(TRAJECTORIES_MERGED, (~of_b, of_b), (0.0, shift_s), strict=True):
-        own = main.take(rows)
-        write_tum(folder / name, replace(own, timestamps_s=own.timestamps_s - shift).in_time_order())
-
-
 def _report(runs: Sequence[_Run], wall_s: float, cpu_s: float) -> RunReport:
     """Return what both runs and their merging have cost."""
     rows = [row for run in runs for row in run.rows]
@@ -219,14 +210,9 @@ def _report(runs: Sequence[_Run], wall_s: float, cpu_s: float) -> RunReport:
         cpu_s += 1e-3 * run.summary.get("cpu_ms_per_frame", 0.0) * len(run.rows)
     return RunReport(
         n_frames=len(rows),
-        dropped=(),
         latencies_ms=latencies_ms,
         steps_ms=latencies_ms,
-        n_late=0,
         wall_s=wall_s,
         cpu_s=cpu_s,
         peak_rss_mb=peak_rss_mb(),
-        interrupted=False,
-        error=None,
-        bug=None,
     )

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 from dualslam.core.errors import InputError, OutputError
 from dualslam.core.interfaces import Sequence
+from dualslam.core.memory import peak_rss_mb
 from dualslam.core.schedule import Recorded
 from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult
@@ -42,21 +43,22 @@ class RunReport:
     """Cost and end of a run. The map itself stays in the system."""
 
     n_frames: int  # frames that the source gave, those dropped included
-    dropped: tuple[tuple[int, float], ...]
-    """tuple of (int, float): index and time of the frames that came too late to be looked at (`realtime`)."""
     latencies_ms: tuple[float, ...]
     """Of each frame that was looked at: in real time from the moment when it was due to its pose, waiting included (to
     the end of its step, where it has none). Else the wall time of its step."""
     steps_ms: tuple[float, ...]  # wall time of each step
-    n_late: int  # frames that the system was ready for only after their time (`realtime`)
     # From the first frame to the end; user and system time of this process and of the children that have ended.
     wall_s: float
     cpu_s: float
     peak_rss_mb: float
     """Highest resident memory of the process since it started, and of the largest of its children that have ended."""
-    interrupted: bool  # true where a signal ended the run early, its end too
-    error: InputError | OutputError | None  # what ended the source early, or kept its results from being written
-    bug: Exception | None
+    dropped: tuple[tuple[int, float], ...] = ()
+    """tuple of (int, float): index and time of the frames that came too late to be looked at (`realtime`)."""
+    n_late: int = 0  # frames that the system was ready for only after their time (`realtime`)
+    interrupted: bool = False  # true where a signal ended the run early, its end too
+    error: InputError | OutputError | None = None
+    """What ended the source early, or kept its results from being written."""
+    bug: Exception | None = None
     """What else was raised and ended the run: by the system, the source or `on_frame`, no property of the input."""
 
     @property
@@ -138,7 +140,7 @@ def run_sequence(
         n_late=schedule.n_late,
         wall_s=clock() - began,
         cpu_s=_cpu_s() - cpu_began,
-        peak_rss_mb=_peak_rss_mb(),
+        peak_rss_mb=peak_rss_mb(with_children=True),
         interrupted=interrupted or stop.left,
         error=steps.error,
         bug=steps.bug,
@@ -192,7 +194,7 @@ class _Steps:
         return True
 
     def _end(self, problem: Exception) -> None:
-        """Note what has ended the frames."""
+        """Note what has ended the frames; an error of the input, or of the output, is no bug."""
         if isinstance(problem, InputError | OutputError):
             self.error = problem
         else:
@@ -246,8 +248,3 @@ def _closing(frames: Iterator[Any]) -> Iterator[None]:
 def _cpu_s() -> float:
     usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(usage.ru_utime + usage.ru_stime for usage in usages)
-
-
-def _peak_rss_mb() -> float:
-    peak = sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10

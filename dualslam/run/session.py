@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from hashlib import sha256
 from itertools import islice
 from pathlib import Path
@@ -20,7 +19,6 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.config.files import dump_config
 from dualslam.core.config.settings import Config
-from dualslam.core.decisions import Decision
 from dualslam.core.errors import InputError, OutputError, SolverError
 from dualslam.core.events import EventKind
 from dualslam.core.interfaces import Sequence
@@ -38,7 +36,6 @@ from dualslam.io.sequence import RecordedSequence, Selection
 from dualslam.io.trajectory_files import Trajectory
 from dualslam.io.video import WebcamSequence
 from dualslam.lab.disturbances import corrupted
-from dualslam.map.frame_numbers import FrameNumbers
 from dualslam.map.frame_records import FrameResult
 from dualslam.report import PlaceAlbum, SampleKeeper, read_run, report_page
 from dualslam.run.front_end import with_frontend_chosen
@@ -197,7 +194,7 @@ def run_to_folder(
     may_look = isinstance(source, RecordedSequence | WorldSequence) and not realtime
     config, chosen = with_frontend_chosen(config, sequence if may_look else None, saved_map)
     if chosen is not None:
-        given["frontend_choice"] = chosen.as_dict()
+        given["frontend_choice"] = asdict(chosen)
         log.info("front end %s: %s", chosen.name, chosen.why)
     recorded = None if replay is None else Recorded.read(Path(replay) / SCHEDULE)
     colours: Colours = {}
@@ -222,7 +219,9 @@ def run_to_folder(
         if recorded is not None:
             warn_of_differences(recorded, origin)
         if decisions:
-            system.events.decisions.write = partial(_write_decision, system.numbers, folder)
+            system.events.decisions.write = lambda decision: folder.append_decision(
+                system.numbers.told(decision).as_dict()
+            )
 
         refusals = StartRefusals()
 
@@ -282,8 +281,7 @@ def run_to_folder(
                     raise
                 raise report.bug from error  # the map of a system that broke may be in pieces
     _raise_what_ended(report, interrupts, out)
-    if refused := summary.get("measurements", {}).get("refused"):
-        raise InputError(f"{refused} The run without measurements is in {out}.")
+    _raise_refused(summary, out)
     return Outcome(Path(out), summary, report, system, trajectories)
 
 
@@ -320,8 +318,7 @@ def save_system(
         if colours:
             save_colours(folder.map_path, colours)
         _write_pages(folder)
-    if refused := summary.get("measurements", {}).get("refused"):
-        raise InputError(f"{refused} The run without measurements is in {out}.")
+    _raise_refused(summary, out)
 
 
 class _Fed:
@@ -352,6 +349,11 @@ def _raise_what_ended(report: RunReport, interrupts: Interrupts, out: str | Path
         raise report.bug
     if report.error is not None:
         raise type(report.error)(f"{report.error} What was found until then is in {out}.")
+
+
+def _raise_refused(summary: Mapping[str, Any], out: str | Path) -> None:
+    if refused := summary.get("measurements", {}).get("refused"):
+        raise InputError(f"{refused} The run without measurements is in {out}.")
 
 
 def _origin(config: Config, given: dict[str, Any]) -> dict[str, Any]:
@@ -536,14 +538,6 @@ class _Watched:
         self._n_events = len(self._system.events)
 
 
-def _write_decision(numbers: FrameNumbers, folder: RunFolder, decision: Decision) -> None:
-    told = replace(decision, frame=numbers.index_of(decision.frame), data=numbers.in_source(decision.data))
-    folder.append_decision(told.as_dict())
-
-
 def _write_new_events(system: System, folder: RunFolder) -> None:
-    if len(system.events) > folder.n_events:
-        for event in islice(system.events, folder.n_events, None):
-            numbers = system.numbers
-            told = replace(event, frame=numbers.index_of(event.frame), data=numbers.in_source(event.data))
-            folder.append_event(told)
+    for event in islice(system.events, folder.n_events, None):
+        folder.append_event(system.numbers.told(event))

@@ -203,14 +203,9 @@ class Slam:
         latencies_ms = tuple(row.latency_ms for row in self.system.rows.values())
         return RunReport(
             n_frames=self._n_frames,
-            dropped=(),
             latencies_ms=latencies_ms,
             steps_ms=latencies_ms,
-            n_late=0,
             wall_s=time.perf_counter() - self._began,
             cpu_s=time.process_time() - self._cpu_began,
             peak_rss_mb=peak_rss_mb(),
-            interrupted=False,
-            error=None,
-            bug=None,
         )

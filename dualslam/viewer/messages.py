@@ -5,7 +5,7 @@ Made in the tracking thread: a message costs a millisecond or two, five times a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -175,7 +175,7 @@ class Teller:
         self._n_events += len(new)
 
         def words(event: Event) -> EventWords:
-            told = replace(event, frame=numbers.index_of(event.frame), data=numbers.in_source(event.data))
+            told = numbers.told(event)
             return EventWords(str(told.event), told.frame, told.submap, event_words(told.as_dict()))
 
         return tuple(map(words, new))

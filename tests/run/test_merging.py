@@ -32,7 +32,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         system = run(PointWorld(wall(), ring(N_LAP)[list(part)]))
         system.finish()
         zeros = (0.0,) * len(part)
-        report = RunReport(len(part), (), zeros, zeros, 0, 1.0, 1.0, 0.0, False, None, None)
+        report = RunReport(len(part), zeros, zeros, 1.0, 1.0, 0.0)
         save_system(system, Config(), CAMERA, report, folder / name)
     return {name: folder / name for name in RANGES}
 

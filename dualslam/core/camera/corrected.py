@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from dualslam.core.camera.base import Camera
+from dualslam.core.camera.base import Camera, lift, plane
 from dualslam.core.camera.models import camera_from_dict
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import distortion
@@ -61,7 +61,19 @@ class LensCorrection:
 
 
 @dataclass(frozen=True)
-class CorrectedCamera(Camera):
+class LayeredCamera(Camera):
+    """A camera upon another one, whose image it has: `width` to `cy` are those of `base`."""
+
+    base: Camera = None  # type: ignore[assignment]  # dataclass inheritance wants a default
+
+    @classmethod
+    def over(cls, base: Camera, *layer: Any) -> Self:
+        """Put a layer, the fields of the class itself, upon a camera."""
+        return cls(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base, *layer)
+
+
+@dataclass(frozen=True)
+class CorrectedCamera(LayeredCamera):
     """A camera whose rectified pixels are those of another, corrected. Made by `correct`.
 
     Attributes
@@ -72,7 +84,6 @@ class CorrectedCamera(Camera):
 
     model: ClassVar[str] = "corrected"
 
-    base: Camera = None  # type: ignore[assignment]  # dataclass inheritance wants a default
     correction: LensCorrection = LensCorrection()
 
     @classmethod
@@ -81,7 +92,7 @@ class CorrectedCamera(Camera):
 
         Raises `InputError` if the correction has no inverse somewhere in the image.
         """
-        return cls(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base, correction)
+        return cls.over(base, correction)
 
     @property
     def K(self) -> FloatArray:
@@ -119,7 +130,7 @@ class CorrectedCamera(Camera):
             du_px=self.correction.du_px * base.width / self.width,
             dv_px=self.correction.dv_px * base.height / self.height,
         )
-        return type(self)(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base, moved)
+        return self.over(base, moved)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers and names, for YAML or JSON."""
@@ -132,7 +143,7 @@ class CorrectedCamera(Camera):
             base, correction = camera_from_dict(values["base"]), LensCorrection(**values["correction"])
         except (KeyError, TypeError) as error:
             raise InputError(f"camera: a corrected camera needs 'base' and 'correction': {error}") from error
-        return cls(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base, correction)
+        return cls.over(base, correction)
 
     def _correct_shutter(self, rectified: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return true normalised coordinates (N, 2) of the base's rectified pixels, and the area ratio (N,)."""
@@ -142,18 +153,13 @@ class CorrectedCamera(Camera):
         return xy, np.asarray(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0], np.float64)
 
     def _distort(self, p_cam: FloatArray) -> FloatArray:
-        xy = p_cam[:, :2] / np.where(p_cam[:, 2] > 0, p_cam[:, 2], np.nan)[:, None]
-        xy = distortion.within_limit(xy, (self.correction.k1, self.correction.k2))
+        xy = distortion.within_limit(plane(p_cam), (self.correction.k1, self.correction.k2))
         base = self.base.K
-        plane = (self.correction.distort_px(base, xy) - base[:2, 2]) / (base[0, 0], base[1, 1])
-        return self.base._distort(np.concatenate([plane, np.ones((len(plane), 1))], 1))
+        return self.base._distort(lift((self.correction.distort_px(base, xy) - base[:2, 2]) / (base[0, 0], base[1, 1])))
 
     def _undistort(self, xy_distorted: FloatArray) -> FloatArray:
-        rays = self.base._undistort(xy_distorted)
-        base = self.base.K
-        plane = rays[:, :2] / np.where(rays[:, 2] > 0, rays[:, 2], np.nan)[:, None]
-        xy, _ = self._correct_shutter(plane * (base[0, 0], base[1, 1]) + base[:2, 2])
-        return np.concatenate([xy, np.ones((len(xy), 1))], 1)
+        base, xy = self.base.K, plane(self.base._undistort(xy_distorted))
+        return lift(self._correct_shutter(xy * (base[0, 0], base[1, 1]) + base[:2, 2])[0])
 
     def _area_ratio(self, xy: FloatArray) -> FloatArray:
         raise NotImplementedError("a corrected camera overrides rectify(), which is all that would ask")

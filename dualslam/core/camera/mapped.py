@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from dualslam.core.camera.base import Camera
-from dualslam.core.camera.corrected import given_camera
+from dualslam.core.camera.corrected import LayeredCamera, given_camera
 from dualslam.core.camera.models import camera_from_dict
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray
@@ -19,7 +19,7 @@ SAME_PX = 1.0
 
 
 @dataclass(frozen=True)
-class MappedCamera(Camera):
+class MappedCamera(LayeredCamera):
     """A camera whose rays are its own, and whose rectified pixels are those of a map. Made by `camera_for_map`.
 
     Attributes
@@ -30,14 +30,12 @@ class MappedCamera(Camera):
 
     model: ClassVar[str] = "mapped"
 
-    base: Camera = None  # type: ignore[assignment]  # dataclass inheritance wants a default
     map_K: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)  # fx, fy, cx, cy of the map's rectified pixels
 
     @classmethod
     def of(cls, base: Camera, K: FloatArray) -> MappedCamera:
         """Bring a camera to the rectified pixels of intrinsics (3, 3)."""
-        map_K = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-        return cls(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base, map_K)
+        return cls.over(base, (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])))
 
     @property
     def K(self) -> FloatArray:
@@ -69,8 +67,7 @@ class MappedCamera(Camera):
 
     def resized(self, width: int, height: int) -> Self:
         """Return the camera of the whole image resized to `width` x `height` pixels."""
-        base = self.base.resized(width, height)
-        return type(self)(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base, self.map_K)
+        return self.over(self.base.resized(width, height), self.map_K)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers and names, for YAML or JSON."""
@@ -83,7 +80,7 @@ class MappedCamera(Camera):
             base, (fx, fy, cx, cy) = camera_from_dict(values["base"]), (float(v) for v in values["map_K"])
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"camera: a mapped camera needs 'base' and four numbers 'map_K': {error}") from error
-        return cls(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base, (fx, fy, cx, cy))
+        return cls.over(base, (fx, fy, cx, cy))
 
     def _from_base(self) -> tuple[FloatArray, FloatArray]:
         """Return the factors (2,) and shifts (2,) from the base's rectified pixels to the map's."""
