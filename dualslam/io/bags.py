@@ -19,7 +19,7 @@ from dualslam.io.camera_keys import camera_of_mapping
 from dualslam.io.decoding import WHOLE, UnreadableImageError, decode, upper_eight, used_bits
 from dualslam.io.images import ImageReader, natural_key
 from dualslam.io.sequence import Given, Recording
-from dualslam.io.times import checked_times, resolve_times
+from dualslam.io.times import checked_times
 
 log = logging.getLogger(__name__)
 
@@ -68,11 +68,7 @@ def open_recording(path: Path, given: Given) -> Recording:
         log.warning("%s is cut off: %d images of %s are before the cut", path, len(messages), topic.name)
     images = BagImages(bag, topic, [place for _, place in messages])
     where = f"{path}, {topic.name}"
-    timestamps_s = images.stamps_s(np.array([time_ns for time_ns, _ in messages]))
-    if given.times is not None:
-        timestamps_s = resolve_times(given.times, len(messages), path)
-    else:
-        timestamps_s = checked_times(timestamps_s, where)
+    timestamps_s = checked_times(images.stamps_s(np.array([time_ns for time_ns, _ in messages])), where)
     info = _info_topic(bag, topic)
     camera = None if given.camera or info is None else _camera(bag, info, topic, f"{path}, {info.name}")
     calibration = "" if info is None else f"{path}, {info.name}"

@@ -14,7 +14,7 @@ from dualslam.io.camera_keys import camera_of_mapping
 from dualslam.io.camera_text import parse_yaml
 from dualslam.io.images import ImageFiles
 from dualslam.io.sequence import Given, Recording
-from dualslam.io.times import checked_times, listed_times, needed_file
+from dualslam.io.times import checked_times, needed_file
 from dualslam.io.trajectory_files import Trajectory, numbered_lines, read_text
 
 
@@ -41,7 +41,7 @@ def open_recording(folder: Path, given: Given) -> Recording:
     return Recording(
         name=mav0.resolve().parent.name,
         images=ImageFiles(paths),
-        timestamps_s=listed_times(given.times, times, listing),
+        timestamps_s=checked_times(times, str(listing)),
         camera=None if given.camera else camera_of_mapping(sensor, str(sensor_path)),
         ground_truth=truth,
         calibration=str(sensor_path),

@@ -11,7 +11,7 @@ from dualslam.core.types import FloatArray
 from dualslam.io.camera_files import read_camera_file
 from dualslam.io.images import IMAGE_SUFFIXES, ImageFiles, list_images
 from dualslam.io.sequence import Given, Recording, image_size
-from dualslam.io.times import NOMINAL_RATE_HZ, recorded_times, resolve_times, times_in_names
+from dualslam.io.times import NOMINAL_RATE_HZ, recorded_times, times_in_names
 from dualslam.io.trajectory_files import read_tum
 
 log = logging.getLogger(__name__)
@@ -28,12 +28,9 @@ def open_recording(folder: Path, given: Given) -> Recording:
     where = folder / "images" if (folder / "images").is_dir() else folder
     paths = list_images(where)
     clock = ""
-    if given.times is not None:
-        clock = "the given times" if not isinstance(given.times, str | Path) else str(given.times)
-        timestamps_s = resolve_times(given.times, len(paths), where)
-    elif times_path.exists():
+    if times_path.exists():
         clock = str(times_path)
-        timestamps_s, paths = recorded_times(None, times_path, paths)
+        timestamps_s, paths = recorded_times(times_path, paths, None)
     elif given.rate_hz is None and (named := times_in_names(paths)) is not None:
         log.warning("%s: its images are named by their times, which are taken", where)
         clock, timestamps_s = f"the names of the images in {where}", named

@@ -27,7 +27,7 @@ def open_recording(folder: Path, given: Given) -> Recording:
     """Open a sequence folder; the left grey camera (``image_0``) goes before the left colour one (``image_2``)."""
     number = next(c for c in _CAMERAS if (folder / f"image_{c}").is_dir())
     times_path, calib_path = folder / "times.txt", folder / "calib.txt"
-    timestamps_s, paths = recorded_times(given.times, times_path, list_images(folder / f"image_{number}"))
+    timestamps_s, paths = recorded_times(times_path, list_images(folder / f"image_{number}"), given.rate_hz)
     images = ImageFiles(paths)
     if not given.camera:
         needed_file(calib_path, "a camera file")

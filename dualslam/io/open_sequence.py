@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.models import camera_from_fov
@@ -54,7 +53,6 @@ def open_sequence(
     stride: int = 1,
     max_frames: int | None = None,
     reverse: bool = False,
-    times: str | Path | ArrayLike | None = None,
     rate_hz: float | None = None,
     time_unit: str | None = None,
     topic: str | None = None,
@@ -70,7 +68,6 @@ def open_sequence(
     - `start`, `stride`, `max_frames`: which frames: counted in the source, from `start`, every `stride`-th, at most
       `max_frames`.
     - `reverse`: read the same frames last to first. Their indices and timestamps stay what they are.
-    - `times`: times to use instead of the source's own, for each of its images.
     - `rate_hz`: frames a second, instead of the source's own times.
     - `time_unit`: of the source's own times. Where it is not given they must make the rate of a camera as seconds.
     - `topic`: of the images of a bag that has several.
@@ -87,14 +84,14 @@ def open_sequence(
     selection = Selection(start, stride, max_frames, reverse)
     if time_unit is not None and time_unit not in UNITS:
         raise InputError(f"The unit of the times is {time_unit!r}; it must be one of {', '.join(UNITS)}.")
-    given = Given(camera_file is not None or fov_degrees is not None, times, rate_hz, topic)
+    given = Given(camera_file is not None or fov_degrees is not None, rate_hz, topic)
     if video.is_live(source):
         if time_unit is not None:
             raise InputError(f"{source} is live and has times of its own; leave out the unit of the times.")
         name = str(source)
         device = int(name) if name.isdigit() else name
         of_file = None if camera_file is None else read_camera_file(camera_file)
-        return video.open_webcam(device, of_file, fov_degrees, selection, given, grey)
+        return video.open_webcam(device, of_file, fov_degrees, selection, rate_hz, grey)
     if topic is not None and not bags.has_topics(Path(str(source))):
         raise InputError(f"{source} is no bag, and has no topics; leave out the topic.")
     recording = _with_clock(_open_recording(Path(str(source)), given), rate_hz, time_unit)
@@ -120,7 +117,7 @@ def _open_recording(source: Path, given: Given) -> Recording:
     if source.is_file() and bags.is_bag_file(source):
         return bags.open_recording(source, given)
     if source.is_file():
-        return video.open_recording(source, given)
+        return video.open_recording(source)
     for known in FORMATS:
         if known.recognises(source):
             log.debug("%s: read as %s", source, known)

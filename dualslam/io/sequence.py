@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.camera.focal import ToldFocal
@@ -48,7 +47,6 @@ class Given:
     """Data that the caller supplies instead of the source."""
 
     camera: bool = False  # a camera file or a field of view was given
-    times: str | Path | ArrayLike | None = None  # a file of seconds, one a line, or the numbers
     rate_hz: float | None = None  # frames a second of a source that has no times, or none that are right
     topic: str | None = None  # of the images, where the source is a bag
 

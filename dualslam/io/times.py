@@ -23,6 +23,8 @@ RATE_HZ = (0.5, 1000.0)
 """Of a camera whose images overlap: slower, a walk moves metres between them; faster, no camera of images is."""
 LIKELY_HZ = (1.0, 500.0)
 """By which a unit is recognised."""
+RATE = "the rate of the frames (--rate HZ)"
+"""For messages."""
 EPOCH_S = (1e9, 4.1e9)
 """The years 2001 to 2099. In a smaller unit such times have 13 digits or more, which no other clock reaches soon."""
 
@@ -73,7 +75,7 @@ def in_seconds(times: FloatArray, where: str, unit: str | None) -> FloatArray:
     steps = np.diff(times)
     rate_hz = 1.0 / float(np.median(steps))
     likely = [u for u in UNITS if u != "s" and LIKELY_HZ[0] <= rate_hz / UNITS[u] <= LIKELY_HZ[1]]
-    say = "give the rate of the frames (--rate HZ), or the unit of the times (--time-unit"
+    say = f"give {RATE}, or the unit of the times (--time-unit"
     if not RATE_HZ[0] <= rate_hz <= RATE_HZ[1]:
         seem = f", but {rate_hz / UNITS[likely[0]]:.3g} Hz as {UNIT_NAMES[likely[0]]}" if likely else ""
         raise InputError(
@@ -107,20 +109,16 @@ def times_in_names(paths: list[Path]) -> FloatArray | None:
     return times if len(times) > 1 and (np.diff(times) > 0).all() else None
 
 
-def recorded_times(
-    given: str | Path | ArrayLike | None, path: Path, paths: list[Path]
-) -> tuple[FloatArray, list[Path]]:
-    """Return the times of a sequence's images, and the images with those that are lost.
+def recorded_times(path: Path, paths: list[Path], rate_hz: float | None) -> tuple[FloatArray, list[Path]]:
+    """Return the times of a sequence's images, by its file of seconds, and the images with those that are lost.
 
-    - `given`: the caller's own times; None: those of the sequence, a file of seconds.
-    - `path`: that file; its sequence cannot do without one.
+    `rate_hz`: of a sequence without the file; without either it is refused.
     """
-    folder = paths[0].parent
-    if given is not None:
-        return resolve_times(given, len(paths), folder), paths
-    times_s = read_times(needed_file(path, "a file of times"))
+    if rate_hz is not None and not path.exists():
+        return np.arange(len(paths)) / rate_hz, paths
+    times_s = read_times(needed_file(path, RATE))
     paths = fill_gaps(paths, len(times_s))
-    check_count(len(times_s), path, len(paths), folder)
+    check_count(len(times_s), path, len(paths), paths[0].parent)
     return times_s, paths
 
 
@@ -129,24 +127,6 @@ def needed_file(path: Path, instead: str) -> Path:
     if not path.exists():
         raise InputError(f"{path} does not exist; it belongs to the sequence: fetch it, or give {instead}.")
     return path
-
-
-def listed_times(given: str | Path | ArrayLike | None, times_s: list[float] | FloatArray, listing: Path) -> FloatArray:
-    """Return the caller's own times if there are any, else those that a listing of images has."""
-    if given is None:
-        return checked_times(times_s, str(listing))
-    return resolve_times(given, len(times_s), listing)
-
-
-def resolve_times(times: str | Path | ArrayLike, n_images: int, images: Path) -> FloatArray:
-    """Return the caller's own times (a file, or numbers) for `n_images` frames."""
-    if isinstance(times, str | Path):
-        where, found = str(times), read_times(Path(times))
-    else:
-        where = "the given times"
-        found = checked_times(times, where)
-    check_count(len(found), where, n_images, images)
-    return found
 
 
 def check_count(n_times: int, where: str | Path, n_images: int, images: Path) -> None:

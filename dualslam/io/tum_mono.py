@@ -12,7 +12,7 @@ from dualslam.core.types import FloatArray
 from dualslam.io.camera_files import read_tum_mono_camera
 from dualslam.io.images import ImageFiles, ImageStore, ZippedImages, list_images
 from dualslam.io.sequence import Given, Recording
-from dualslam.io.times import check_count, checked_times, needed_file, resolve_times
+from dualslam.io.times import RATE, check_count, checked_times, needed_file
 from dualslam.io.trajectory_files import Trajectory, numbered_lines, read_tum
 
 log = logging.getLogger(__name__)
@@ -32,11 +32,10 @@ def open_recording(folder: Path, given: Given) -> Recording:
     else:
         images, where = ZippedImages(folder / "images.zip"), folder / "images.zip"
     times_path, camera_path, truth_path = folder / "times.txt", folder / "camera.txt", folder / "groundtruthSync.txt"
-    exposure_s: FloatArray | None = None
-    if given.times is not None:
-        timestamps_s = resolve_times(given.times, len(images), where)
+    if given.rate_hz is not None and not times_path.exists():
+        timestamps_s, exposure_s = np.arange(len(images)) / given.rate_hz, None
     else:
-        timestamps_s, exposure_s = read_times_with_exposure(needed_file(times_path, "a file of times"))
+        timestamps_s, exposure_s = read_times_with_exposure(needed_file(times_path, RATE))
         check_count(len(timestamps_s), times_path, len(images), where)
     if not given.camera:
         needed_file(camera_path, "a camera file")

@@ -10,7 +10,7 @@ from dualslam.core.errors import InputError
 from dualslam.io.camera_files import radtan_camera
 from dualslam.io.images import ImageFiles
 from dualslam.io.sequence import Given, Recording
-from dualslam.io.times import listed_times
+from dualslam.io.times import checked_times
 from dualslam.io.trajectory_files import numbered_lines, read_tum
 
 # fx fy cx cy k1 k2 p1 p2 k3 of the colour cameras, 640 x 480, as the benchmark publishes them.
@@ -43,7 +43,7 @@ def open_recording(folder: Path, given: Given) -> Recording:
     return Recording(
         name=folder.resolve().name,
         images=ImageFiles(paths),
-        timestamps_s=listed_times(given.times, times, listing),
+        timestamps_s=checked_times(times, str(listing)),
         camera=None if given.camera else _camera(folder),
         ground_truth=read_tum(truth_path) if truth_path.exists() else None,
         calibration="the benchmark's calibration",

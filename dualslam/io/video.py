@@ -26,8 +26,8 @@ from dualslam.io.decoding import UnreadableImageError
 from dualslam.io.exif import is_likely, over_longer_side
 from dualslam.io.images import ImageReader
 from dualslam.io.read_ahead import read_ahead
-from dualslam.io.sequence import Given, Recording, Selection, camera_of_size
-from dualslam.io.times import NOMINAL_RATE_HZ, resolve_times
+from dualslam.io.sequence import Recording, Selection, camera_of_size
+from dualslam.io.times import NOMINAL_RATE_HZ, RATE
 
 log = logging.getLogger(__name__)
 
@@ -71,11 +71,9 @@ class Capture(Protocol):
         ...
 
 
-def open_recording(path: Path, given: Given) -> Recording:
+def open_recording(path: Path) -> Recording:
     """Open a video file: count its frames and take their presentation times (one pass without colour conversion)."""
     video = VideoFile(path)
-    if given.times is not None:
-        video.timestamps_s = resolve_times(given.times, len(video), path)
     return Recording(path.stem, video, video.timestamps_s, camera=None)
 
 
@@ -84,23 +82,20 @@ class VideoFile:
 
     Attributes
     ----------
-    media_s : (N,) float64
-        Presentation time of each frame in the file.
     timestamps_s : (N,) float64
-        The same, if not replaced by the caller's times.
+        Presentation time of each frame in the file.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.media_s = _scan(path)
-        self.timestamps_s = self.media_s
+        self.timestamps_s = _scan(path)
 
     def __len__(self) -> int:
-        return len(self.media_s)
+        return len(self.timestamps_s)
 
     def reader(self, grey: bool) -> ImageReader:
         """Return a reader with its own decoder."""
-        return _VideoReader(self.path, self.media_s, grey)
+        return _VideoReader(self.path, self.timestamps_s, grey)
 
     def told_focal(self) -> ToldFocal | None:
         """Return what the container tells of the camera, which OpenCV does not read."""
@@ -117,10 +112,8 @@ class VideoFile:
 class _VideoReader:
     """Random access over a decoder that can only go forwards."""
 
-    def __init__(self, path: Path, media_s: FloatArray, grey: bool) -> None:
-        self._path = path
-        self._media_s = media_s
-        self._grey = grey
+    def __init__(self, path: Path, times_s: FloatArray, grey: bool) -> None:
+        self._path, self._times_s, self._grey = path, times_s, grey
         self._capture = _open(path)
         self._next = 0
         self._block: dict[int, NDArray[np.uint8] | None] = {}
@@ -160,8 +153,8 @@ class _VideoReader:
     def _seek(self, index: int) -> None:
         # Seeking is exact with some codecs only: the next frame's time tells, and if it is wrong, count from the start.
         if index > 0 and self._capture.set(cv2.CAP_PROP_POS_FRAMES, index - 1) and self._capture.grab():
-            step = float(np.min(np.diff(self._media_s)))
-            if abs(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3 - self._media_s[index - 1]) < 0.5 * step:
+            step = float(np.min(np.diff(self._times_s)))
+            if abs(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3 - self._times_s[index - 1]) < 0.5 * step:
                 self._next = index
                 return
         self._capture.release()
@@ -197,7 +190,7 @@ def _scan(path: Path) -> FloatArray:
     if np.isfinite(times).all() and (np.diff(times) > 0).all():
         return times
     if not (np.isfinite(fps) and fps > 0):
-        raise InputError(f"{path} tells neither the times of its frames nor their rate; give a file of times.")
+        raise InputError(f"{path} tells neither the times of its frames nor their rate; give {RATE}.")
     log.warning("%s has no usable times of its frames: they are counted at its %g Hz", path, fps)
     return np.arange(len(times)) / fps
 
@@ -282,7 +275,7 @@ def open_webcam(
     camera: Camera | None,
     fov_degrees: float | None,
     selection: Selection,
-    given: Given,
+    rate_hz: float | None,
     grey: bool,
     connect: Callable[[Any], Capture] = cv2.VideoCapture,
 ) -> WebcamSequence:
@@ -301,8 +294,8 @@ def open_webcam(
         name, called = Path(source).name, source
     if selection.reverse:
         raise InputError(f"{called} is live and cannot be read in reverse.")
-    if given.times is not None or given.rate_hz is not None:
-        raise InputError(f"{called} is live and has times of its own; leave out the file of times, or the rate.")
+    if rate_hz is not None:
+        raise InputError(f"{called} is live and has times of its own; leave out the rate.")
     if camera is None and fov_degrees is None:
         raise InputError(f"{called} has no calibration; give a camera file, or a field of view in degrees.")
 

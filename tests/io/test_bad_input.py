@@ -139,7 +139,8 @@ def test_missing_parts_of_known_layouts(make, tmp_path: Path, layout: str) -> No
     calibration = {"kitti": "calib.txt", "tum_mono": "camera.txt"}[layout]
     times = (folder / "times.txt").read_text()
     (folder / "times.txt").unlink()
-    raises_sentence(folder, "times.txt does not exist")
+    raises_sentence(folder, "times.txt does not exist", "give the rate of the frames (--rate HZ)")
+    assert open_sequence(folder, rate_hz=20.0).rate_hz == pytest.approx(20.0)
     (folder / "times.txt").write_text("\n".join(times.splitlines()[:-1]))
     raises_sentence(folder, "times.txt has 5 times", "6 images", "one time for each image")
     (folder / "times.txt").write_text(times)
@@ -174,12 +175,6 @@ def test_missing_parts_of_known_layouts(make, tmp_path: Path, layout: str) -> No
 def test_bad_times(dataset: Path, content: str, words: list[str]) -> None:
     (dataset / "times.txt").write_text(content)
     raises_sentence(dataset, "times.txt", *words)
-
-
-def test_bad_times_of_the_caller(dataset: Path) -> None:
-    raises_sentence(dataset, "the given times has 2 times", times=[0.0, 1.0])
-    raises_sentence(dataset, "the given times: time 2", times=[0.0, float("nan")])
-    raises_sentence(dataset, "nowhere.txt does not exist", times=dataset / "nowhere.txt")
 
 
 @pytest.mark.parametrize(

@@ -208,7 +208,8 @@ def test_plain_folder_in_natural_order(tmp_path: Path, image_number, caplog: pyt
     assert sequence.rate_hz == pytest.approx(30.0)
     assert open_sequence(tmp_path, fov_degrees=90, rate_hz=5).frame_timestamps[1] == 0.2
     own = [0.0, 0.5, *np.arange(1, 11)]
-    assert open_sequence(tmp_path, fov_degrees=90, times=own).frame_timestamps.tolist() == own
+    (tmp_path / "times.txt").write_text("\n".join(map(str, own)))
+    assert open_sequence(tmp_path, fov_degrees=90).frame_timestamps.tolist() == own
 
 
 def test_plain_folder_whose_times_and_calibration_stand_among_the_images(dataset: Path, tmp_path: Path) -> None:
@@ -219,7 +220,7 @@ def test_plain_folder_whose_times_and_calibration_stand_among_the_images(dataset
     assert loose.camera == whole.camera
     assert loose.frame_timestamps.tolist() == whole.frame_timestamps.tolist()
     assert open_sequence(dataset / "images", fov_degrees=90).camera.fx == pytest.approx(16.0)
-    assert open_sequence(dataset / "images", times=np.arange(6.0) / 2).frame_timestamps[5] == 2.5
+    assert open_sequence(dataset / "images", rate_hz=2.0).frame_timestamps[5] == 2.5
     (dataset / "images" / "times.txt").write_text("1\n2\n")
     with pytest.raises(InputError, match=r"times.txt has 2 times, but .* has 6 images"):
         open_sequence(dataset / "images")

@@ -13,7 +13,7 @@ import pytest
 from dualslam.core.camera.models import camera_from_fov
 from dualslam.core.errors import InputError
 from dualslam.io import open_sequence
-from dualslam.io.sequence import Given, Selection
+from dualslam.io.sequence import Selection
 from dualslam.io.video import open_webcam
 
 N, FPS = 70, 20.0
@@ -60,11 +60,9 @@ def test_frames_of_a_video(video: Path, options, expected) -> None:
     assert sequence.name == "walk"
 
 
-def test_video_colour_and_own_times(video: Path) -> None:
-    times = np.arange(N) * 0.1 + 5
-    frame = next(iter(open_sequence(video, fov_degrees=70, grey=False, times=times)))
+def test_video_in_colour(video: Path) -> None:
+    frame = next(iter(open_sequence(video, fov_degrees=70, grey=False)))
     assert frame.image.shape == (HEIGHT, WIDTH, 3)
-    assert frame.timestamp_s == 5.0
 
 
 def test_a_video_that_ends_early_says_so(video: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -82,8 +80,6 @@ def test_a_video_that_ends_early_says_so(video: Path, tmp_path: Path, caplog: py
 def test_bad_videos(video: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no calibration"):
         open_sequence(video)
-    with pytest.raises(InputError, match=r"the given times has 2 times, but .*walk.avi has 70 images"):
-        open_sequence(video, fov_degrees=70, times=[0.0, 1.0])
     broken = tmp_path / "broken.avi"
     broken.write_bytes(video.read_bytes()[:300])
     with pytest.raises(InputError, match=r"broken.avi (is no video|holds no frame)"):
@@ -127,7 +123,8 @@ class FakeCapture:
 
 
 def webcam(connect: Callable[[int], FakeCapture], selection: Selection, **given):
-    return open_webcam(0, given.pop("camera", None), given.pop("fov", 70.0), selection, Given(**given), True, connect)
+    camera, fov, rate_hz = given.get("camera"), given.get("fov", 70.0), given.get("rate_hz")
+    return open_webcam(0, camera, fov, selection, rate_hz, True, connect)
 
 
 def test_webcam() -> None:
@@ -176,7 +173,7 @@ def test_bad_webcams() -> None:
     with pytest.raises(InputError, match="cannot be read in reverse"):
         webcam(lambda n: FakeCapture(), Selection(reverse=True))
     with pytest.raises(InputError, match="times of its own"):
-        webcam(lambda n: FakeCapture(), Selection(), times=[1.0])
+        webcam(lambda n: FakeCapture(), Selection(), rate_hz=20.0)
     with pytest.raises(InputError, match="no calibration"):
         webcam(lambda n: FakeCapture(), Selection(), fov=None)
     with pytest.raises(InputError, match="10 x 10 pixels"):
