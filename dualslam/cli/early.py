@@ -16,7 +16,7 @@ def check(args: argparse.Namespace) -> None:
     """
     if hasattr(args, "set"):
         config_of(args)
-    source = getattr(args, "source", None)
-    # A number is a webcam; with a colon it is a stream or a synthetic world.
-    if source is not None and ":" not in source and not source.isdigit():
-        check_exists(Path(source))
+    for source in getattr(args, "sources", ()):
+        # A number is a webcam; with a colon it is a stream or a synthetic world.
+        if ":" not in source and not source.isdigit():
+            check_exists(Path(source))

@@ -142,7 +142,8 @@ def _flag(group: argparse._ActionsContainer, name: str, help_text: str) -> None:
 
 def _add_run(commands: Commands) -> None:
     parser, talk = _command(commands, "run", "Run on a source of frames and write a run folder.")
-    _value(parser, "source", "SOURCE", SOURCE_HELP, _source)
+    several = SOURCE_HELP + ". Several: a run folder for each below DIR, and a table of all"
+    _value(parser, "sources", "SOURCE", several, _source, nargs="+")
     _value(parser, "--topic", "NAME", "topic of the images, where SOURCE is a bag of several")
     _add_output(parser)
     _flag(parser, "--decisions", "write decisions.jsonl, which dualslam explain prints")

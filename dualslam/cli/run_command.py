@@ -12,6 +12,7 @@ from pathlib import Path
 from dualslam.build import check_config, fault_of_frontend
 from dualslam.build.parts import measurement_sources
 from dualslam.cli import logs
+from dualslam.cli.batch import run_all
 from dualslam.cli.configuration import config_of, naming_source
 from dualslam.cli.console import final_line, no_map_line, progress, stage_table, verdict_line, waiting
 from dualslam.core import exit_status
@@ -42,10 +43,11 @@ def execute(args: argparse.Namespace) -> int:
     with naming_source(args):
         check_config(config)
     with naming_frontend(config):
-        return _run(args, config)
+        return _run(args, config) if len(args.sources) == 1 else run_all(args, lambda one: _run(one, config))
 
 
 def _run(args: argparse.Namespace, config: Config) -> int:
+    (source,) = args.sources
     check_out(
         args.out, overwrite=args.overwrite, saved_map=args.map, replay=args.replay
     )  # before a search for the camera
@@ -63,11 +65,11 @@ def _run(args: argparse.Namespace, config: Config) -> int:
     has_camera = True
     with waiting("opening the source, and looking for its camera where it tells of none", args.quiet):
         try:
-            sequence = open_source(args.source, camera_file=args.camera, fov_degrees=args.fov, **selection)
+            sequence = open_source(source, camera_file=args.camera, fov_degrees=args.fov, **selection)
         except NoCalibrationError:
             has_camera = False
             logs.discard()  # it is opened again
-            recorded = open_without_calibration(args.source, **selection)
+            recorded = open_without_calibration(source, **selection)
             of_map = None if args.map is None else with_camera_of_map(args.map, recorded)
             if of_map is not None:
                 sequence = of_map

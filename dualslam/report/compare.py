@@ -65,13 +65,20 @@ def comparison_table(runs: Sequence[RunData]) -> list[list[str]]:
 
 def run_names(runs: Sequence[RunData]) -> list[str]:
     """Return the folders' names, with as many parents as it takes to tell them apart."""
-    parts = [run.path.resolve().parts for run in runs]
-    longest = max(len(p) for p in parts)
+    paths = [run.path.resolve() for run in runs]
+    names = distinct_names(paths)
+    return names if len(set(names)) == len(names) else [f"{i} {run.name}" for i, run in enumerate(runs, 1)]
+
+
+def distinct_names(paths: Sequence[Path]) -> list[str]:
+    """Return the last parts of paths, as many as it takes to tell the paths apart; the same only for the same path."""
+    longest = max(len(path.parts) for path in paths)
+    names: list[str] = []
     for depth in range(1, longest + 1):
-        names = ["/".join(p[-depth:]) for p in parts]
+        names = ["/".join(path.parts[-depth:]) for path in paths]
         if len(set(names)) == len(names):
-            return names
-    return [f"{i} {run.name}" for i, run in enumerate(runs, 1)]
+            break
+    return names
 
 
 def _plain(key: str) -> Callable[[dict[str, Any]], str]:
@@ -96,6 +103,7 @@ def _median_recovery(s: dict[str, Any]) -> str:
 MEASURES: tuple[Measure, ...] = (
     ("frames", _plain("frames")),
     ("coverage", lambda s: f"{100 * s.get('coverage', 0):.1f} %"),
+    ("verdict", lambda s: str((s.get("verdict") or {}).get("level", "-"))),
     ("failures", _plain("failures")),
     ("recoveries", _plain("recoveries")),
     ("recovery time (median)", _median_recovery),

@@ -270,3 +270,14 @@ def test_missing_field_and_bad_omega_are_refused() -> None:
         FovCamera(640, 480, 500.0, 500.0, 320.0, 240.0, 4.0)
     with pytest.raises(InputError, match="field of view"):
         camera_from_fov(640, 480, 180.0)
+
+
+def test_the_circle_of_a_fisheye_lens_may_end_in_the_image() -> None:
+    """A GoPro's calibration, as published, ends at 104 degrees: within the image. One that ends at 50 is a slip."""
+    lens = {"k1": -0.02196, "k2": -0.01896, "k3": 0.001694, "k4": -0.000168}
+    gopro = KannalaBrandtCamera(2704, 2028, 796.9, 799.2, 1354.4, 1011.5, **lens)
+    inside, beyond = gopro.rectify([[400.0, 1011.5], [100.0, 1011.5]])[0]
+    assert np.isfinite(inside).all()
+    assert np.isnan(beyond).all()
+    with pytest.raises(InputError, match="no inverse at pixel"):
+        KannalaBrandtCamera(2704, 2028, 796.9, 799.2, 1354.4, 1011.5, **lens | {"k1": -0.44})

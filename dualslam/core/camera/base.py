@@ -37,7 +37,8 @@ class Camera(ABC):
 
     model: ClassVar[str]  # name of the class in files
     corners_matter: ClassVar[bool] = True
-    """Whether `validate` wants an inverse in the corners of the image, or only at the middle of its sides."""
+    """Whether `validate` wants an inverse in the corners of the image, or only at the middle of its sides. The circle
+    of a fisheye lens may end before, beyond the last ray that `rectify` keeps."""
 
     # Of the raw image, pixels.
     width: int
@@ -201,11 +202,20 @@ class Camera(ABC):
             if not -0.5 <= getattr(self, name) <= size - 0.5:
                 raise InputError(f"camera: {name} is {getattr(self, name)}, outside of the image of {size} pixels")
         outside = np.isnan(self.unproject(self._border())).any(1)
+        outside &= self.corners_matter | ~self._reaches_beyond_use(self._border())
         if outside.any():
             u, v = self._border()[int(np.argmax(outside))]
             raise InputError(
                 f"camera: the distortion of model '{self.model}' has no inverse at pixel ({u:.0f}, {v:.0f})"
             )
+
+    def _reaches_beyond_use(self, uv: FloatArray) -> BoolArray:
+        """Return towards which pixels (N, 2) the model images every ray that `rectify` keeps."""
+        towards = (uv - (self.cx, self.cy)) / (self.fx, self.fy)
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        last = MAX_RECTIFIED_ANGLE_RAD
+        rays = np.concatenate([towards * math.sin(last), np.full((len(uv), 1), math.cos(last))], 1)
+        return np.asarray(np.isfinite(self.project(rays)).all(1))
 
     def _border(self) -> FloatArray:
         """Return the pixels where the distortion must be invertible: the border, or the middle of its four sides."""
