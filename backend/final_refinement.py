@@ -4,9 +4,14 @@ The graph used by tracking has a part of the observations and Huber's loss, unde
 same force. A loss that forgets leads astray while a map is made; from a map that is right already it leads closer: on
 rendered streets by a fifth, on a road by a tenth to two fifths (six seeds, three others). Hand-held maps do not change
 (docs/notes/2026-11-27-a-last-batch-over-all-observations.md).
+
+The landmarks with most views go first. A false match with few views, right before the camera, bends a pose until it
+agrees: that is an optimum, too (docs/notes/2026-11-28-few-false-near-points-hold-a-wrong-pose.md).
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,7 +20,7 @@ from dualslam.backend.noise import residual_variance
 from dualslam.backend.observability import compute_residuals
 from dualslam.backend.point_refinement import refit_points
 from dualslam.core.bundle import FrameRows
-from dualslam.core.types import FloatArray
+from dualslam.core.types import FloatArray, IntArray
 from dualslam.map.submap import Submap
 
 FORGETS_AT = 4.0
@@ -42,17 +47,34 @@ def refine_submap(submap: Submap, robust_k: float, frames: FrameRows | None = No
     first, *others = submap.keyframes
     if not others:
         return FORGETS_AT
-    shape = FORGETS_AT * _residual_sigma(submap)
-    bundle = bundle_adjust(submap, others, [first], shape, ITERATIONS, forgets=True, frames=frames)
-    keyframe_ids, T, landmark_ids, xyz_mu = bundle.estimate
-    centre, T = submap.T_submap_kf[first][:3, 3], T.copy()
-    unit = _extent(submap.keyframe_poses(keyframe_ids), centre) / _extent(T, centre)
+    shape, centre = FORGETS_AT * _residual_sigma(submap), submap.T_submap_kf[first][:3, 3]
+    refined, seen = submap.copy(), submap.landmarks_of_keyframes([first, *others])
+    for landmarks in (_best_seen(submap), seen):
+        bundle = bundle_adjust(refined, others, [first], shape, ITERATIONS, True, frames, landmarks)
+        refined.apply_estimate(*bundle.estimate)
+        if frames is not None:
+            frames = replace(frames, T_submap_cam=bundle.T_submap_frame)
+        beside = np.setdiff1d(seen, bundle.estimate[2])
+        refined.landmarks["xyz_mu"][beside] = refit_points(refined, robust_k, beside)
+    T = refined.keyframe_poses(others)
+    unit = _extent(submap.keyframe_poses(others), centre) / _extent(T, centre)
     T[:, :3, 3] = centre + unit * (T[:, :3, 3] - centre)
-    submap.apply_estimate(keyframe_ids, T, landmark_ids, centre + unit * (xyz_mu - centre))
-    beside = np.setdiff1d(np.flatnonzero(submap.landmarks["alive"]), landmark_ids)
-    if len(beside):
-        submap.landmarks["xyz_mu"][beside] = refit_points(submap, robust_k, beside)
+    submap.apply_estimate(np.array(others), T, seen, centre + unit * (refined.landmarks["xyz_mu"][seen] - centre))
     return shape
+
+
+def _best_seen(submap: Submap) -> IntArray:
+    """Return the landmarks with as many views as the median of their keyframe, in half of the keyframes that see them.
+
+    Their number of views is relative: on a road all have few.
+    """
+    n_views = submap.n_observations(np.arange(len(submap.landmarks)))
+    n_leads = np.zeros(len(n_views), np.int64)
+    for seen in submap.landmark_of.values():
+        ids = seen[seen >= 0]
+        if len(ids):
+            n_leads[ids[n_views[ids] >= np.median(n_views[ids])]] += 1
+    return np.flatnonzero(submap.landmarks["alive"] & (n_leads > 0) & (2 * n_leads >= n_views))
 
 
 def _extent(T_submap_kf: FloatArray, centre: FloatArray) -> float:

@@ -30,12 +30,15 @@ class SubmapBundle:
     rows : (R,) int64
         Rows of the submap's observation table, as in ``result.chi2``.
     result : BundleResult
+    T_submap_frame : (G, 4, 4) float64
+        Poses of the frames that took part.
     """
 
     keyframe_ids: IntArray
     landmark_ids: IntArray
     rows: IntArray
     result: BundleResult
+    T_submap_frame: FloatArray
 
     @property
     def estimate(self) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
@@ -105,8 +108,9 @@ def bundle_adjust(
     max_iterations: int = 10,
     forgets: bool = False,
     frames: FrameRows | None = None,
+    landmarks: IntArray | None = None,
 ) -> SubmapBundle:
-    """Refine some keyframes of a submap and every landmark that they see; the submap itself is not changed.
+    """Refine some keyframes of a submap and the landmarks that they see; the submap itself is not changed.
 
     Parameters
     ----------
@@ -118,7 +122,9 @@ def bundle_adjust(
     robust_k, max_iterations, forgets
         See `bundle_adjust_arrays`.
     frames : FrameRows, optional
-        Frames that have their say on the landmarks, too. Their poses are free, and are not handed back.
+        Frames that count, too. Their poses are free.
+    landmarks : landmark ids, optional
+        Those of them that take part, ascending; default: all.
 
     Raises
     ------
@@ -126,7 +132,8 @@ def bundle_adjust(
         If the solver fails.
     """
     free = np.asarray(free_keyframes, np.int64)
-    landmarks = submap.landmarks_of_keyframes(free)
+    seen = submap.landmarks_of_keyframes(free)
+    landmarks = seen if landmarks is None else np.intersect1d(seen, landmarks)
     if fixed_keyframes is None:
         fixed_keyframes = np.setdiff1d(submap.covisible(landmarks)[0], free)
     keyframes = np.concatenate([free, np.asarray(fixed_keyframes, np.int64)])
@@ -150,5 +157,6 @@ def bundle_adjust(
     problem = BundleProblem(submap.K, T, fixed, xyz_mu, pose, point, uv, sigma)
     result = bundle_adjust_arrays(problem, robust_k, max_iterations, forgets=forgets)
     n, n_rows = len(keyframes), len(rows)
+    T_submap_frame = result.T_submap_kf[n:]
     result = replace(result, T_submap_kf=result.T_submap_kf[:n], chi2=result.chi2[:n_rows])
-    return SubmapBundle(keyframes, landmarks, rows, result)
+    return SubmapBundle(keyframes, landmarks, rows, result, T_submap_frame)
