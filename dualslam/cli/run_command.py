@@ -63,7 +63,7 @@ def _run(args: argparse.Namespace, config: Config) -> int:
     }
     focal: FocalSearch | None = None
     has_camera = True
-    with waiting("opening the source, and looking for its camera where it tells of none", args.quiet):
+    with waiting("opening the source; estimating its camera if none is given", args.quiet):
         try:
             sequence = open_source(source, camera_file=args.camera, fov_degrees=args.fov, **selection)
         except NoCalibrationError:

@@ -14,11 +14,11 @@ def camera_words(run: RunData) -> Markup | None:
     given: dict[str, Any] = run.summary.get("camera") or {}
     if "fx" not in given:
         return None
-    source = (
-        "searched for in the first frames, as nothing was known of it"
-        if run.summary.get("focal_search")
-        else f"from {run.summary.get('calibration') or 'the source, --camera or --fov'}"
-    )
+    search: dict[str, Any] = run.summary.get("focal_search") or {}
+    source = f"from {run.summary.get('calibration') or 'the source, --camera or --fov'}"
+    if search:
+        low, high = (number(px, 4) for px in search.get("focal_range_px", (given["fx"],) * 2))
+        source = f"searched for in the first frames ({low} to {high} px), as nothing was known of it"
     words = f"{given.get('model', 'camera')}, {given.get('width')} x {given.get('height')} pixels, "
     words += f"focal length {number(given['fx'], 4)} px, {source}."
     refined: dict[str, Any] = run.summary.get("refined") or {}

@@ -12,7 +12,7 @@ from dualslam.report.canvas import Canvas
 from dualslam.report.markup import Markup, join, tag
 from dualslam.report.placement import Placed, PlacedRun, extent, place, plane_from_above
 from dualslam.report.run_data import RunData
-from dualslam.report.statuses import MEANING, count, span, stretches
+from dualslam.report.statuses import MEANING, Stretch, count, span, stretches
 
 MIN_CLOSE_UP = 4
 BEYOND = 40
@@ -85,6 +85,7 @@ def _drawing(
     shapes += _truth(run, scene, canvas, axes)
     words: list[Markup] = []
     for placed in scene.placed:
+        shapes += [] if len(scene.truth_row) else _bridges(run, placed, canvas, axes)
         shapes += _path(run, placed, canvas, axes)
         if placed.submap is not None and len(placed.row) and window is None:
             words.append(canvas.label(placed.xyz[len(placed.row) // 2] @ axes.T, f"submap {placed.submap}", "name"))
@@ -108,18 +109,45 @@ def _path(run: RunData, placed: Placed, canvas: Canvas, axes: FloatArray) -> lis
     uv = placed.xyz @ axes.T
     status = [run.rows[i].status for i in placed.row.tolist()]
     # A line does not bridge frames without a pose.
-    break_before = np.diff(placed.row, prepend=placed.row[0]) > 1
-    keys = list(zip(status, np.cumsum(break_before).tolist(), strict=True))
+    pieces = np.cumsum(np.diff(placed.row, prepend=placed.row[0]) > 1).tolist()
     loose = " loose" if placed.submap is not None else ""
-    shapes = []
-    for stretch in stretches(keys):
-        first = stretch.start - (stretch.start > 0 and not break_before[stretch.start])
-        value = status[stretch.start]
+    where = "main map" if placed.submap is None else f"submap {placed.submap}, not linked"
+
+    def draw(stretch: Stretch, first: int, cls: str, words: str) -> Markup:
         frames = span(run.rows[int(placed.row[stretch.start])].index, run.rows[int(placed.row[stretch.stop - 1])].index)
-        where = "main map" if placed.submap is None else f"submap {placed.submap}, not linked"
-        title = f"{frames}: {value}, {where}"
-        shapes.append(canvas.line(uv[first : stretch.stop], f"way st-{value}{loose}", title))
+        return canvas.line(uv[first : stretch.stop], cls, f"{frames}: {words}, {where}")
+
+    shapes = []
+    for stretch in stretches(list(zip(status, pieces, strict=True))):
+        first = stretch.start - (stretch.start > 0 and pieces[stretch.start - 1] == pieces[stretch.start])
+        value = status[stretch.start]
+        shapes.append(draw(stretch, first, f"way st-{value}{loose}", str(value)))
+    doubt = _doubts(run, placed)
+    shapes += [
+        draw(stretch, stretch.start, "doubtful", f"doubtful ({doubt[stretch.start]})")
+        for stretch in stretches(list(zip(doubt, pieces, strict=True)))
+        if doubt[stretch.start]
+    ]
     return shapes
+
+
+def _doubts(run: RunData, placed: Placed) -> list[str]:
+    """Return the doubt of each frame of the main map; a map that is not linked is drawn loose instead."""
+    return [run.rows[i].doubt if placed.submap is None else "" for i in placed.row.tolist()]
+
+
+def _bridges(run: RunData, placed: Placed, canvas: Canvas, axes: FloatArray) -> list[Markup]:
+    """Draw straight lines over the frames that have no pose in this map, where no true path shows them."""
+    uv = placed.xyz @ axes.T
+    rows = placed.row.tolist()
+    return [
+        canvas.line(
+            uv[i : i + 2],
+            "gap",
+            f"{span(run.rows[rows[i] + 1].index, run.rows[rows[i + 1] - 1].index)}: no pose in this map",
+        )
+        for i in np.flatnonzero(np.diff(placed.row) > 1).tolist()
+    ]
 
 
 def _truth(run: RunData, scene: PlacedRun, canvas: Canvas, axes: FloatArray) -> list[Markup]:
@@ -178,6 +206,10 @@ def _legend(run: RunData, scene: PlacedRun) -> list[Markup]:
     items = [_key(f"way st-{s}", f"{s}: {MEANING[s]}") for s in FrameStatus if s in drawn]
     if len(scene.truth_row):
         items += [_key("truth", "true path"), _key("gap", "no pose (drawn on the true path)")]
+    elif any((np.diff(placed.row) > 1).any() for placed in scene.placed):
+        items.append(_key("gap", "no pose (a straight line)"))
+    if any(any(_doubts(run, placed)) for placed in scene.placed):
+        items.append(_key("doubtful", "doubtful: a reason of the verdict concerns these frames"))
     if any(p.submap is not None for p in scene.placed):
         items.append(_key("way st-tracked loose", "a submap that is not linked, aligned by itself"))
     if len(scene.points):

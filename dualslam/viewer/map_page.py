@@ -83,17 +83,18 @@ def map_page(run: RunData) -> str | None:
     title = join(f"{run.summary.get('sequence', run.name)}: the map")
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     strip = _strip(playback)
-    told = join([verdict_words(run), headline(run)])
-    return page.substitute(title=title, headline=told, key=join(key), strip=strip, data=text)
+    return page.substitute(
+        title=title, verdict=join(verdict_words(run)), headline=headline(run), key=join(key), strip=strip, data=text
+    )
 
 
 def verdict_words(run: RunData) -> str:
-    """Return the verdict on a run in one sentence; empty where it has none."""
+    """Return the verdict on a run, with its reasons; empty where it has none."""
     verdict = run.summary.get("verdict") or {}
     if not verdict:
         return ""
-    reasons = "; ".join(str(reason.get("text", "")) for reason in verdict.get("reasons", ()))
-    return f"Verdict: {verdict.get('level', '')}{': ' if reasons else ''}{reasons}. "
+    reasons = [str(reason.get("text", "")) for reason in verdict.get("reasons", ())]
+    return " ".join([f"Verdict: {verdict.get('level', '')}.", *reasons])
 
 
 def _strip(playback: Playback) -> Markup:

@@ -44,9 +44,9 @@ def test_the_camera_says_how_sure_it_is_and_where_it_is_from(broken_run: RunData
     assert words is not None
     assert "585 px, from calib.txt" in words
     refined = {"focal_px": 580.0, "log_focal_sigma": 0.004}
-    searched = summary | {"focal_search": {"fov_deg": 60}, "refined": refined}
+    searched = summary | {"focal_search": {"focal_range_px": [513.0, 586.2]}, "refined": refined}
     words = camera_words(replace(broken_run, summary=searched))
     assert words is not None
-    assert "searched for" in words
+    assert "searched for in the first frames (513 to 586.2 px)" in words
     assert "580 px, sigma 0.4 %" in words
     assert camera_words(replace(broken_run, summary={})) is None

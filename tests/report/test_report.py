@@ -239,6 +239,20 @@ def test_a_run_without_truth_draws_its_maps_apart(make_run: MakeRun) -> None:
     assert "ATE" not in text.split("Trajectory")[0]
 
 
+def test_missing_and_doubtful_stretches_are_on_the_path_without_a_truth(make_run: MakeRun) -> None:
+    run = read_run(make_run(truth=False))
+    kept = (run.main.row < 5) | (run.main.row > 7)
+    main = replace(run.main, row=run.main.row[kept], T_map_cam=run.main.T_map_cam[kept])
+    rows = [replace(row, doubt="scale") if 3 <= i <= 9 else row for i, row in enumerate(run.rows)]
+    found = outline(replace(run, main=main, rows=rows))
+    assert "frames 5 to 7: no pose in this map" in found.text
+    for frames in ("frames 3 to 4", "frames 8 to 9"):
+        assert f"{frames}: doubtful (scale), main map" in found.text
+    assert "no pose (a straight line)" in found.text
+    assert "doubtful: a reason of the verdict" in found.text
+    assert not outline(run).of_class("doubtful")
+
+
 def test_a_run_without_a_map_says_so(make_run: MakeRun) -> None:
     run = read_run(make_run(lost=tuple(range(N_FRAMES))))
     found = outline(run)
