@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -90,9 +91,7 @@ def build_camera(lens: str, numbers: dict[str, float], where: str) -> Camera:
     for name in ("width", "height"):
         if not float(numbers.get(name, 0.0)).is_integer() or numbers.get(name, 0.0) < 1:
             raise InputError(f"{where}: {name} is {numbers.get(name)}; it must be a whole number of pixels.")
-    if numbers["fy"] < 0:
-        log.info("%s: fy is negative, so its y-axis points up; here it points down", where)
-        numbers |= {"fy": -numbers["fy"]} | ({"p1": -numbers["p1"]} if "p1" in numbers else {})
+    numbers = with_y_down(numbers, where)
     if lens == ANY:
         lens = RadTanCamera.model
     if lens == NONE or (lens == RadTanCamera.model and not set(numbers) & set(COEFFICIENTS[lens])):
@@ -103,6 +102,18 @@ def build_camera(lens: str, numbers: dict[str, float], where: str) -> Camera:
         raise InputError(f"{where}: {odd[0]} is {numbers[odd[0]]:g}, but the model {lens!r} has {reads}; correct it.")
     width, height = int(numbers.pop("width")), int(numbers.pop("height"))
     return make_camera(where, lambda: MODELS[lens](width, height, **numbers))
+
+
+def with_y_down(numbers: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return a calibration whose y-axis points down: a negative fy (ICL-NUIM's is -480) says that it points up.
+
+    The image is the same.
+    """
+    fy = numbers.get("fy")
+    if not isinstance(fy, int | float) or fy >= 0:
+        return numbers
+    log.info("%s: fy is negative, so its y-axis points up; here it points down", where)
+    return numbers | {"fy": -fy} | ({"p1": -numbers["p1"]} if numbers.get("p1") else {})
 
 
 def make_camera(where: str, build: Callable[[], Camera]) -> Camera:

@@ -16,14 +16,13 @@ keys are read by `dualslam.io.camera_keys`, lines of numbers and COLMAP's camera
 
 from __future__ import annotations
 
-import logging
 import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from dualslam.core.camera.base import Camera
-from dualslam.core.camera.models import MODELS, FovCamera, RadTanCamera, camera_from_dict
+from dualslam.core.camera.models import MODELS, FovCamera, PinholeCamera, RadTanCamera, camera_from_dict
 from dualslam.core.errors import InputError
 from dualslam.io.camera_build import (
     ANY,
@@ -35,13 +34,12 @@ from dualslam.io.camera_build import (
     lens_of,
     make_camera,
     whole_size,
+    with_y_down,
 )
 from dualslam.io.camera_dialects import in_common_keys
 from dualslam.io.camera_keys import camera_of_mapping
 from dualslam.io.camera_text import read_mappings
 from dualslam.io.trajectory_files import read_text
-
-log = logging.getLogger(__name__)
 
 CALIB_LINE = "fx fy cx cy [k1 k2 p1 p2 [k3]] [width height]"
 COLMAP_MODELS = (
@@ -105,14 +103,9 @@ def _of_mapping(content: dict[str, Any], where: str, images_px: Callable[[], Siz
         return _of_colmap([str(word) for word in (*words, *content["params"])], where)
     if content.get("model") not in (*MODELS, "corrected") or "fl_x" in content:
         return camera_of_mapping(content, where, images_px)
-    if content["model"] in ("pinhole", RadTanCamera.model) and _is_negative(content.get("fy")):
-        log.info("%s: fy is negative, so its y-axis points up; here it points down", where)
-        content = {**content, "fy": -content["fy"]} | ({"p1": -content["p1"]} if content.get("p1") else {})
+    if content["model"] in (PinholeCamera.model, RadTanCamera.model):
+        content = with_y_down(content, where)
     return make_camera(where, lambda: camera_from_dict(content))
-
-
-def _is_negative(value: object) -> bool:
-    return isinstance(value, int | float) and value < 0
 
 
 # --- COLMAP
@@ -162,19 +155,14 @@ def _colmap_binary(path: Path) -> list[Camera]:
 # --- lines of numbers
 
 
-def radtan_camera(fxycxy: list[float], distortion: list[float], size: tuple[float, float], where: str) -> Camera:
-    """Make a pinhole camera, or a radial-tangential one where any of k1 k2 p1 p2 [k3] is not zero.
-
-    A negative fy (ICL-NUIM's is -480) says that y points up in the calibration's camera frame. The image is the same;
-    here y points down.
-    """
-    return _listed_camera(RadTanCamera.model, fxycxy, distortion, size, where)
-
-
-def _listed_camera(
-    lens: str, fxycxy: list[float], distortion: list[float], size: tuple[float, float], where: str
+def listed_camera(
+    fxycxy: list[float],
+    distortion: list[float],
+    size: tuple[float, float],
+    where: str,
+    lens: str = RadTanCamera.model,
 ) -> Camera:
-    """Make the camera of a lens and its coefficients in their common order."""
+    """Make the camera of a lens and its coefficients in their common order; a pinhole if all of them are zero."""
     width, height = whole_size(size, where)
     numbers = dict(zip(("fx", "fy", "cx", "cy"), fxycxy, strict=True)) | {"width": width, "height": height}
     return build_camera(lens, numbers | dict(zip(COEFFICIENTS.get(lens, ()), distortion, strict=False)), where)
@@ -192,7 +180,7 @@ def _of_line(path: Path, words: list[str], images_px: Callable[[], Size] | None)
         content = {"model": "radtan", "camera_matrix": numbers[:4], "distortion_coefficients": numbers[4:]}
         return camera_of_mapping(content, str(path), images_px)
     *intrinsics, width, height = numbers
-    return radtan_camera(intrinsics[:4], intrinsics[4:], (width, height), str(path))
+    return listed_camera(intrinsics[:4], intrinsics[4:], (width, height), str(path))
 
 
 _DSO_COUNTS = {"fov": (5,), "pinhole": (4, 5), "radtan": (8,), "kannalabrandt": (8,), "equidistant": (8,)}
@@ -228,7 +216,7 @@ def read_tum_mono_camera(path: Path) -> Camera:
     lens = lens_of(model, str(path))
     if lens == ANY and any(numbers[4:]):
         raise InputError(f"{path}: the fifth number of a Pinhole is {numbers[4]:g}; it must be 0, as it has no lens.")
-    return _listed_camera(lens, [fx, fy, cx, cy], numbers[4:], size, str(path))
+    return listed_camera([fx, fy, cx, cy], numbers[4:], size, str(path), lens)
 
 
 def _are_numbers(lines: list[list[str]]) -> bool:

@@ -57,7 +57,10 @@ def _numbers(said: CameraTable, lens: str, images_px: Callable[[], Size] | None)
         numbers |= dict(zip(names, listed, strict=True))
     elif said.has("focals") and said.has("principal"):
         for name, keys in (("focals", ("fx", "fy")), ("principal", ("cx", "cy"))):
-            numbers |= dict(zip(keys, said.pair(name), strict=True))
+            pair = said.numbers(name) or []
+            if len(pair) != 2:
+                raise InputError(f"{said.key(name)} has {len(pair)} numbers; it should be two, in pixels.")
+            numbers |= dict(zip(keys, pair, strict=True))
     elif said.has("angle") and not said.has("fx"):
         numbers["width"] = said.size(numbers, images_px)[0]
         numbers["fx"] = 0.5 * numbers["width"] / math.tan(0.5 * said.number("angle"))
@@ -88,7 +91,7 @@ def _coefficients(said: CameraTable, lens: str) -> dict[str, float]:
     names = COEFFICIENTS.get(lens, COEFFICIENTS[RadTanCamera.model])
     found: dict[str, float] = {}
     if lens == KannalaBrandtCamera.model and "mu" in said.own:  # camodocal counts from k2
-        return {f"k{i - 1}": said.number_at(f"k{i}") for i in range(2, 6)}
+        return {f"k{i - 1}": said.number(f"k{i}") for i in range(2, 6)}
     listed = said.numbers("list")
     if listed is not None:
         if any(listed[len(names) :]):
@@ -116,12 +119,11 @@ def _of_photogrammetry(said: CameraTable, lens: str, images_px: Callable[[], Siz
     if "projectiontype" in said.own:
         unit = float(max(width, height))
         for name in ("fx", "fy"):
-            focal = "focal" if said.has("f") else f"focal{name[1]}"
-            numbers[name] = unit * said.number_at(focal)
+            numbers[name] = unit * said.number("focal" if said.has("f") else f"focal{name[1]}")
         numbers |= {name: middle[name] + unit * said.optional(name) for name in middle}
         return numbers | _coefficients(said, lens)
     f = said.number("f")
-    numbers |= {"fx": f + said.number_at("b1", 0.0), "fy": f}
+    numbers |= {"fx": f + said.optional("b1"), "fy": f}
     numbers |= {name: middle[name] + said.optional(name) for name in middle}
     lensed = {name: said.optional(name) for name in ("k1", "k2", "k3", "k4")}
     # Its tangential terms are OpenCV's in the other order.

@@ -170,12 +170,6 @@ class CameraTable:
         """Return a number that is zero where it is missing."""
         return self.number(name) if self.has(name) else 0.0
 
-    def number_at(self, word: str, missing: float | None = None) -> float:
-        """Return the number of one key alone."""
-        if missing is not None and word not in self.own:
-            return missing
-        return self.number(word)
-
     def numbers(self, name: str) -> list[float] | None:
         """Return the numbers of a list or a matrix, by rows; None where there is none."""
         value = self.take(name)
@@ -190,13 +184,6 @@ class CameraTable:
             numbers = [numbers[i] for i in (0, 1, 2, 4, 5, 6, 8, 9, 10)]
         if name == "matrix" and not any(numbers):
             raise InputError(f"{self.key(name)} is all zeros: this camera was not calibrated.")
-        return numbers
-
-    def pair(self, name: str) -> list[float]:
-        """Return the two numbers of a list."""
-        numbers = self.numbers(name) or []
-        if len(numbers) != 2:
-            raise InputError(f"{self.key(name)} has {len(numbers)} numbers; it should be two, in pixels.")
         return numbers
 
     def size(self, numbers: dict[str, float], images_px: Callable[[], Size] | None) -> Size:

@@ -9,7 +9,7 @@ import numpy as np
 from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray
-from dualslam.io.camera_files import radtan_camera
+from dualslam.io.camera_files import listed_camera
 from dualslam.io.images import ImageFiles, ImageStore, list_images
 from dualslam.io.sequence import Given, Recording, image_size
 from dualslam.io.times import needed_file, recorded_times
@@ -62,7 +62,7 @@ def read_projection(path: Path, camera: int) -> FloatArray:
 def _camera(P: FloatArray, images: ImageStore, name: str, where: str) -> Camera:
     # calib.txt does not say the size of the rectified images, which differs between the sequences.
     size = image_size(images, name)
-    return radtan_camera([P[0, 0], P[1, 1], P[0, 2], P[1, 2]], [], size, where)
+    return listed_camera([P[0, 0], P[1, 1], P[0, 2], P[1, 2]], [], size, where)
 
 
 def _ground_truth(folder: Path, timestamps_s: FloatArray, P: FloatArray | None) -> Trajectory | None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
-from dualslam.io.camera_files import radtan_camera
+from dualslam.io.camera_files import listed_camera
 from dualslam.io.images import ImageFiles
 from dualslam.io.sequence import Given, Recording
 from dualslam.io.times import checked_times
@@ -60,4 +60,4 @@ def _camera(folder: Path) -> Camera:
             "This name has none; give a camera file."
         )
     numbers = INTRINSICS[int(found.group(1))]
-    return radtan_camera(numbers[:4], numbers[4:], (640, 480), f"fr{found.group(1)}")
+    return listed_camera(numbers[:4], numbers[4:], (640, 480), f"fr{found.group(1)}")
