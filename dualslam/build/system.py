@@ -110,7 +110,7 @@ def build_system(
     if isinstance(known, MappedCamera):
         camera = known
     if is_known:  # its camera is its own: to change it would part what is there from what comes
-        config = config.model_copy(update={"calibration": config.calibration.model_copy(update={"refine": False})})
+        config = config.with_section("calibration", refine=False)
     calibration = new_calibration(config, known)
     faults = FaultScript(config.corruptions)
     shutter = RollingShutter(frontend, config.camera, config.seed)

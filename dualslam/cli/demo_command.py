@@ -14,7 +14,6 @@ from dualslam.cli.configuration import config_of, naming_source
 from dualslam.cli.console import progress
 from dualslam.cli.outputs import check_free
 from dualslam.cli.run_command import conclude, naming_frontend
-from dualslam.core.config.settings import Config
 from dualslam.core.errors import InputError
 from dualslam.core.types import Frame
 from dualslam.io.run_folder import MAP_PAGE
@@ -49,9 +48,8 @@ def execute(args: argparse.Namespace) -> int:
         if not args.quiet:
             print(f"Recovery {name}:", flush=True)
         with naming_frontend(config), progress(sequence, args.quiet) as shown:
-            outcome = run_to_folder(
-                _with_recovery(config, enabled), sequence, args.out / name, overwrite=args.overwrite, watcher=shown
-            )
+            own = config.with_section("recovery", enabled=enabled)
+            outcome = run_to_folder(own, sequence, args.out / name, overwrite=args.overwrite, watcher=shown)
         status = conclude(outcome, args)
         if outcome.report.interrupted:
             return status
@@ -81,7 +79,3 @@ class _Rendered:
 
     def __iter__(self) -> Iterator[Frame]:
         return iter(self._frames)
-
-
-def _with_recovery(config: Config, enabled: bool) -> Config:
-    return config.model_copy(update={"recovery": config.recovery.model_copy(update={"enabled": enabled})})

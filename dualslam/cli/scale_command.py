@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+from contextlib import suppress
 
 from dualslam.core.errors import InputError
 from dualslam.io.colours import load_pictures
@@ -37,7 +37,9 @@ def execute(args: argparse.Namespace) -> int:
         topic, pictures = read_summary(args.run).get("topic"), load_pictures(args.run / MAP)
         source = open_images_of_run(args.images, exported.size_px, topic, pictures)
         scale = by_marker(exported, stored.camera, source, numbers, args.marker, args.dictionary)
-    before = _scale_before(args.run)
+    before: float | None = None
+    with suppress(InputError):  # damaged: to scale again is what mends it
+        before = read_scale(args.run)
     write_scale(args.run, scale.metres_per_unit, scale.sigma_rel, scale.words)
     if not args.quiet:
         how_sure = "" if scale.sigma_rel is None else f" (sigma {100 * scale.sigma_rel:.2g} %)"
@@ -46,10 +48,3 @@ def execute(args: argparse.Namespace) -> int:
             times = scale.metres_per_unit / before
             print(f"that is {times:.3g} times what it was ({before:.5g} m): exports made before do not go with it")
     return 0
-
-
-def _scale_before(run: Path) -> float | None:
-    try:
-        return read_scale(run)
-    except InputError:  # damaged: to scale again is what mends it
-        return None

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray
 from dualslam.io.camera_files import listed_camera
-from dualslam.io.images import ImageFiles, ImageStore, list_images
+from dualslam.io.images import ImageFiles, list_images
 from dualslam.io.sequence import Given, Recording, image_size
 from dualslam.io.times import needed_file, recorded_times
 from dualslam.io.trajectory_files import Trajectory, numbered_lines, read_kitti
@@ -32,12 +31,16 @@ def open_recording(folder: Path, given: Given) -> Recording:
     if not given.camera:
         needed_file(calib_path, "a camera file")
     P = read_projection(calib_path, number) if calib_path.exists() else None
-    name = folder.resolve().name
+    name, camera = folder.resolve().name, None
+    if P is not None and not given.camera:
+        # calib.txt does not say the size of the rectified images, which differs between the sequences.
+        fxycxy = [P[0, 0], P[1, 1], P[0, 2], P[1, 2]]
+        camera = listed_camera(fxycxy, [], image_size(images, name), str(calib_path))
     return Recording(
         name=f"kitti_{name}" if name.isdigit() else name,
         images=images,
         timestamps_s=timestamps_s,
-        camera=None if given.camera or P is None else _camera(P, images, name, str(calib_path)),
+        camera=camera,
         ground_truth=_ground_truth(folder, timestamps_s, P),
         calibration=str(calib_path),
         clock=str(times_path),
@@ -57,12 +60,6 @@ def read_projection(path: Path, camera: int) -> FloatArray:
                 raise InputError(f"{path}: P{camera} should be 12 finite numbers (a 3 x 4 matrix by rows).")
             return P.reshape(3, 4)
     raise InputError(f"{path} has no line `P{camera}:` with the projection matrix of image_{camera}.")
-
-
-def _camera(P: FloatArray, images: ImageStore, name: str, where: str) -> Camera:
-    # calib.txt does not say the size of the rectified images, which differs between the sequences.
-    size = image_size(images, name)
-    return listed_camera([P[0, 0], P[1, 1], P[0, 2], P[1, 2]], [], size, where)
 
 
 def _ground_truth(folder: Path, timestamps_s: FloatArray, P: FloatArray | None) -> Trajectory | None:

@@ -7,6 +7,7 @@ import math
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import fields
 from itertools import chain, count
 from pathlib import Path
@@ -68,13 +69,9 @@ def load_arrays(
         OSError, ValueError, zipfile.BadZipFile, zlib.error, EOFError, KeyError, TypeError, AttributeError, RuntimeError
     ) as e:  # fmt: skip
         # Where numpy sees no archive of its own it speaks of pickles, and of how to load one unsafely.
-        problem = "it is no archive of arrays" if isinstance(e, ValueError) and "pickle" in str(e) else _reason(e)
+        problem = "it is no archive of arrays" if isinstance(e, ValueError) and "pickle" in str(e) else str(e)
+        problem = (getattr(e, "strerror", None) or problem).rstrip(".")
         raise InputError(f"{path} is no map file, or is damaged: {problem}. Give another map, or make it again.") from e
-
-
-def _reason(error: Exception) -> str:
-    words = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    return words.rstrip(".")
 
 
 def save_map(folder: str | Path, arrays: Mapping[str, Arrays], metadata: Mapping[str, Any]) -> None:
@@ -85,13 +82,18 @@ def save_map(folder: str | Path, arrays: Mapping[str, Arrays], metadata: Mapping
     names them: interrupted, the old map is there as it was.
     """
     folder = Path(folder)
-    names = {group: _free_name(folder, group) for group in arrays}
+    names = {}
+    for group in arrays:
+        free = chain([f"{group}.npz"], (f"{group}.{n}.npz" for n in count(1)))
+        names[group] = next(name for name in free if not (folder / name).exists())
     for group, content in arrays.items():
         save_arrays(folder / names[group], content)
     files = {group: name for group, name in names.items() if name != f"{group}.npz"}
     document = {"format": MAP_FORMAT, "groups": sorted(arrays), "metadata": to_plain(metadata)}
     document |= {"files": files} if files else {}
-    groups = {*arrays, *_groups_there(folder)}
+    groups = set(arrays)
+    with suppress(InputError):  # no map before, or one that cannot be read
+        groups |= read_index(folder)[0].keys()
     write_text(folder / METADATA, json.dumps(document, indent=2, allow_nan=False) + "\n")
     for path in sorted(folder.glob("*.npz")):  # of the map before, and of saves that were interrupted
         group, *number = path.stem.split(".", maxsplit=1)
@@ -99,47 +101,21 @@ def save_map(folder: str | Path, arrays: Mapping[str, Arrays], metadata: Mapping
             path.unlink()
 
 
-def _groups_there(folder: Path) -> list[str]:
-    """Return the groups of the map that is in a folder, if there is one that can be read."""
-    try:
-        return load_metadata(folder)[0]
-    except InputError:
-        return []
-
-
-def _free_name(folder: Path, group: str) -> str:
-    names = chain([f"{group}.npz"], (f"{group}.{n}.npz" for n in count(1)))
-    return next(name for name in names if not (folder / name).exists())
-
-
-def array_files(folder: str | Path) -> dict[str, Path]:
-    """Return where the groups of arrays of a map are, by its metadata."""
-    folder = Path(folder)
-    groups, _, files = _read_metadata(folder)
-    return {group: folder / files.get(group, f"{group}.npz") for group in groups}
-
-
 def load_map(folder: str | Path) -> tuple[dict[str, dict[str, NDArray[Any]]], dict[str, Any]]:
     """Read what `save_map` wrote: groups of arrays, and metadata."""
-    _, metadata = load_metadata(folder)
-    return {group: load_arrays(path) for group, path in array_files(folder).items()}, metadata
+    files, metadata = read_index(folder)
+    return {group: load_arrays(path) for group, path in files.items()}, metadata
 
 
-def load_metadata(folder: str | Path) -> tuple[list[str], dict[str, Any]]:
-    """Read the names of the groups that `save_map` wrote, and the metadata, but no arrays."""
-    groups, metadata, _ = _read_metadata(Path(folder))
-    return groups, metadata
-
-
-def _read_metadata(folder: Path) -> tuple[list[str], dict[str, Any], dict[str, str]]:
-    """Return groups, metadata, and the names of the files that are not named as their group."""
-    path = folder / METADATA
+def read_index(folder: str | Path) -> tuple[dict[str, Path], dict[str, Any]]:
+    """Read where the groups of arrays are that `save_map` wrote, and the metadata, but no arrays."""
+    path = Path(folder) / METADATA
     text = read_text(path)
     try:
         document = json.loads(text)
         version = int(document.get("format", 1))
         groups, metadata = list(document["groups"]), dict(document["metadata"])
-        files = {str(group): Path(str(name)).name for group, name in document.get("files", {}).items()}
+        named = {str(group): Path(str(name)).name for group, name in document.get("files", {}).items()}
         if not all(isinstance(group, str) for group in groups):
             raise TypeError("a group is named by a word")
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
@@ -148,7 +124,7 @@ def _read_metadata(folder: Path) -> tuple[list[str], dict[str, Any], dict[str, s
         ) from None
     if version > MAP_FORMAT:
         raise InputError(f"{path} is of format {version}, newer than this version of dualslam reads ({MAP_FORMAT}).")
-    return groups, metadata, files
+    return {group: path.with_name(named.get(group, f"{group}.npz")) for group in groups}, metadata
 
 
 def to_plain(value: Any) -> Any:

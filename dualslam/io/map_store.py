@@ -23,10 +23,9 @@ from dualslam.io.map_checks import FRAME_ROWS, HELD_ROWS, LINK_ROWS, PLACED_ROWS
 from dualslam.io.map_files import (
     METADATA,
     Arrays,
-    array_files,
     load_arrays,
     load_map,
-    load_metadata,
+    read_index,
     save_map,
     submap_from_arrays,
     submap_to_arrays,
@@ -66,7 +65,7 @@ class StoredMap:
 def submap_path(folder: Path, submap_id: int) -> Path:
     """Where the arrays of a submap are in a ``map`` folder, or would be: the metadata may lack it."""
     name = f"{SUBMAP}{submap_id:02d}"
-    return array_files(folder).get(name, folder / f"{name}.npz")
+    return read_index(folder)[0].get(name, folder / f"{name}.npz")
 
 
 class _Groups(Mapping[str, dict[str, NDArray[Any]]]):
@@ -145,7 +144,7 @@ def load_camera(folder: str | Path) -> Camera | None:
     Raises `InputError` if there is no map, or it is damaged.
     """
     folder = _map_folder(folder)
-    _, metadata = load_metadata(folder)
+    _, metadata = read_index(folder)
     with _naming_damage(folder):
         return _camera(metadata)
 
@@ -158,11 +157,10 @@ def load_joints(folder: str | Path) -> tuple[list[int], Atlas]:
     Raises `InputError` if there is no map, or it is damaged.
     """
     folder = Path(folder)
-    groups, metadata = load_metadata(folder)
+    files, metadata = read_index(folder)
     with _naming_damage(folder):
-        ids = sorted(int(name.removeprefix(SUBMAP)) for name in groups if name not in _OTHER)
-        files = array_files(folder)
-        solution = load_arrays(files[SOLUTION]) if SOLUTION in groups else None
+        ids = sorted(int(name.removeprefix(SUBMAP)) for name in files if name not in _OTHER)
+        solution = load_arrays(files[SOLUTION]) if SOLUTION in files else None
         atlas = Atlas()
         _join(atlas, ids, load_arrays(files[LINKS]), solution, metadata)
         return ids, atlas

@@ -132,7 +132,8 @@ class RecordedSequence:
         self.source_indices = self.selection.indices(len(recording.images), recording.name)
         self.frame_timestamps = recording.timestamps_s[self.source_indices]
         self.exposure_s = None if recording.exposure_s is None else recording.exposure_s[self.source_indices]
-        self.rate_hz = _rate(self.frame_timestamps)
+        steps_s = np.abs(np.diff(self.frame_timestamps))
+        self.rate_hz = float(1.0 / np.median(steps_s)) if len(steps_s) else NOMINAL_RATE_HZ
 
     def with_camera(self, camera: Camera) -> RecordedSequence:
         """Return the same frames as those of another camera, of images of the same size."""
@@ -251,9 +252,3 @@ def camera_of_size(camera: Camera, size_px: tuple[int, int], name: str, calibrat
         )
     log.warning("%s is for images of %s pixels: scaled to those of %s, %d x %d", calibration, was, name, width, height)
     return camera.resized(width, height)
-
-
-def _rate(timestamps_s: FloatArray) -> float:
-    if len(timestamps_s) < 2:
-        return NOMINAL_RATE_HZ
-    return float(1.0 / np.median(np.abs(np.diff(timestamps_s))))

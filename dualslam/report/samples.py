@@ -109,12 +109,17 @@ def smaller(jpeg: bytes) -> bytes:
     )
 
 
-def thumbnail(image: NDArray[np.uint8], width_px: int = WIDTH_PX) -> bytes:
-    """Return a small JPEG of an image (H, W) or (H, W, 3) RGB."""
+def shrunk(image: NDArray[np.uint8], width_px: int) -> tuple[NDArray[np.uint8], float]:
+    """Return an image of at most a width, in its own shape, and the factor by which it was resized."""
     height, width = image.shape[:2]
     factor = min(1.0, width_px / width)
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8), factor
+
+
+def thumbnail(image: NDArray[np.uint8], width_px: int = WIDTH_PX) -> bytes:
+    """Return a small JPEG of an image (H, W) or (H, W, 3) RGB."""
+    small, _ = shrunk(image, width_px)
     if small.ndim == 3:
         small = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
     _, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])

@@ -77,5 +77,4 @@ def with_camera_of_map(saved_map: str | Path, sequence: RecordedSequence) -> Rec
 def with_prior(config: Config, found: FocalSearch) -> Config:
     """Return a config whose self-calibration trusts the focal length as far as it was found."""
     sigma = max(config.calibration.log_focal_sigma, found.log_sigma)
-    calibration = config.calibration.model_copy(update={"log_focal_sigma": sigma})
-    return config.model_copy(update={"calibration": calibration})
+    return config.with_section("calibration", log_focal_sigma=sigma)

@@ -46,8 +46,7 @@ def with_frontend_chosen(
     else:
         with _faults_unreported():
             choice = find_frontend(config, frames, frames.camera)
-    frontend = config.frontend.model_copy(update={"name": choice.name})
-    return config.model_copy(update={"frontend": frontend}), choice
+    return config.with_section("frontend", name=choice.name), choice
 
 
 @contextmanager

@@ -61,7 +61,7 @@ def camera_that_fits(config: Config, frames: Iterable[Frame], camera: Camera, sa
     known = load_camera(saved_map)
     if known is None:
         return camera
-    config = config.model_copy(update={"recovery": config.recovery.model_copy(update={"workers": 0})})
+    config = config.with_section("recovery", workers=0)
     tried, zoom = camera, 0.0
     for _ in range(N_TRIES):
         seen = _frames_in_map(config, frames, tried, load_atlas(saved_map))

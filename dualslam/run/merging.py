@@ -139,7 +139,7 @@ def merge_runs(
             f"{b.config.frontend.name}: their descriptors cannot be compared. Run one of them again."
         )
     b, shift_s = b.after(a, create_frontend(a.config.frontend).scale_factor)
-    config = a.config.model_copy(update={"recovery": a.config.recovery.model_copy(update={"workers": 0})})
+    config = a.config.with_section("recovery", workers=0)
     about = [a.about(0.0), b.about(shift_s)]
     system = _system_of(config, a, b)
     system.join(sorted(b.stored.atlas.submaps))

@@ -63,11 +63,9 @@ class StartRefusals:
         if 0 < self._n_images <= SHORT and reason is not FailureReason.NO_TEXTURE:
             return f"too short: {self._n_images} {'image' if self._n_images == 1 else 'images'}"
         if reason is FailureReason.LOW_PARALLAX:
-            words = NOTHING_MOVES if self._stands_still() else LITTLE_PARALLAX
+            stands = self._shifts_px and float(np.quantile(self._shifts_px, STILL_QUANTILE)) < STILL_PX
+            words = NOTHING_MOVES if stands else LITTLE_PARALLAX
         else:
             words = WORDS.get(reason, f"no start was possible ({reason})")
         total = self._counts.total()
         return words if n == total else f"{words} ({n} of {total} frames)"
-
-    def _stands_still(self) -> bool:
-        return bool(self._shifts_px) and float(np.quantile(self._shifts_px, STILL_QUANTILE)) < STILL_PX

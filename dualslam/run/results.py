@@ -147,7 +147,7 @@ def summarise(
         "recoveries_failed": len(system.events.of_kind(EventKind.RECOVERY_FAILED)),
         "submaps": len(system.atlas.submaps),
         "links": len(system.atlas.believed),
-        "connections": _connections(system),
+        "connections": dict(Counter(str(link.kind) for link in system.atlas.believed)),
         "rejected_connections": sum(link.rejected for link in system.atlas.links),
         "keyframes": sum(len(submap.keyframes) for submap in system.atlas.submaps.values()),
         "saved_keyframes": sum(
@@ -183,12 +183,6 @@ def summarise(
     if truth is not None:
         summary |= _errors(system, main, truth, report)
     return summary
-
-
-def _connections(system: System) -> dict[str, int]:
-    """How many connections of each kind the atlas believes."""
-    kinds = [str(link.kind) for link in system.atlas.believed]
-    return {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)}
 
 
 def truth_of_frames(truth: Trajectory, rows: Iterable[FrameRow]) -> Trajectory:

@@ -147,17 +147,14 @@ class Page:
         self._landmarks = gui.add_checkbox("landmarks", True)
         self._landmarks.on_update(lambda _: self._show_landmarks())
         save = gui.add_button("save this map as a page")
-        save.on_click(lambda _: self._pressed.append((SAVE, self._as_page())))
+        # The scene as HTML that needs nothing else, and opens on the whole map.
+        save.on_click(lambda _: self._pressed.append((SAVE, str(self._server.scene.as_html(dark_mode=True)))))
         self._told = gui.add_markdown("")
 
     def pressed(self) -> list[tuple[str, object]]:
         """Return what was pressed since the last call."""
         pressed, self._pressed = self._pressed, []
         return pressed
-
-    def _as_page(self) -> str:
-        """Return the scene as HTML that needs nothing else, and opens on the whole map."""
-        return str(self._server.scene.as_html(dark_mode=True))
 
     def show(self, message: Message) -> None:
         """Bring the page up to a message."""

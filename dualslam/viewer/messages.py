@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from dualslam.core.walk_news import WalkNews
 from dualslam.map.frame_records import FrameResult
 from dualslam.map.submap import Submap
 from dualslam.report.event_words import event_words
+from dualslam.report.samples import shrunk
 
 if TYPE_CHECKING:
     from dualslam.system.system import System
@@ -192,17 +192,14 @@ class Teller:
     def _picture(self, frame: Frame) -> Picture | None:
         if frame.image is None:
             return None
-        height, width = frame.image.shape[:2]
-        factor = min(1.0, WIDTH_PX / width)
-        size = (max(1, round(width * factor)), max(1, round(height * factor)))
-        small = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+        small, factor = shrunk(frame.image, WIDTH_PX)
         if small.ndim == 2:
             small = np.repeat(small[..., None], 3, axis=2)
         track = self._track
         if track is None or track.view.timestamp_s != frame.timestamp_s:
-            return Picture(np.asarray(small, np.uint8), np.zeros((0, 2), np.float32), np.zeros(0, bool))
+            return Picture(small, np.zeros((0, 2), np.float32), np.zeros(0, bool))
         uv = (track.view.features.uv_px * factor).astype(np.float32)
-        return Picture(np.asarray(small, np.uint8), uv, track.landmark_ids >= 0)
+        return Picture(small, uv, track.landmark_ids >= 0)
 
 
 def _arrays(submap: Submap) -> SubmapArrays:

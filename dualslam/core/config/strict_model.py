@@ -37,6 +37,10 @@ class StrictModel(BaseModel):
                 "load_config(overrides=[...]) or with model_copy(update={...})."
             )
 
+    def with_section(self, section: str, /, **values: Any) -> Self:
+        """Return a copy in which fields of a section have other values."""
+        return self.model_copy(update={section: getattr(self, section).model_copy(update=values)})
+
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """Return a copy with other values in some fields, which are checked as all are."""
         copied = super().model_copy(deep=deep)
