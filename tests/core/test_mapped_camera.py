@@ -50,3 +50,10 @@ def test_a_map_that_was_extended_by_another_camera_knows_that_one_again() -> Non
     mapped = camera_for_map(CORRECTED, OTHERS[0])
     assert camera_for_map(mapped, OTHERS[0]) is mapped
     np.testing.assert_array_equal(camera_for_map(mapped, MAP).K, CORRECTED.K)
+
+
+def test_a_circle_that_fills_a_third_of_the_image_is_of_the_same_camera() -> None:
+    circle = KannalaBrandtCamera(1920, 1080, 420.6, 421.7, 959.9, 542.8, -0.01197, -0.0393, 0.01858, -0.005076)
+    corrected = correct(circle, LensCorrection(log_focal=0.01))
+    assert camera_for_map(corrected, replace(circle, fx=420.601)) is corrected
+    assert camera_for_map(corrected, replace(circle, fx=430.0)) is not corrected

@@ -124,7 +124,8 @@ def is_same(a: Camera, b: Camera) -> bool:
         return False
     u, v = np.meshgrid(np.linspace(0, a.width - 1, 9), np.linspace(0, a.height - 1, 9))
     uv = np.stack([u.ravel(), v.ravel()], 1)
-    back = a.project(b.unproject(uv))
-    known = np.isfinite(back).all(1)
+    rays = b.unproject(uv)
+    back = a.project(rays)
+    known, imaged = np.isfinite(back).all(1), np.isfinite(rays).all(1)
     apart = np.linalg.norm(back[known] - uv[known], axis=1)
-    return bool(known.mean() > 0.5 and (apart < SAME_PX).all())
+    return bool(known.sum() > 0.5 * imaged.sum() and (apart < SAME_PX).all())
