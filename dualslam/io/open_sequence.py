@@ -104,7 +104,10 @@ def open_sequence(
     else:
         size_px = image_size(recording.images, recording.name, camera.size_px)
         camera = camera_of_size(camera, size_px, recording.name, calibration)
-    recording, camera = _reduced(recording, camera, max_side_px)
+    if (factor := reduction(camera, max_side_px)) > 1:
+        sizes, camera = camera.size_px, reduced_camera(camera, factor)
+        log.warning("%s: its images of %d x %d pixels are read as %d x %d", recording.name, *sizes, *camera.size_px)
+        recording = replace(recording, images=ReducedImages(recording.images, factor))
     log.info("%s: %d frames, %s", recording.name, len(recording.images), camera)
     place = str(Path(str(source)).resolve())
     return RecordedSequence(recording, camera, selection, grey=grey, source=place, calibration=calibration)
@@ -155,16 +158,6 @@ def _with_clock(recording: Recording, rate_hz: float | None, unit: str | None) -
             "which are different clocks; give both in the same seconds, or take the ground truth away."
         )
     return recording
-
-
-def _reduced(recording: Recording, camera: Camera, max_side_px: int | None) -> tuple[Recording, Camera]:
-    factor = reduction(camera, max_side_px)
-    if factor == 1:
-        return recording, camera
-    small = reduced_camera(camera, factor)
-    sizes = camera.width, camera.height, small.width, small.height
-    log.warning("%s: its images of %d x %d pixels are read as %d x %d", recording.name, *sizes)
-    return replace(recording, images=ReducedImages(recording.images, factor)), small
 
 
 def _camera_from_fov(recording: Recording, fov_degrees: float | None) -> Camera:

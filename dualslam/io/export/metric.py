@@ -11,9 +11,9 @@ import numpy as np
 from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.geometry import se3
-from dualslam.core.types import BoolArray, FloatArray, Frame
+from dualslam.core.types import FloatArray, Frame
 from dualslam.io.export.exported_map import ExportedMap
-from dualslam.io.export.images import undistortion
+from dualslam.io.export.images import undistorted
 
 MAX_TILT_DEG = 15.0
 """Of the ground against the image's rows: a camera that is mounted level, on a road that may slope."""
@@ -132,14 +132,8 @@ def _height_over_ground(p: FloatArray, rng: np.random.Generator) -> float | None
     best = int(votes.argmax())
     if votes[best] < MIN_GROUND_POINTS:
         return None
-    return float(_refined(p, on[best]))
-
-
-def _refined(p: FloatArray, on: BoolArray) -> float:
-    """Return the distance of the origin from the plane of least squares."""
-    middle = p[on].mean(axis=0)
-    normal = np.linalg.svd(p[on] - middle)[2][2]
-    return abs(float(normal @ middle))
+    middle = p[on[best]].mean(axis=0)  # of the plane of least squares
+    return abs(float(np.linalg.svd(p[on[best]] - middle)[2][2] @ middle))
 
 
 def by_marker(
@@ -165,7 +159,7 @@ def by_marker(
     for seen in corners.values():
         if len(seen) < MIN_MARKER_VIEWS:
             continue
-        xyz = np.array([_triangulate([(exported, v, uv[i]) for v, uv in seen]) for i in range(4)])
+        xyz = np.array([_triangulate(exported, [(v, uv[i]) for v, uv in seen]) for i in range(4)])
         around = np.linalg.norm(xyz - np.roll(xyz, 1, axis=0), axis=1)
         sides.append(float(around.mean()))
         sigmas.append(float(around.std(ddof=1) / 2))
@@ -189,23 +183,18 @@ def _marker_corners(
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary]), parameters)
-    row_of = exported.rows_by_index(numbers)
     found: dict[int, list[tuple[int, FloatArray]]] = {}
-    for frame in frames:
-        v = row_of.get(frame.index)
-        if v is None or frame.image is None:
-            continue
-        maps = undistortion(camera, exported.K[int(exported.camera[v])], exported.size_px)
-        corners, ids, _ = detector.detectMarkers(cv2.remap(frame.image, *maps, cv2.INTER_LINEAR))
+    for v, image, _ in undistorted(exported, camera, frames, numbers):
+        corners, ids, _ = detector.detectMarkers(image)
         for marker, uv in zip([] if ids is None else ids.ravel().tolist(), corners, strict=True):
             found.setdefault(marker, []).append((v, np.asarray(uv, float).reshape(4, 2)))
     return found
 
 
-def _triangulate(seen: list[tuple[ExportedMap, int, FloatArray]]) -> FloatArray:
+def _triangulate(exported: ExportedMap, seen: list[tuple[int, FloatArray]]) -> FloatArray:
     """Return the point (3,) nearest to the rays of all views."""
     A, b = np.zeros((3, 3)), np.zeros(3)
-    for exported, v, uv in seen:
+    for v, uv in seen:
         T = exported.T_world_cam[v]
         ray = T[:3, :3] @ np.linalg.inv(exported.K[int(exported.camera[v])]) @ np.array([*uv, 1.0])
         ray /= np.linalg.norm(ray)
