@@ -202,7 +202,8 @@ class Camera(ABC):
             if not -0.5 <= getattr(self, name) <= size - 0.5:
                 raise InputError(f"camera: {name} is {getattr(self, name)}, outside of the image of {size} pixels")
         outside = np.isnan(self.unproject(self._border())).any(1)
-        outside &= self.corners_matter | ~self._reaches_beyond_use(self._border())
+        if outside.any() and not self.corners_matter:
+            outside &= ~self._reaches_beyond_use(self._border())
         if outside.any():
             u, v = self._border()[int(np.argmax(outside))]
             raise InputError(
@@ -212,7 +213,7 @@ class Camera(ABC):
     def _reaches_beyond_use(self, uv: FloatArray) -> BoolArray:
         """Return towards which pixels (N, 2) the model images every ray that `rectify` keeps."""
         towards = (uv - (self.cx, self.cy)) / (self.fx, self.fy)
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
         last = MAX_RECTIFIED_ANGLE_RAD
         rays = np.concatenate([towards * math.sin(last), np.full((len(uv), 1), math.cos(last))], 1)
         return np.asarray(np.isfinite(self.project(rays)).all(1))
