@@ -8,7 +8,7 @@ from dualslam.core.camera.base import Camera
 from dualslam.core.camera.rectification import rectify
 from dualslam.core.grey_image import GreyImage
 from dualslam.core.interfaces import Frontend, Shutter
-from dualslam.core.types import Failure, FailureReason, Frame, View
+from dualslam.core.types import Failure, FailureReason, Frame, LateFrame, View
 from dualslam.frontends.asking import checked
 from dualslam.frontends.features.images import to_grey
 from dualslam.frontends.scene_mask import Cover, SceneMask
@@ -45,6 +45,15 @@ class FrameReader:
         view = view_of(frame, self._frontend, camera, self._model_sigma_px, cover)
         # 4. The rows' times taken out, where the shutter is known to roll.
         return view if isinstance(view, Failure) else self._shutter.shutter_corrected(view, camera)
+
+    def keep(self, frame: Frame) -> LateFrame | Failure:
+        """Return what is kept of a frame that came too late to be tracked: its image; a failure as above."""
+        if (unusable := _unusable(frame, self._camera())) is not None:
+            return unusable
+        assert frame.image is not None, "an image that is missing is unusable"
+        cover = self._scene.cover_of(frame)
+        image = frame.image if cover is None else cover.paint(frame.image)
+        return LateFrame(frame.index, frame.timestamp_s, GreyImage.of(to_grey(image)))
 
 
 def view_of(

@@ -149,6 +149,7 @@ def build_system(
     return System(
         Components(
             view_of=faults.around_views(reader),
+            keep=reader.keep,
             new_starter=partial(_starter_beside, desk, live) if workers else live.new_starter,
             new_graph=graphs.new_graph if graphs is not None else new_graph,
             new_odometry=faults.around_odometry(live.new_odometry),

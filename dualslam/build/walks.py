@@ -14,8 +14,9 @@ from dualslam.core.config.settings import AttemptConfig, Config, FrontendConfig
 from dualslam.core.errors import ConfigError
 from dualslam.core.estimates import PreferredCamera
 from dualslam.core.interfaces import Frontend, SubmapGraph
-from dualslam.core.types import Failure, FailureReason, IntArray, View
+from dualslam.core.types import Failure, FailureReason, Frame, IntArray, LateFrame, View
 from dualslam.frontends.features.image_features import ImageFeatures
+from dualslam.frontends.frame_reader import view_of
 from dualslam.frontends.gap.auxiliary_features import Auxiliary, BufferedFeatures, OwnFeatures
 from dualslam.frontends.gap.pnp_odometry import PnpOdometry
 from dualslam.frontends.gap.refinding import Refinder
@@ -70,6 +71,10 @@ def recovery_parts(
         settings = (config.calibration, config.graph.robust_k, config.seed)
         return find_preferred_camera(submap, keyframe_ids, job.camera, *settings, job.camera_covariance)
 
+    def read(frame: LateFrame, camera: Camera) -> View | Failure:
+        taken = Frame(frame.index, frame.timestamp_s, frame.image.pixels())
+        return view_of(taken, frontend, camera, config.camera.model_sigma_px)
+
     return RecoveryParts(
         attempts=_attempts(config, frontend, live, camera, auxiliaries),
         posing=Attempt("live", live),
@@ -77,6 +82,7 @@ def recovery_parts(
         matcher=DescriptorMatcher(frontend.distance, frontend.max_distance, DESCRIPTOR_RADIUS_PX),
         find_camera=find_camera,
         config=config,
+        read=read,
         foresee=foresee,
     )
 

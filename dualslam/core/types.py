@@ -199,6 +199,23 @@ class View:
         return self.features.nbytes + (self.image.nbytes if self.image is not None else 0)
 
 
+@dataclass(frozen=True, slots=True)
+class LateFrame:
+    """A frame that came too late to be tracked: its features are found by whoever comes to need them.
+
+    `image`: without the pixels that show no scene.
+    """
+
+    index: int
+    timestamp_s: float
+    image: GreyImage
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the image."""
+        return self.image.nbytes
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
     """Pairs of features (or landmarks) of two sets.

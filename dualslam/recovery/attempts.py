@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dualslam.core.camera.base import Camera
 from dualslam.core.config.settings import Config
 from dualslam.core.estimates import PreferredCamera
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
-from dualslam.core.types import Failure, IntArray, View
+from dualslam.core.types import Failure, IntArray, LateFrame, View
 from dualslam.linking import DescriptorMatcher, LinkEstimate, estimate_link
 from dualslam.map.submap import Submap
 from dualslam.recovery.job import RecoveryJob
@@ -37,6 +38,7 @@ class RecoveryParts:
 
     `posing`: the way back where there is no lost map, but frames without a pose.
     `find_camera`: asks keyframes of a map that a walk has grown about the camera.
+    `read`: finds the live front end's features in a frame that came too late.
     `foresee`: precomputes the features that crossing a gap may need in a frame.
     """
 
@@ -46,6 +48,7 @@ class RecoveryParts:
     matcher: DescriptorMatcher
     find_camera: Callable[[RecoveryJob, Submap, IntArray], PreferredCamera | None]
     config: Config
+    read: Callable[[LateFrame, Camera], View | Failure]
     foresee: Callable[[View], None] = lambda view: None
 
     def link(self, old: Submap, new: Submap, onset: int | None) -> LinkEstimate | Failure:

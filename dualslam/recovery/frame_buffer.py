@@ -1,15 +1,18 @@
 """The frames that reverse tracking can still read: features and grey images, in both directions of time.
 
+Of frames that came too late to be tracked it has the image alone. Only reverse tracking asks for these.
+
 K = k + k_r frames: the last k while all is well, and all that came since while the live submap is lost. Memory has a
 hard bound, which k frames and a short loss stay far below. A long loss (a lens that stays covered) reaches it, and then
 the frames of the loss give way, not those before it: a recovery needs the k frames before the loss, which the old map
 saw, and the newest, with which the new map starts. It skips unusable frames between. In order:
 
-1. images are packed (`GreyImage.pack`), the oldest first: nothing is lost but time;
-2. images of the stretch are dropped, each time the one whose neighbours stay closest together. The rest thins out
+1. frames that came too late are dropped, the oldest first;
+2. images are packed (`GreyImage.pack`), the oldest first: nothing is lost but time;
+3. images of the stretch are dropped, each time the one whose neighbours stay closest together. The rest thins out
    evenly, and reverse tracking takes longer, but even, steps;
-3. then whole frames of the stretch, in the same way;
-4. where the bound does not even hold the rest, the oldest images, and at last the oldest frames.
+4. then whole frames of the stretch, in the same way;
+5. where the bound does not even hold the rest, the oldest images, and at last the oldest frames.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from itertools import islice
 
 import numpy as np
 
-from dualslam.core.types import View
+from dualslam.core.types import LateFrame, View
 
 MB = 2**20
 SLOW_HZ = 5.0
@@ -46,6 +49,7 @@ class FrameBuffer:
         self._duration_s = duration_s
         self._max_bytes = max_mb * MB
         self._views: deque[View] = deque()
+        self._late: deque[LateFrame] = deque()
         self._frozen = False
         self._before_loss: int | None = None  # the newest frame that came before it
         self._stale: set[int] = set()  # frames that are still to be changed
@@ -56,14 +60,19 @@ class FrameBuffer:
         return len(self._views)
 
     def __iter__(self) -> Iterator[View]:
-        """From the oldest to the newest."""
+        """From the oldest to the newest, without those that came too late."""
         self.settle()
         return iter(self._views)
 
     @property
     def indices(self) -> list[int]:
-        """Of the frames, from the oldest to the newest."""
+        """Of these frames."""
         return [view.index for view in self._views]
+
+    @property
+    def late(self) -> tuple[LateFrame, ...]:
+        """The frames that came too late, from the oldest to the newest."""
+        return tuple(self._late)
 
     @property
     def duration_s(self) -> float:
@@ -82,9 +91,16 @@ class FrameBuffer:
         self.nbytes += view.nbytes
         while self._is_over_full():
             self.nbytes -= self._views.popleft().nbytes
+        while self._late and self._late[0].index < self._views[0].index:
+            self.nbytes -= self._late.popleft().nbytes
         if self.nbytes > self._max_bytes:
             self._make_room()
         self.peak_bytes = max(self.peak_bytes, self.nbytes)
+
+    def append_late(self, frame: LateFrame) -> None:
+        """Take in a frame that came too late to be tracked."""
+        self._late.append(frame)
+        self.nbytes += frame.nbytes
 
     def _is_over_full(self) -> bool:
         is_old = not self._frozen and self._age_s(self._views[0]) > self._duration_s
@@ -104,7 +120,7 @@ class FrameBuffer:
         """Put what `change` makes of the views, oldest first, into their places."""
         self.settle()
         self._views = deque(change(self._views))
-        self.nbytes = sum(view.nbytes for view in self._views)
+        self.nbytes = sum(view.nbytes for view in self._views) + sum(frame.nbytes for frame in self._late)
 
     def map_later(self, change: Callable[[View], View], subject: str) -> None:
         """Do the same in slices (`settle`), and what is left as soon as somebody looks.
@@ -155,6 +171,8 @@ class FrameBuffer:
 
     def _make_room(self) -> None:
         """Give up what is needed least until the bound holds; the newest view always stays whole."""
+        while self._late and self.nbytes > self._max_bytes:
+            self.nbytes -= self._late.popleft().nbytes
         views = list(self._views)
         self._pack(views)
         stretch = self._stretch(views)

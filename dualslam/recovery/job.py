@@ -9,7 +9,7 @@ from typing import Any
 from dualslam.atlas.trajectory import FramePose, Path
 from dualslam.core.camera.base import Camera
 from dualslam.core.events import Event
-from dualslam.core.types import Failure, FloatArray, FrameMethod, View
+from dualslam.core.types import Failure, FloatArray, FrameMethod, LateFrame, View
 from dualslam.linking import LinkEstimate
 from dualslam.linking.link_tries import LinkTries
 from dualslam.map.frame_observations import FrameObservations
@@ -43,6 +43,7 @@ class RecoveryJob:
     """Copies of lost submaps that are joined with it by a scale too loose to be relied on: these links are measured
     again, by the keyframes that both hold."""
     live_since: int = 0  # the keyframe that the submap's first walk set out from
+    late: tuple[LateFrame, ...] = ()  # frames among the views that came too late to be tracked
     is_again: bool = False  # whether reverse tracking from this submap is repeated: by the first attempt alone
 
 

@@ -20,7 +20,7 @@ from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.interfaces import SubmapGraph, VisualOdometry
 from dualslam.core.jobs import Desk, Ended, JobKind
-from dualslam.core.types import Failure, FailureReason, View
+from dualslam.core.types import Failure, FailureReason, LateFrame, View
 from dualslam.linking.join_test import judge_motion
 from dualslam.linking.link_tries import LinkTries
 from dualslam.linking.motion import gaps_of, join_slack, seam_motions, step_motions
@@ -139,7 +139,10 @@ class Recoveries:
                 again=now is not None,
                 **numbers,
             )
-        self._submit(submap, newest.index, self._views_before(newest, submap, lost), lost, now)
+        views = self._views_before(newest, submap, lost)
+        oldest = min((view.index for view in views), default=newest.index)
+        late = tuple(frame for frame in self._buffer.late if oldest < frame.index < newest.index)
+        self._submit(submap, newest.index, views, lost, now, late)
 
     def retry(self, submap: Submap, now: FrameStamp, last_chance: bool = False) -> None:
         """Track in reverse again where something was left to find, once the map has grown or its camera was calibrated.
@@ -176,7 +179,13 @@ class Recoveries:
         return outgrows
 
     def _submit(
-        self, submap: Submap, newest_id: int, views: Iterable[View], lost: dict[int, Loss], now: FrameStamp | None
+        self,
+        submap: Submap,
+        newest_id: int,
+        views: Iterable[View],
+        lost: dict[int, Loss],
+        now: FrameStamp | None,
+        late: tuple[LateFrame, ...] = (),
     ) -> None:
         joined, submaps = self._joined_loosely(submap.id), self._record.atlas.submaps
         job = RecoveryJob(
@@ -194,6 +203,7 @@ class Recoveries:
             notes_rivals=bool(lost),
             joined={m: sound_copy(submaps[m]) for m in joined},
             live_since=self._retries.start_of(submap, newest_id),
+            late=late,
             is_again=now is not None,
         )
         n_live = self._retries.n_live(submap, newest_id if now is None else now.index)

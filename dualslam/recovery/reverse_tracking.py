@@ -63,6 +63,7 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Steps[RecoveryRe
     """Do what `run_recovery` does, in steps: yields how far it has come, and is sent whether its time is over."""
     started, cpu_started = time.perf_counter(), time.process_time()
     walks, tries = list[Walk](), job.tries.copy()
+    job = _with_late_frames(job, parts)
     for attempt in parts.attempts if job.lost else (parts.posing,) if job.views or not job.joined else ():
         made = [walk for walk in walks if walk.problem is None]
         if attempt.max_unrecognised is not None and made and not any(walk.leaves_open for walk in made):
@@ -90,6 +91,15 @@ def recover_in_steps(job: RecoveryJob, parts: RecoveryParts) -> Steps[RecoveryRe
         relinked=relinked,
         failure=None if best or job.joined else walks[-1].problem,
     )
+
+
+def _with_late_frames(job: RecoveryJob, parts: RecoveryParts) -> RecoveryJob:
+    """Return the job with the frames that came too late as views among the others."""
+    if not job.late:
+        return job
+    read = (view for frame in job.late if not isinstance(view := parts.read(frame, job.camera), Failure))
+    views = sorted((*job.views, *read), key=lambda view: view.index, reverse=True)
+    return replace(job, views=tuple(views), late=())
 
 
 def _best_of(walks: list[Walk]) -> Walk | None:

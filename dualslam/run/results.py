@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from platform import python_version
@@ -20,7 +20,7 @@ from dualslam.core.errors import InputError
 from dualslam.core.events import EventKind
 from dualslam.core.geometry import sim3
 from dualslam.core.memory import peak_rss_mb
-from dualslam.core.types import FloatArray, FrameStatus
+from dualslam.core.types import FloatArray
 from dualslam.io.run_folder import FrameRow
 from dualslam.io.trajectory_files import MAX_DT_S, Trajectory, associate
 from dualslam.lab.metrics.trajectory_metrics import score_trajectory
@@ -72,8 +72,7 @@ def trajectories_of(system: System) -> Trajectories:
 def frame_rows(
     system: System,
     main: Trajectory | None = None,
-    dropped: Iterable[tuple[int, float]] = (),
-    latencies_ms: Sequence[float] | None = None,
+    latencies_ms: Mapping[int, float] | None = None,
 ) -> list[FrameRow]:
     """Return a row for every frame of the source, in the order in which they came: those of ``frames.csv``.
 
@@ -84,27 +83,21 @@ def frame_rows(
     system : System
     main : Trajectory, optional
         That of `trajectories_of`, if it is there already.
-    dropped : iterable of (int, float), optional
-        Index and time of frames that the system was not given; they come where they belong.
-    latencies_ms : sequence of float, optional
-        Of the frames that were looked at, as the harness measured them; else the time of their steps.
+    latencies_ms : mapping of int to float, optional
+        Of the frames that were looked at, by their index, as the harness measured them; else the time of their steps.
     """
     in_main = set((trajectories_of(system).main if main is None else main).index.tolist())
     claims = {m: claims_of(submap) for m, submap in system.atlas.submaps.items()}
-    rows = [
+    return [
         replace(
             _with_claim(system, row, claims),
             index=system.numbers.index_of(row.index),
             in_main_map=system.numbers.index_of(row.index) in in_main,
-            latency_ms=row.latency_ms if latencies_ms is None else latencies_ms[n],
+            latency_ms=(latencies_ms or {}).get(system.numbers.index_of(row.index), row.latency_ms),
             method=row.method if row.index in system.poses else None,
         )
-        for n, row in enumerate(system.rows.values())
+        for row in system.rows.values()
     ]
-    late = [FrameRow(i, t, FrameStatus.DROPPED, in_main_map=False) for i, t in dropped]
-    if not late:
-        return rows
-    return sorted(rows + late, key=lambda row: system.numbers.number_of(row.index))
 
 
 def _with_claim(system: System, row: FrameRow, claims: Mapping[int, Mapping[int, Claim]]) -> FrameRow:
@@ -236,7 +229,7 @@ def _latency(latencies_ms: tuple[float, ...]) -> dict[str, float]:
 
 def _errors(system: System, main: Trajectory, truth: Trajectory, report: RunReport) -> dict[str, Any]:
     """Return the errors; ``no_errors`` with the reason where the truth, which others made, cannot be used."""
-    times = [row.timestamp_s for row in system.rows.values()] + [t for _, t in report.dropped]
+    times = [row.timestamp_s for row in system.rows.values()]
     if len(times) < 2 or not len(main):
         return {}
     try:

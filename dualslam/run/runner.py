@@ -17,7 +17,7 @@ from dualslam.core.schedule import Recorded
 from dualslam.core.types import Frame
 from dualslam.map.frame_records import FrameResult
 from dualslam.run.interrupts import Interrupts
-from dualslam.run.schedule import Schedule, as_recorded, prepared
+from dualslam.run.schedule import Handed, Schedule, as_recorded, prepared
 from dualslam.system.pace import Pace
 
 PAUSE_S = 0.05
@@ -31,6 +31,10 @@ class Steppable(Protocol):
 
     def step(self, frame: Frame) -> FrameResult:
         """Take one frame."""
+        ...
+
+    def keep(self, frame: Frame) -> None:
+        """Keep a frame that came too late to be looked at."""
         ...
 
     def finish(self, interrupted: bool = False) -> None:
@@ -52,8 +56,8 @@ class RunReport:
     cpu_s: float
     peak_rss_mb: float
     """Highest resident memory of the process since it started, and of the largest of its children that have ended."""
-    dropped: tuple[tuple[int, float], ...] = ()
-    """tuple of (int, float): index and time of the frames that came too late to be looked at (`realtime`)."""
+    dropped: tuple[int, ...] = ()
+    """Index in the source of the frames that came too late to be tracked (`realtime`)."""
     n_late: int = 0  # frames that the system was ready for only after their time (`realtime`)
     interrupted: bool = False  # true where a signal ended the run early, its end too
     error: InputError | OutputError | None = None
@@ -88,8 +92,8 @@ def run_sequence(
     first frame (source, system, `on_frame`, full disk) ends the run in the same way. It is in the report, for the
     caller to raise again once the rest is saved.
 
-    - `realtime`: frames come at the times that their timestamps tell, and those that are too late are dropped before
-      anything is done with them: a frame is, if it is more than `MAX_LATE_S` late when the system is ready for it, and
+    - `realtime`: frames come at the times that their timestamps tell, and those that are too late are not tracked, but
+      kept (`Steppable.keep`): a frame is, if it is more than `MAX_LATE_S` late when the system is ready for it, and
       the next one is due already. A system that has not been in time for `CATCH_UP_S` is given the newest frame.
     - `prepare`: in real time: called with a frame, on a thread of its own, while the one before it is in its step;
       returns what the system is given.
@@ -97,20 +101,18 @@ def run_sequence(
     - `on_frame`: called with the result of each step.
     - `is_paused`: asked before each frame; the run waits for as long as it says so, or until a signal ends it.
     - `interrupts`: entered already, where the caller has more to do that signals must not end.
-    - `repeats`: the schedule of a run that is repeated: its frames are given, without those that it dropped.
+    - `repeats`: the schedule of a run that is repeated: its frames are given as they were then.
     - `clock`, `sleep`: for tests.
 
     Raises `InputError` if the source gives no frame at all.
     Raises `Exception`: whatever the source raises before its first frame.
     """
-    dropped: list[tuple[int, float]] = []
     began, cpu_began = clock(), _cpu_s()
     source = iter(sequence)
     schedule = Schedule(clock, sleep)
-    given = source if repeats is None else as_recorded(source, repeats, dropped)
-    frames: Iterator[tuple[Frame, float]] = ((frame, 0.0) for frame in given)
+    frames = map(Handed, source) if repeats is None else as_recorded(source, repeats)
     if realtime:
-        frames = prepared(schedule.hand_out(source, dropped), prepare, schedule, clock)
+        frames = prepared(schedule.hand_out(source), prepare, schedule, clock)
     steps = _Steps(system, schedule if realtime else None, pace, on_frame, clock)
     with Interrupts() if interrupts is None else nullcontext(interrupts) as stop, _switching_quickly(realtime):
 
@@ -133,8 +135,8 @@ def run_sequence(
         except Exception as problem:
             steps.bug = steps.bug or problem  # a system that broke may well break again here: the first one tells why
     return RunReport(
-        n_frames=len(steps.latencies_ms) + len(dropped),
-        dropped=tuple(dropped),
+        n_frames=len(steps.latencies_ms) + len(steps.dropped),
+        dropped=tuple(steps.dropped),
         latencies_ms=tuple(steps.latencies_ms),
         steps_ms=tuple(steps.steps_ms),
         n_late=schedule.n_late,
@@ -165,16 +167,17 @@ class _Steps:
         self._on_frame, self._clock = on_frame, clock
         self.latencies_ms: list[float] = []
         self.steps_ms: list[float] = []
+        self.dropped: list[int] = []
         self.error: InputError | OutputError | None = None
         self.bug: Exception | None = None
 
-    def take_next(self, frames: Iterator[tuple[Frame, float]]) -> bool:
+    def take_next(self, frames: Iterator[Handed]) -> bool:
         """Give the system the next frame; return whether another may follow.
 
         Raises `Exception`: the source breaks before its first frame.
         """
         try:
-            frame, spent_s = next(frames)
+            handed = next(frames)
         except StopIteration:
             return False
         except Exception as problem:
@@ -182,7 +185,10 @@ class _Steps:
                 raise
             self._end(problem)
             return False
-        result = self._step(frame, spent_s)
+        for late in handed.dropped:
+            self._system.keep(late)
+            self.dropped.append(late.index)
+        result = self._step(handed.frame, handed.prepared_s)
         if result is None:
             return False
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 from dualslam.core.schedule import Recorded
 from dualslam.core.types import Frame
@@ -15,6 +16,15 @@ CATCH_UP_S = 1.0
 """Time without a punctual frame after which a system does not catch up: late frames are then dropped."""
 LATE_S = 2e-3
 """A sleeping process may wake up so late. It does not count as lateness of the system."""
+
+
+@dataclass(frozen=True, slots=True)
+class Handed:
+    """A frame to be looked at, how long it was prepared, and the frames before it that came too late."""
+
+    frame: Frame
+    dropped: tuple[Frame, ...] = ()
+    prepared_s: float = 0.0
 
 
 class Schedule:
@@ -33,8 +43,8 @@ class Schedule:
         # Absolute: a sequence that is read in reverse runs at the same rate.
         return now - self._began - abs(frame.timestamp_s - self._first_s)
 
-    def hand_out(self, frames: Iterator[Frame], dropped: list[tuple[int, float]]) -> Iterator[Frame]:
-        """Yield each frame when its time has come, and note as dropped those that came too late.
+    def hand_out(self, frames: Iterator[Frame]) -> Iterator[Handed]:
+        """Yield each frame when its time has come, with those before it that came too late.
 
         The next frame is asked for only where the one in hand may be dropped for it: a camera gives it when it is due,
         and no sooner. A frame that had to be waited for is the newest, and who waits is in time.
@@ -44,6 +54,7 @@ class Schedule:
             return
         self._first_s, self._began = frame.timestamp_s, self._clock()
         self._in_time_at = self._began
+        dropped: list[Frame] = []
         while frame is not None:
             now = self._clock()
             late_s, upcoming, broken = self.late_s(frame, now), None, None
@@ -56,12 +67,13 @@ class Schedule:
                 except Exception as error:  # after the frame in hand
                     broken = error
             if upcoming is not None and self.late_s(upcoming, self._clock()) >= 0:
-                dropped.append((frame.index, frame.timestamp_s))
+                dropped.append(frame)
             else:
                 if late_s < 0:
                     self._sleep(-late_s)
                 self.n_late += late_s > LATE_S
-                yield frame
+                yield Handed(frame, tuple(dropped))
+                dropped.clear()
             if broken is not None:
                 raise broken
             frame = upcoming if is_late else self._fetched(frames)
@@ -75,31 +87,34 @@ class Schedule:
         return frame
 
 
-def as_recorded(frames: Iterator[Frame], recorded: Recorded, dropped: list[tuple[int, float]]) -> Iterator[Frame]:
-    """Yield the frames that a recorded run has looked at, and note as dropped those that it dropped."""
+def as_recorded(frames: Iterator[Frame], recorded: Recorded) -> Iterator[Handed]:
+    """Yield the frames that a recorded run has looked at, with those before them that it dropped."""
+    dropped: list[Frame] = []
     for frame in frames:
         if frame.index in recorded.dropped:
-            dropped.append((frame.index, frame.timestamp_s))
+            dropped.append(frame)
         else:
-            yield frame
+            yield Handed(frame, tuple(dropped))
+            dropped.clear()
         if frame.index == recorded.last_frame:
             return
 
 
 def prepared(
-    frames: Iterator[Frame], prepare: Callable[[Frame], Frame] | None, schedule: Schedule, clock: Callable[[], float]
-) -> Iterator[tuple[Frame, float]]:
-    """Yield frames, and how long each was prepared: the next one is begun when the last was taken.
+    handed: Iterator[Handed], prepare: Callable[[Frame], Frame] | None, schedule: Schedule, clock: Callable[[], float]
+) -> Iterator[Handed]:
+    """Prepare the frames: the next one is begun when the last was taken.
 
     One that comes in time finds nothing else to be done: it goes as it is, and leaves the other cores alone.
     """
     if prepare is None:
-        return ((frame, 0.0) for frame in frames)
+        return handed
 
-    def ready() -> Iterator[tuple[Frame, float]]:
-        for frame in frames:
+    def ready() -> Iterator[Handed]:
+        for each in handed:
             began = clock()
-            late = schedule.late_s(frame, began) > LATE_S
-            yield prepare(frame) if late else frame, clock() - began
+            late = schedule.late_s(each.frame, began) > LATE_S
+            frame = prepare(each.frame) if late else each.frame
+            yield replace(each, frame=frame, prepared_s=clock() - began)
 
     return read_ahead(ready(), depth=1)

@@ -250,7 +250,7 @@ def run_to_folder(
                 repeats=recorded,
             )
             system.desk.close()  # a system that broke, or was left, has not come to it
-            for index, _ in report.dropped:
+            for index in report.dropped:
                 folder.append_schedule({"dropped": index})
             if system.rows:
                 last = next(reversed(system.rows.values()))
@@ -434,7 +434,9 @@ def _write_results(
     measured, refused = _measured(system, config, trajectories, sources)
     if measured is not None and measured.undone:
         trajectories = trajectories_of(system)
-    rows = frame_rows(system, trajectories.main, report.dropped, report.latencies_ms)
+    dropped = set(report.dropped)
+    looked_at = [i for i in map(system.numbers.index_of, system.rows) if i not in dropped]
+    rows = frame_rows(system, trajectories.main, dict(zip(looked_at, report.latencies_ms, strict=False)))
     verdict = judge_run(system, trajectories, rows, crashed=report.bug is not None, measured=measured, besides=reasons)
     rows = [replace(row, doubt=verdict.doubt_about(row.index)) for row in rows]
     truth: Trajectory | None = getattr(sequence, "ground_truth", None)
@@ -502,6 +504,9 @@ class _Watched:
         self._n_events = len(system.events)
         if watcher is not None:
             watcher.begin(system)
+
+    def keep(self, frame: Frame) -> None:
+        self._system.keep(frame)
 
     def step(self, frame: Frame) -> FrameResult:
         result = self._system.step(frame)

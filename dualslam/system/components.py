@@ -15,7 +15,7 @@ from dualslam.core.interfaces import (
     Shutter,
     SubmapGraph,
 )
-from dualslam.core.types import Failure, FloatArray, Frame, View
+from dualslam.core.types import Failure, FloatArray, Frame, LateFrame, View
 from dualslam.core.walk_news import WalkWatch
 from dualslam.map.graph_beside import BesideGraphs
 from dualslam.map.lens import Calibration
@@ -28,9 +28,10 @@ from dualslam.workers.scheduled_desk import ScheduledDesk
 class Components:
     """The parts that the composition root puts in: the system itself knows neither front end nor solver.
 
-    `new_relocaliser`: a front end that finds its submap again wherever it is seen, and tracks from there. `walk_watch`:
-    hears of reverse tracking that is under way. `desk`: does the background work. `graphs`: carries changes to submaps'
-    graphs in another process and back, if they are solved there. `refine_at_end`: has the last word on each submap.
+    `keep`: what stays of a frame that came too late to be tracked. `new_relocaliser`: a front end that finds its submap
+    again wherever it is seen, and tracks from there. `walk_watch`: hears of reverse tracking that is under way. `desk`:
+    does the background work. `graphs`: carries changes to submaps' graphs in another process and back, if they are
+    solved there. `refine_at_end`: has the last word on each submap.
     `patches`: compares frames with the images of older keyframes. `open_graph`: makes a graph of a submap in this
     process, solved. `open_features`: starts one more process, and returns a function that has the features of a frame
     found there. `foresee`: precomputes in the background the features that reverse tracking may need. None without
@@ -38,6 +39,7 @@ class Components:
     """
 
     view_of: Callable[[Frame], View | Failure]
+    keep: Callable[[Frame], LateFrame | Failure]
     new_starter: Callable[[], MapStarter]
     new_graph: Callable[[], SubmapGraph]
     new_odometry: Callable[[Submap, SubmapGraph], Seeker]

@@ -263,6 +263,23 @@ class System:
                 self.blank.add(frame.index)
         return self._result(frame, outcome, started)
 
+    def keep(self, frame: Frame) -> None:
+        """Keep a frame that came too late to be tracked, instead of a step: reverse tracking may find its pose.
+
+        Parameters
+        ----------
+        frame : Frame
+
+        Raises
+        ------
+        InputError
+            As `step` does.
+        """
+        source, frame = frame, self.numbers.numbered(frame)
+        self.rows[frame.index] = FrameRow(frame.index, frame.timestamp_s, FrameStatus.DROPPED)
+        if not isinstance(late := self._state.parts.keep(source), Failure):
+            self.buffer.append_late(replace(late, index=frame.index))
+
     def join(self, submap_ids: Collection[int]) -> None:
         """Link submaps of another run, which the atlas holds besides the saved map's, with these; end the run.
 

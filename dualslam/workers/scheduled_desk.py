@@ -38,8 +38,7 @@ UNANSWERED = frozenset({JobKind.FORESIGHT})
 class ScheduledDesk:
     """The `dualslam.core.jobs.Desk` whose answers come by a schedule.
 
-    - `finish_wait_s`: how long the end of a run in real time, or of one that was interrupted, waits for what is under
-      way.
+    - `finish_wait_s`: how long the end of a run that was interrupted waits for what is under way.
     - `budget_s`: time after which a job that can stop early must, in real time.
 
     Attributes
@@ -93,7 +92,7 @@ class ScheduledDesk:
     def begin_end(self, interrupted: bool = False) -> None:
         """Say that no frame comes any more; `interrupted`: someone is waiting."""
         self._frame = AT_END
-        self._is_brief = (self._is_live or interrupted) and self.recorded is None
+        self._is_brief = interrupted and self.recorded is None
 
     def recorded_lateness(self, frame: int) -> Lateness | None:
         """Return how late a frame was in the run that is repeated; None where there is none, or no clock."""
@@ -155,7 +154,7 @@ class ScheduledDesk:
         self.executor.withdraw(of)
 
     def drain(self, kind: JobKind) -> list[Ended]:
-        """Give out the answers of a kind now, due or not; wait for them, in real time for a limited time."""
+        """Give out the answers of a kind now, due or not; wait for them, after an interruption for a limited time."""
         requests = [r for r in self._open.values() if r.kind is kind]
         self._is_draining = True
         if self._is_brief:

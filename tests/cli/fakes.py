@@ -87,6 +87,15 @@ class FakeSystem:
         self.poses[number] = FramePose(number, frame.timestamp_s, self._submap.id, number, np.eye(4))
         return self._result(frame, FrameStatus.TRACKED)
 
+    def keep(self, frame: Frame) -> None:
+        number = self.numbers.number(frame.index)
+        self.rows[number] = FrameRow(number, frame.timestamp_s, FrameStatus.DROPPED)
+
+    def seen(self) -> list[int]:
+        """Return the indices of the frames that were given to a step."""
+        rows = self.rows.values()
+        return [self.numbers.index_of(row.index) for row in rows if row.status is not FrameStatus.DROPPED]
+
     def finish(self, interrupted: bool = False) -> None:
         self.n_finished += 1
         self.was_interrupted = interrupted

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dualslam.core.grey_image import GreyImage
-from dualslam.core.types import View
+from dualslam.core.types import LateFrame, View
 from dualslam.recovery.frame_buffer import MB, FrameBuffer
 from dualslam.testing.point_world import random_features
 
@@ -105,6 +105,25 @@ class TestFrameBuffer:
         assert [v.index for v in buffer.backwards_from(49)] == list(range(48, 40, -1))
         assert [v.index for v in buffer.backwards_from(45)] == list(range(44, 40, -1))
         assert list(buffer.backwards_from(7)) == []
+
+    def test_late_frames_stay_as_long_as_those_about_them_and_are_the_first_to_go(self) -> None:
+        buffer = FrameBuffer(1.0, 10.0)
+        for i in range(50):
+            if i % 3:
+                buffer.append(view(i))
+            else:
+                buffer.append_late(LateFrame(i, i / RATE_HZ, GreyImage.of(NOISE)))
+        oldest = indices(buffer)[0]
+        assert [frame.index for frame in buffer.late] == [i for i in range(oldest, 50) if i % 3 == 0]
+        kept = sum(v.nbytes for v in buffer) + sum(frame.nbytes for frame in buffer.late)
+        assert buffer.nbytes == kept
+        small = FrameBuffer(100.0, 4.5 * NOISE.nbytes / MB)
+        for i in range(3):
+            small.append_late(LateFrame(2 * i, i / 4, GreyImage.of(NOISE)))
+            small.append(view(2 * i + 1))
+        assert len(small.late) < 3
+        assert with_image(small) == [1, 3, 5]
+        assert small.nbytes <= 4.5 * NOISE.nbytes
 
     def test_time_may_run_backwards(self) -> None:
         buffer = FrameBuffer(1.0, 10.0)

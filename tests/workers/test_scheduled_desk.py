@@ -228,9 +228,19 @@ def test_a_run_in_real_time_does_not_wait() -> None:
 
     wait_until(comes)
     assert desk.n_open(WALK) == 1
-    desk.begin_end()
+    desk.begin_end(interrupted=True)
     (late,) = desk.drain(WALK)
     assert late.result.reason is FailureReason.TIMEOUT
+    desk.close()
+
+
+def test_the_end_of_a_run_in_real_time_waits_for_what_is_under_way() -> None:
+    desk = ScheduledDesk(WorkerDesk([lane(WALK)], 0.0), finish_wait_s=0.0)
+    desk.begin_frame(0, in_real_time=True)
+    desk.submit(WALK, ("sleep", 0.3))
+    desk.begin_end()
+    (ended,) = desk.drain(WALK)
+    assert not isinstance(ended.result, Failure)
     desk.close()
 
 

@@ -7,6 +7,7 @@ import pickle
 import signal
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -15,8 +16,9 @@ import pytest
 from dualslam.build import recovery_parts, walk_handlers
 from dualslam.core.config.settings import Config
 from dualslam.core.events import EventKind
+from dualslam.core.grey_image import GreyImage
 from dualslam.core.jobs import JobKind, Limit
-from dualslam.core.types import Failure, FailureReason
+from dualslam.core.types import Failure, FailureReason, Frame, LateFrame
 from dualslam.recovery.job import RecoveryJob, RecoveryResult
 from dualslam.recovery.reverse_tracking import run_recovery
 from dualslam.run.results import trajectories_of
@@ -92,6 +94,28 @@ def test_a_recovery_out_of_time_gives_what_it_has(job: RecoveryJob) -> None:
     assert result.link is None
     (attempt,) = result.events
     assert attempt.data["verdict"] == "out of time"
+
+
+@pytest.mark.slow
+def test_frames_that_came_too_late_are_posed_by_reverse_tracking() -> None:
+    late = range(30, 35)
+    world = PointWorld(cloud(600), hand_held(60), covered=COVERED)
+    system = system_in(world, recovery={"enabled": True})
+
+    def keep(frame: Frame) -> LateFrame:
+        return LateFrame(frame.index, frame.timestamp_s, GreyImage.of(np.zeros((4, 4), np.uint8)))
+
+    system._state.parts = replace(system._state.parts, keep=keep)
+    kept = replace_walks(system, lambda _: KeptWalks())
+    for frame in world.frames():
+        (system.keep if frame.index in late else system.step)(frame)
+    _, job = kept.jobs
+    assert [frame.index for frame in job.late] == list(late)
+    result = run_recovery(job, replace(MAKE_PARTS(), read=lambda frame, camera: world.view(frame.index)))
+    assert result.link is not None
+    assert set(late) <= {frame.pose.index for frame in result.frames}
+    without = run_recovery(replace(job, late=()), MAKE_PARTS())
+    assert set(late).isdisjoint(frame.pose.index for frame in without.frames)
 
 
 @pytest.mark.slow

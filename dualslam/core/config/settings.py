@@ -182,7 +182,8 @@ class RecoveryConfig(StrictModel):
     self-calibration. With any there is one more, which solves the live map's graph. 0: inline, in the tracking process,
     which waits."""
     finish_wait_s: float = Field(30.0, ge=0)
-    """How long the end of the run waits for walks that are still under way."""
+    """How long the end of a run that was interrupted waits for walks that are still under way. Any other end waits for
+    all of them."""
 
 
 class BufferConfig(StrictModel):
