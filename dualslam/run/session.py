@@ -235,6 +235,7 @@ def run_to_folder(
         if realtime and isinstance(system.desk.executor, WorkerDesk):
             system.desk.executor.wait_until_ready()
         album = PlaceAlbum(folder.write_sample)
+        watcher = Watchers(()) if watcher is None else watcher
         faults = ImageFaults()
         watched = _Watched(system, SampleKeeper(folder.write_sample), album, watcher, faults)
         with Interrupts() as interrupts:
@@ -245,7 +246,7 @@ def run_to_folder(
                 prepare=prepare,
                 pace=system.pace,
                 on_frame=after_frame,
-                is_paused=None if watcher is None else watcher.is_paused,
+                is_paused=watcher.is_paused,
                 interrupts=interrupts,
                 repeats=recorded,
             )
@@ -497,13 +498,12 @@ class _Watched:
     """A system whose frames are looked at: for sample pictures, and by who watches the run."""
 
     def __init__(
-        self, system: System, samples: SampleKeeper, album: PlaceAlbum, watcher: Watcher | None, faults: ImageFaults
+        self, system: System, samples: SampleKeeper, album: PlaceAlbum, watcher: Watcher, faults: ImageFaults
     ) -> None:
         self._system, self._samples, self._album, self._watcher = system, samples, album, watcher
         self._faults = faults
         self._n_events = len(system.events)
-        if watcher is not None:
-            watcher.begin(system)
+        watcher.begin(system)
 
     def keep(self, frame: Frame) -> None:
         self._system.keep(frame)
@@ -515,8 +515,7 @@ class _Watched:
         self._samples.take(frame, result.status)
         self._album.take(frame, result.status)
         self._show_places()
-        if self._watcher is not None:
-            self._watcher.after(frame, result)
+        self._watcher.after(frame, result)
         return result
 
     def finish(self, interrupted: bool = False) -> None:
@@ -524,15 +523,11 @@ class _Watched:
             self._system.finish(interrupted)
             self._show_places()
         except KeyboardInterrupt:
-            self._end_watching()  # the run has ended for who looks on, too
+            self._watcher.end()  # the run has ended for who looks on, too
             raise
         finally:
             self._samples.finish()
-        self._end_watching()
-
-    def _end_watching(self) -> None:
-        if self._watcher is not None:
-            self._watcher.end()
+        self._watcher.end()
 
     def _show_places(self) -> None:
         numbers = self._system.numbers
