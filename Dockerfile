@@ -1,5 +1,5 @@
 # docker build -t dualslam .
-# docker run --rm -v "$PWD":/data dualslam run /data/walk.mp4 --out /data/runs/walk
+# docker run --rm --user "$(id -u):$(id -g)" -v "$PWD":/data dualslam run walk.mp4 --out runs/walk
 FROM python:3.13-slim
 ENV OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 PIP_NO_CACHE_DIR=1
 COPY requirements/core.lock /tmp/core.lock

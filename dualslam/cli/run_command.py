@@ -19,7 +19,7 @@ from dualslam.core import exit_status
 from dualslam.core.camera.focal import FocalSearch
 from dualslam.core.config.settings import Config
 from dualslam.core.errors import DualSlamError, InputError, NoCalibrationError
-from dualslam.io.atomic import atomic_file
+from dualslam.io.atomic import write_text
 from dualslam.io.reduced import MAX_SIDE_PX
 from dualslam.io.run_folder import MAP_PAGE, REPORT
 from dualslam.io.sequence import RecordedSequence
@@ -133,7 +133,7 @@ def live_view(args: argparse.Namespace) -> Iterator[LiveView | None]:
         yield None
         return
     live = LiveView(args.live)
-    live.on_save = lambda page: _keep_page(Path(args.out) / PAGE, page)
+    live.on_save = lambda page: write_text(Path(args.out) / PAGE, page)
     print(f"live view: {live.url}", flush=True)
     try:
         yield live
@@ -146,11 +146,6 @@ def stay_open(live: LiveView | None) -> None:
     if live is not None and sys.stdin is not None and sys.stdin.isatty() and live.alive:
         print(f"the live view stays at {live.url} until you press Ctrl-C", flush=True)
         live.wait()
-
-
-def _keep_page(path: Path, page: str) -> None:
-    with atomic_file(path) as file:
-        file.write(page.encode())
 
 
 def _tell(focal: FocalSearch | None, quiet: bool) -> None:

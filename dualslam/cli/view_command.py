@@ -8,7 +8,7 @@ from pathlib import Path
 from dualslam.cli.outputs import check_free
 from dualslam.core.errors import InputError
 from dualslam.core.extras import how_to_install
-from dualslam.io.atomic import atomic_file
+from dualslam.io.atomic import write_bytes
 from dualslam.report.run_data import RunData, read_run
 from dualslam.viewer.window import has_display, open_viewer
 
@@ -28,9 +28,7 @@ def execute(args: argparse.Namespace) -> int:
 
 def save_recording(run: Path, out: Path, quiet: bool) -> None:
     """Write the recording of a run."""
-    recording = _record(read_run(run))
-    with atomic_file(out) as file:
-        file.write(recording)
+    write_bytes(out, _record(read_run(run)))
     if not quiet:
         print(f"recording in {out}; open it with rerun {out}", flush=True)
 

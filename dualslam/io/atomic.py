@@ -32,8 +32,9 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        # mkstemp makes files private to the user; results follow the umask like any other file.
-        part.chmod(0o666 & ~_umask())
+        # mkstemp makes files private to the user; results follow the umask, which can only be read by setting it.
+        os.umask(mask := os.umask(0o022))
+        part.chmod(0o666 & ~mask)
         part.replace(path)
     except OSError as e:
         raise OutputError(f"{path} cannot be written: {e.strerror or e}.") from e
@@ -41,15 +42,13 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
         part.unlink(missing_ok=True)
 
 
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file atomically."""
+    with atomic_file(path) as file:
+        file.write(content)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically, UTF-8."""
-    with atomic_file(path) as file:
-        # A file's name may hold bytes that the locale does not know: they go back as they came.
-        file.write(text.encode(errors="surrogateescape"))
-
-
-def _umask() -> int:
-    # The mask can only be read by setting it.
-    mask = os.umask(0o022)
-    os.umask(mask)
-    return mask
+    # A file's name may hold bytes that the locale does not know: they go back as they came.
+    write_bytes(path, text.encode(errors="surrogateescape"))

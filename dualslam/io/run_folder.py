@@ -23,7 +23,7 @@ from dualslam.core.errors import OutputError
 from dualslam.core.events import Event
 from dualslam.core.schedule import SCHEDULE
 from dualslam.core.types import BoolArray
-from dualslam.io.atomic import atomic_file, write_text
+from dualslam.io.atomic import write_bytes, write_text
 from dualslam.io.folder_lock import FolderLock
 from dualslam.io.map_files import METADATA, to_plain
 from dualslam.io.metric_files import METRIC_FILES
@@ -185,14 +185,11 @@ class RunFolder:
 
     def write_sample(self, index: int, jpeg: bytes) -> None:
         """Write a small picture of a frame."""
-        with atomic_file(self.path / SAMPLES / f"{index:06d}.jpg") as file:
-            file.write(jpeg)
+        write_bytes(self.path / SAMPLES / f"{index:06d}.jpg", jpeg)
 
     def write_mask(self, hidden: BoolArray) -> None:
         """Write ``mask.png``: 0 for the pixels (H, W) that show no scene, 255 for the others."""
-        encoded = cv2.imencode(".png", np.where(hidden, 0, 255).astype(np.uint8))[1]
-        with atomic_file(self.path / MASK) as file:
-            file.write(encoded.tobytes())
+        write_bytes(self.path / MASK, cv2.imencode(".png", np.where(hidden, 0, 255).astype(np.uint8))[1].tobytes())
 
     def write_map_page(self, page: str) -> None:
         """Write ``map.html``."""

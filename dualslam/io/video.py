@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import urlsplit
 
 import cv2
@@ -41,34 +41,6 @@ LOG_CROP, CROP_SIGMA = 0.12, 0.08
 logarithm's mean and sigma. A telephone reads a part of its sensor and keeps a rim for stabilisation: from nothing (an
 iPhone 13 without: 69.5 degrees at 3840 x 2160, where 27 mm are 69.9) to 0.25 (an iPhone 7's film shows 42.2 cm where
 its photograph, of 28 mm, shows 49.6)."""
-
-
-class Capture(Protocol):
-    """The part of ``cv2.VideoCapture`` that is used."""
-
-    def isOpened(self) -> bool:
-        """Tell whether there is a source behind it."""
-        ...
-
-    def grab(self) -> bool:
-        """Go to the next frame; False at the end."""
-        ...
-
-    def retrieve(self) -> tuple[bool, NDArray[np.uint8] | None]:
-        """Return the frame that was grabbed."""
-        ...
-
-    def get(self, prop: int, /) -> float:
-        """Return a property."""
-        ...
-
-    def set(self, prop: int, value: float, /) -> bool:
-        """Set a property."""
-        ...
-
-    def release(self) -> None:
-        """Let go of the source."""
-        ...
 
 
 def open_recording(path: Path) -> Recording:
@@ -162,7 +134,7 @@ class _VideoReader:
         self._next = 0
 
 
-def _open(path: Path) -> Capture:
+def _open(path: Path) -> cv2.VideoCapture:
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise InputError(
@@ -220,7 +192,7 @@ class WebcamSequence:
         rate_hz: float,
         selection: Selection,
         grey: bool,
-        connect: Callable[[], Capture],
+        connect: Callable[[], cv2.VideoCapture],
     ) -> None:
         self.name = name
         self.camera = camera
@@ -277,7 +249,7 @@ def open_webcam(
     selection: Selection,
     rate_hz: float | None,
     grey: bool,
-    connect: Callable[[Any], Capture] = cv2.VideoCapture,
+    connect: Callable[[Any], Any] = cv2.VideoCapture,
 ) -> WebcamSequence:
     """Open a webcam by its number or device, or a stream by its address.
 
@@ -299,8 +271,8 @@ def open_webcam(
     if camera is None and fov_degrees is None:
         raise InputError(f"{called} has no calibration; give a camera file, or a field of view in degrees.")
 
-    def connected() -> Capture:
-        capture = connect(source)
+    def connected() -> cv2.VideoCapture:
+        capture: cv2.VideoCapture = connect(source)
         if not capture.isOpened():
             raise InputError(f"{called} cannot be opened; {check}.")
         return capture

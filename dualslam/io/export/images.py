@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dualslam.core.camera.base import Camera
 from dualslam.core.errors import InputError
 from dualslam.core.types import FloatArray, Frame
-from dualslam.io.atomic import atomic_file
+from dualslam.io.atomic import write_bytes
 from dualslam.io.export.colmap import image_name, mask_path
 from dualslam.io.export.exported_map import ExportedMap
 
@@ -96,7 +96,5 @@ def undistortion(
 
 def _write(path: Path, image: NDArray[np.uint8]) -> None:
     """Write a grey or an RGB image; OpenCV encodes BGR."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     encoded = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image)[1]
-    with atomic_file(path) as file:
-        file.write(encoded.tobytes())
+    write_bytes(path, encoded.tobytes())

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from dualslam.io.atomic import atomic_file, write_text
+from dualslam.io.atomic import write_text
 from dualslam.io.export.colmap import image_name, mask_path
 from dualslam.io.export.decimals import DECIMALS
 from dualslam.io.export.exported_map import ExportedMap
-from dualslam.io.export.ply import ply_bytes
+from dualslam.io.export.ply import write_ply
 
 POINTS = "points.ply"
 TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -37,6 +37,5 @@ def write_nerfstudio(exported: ExportedMap, out: Path) -> None:
             | ({"mask_path": mask.as_posix()} if (out / mask).is_file() else {})
         )
     content = {"camera_model": "OPENCV", "w": width, "h": height, "ply_file_path": POINTS, "frames": frames}
-    with atomic_file(out / POINTS) as file:
-        file.write(ply_bytes(exported))
+    write_ply(exported, out / POINTS)
     write_text(out / "transforms.json", json.dumps(content, indent=1) + "\n")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dualslam.io.atomic import atomic_file
+from dualslam.io.atomic import write_bytes
 from dualslam.io.export.exported_map import ExportedMap
 
 _VERTEX = np.dtype(
@@ -14,21 +14,14 @@ _VERTEX = np.dtype(
 )
 
 
-def ply_bytes(exported: ExportedMap) -> bytes:
-    """Return the content of the file."""
+def write_ply(exported: ExportedMap, out: Path) -> None:
+    """Write one file."""
+    colours = ("red", "green", "blue")
     vertices = np.empty(len(exported.xyz), _VERTEX)
     for axis, name in enumerate("xyz"):
         vertices[name] = exported.xyz[:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
+    for channel, name in enumerate(colours):
         vertices[name] = exported.colour[:, channel]
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    head += [f"property float {name}" for name in "xyz"] + [
-        f"property uchar {name}" for name in ("red", "green", "blue")
-    ]
-    return ("\n".join([*head, "end_header"]) + "\n").encode() + vertices.tobytes()
-
-
-def write_ply(exported: ExportedMap, out: Path) -> None:
-    """Write one file."""
-    with atomic_file(out) as file:
-        file.write(ply_bytes(exported))
+    head += [f"property float {name}" for name in "xyz"] + [f"property uchar {name}" for name in colours]
+    write_bytes(out, ("\n".join([*head, "end_header"]) + "\n").encode() + vertices.tobytes())
