@@ -27,49 +27,26 @@ class Gauge(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mount:
-    """How a sensor is fixed to the camera.
+    """How a sensor is fixed to the camera."""
 
-    Attributes
-    ----------
-    T_cam_body : (4, 4)
-        Sensor to camera (x right, y down, z forward), metres.
-    is_given : bool
-        False: the turn of a sensor that measures rotations is estimated; its place is taken to be the camera's.
-    """
-
-    T_cam_body: FloatArray = field(default_factory=lambda: np.eye(4))
+    T_cam_body: FloatArray = field(default_factory=lambda: np.eye(4))  # to x right, y down, z forward; metres
     is_given: bool = False
+    """False: the turn of a sensor that measures rotations is estimated; its place is taken to be the camera's."""
 
 
 class Measurement(Protocol):
-    """One reading with its sigmas: a frozen dataclass, which may inherit from this one. `conformance` checks it all.
+    """One reading with its sigmas: a frozen dataclass, which may inherit from this one. `conformance` checks it all."""
 
-    Attributes
-    ----------
-    kind : str
-        The word that names it in files and in the registry.
-    columns : tuple of str
-        Fields of its line in a file, after the kind.
-    units : tuple of str
-        ``m`` or ``rad`` for each component of the residual.
-    fixes : frozenset of Gauge
-    shared_sigmas : tuple of float
-        Standard deviations of the unknowns that all readings of a kind share, such as a bias; their mean is 0.
-    times_s : tuple of float
-        Of the poses that it is about, on the sensor's clock.
-    sigmas : (d,)
-        Standard deviations of the residual.
-    """
-
-    kind: ClassVar[str]
-    columns: ClassVar[tuple[str, ...]]
-    units: ClassVar[tuple[str, ...]]
-    fixes: ClassVar[frozenset[Gauge]]
+    kind: ClassVar[str]  # the word that names it in files and in the registry
+    columns: ClassVar[tuple[str, ...]]  # of its line in a file, after the kind
+    units: ClassVar[tuple[str, ...]]  # `m` or `rad` for each component of the residual
+    fixes: ClassVar[frozenset[Gauge]] = frozenset()
     shared_sigmas: ClassVar[tuple[float, ...]] = ()
+    """Of the unknowns that all readings of a kind share, such as a bias; their mean is 0."""
 
     @property
     def times_s(self) -> tuple[float, ...]:
-        """Times of the poses: the columns that begin with ``t_``."""
+        """Times of the poses that it is about, on the sensor's clock: the columns that begin with ``t_``."""
         return tuple(getattr(self, name) for name in self.columns if name.startswith("t_"))
 
     @property
@@ -78,14 +55,7 @@ class Measurement(Protocol):
         return np.array([getattr(self, f"sigma_{unit}") for unit in self.units])
 
     def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
-        """Compare the reading with poses.
-
-        Parameters
-        ----------
-        T : (k, 4, 4)
-            Camera to the measurements' frame, metres, at `times_s`.
-        shared : (n,)
-        """
+        """Compare with poses T (k, 4, 4), camera to the measurements' frame, and with shared unknowns (n,)."""
         ...
 
     @classmethod
@@ -111,14 +81,9 @@ def point_jacobian(T: FloatArray, p_cam: FloatArray) -> FloatArray:
 
 
 def between(T: FloatArray, T_cam_body: FloatArray, T_a_b: FloatArray) -> Residual:
-    """Compare a motion with two poses (2, 4, 4): residual (6,) and Jacobian (6, 12), rotation then translation.
+    """Compare a body's motion, its second pose in its first, with two poses (2, 4, 4): (6,), (6, 12).
 
-    Parameters
-    ----------
-    T : (2, 4, 4)
-    T_cam_body : (4, 4)
-    T_a_b : (4, 4)
-        Measured motion of the body: its second pose in its first.
+    Rotation stands before translation.
     """
     T_b_a = se3.inverse(T[1] @ T_cam_body) @ T[0] @ T_cam_body
     r = se3.log(se3.inverse(T_b_a @ T_a_b))

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Self
 
 import gtsam
@@ -49,11 +50,9 @@ MAX_RUN = 2
 
 
 def _integrated(source: MeasurementSource, cuts_s: FloatArray) -> MeasurementSource:
-    kinds: dict[type, list[object]] = {}
-    for reading in source.readings:
-        kinds.setdefault(type(reading), []).append(reading)
     done: list[object] = []
-    for cls, readings in kinds.items():
+    for cls in dict.fromkeys(map(type, source.readings)):
+        readings = [r for r in source.readings if type(r) is cls]
         integrate = getattr(cls, "integrate", None)
         done += readings if integrate is None else integrate(readings, cuts_s)
     return replace(source, readings=done)
@@ -172,14 +171,9 @@ class JointGraph:
 
     def longest_run(self) -> list[float]:
         """Return the times of the most positions in a row that are outvoted."""
-        runs: list[list[float]] = [[]]
-        for term in self.terms:
-            if term.reading.kind == POSITION:
-                if term.weight > 0.5:
-                    runs.append([])
-                else:
-                    runs[-1].append(term.reading.t_s)
-        return max(runs, key=len)
+        positions = [t for t in self.terms if t.reading.kind == POSITION]
+        runs = [[t.reading.t_s for t in run] for counts, run in groupby(positions, _counts) if not counts]
+        return max(runs, key=len, default=[])
 
     def _clock_jumps_s(self) -> dict[int, float]:
         """Return, by source, where its clock's offset changes most: by medians of positions before and after."""
@@ -204,9 +198,8 @@ class JointGraph:
         if up is None or all(source.origin is None for source in self.sources):
             return 0.0
         middle = len(self.problem.S_world_node) // 2
-        S = convert.from_similarity3(self.values.atSimilarity3(middle)) @ sim3.inverse(
-            self.problem.S_world_node[middle]
-        )
+        S_metric_node = convert.from_similarity3(self.values.atSimilarity3(middle))
+        S = S_metric_node @ sim3.inverse(self.problem.S_world_node[middle])
         return float((((sim3.rotation(S) @ up - [0.0, 0.0, 1.0]) / UPRIGHT_SIGMA) ** 2).sum())
 
     def _set_clocks_right(self, graph: gtsam.NonlinearFactorGraph) -> bool:
@@ -215,15 +208,13 @@ class JointGraph:
         An offset that is estimated in vain costs accuracy along the way: 0.07 s are 0.7 m at 10 m/s.
         """
         marginals = gtsam.Marginals(graph, self.values)
-        right = []
-        for source, key in self._clock.items():
+        n = len(self._clock)
+        for source, key in list(self._clock.items()):
             sigma = float(np.sqrt(marginals.marginalCovariance(key)[0, 0]))
             if abs(self.offsets_s[source] + float(self.values.atVector(key)[0])) < CLOCK_SIGMAS * sigma:
-                right.append(source)
-        for source in right:
-            self.values.erase(self._clock.pop(source))
-            self._right_clocks[source] = -self.offsets_s[source]
-        return bool(right)
+                self.values.erase(self._clock.pop(source))
+                self._right_clocks[source] = -self.offsets_s[source]
+        return len(self._clock) < n
 
     def _graduate(self) -> None:
         """Find the readings and connections that count: graduated non-convexity on truncated least squares."""
@@ -261,9 +252,8 @@ class JointGraph:
     def _reject(self) -> bool:
         """Take out what is beyond its quantile, take in what is within; return whether anything changed."""
         before = self._weights()
-        after = (self._ratios() <= 1.0).astype(float)
-        self._weigh(after)
-        return not np.array_equal(before, after)
+        self._weigh((self._ratios() <= 1.0).astype(float))
+        return not np.array_equal(before, self._weights())
 
     def _weights(self) -> FloatArray:
         return np.concatenate(([t.weight for t in self.terms], self.link_weights))
@@ -367,8 +357,7 @@ class JointGraph:
         r, J = term.reading.residual(T, shared)
         by_node: dict[int, FloatArray] = {}
         for i, node in enumerate(term.nodes):
-            own = J[:, 6 * i : 6 * i + 6] @ J_node[i]
-            by_node[node] = by_node[node] + own if node in by_node else own
+            by_node[node] = by_node.get(node, 0.0) + J[:, 6 * i : 6 * i + 6] @ J_node[i]
         found = list(by_node.values())
         if clock is not None:
             found.append((J[:, : 6 * len(T)] @ np.concatenate(J_tau))[:, None])
@@ -380,12 +369,9 @@ class JointGraph:
 
     def _ratios(self) -> FloatArray:
         """Return squared residuals over their quantiles: of readings, then of doubtful connections."""
-        found = []
-        for term in self.terms:
-            r = self._evaluate(term, self.values)[0] / term.reading.sigmas
-            found.append(float(r @ r) / CHI2_99[min(len(r), len(CHI2_99) - 1)])
-        found += [self._edge_chi2(i) / CHI2_999[7] for i in self.doubtful]
-        return np.array(found)
+        whitened = [self._evaluate(t, self.values)[0] / t.reading.sigmas for t in self.terms]
+        found = [float(r @ r) / CHI2_99[min(len(r), len(CHI2_99) - 1)] for r in whitened]
+        return np.array(found + [self._edge_chi2(i) / CHI2_999[7] for i in self.doubtful])
 
     def _edge_chi2(self, i: int) -> float:
         e = self.problem.edges[i]
@@ -395,8 +381,7 @@ class JointGraph:
 
     def _excess(self, graph: gtsam.NonlinearFactorGraph) -> float:
         """Return how far the joint cost exceeds its expectation, in its standard deviations."""
-        dims = [len(t.reading.sigmas) for t in self.terms if t.weight > 0.5]
-        dof = max(sum(dims) - 7, 1)
+        dof = max(sum(len(t.reading.sigmas) for t in self.terms if _counts(t)) - 7, 1)
         return float((2.0 * graph.error(self.values) - dof) / np.sqrt(2.0 * dof))
 
     def _solution(self, graph: gtsam.NonlinearFactorGraph, excess: float) -> MetricSolution:
@@ -404,23 +389,14 @@ class JointGraph:
         nodes = range(len(self.problem.S_world_node))
         C = np.array([marginals.marginalCovariance(n) for n in nodes]).reshape(-1, 7, 7)
         S = np.array([convert.from_similarity3(self.values.atSimilarity3(n)) for n in nodes])
-        used, rejected, sums, dims = Counter[str](), Counter[str](), Counter[str](), Counter[str]()
-        for term in self.terms:
-            kind = term.reading.kind
-            if term.weight < 0.5:
-                rejected[kind] += 1
-                continue
-            used[kind] += 1
+        count = [t for t in self.terms if _counts(t)]
+        whitened: dict[str, list[FloatArray]] = {}
+        for term in count:
             r = self._evaluate(term, self.values)[0] / term.reading.sigmas
-            sums[kind] += float(r @ r)  # type: ignore[assignment]
-            dims[kind] += len(r)
-        offsets, sigmas = {}, {}
-        for i, key in self._clock.items():
-            name = self.sources[i].name
-            offsets[name] = self.offsets_s[i] + float(self.values.atVector(key)[0])
-            sigmas[name] = float(np.sqrt(marginals.marginalCovariance(key)[0, 0]))
+            whitened.setdefault(term.reading.kind, []).append(r)
+        clocks = {self.sources[i].name: (i, key) for i, key in self._clock.items()}
         believed = np.ones(len(self.problem.edges), bool)
-        believed[np.array(self.doubtful, int)[self.link_weights < 0.5]] = False
+        believed[self.doubtful] = self.link_weights > 0.5
         middle = len(nodes) // 2
         s = float(sim3.scale(S[middle]))
         per_world = s / float(sim3.scale(self.problem.S_world_node[middle]))
@@ -428,21 +404,25 @@ class JointGraph:
             S_metric_node=S,
             covariance=C,
             believed=believed,
-            used=dict(used),
-            rejected=dict(rejected),
+            used={kind: len(r) for kind, r in whitened.items()},
+            rejected=dict(Counter(t.reading.kind for t in self.terms if not _counts(t))),
             outside=dict(Counter(r.kind for r in self.outside)),
             repeated=self.n_repeated,
-            normalised={k: float(np.sqrt(sums[k] / dims[k])) for k in used},
-            clock_offset_s=offsets,
-            clock_sigma_s=sigmas,
+            normalised_rms={kind: float(np.sqrt((np.concatenate(r) ** 2).mean())) for kind, r in whitened.items()},
+            clock_offset_s={n: self.offsets_s[i] + float(self.values.atVector(k)[0]) for n, (i, k) in clocks.items()},
+            clock_sigma_s={n: float(np.sqrt(marginals.marginalCovariance(k)[0, 0])) for n, (_, k) in clocks.items()},
             metres_per_unit=per_world,
             scale_sigma=float(np.sqrt(C[middle, 6, 6])),
             rotation_sigma_rad=_largest_sigma(C[middle, :3, :3]),
             translation_sigma_m=s * _largest_sigma(C[middle, 3:6, 3:6]),
             drift=self.drift,
-            misfit=excess,
-            exports=export_graph(self.problem, S, [t for t in self.terms if t.weight > 0.5]),
+            misfit_sigmas=excess,
+            exports=export_graph(self.problem, S, count),
         )
+
+
+def _counts(term: Term) -> bool:
+    return term.weight > 0.5
 
 
 def _largest_sigma(C: FloatArray) -> float:

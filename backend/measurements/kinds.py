@@ -20,16 +20,7 @@ MOTION_UNITS = ("rad",) * 3 + ("m",) * 3
 
 @dataclass(frozen=True, slots=True)
 class Position(Measurement):
-    """Where an antenna is: GPS, RTK, motion capture.
-
-    Attributes
-    ----------
-    t_s : float
-    xyz_m : (float, float, float)
-    sigma_m : float or (float, float, float)
-    lever_arm_m : (float, float, float)
-        The antenna in the camera's axes: x right, y down, z forward.
-    """
+    """Where an antenna is: GPS, RTK, motion capture."""
 
     kind: ClassVar[str] = "position"
     columns: ClassVar[tuple[str, ...]] = ("t_s", "x_m", "y_m", "z_m", "sigma_x_m", "sigma_y_m", "sigma_z_m")
@@ -39,7 +30,7 @@ class Position(Measurement):
     t_s: float
     xyz_m: Vector
     sigma_m: float | Vector
-    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)  # the antenna in the camera's axes: x right, y down, z forward
 
     @property
     def sigmas(self) -> FloatArray:
@@ -79,7 +70,7 @@ class Height(Measurement):
 
     def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
         """Return predicted minus measured height, metres."""
-        return np.array([T[0, 2, 3] - self.z_m]), point_jacobian(T[0], np.zeros(3))[2:]
+        return T[0, 2, 3:] - self.z_m, point_jacobian(T[0], np.zeros(3))[2:]
 
     @classmethod
     def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:
@@ -89,15 +80,7 @@ class Height(Measurement):
 
 @dataclass(frozen=True, slots=True)
 class Direction(Measurement):
-    """A direction in the camera's axes, and the same one in the measurements' frame: gravity, north.
-
-    Attributes
-    ----------
-    t_s : float
-    in_camera, in_world : (float, float, float)
-        Of any length. Gravity: down in both.
-    sigma_rad : float
-    """
+    """A direction in the camera's axes, and the same one in the measurements' frame: gravity (down in both), north."""
 
     kind: ClassVar[str] = "direction"
     columns: ClassVar[tuple[str, ...]] = ("t_s", "bx", "by", "bz", "wx", "wy", "wz", "sigma_rad")
@@ -105,15 +88,14 @@ class Direction(Measurement):
     fixes: ClassVar[frozenset[Gauge]] = frozenset({Gauge.ROTATION})
 
     t_s: float
-    in_camera: Vector
+    in_camera: Vector  # of any length, as the other
     in_world: Vector
     sigma_rad: float
 
     def residual(self, T: FloatArray, shared: FloatArray) -> Residual:
         """Return the difference of the two unit vectors, in the measurements' frame."""
-        R, seen, known = T[0, :3, :3], np.asarray(self.in_camera), np.asarray(self.in_world)
-        d = seen / np.linalg.norm(seen)
-        return R @ d - known / np.linalg.norm(known), np.hstack((-R @ so3.hat(d), np.zeros((3, 3))))
+        R, (d, known) = T[0, :3, :3], (np.asarray(v) / np.linalg.norm(v) for v in (self.in_camera, self.in_world))
+        return R @ d - known, np.hstack((-R @ so3.hat(d), np.zeros((3, 3))))
 
     @classmethod
     def of_row(cls, row: Sequence[float], mount: Mount) -> Self:
@@ -146,10 +128,8 @@ class Distance(Measurement):
         """Return predicted minus measured distance, metres."""
         d = T[1, :3, 3] - T[0, :3, 3]
         length = float(np.linalg.norm(d))
-        u = d / max(length, 1e-12)
-        J = np.zeros((1, 12))
-        J[0, 3:6], J[0, 9:12] = -u @ T[0, :3, :3], u @ T[1, :3, :3]
-        return np.array([length - self.distance_m]), J
+        u, none = d / max(length, 1e-12), np.zeros(3)
+        return np.array([length - self.distance_m]), np.hstack((none, -u @ T[0, :3, :3], none, u @ T[1, :3, :3]))[None]
 
     @classmethod
     def simulate(cls, times_s: Sequence[float], T: FloatArray, sigma: float, rng: Generator | None = None) -> Self:
@@ -160,16 +140,7 @@ class Distance(Measurement):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativePose(Measurement):
-    """Motion of the body between two times: wheel odometry, or any other odometry.
-
-    Attributes
-    ----------
-    t_a_s, t_b_s : float
-    T_a_b : (4, 4)
-        The body's second pose in its first, metres.
-    sigma_m, sigma_rad : float
-    mount : Mount
-    """
+    """Motion of the body between two times: wheel odometry, or any other odometry."""
 
     kind: ClassVar[str] = "relative_pose"
     columns: ClassVar[tuple[str, ...]] = (
@@ -180,7 +151,7 @@ class RelativePose(Measurement):
 
     t_a_s: float
     t_b_s: float
-    T_a_b: FloatArray
+    T_a_b: FloatArray  # (4, 4): the body's second pose in its first, metres
     sigma_m: float
     sigma_rad: float
     mount: Mount = field(default_factory=Mount)
@@ -219,7 +190,6 @@ class SamePlace(Measurement):
     kind: ClassVar[str] = "same_place"
     columns: ClassVar[tuple[str, ...]] = ("t_a_s", "t_b_s", "sigma_m", "sigma_rad")
     units: ClassVar[tuple[str, ...]] = MOTION_UNITS
-    fixes: ClassVar[frozenset[Gauge]] = frozenset()
 
     t_a_s: float
     t_b_s: float

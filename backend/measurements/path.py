@@ -17,12 +17,7 @@ MAX_GAP_S = 1.0
 
 
 class CameraPath:
-    """Poses of a linked set of submaps at any time.
-
-    Parameters
-    ----------
-    problem : MetricProblem
-    """
+    """Poses of a linked set of submaps at any time."""
 
     def __init__(self, problem: MetricProblem) -> None:
         self._t, self._T, self._node = problem.times_s, problem.T_world_cam, problem.node
@@ -50,50 +45,30 @@ class CameraPath:
         node = np.where(share < 0.5, self._node[before], self._node[after])
         return T, xi / step[:, None], node
 
-    def in_node(self, T_world_cam: FloatArray, node: IntArray) -> FloatArray:
-        """Return poses (M, 4, 4) in the frames of their nodes, in their units."""
-        return sim3.act_on_pose(self._S_node_world[node], T_world_cam)
-
-    def scale_of(self, node: IntArray) -> FloatArray:
-        """Return units of the node a unit of the world is long, (M,)."""
-        return sim3.scale(self._S_node_world[node])
+    def at_nodes(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Return the same, poses and twists in the frames and units of the nodes."""
+        T, twist, node = self.at(times_s)
+        S = self._S_node_world[node]
+        twist[:, 3:] *= sim3.scale(S)[:, None]
+        return sim3.act_on_pose(S, T), twist, node
 
 
 @dataclass(slots=True, eq=False)
 class Term:
-    """A reading with the poses that it is about.
-
-    Attributes
-    ----------
-    reading : Measurement
-    source : int
-    nodes : tuple of int
-        One for each pose; they may be equal.
-    T_node_cam, twist : (k, 4, 4), (k, 6)
-        At the offset that `attach` was given; the twist in the node's unit.
-    weight : float
-    """
+    """A reading with the poses that it is about, at the clock's offset that `attach` was given."""
 
     reading: Any
     source: int
-    nodes: tuple[int, ...]
-    T_node_cam: FloatArray
-    twist: FloatArray
+    nodes: tuple[int, ...]  # one for each pose; they may be equal
+    T_node_cam: FloatArray  # (k, 4, 4)
+    twist: FloatArray  # (k, 6): in the node's unit
     weight: float = 1.0
 
 
 def attach(
     path: CameraPath, sources: Sequence[MeasurementSource], offsets_s: Sequence[float]
 ) -> tuple[list[Term], list[Any]]:
-    """Attach the readings whose times have poses; return them and the others.
-
-    Parameters
-    ----------
-    path : CameraPath
-    sources : sequence of MeasurementSource
-    offsets_s : sequence of float
-        Of the sources' clocks.
-    """
+    """Attach the readings whose times have poses; return them and the others. `offsets_s`: of the sources' clocks."""
     terms: list[Term] = []
     outside: list[Any] = []
     for i, (source, offset) in enumerate(zip(sources, offsets_s, strict=True)):
@@ -102,9 +77,7 @@ def attach(
         counts = np.array([len(r.times_s) for r in source.readings])
         times = np.array([t for r in source.readings for t in r.times_s]) + offset
         known = path.knows(times)
-        T, twist, node = path.at(times)
-        T = path.in_node(T, node)
-        twist[:, 3:] *= path.scale_of(node)[:, None]
+        T, twist, node = path.at_nodes(times)
         ends = np.cumsum(counts)
         for reading, a, b in zip(source.readings, (ends - counts).tolist(), ends.tolist(), strict=True):
             if known[a:b].all():

@@ -19,14 +19,15 @@ from dualslam.core.metric_problem import MeasurementRow, MeasurementSource, RowS
 ENTRY_POINT_GROUP = "dualslam.measurements"
 """A package offers one by ``[project.entry-points."dualslam.measurements"] kind = "module:Class"``."""
 
+_OURS = "dualslam.backend.measurements"
 BUILT_IN: Mapping[str, str] = {
-    "position": "kinds:Position",
-    "relative_pose": "kinds:RelativePose",
-    "rotation_rate": "rotation_rate:RotationRate",
-    "direction": "kinds:Direction",
-    "height": "kinds:Height",
-    "distance": "kinds:Distance",
-    "same_place": "kinds:SamePlace",
+    "position": f"{_OURS}.kinds:Position",
+    "relative_pose": f"{_OURS}.kinds:RelativePose",
+    "rotation_rate": f"{_OURS}.rotation_rate:RotationRate",
+    "direction": f"{_OURS}.kinds:Direction",
+    "height": f"{_OURS}.kinds:Height",
+    "distance": f"{_OURS}.kinds:Distance",
+    "same_place": f"{_OURS}.kinds:SamePlace",
 }
 MOUNT = "mount"
 """The kind of a line that says how the sensor of the lines after it is fixed to the camera."""
@@ -41,22 +42,15 @@ def known_kinds() -> list[str]:
 def measurement_class(kind: str, where: str = "") -> type[Any]:
     """Return the class of a kind: a built-in one, an entry point's, or ``module:Class``.
 
-    Raises
-    ------
-    InputError
-        If there is none, or it cannot be imported.
+    Raises `InputError` if there is none, or it cannot be imported.
     """
     at = f"{where}: " if where else ""
     try:
-        if kind in BUILT_IN:
-            module, _, name = BUILT_IN[kind].partition(":")
-            found = getattr(importlib.import_module(f"dualslam.backend.measurements.{module}"), name)
-        elif ":" in kind:
-            module, _, name = kind.partition(":")
+        module, _, name = BUILT_IN.get(kind, kind).rpartition(":")
+        if module:
             found = getattr(importlib.import_module(module), name)
         else:
-            entry = next(iter(entry_points(group=ENTRY_POINT_GROUP, name=kind)), None)
-            found = None if entry is None else entry.load()
+            found = next((e.load() for e in entry_points(group=ENTRY_POINT_GROUP, name=kind)), None)
     except (ImportError, AttributeError, ValueError, SyntaxError) as error:
         raise InputError(f"{at}the measurement {kind!r} cannot be imported: {error}.") from error
     if found is None:
@@ -72,10 +66,7 @@ def measurement_class(kind: str, where: str = "") -> type[Any]:
 def readings_of(source: RowSource) -> MeasurementSource:
     """Make the readings of a file's lines.
 
-    Raises
-    ------
-    InputError
-        Naming the line: of an unknown kind, too few numbers, or a sigma that is not above 0.
+    Raises `InputError`, naming the line: of an unknown kind, too few numbers, or a sigma that is not above 0.
     """
     mount = Mount()
     classes: dict[str, type[Any]] = {}

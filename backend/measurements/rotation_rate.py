@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.random import Generator
 
-from dualslam.backend.measurements.base import Gauge, Measurement, Mount, Residual, noise
+from dualslam.backend.measurements.base import Measurement, Mount, Residual, noise
 from dualslam.core.geometry import so3
 from dualslam.core.types import FloatArray
 
@@ -21,32 +21,20 @@ MAX_GAP_S = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RotationRate(Measurement):
-    """Turn of the body from one time to another, integrated from a gyroscope.
-
-    Attributes
-    ----------
-    t_a_s, t_b_s : float
-    turn_rad : (3,)
-        Rotation vector in the body's axes.
-    sigma_rad : float
-        Of the turn.
-    mount : Mount
-    bias_effect_s : (3, 3)
-        Derivative of the turn's right perturbation by minus the bias; None: a short turn.
-    """
+    """Turn of the body from one time to another, integrated from a gyroscope."""
 
     kind: ClassVar[str] = "rotation_rate"
     columns: ClassVar[tuple[str, ...]] = ("t_s", "wx_rad_s", "wy_rad_s", "wz_rad_s", "sigma_rad_s")
     units: ClassVar[tuple[str, ...]] = ("rad",) * 3
-    fixes: ClassVar[frozenset[Gauge]] = frozenset()
     shared_sigmas: ClassVar[tuple[float, ...]] = (BIAS_SIGMA_RAD_S,) * 3
 
     t_a_s: float
     t_b_s: float
-    turn_rad: FloatArray
-    sigma_rad: float
+    turn_rad: FloatArray  # (3,): rotation vector in the body's axes
+    sigma_rad: float  # of the turn
     mount: Mount = field(default_factory=Mount)
     bias_effect_s: FloatArray | None = None
+    """(3, 3): derivative of the turn's right perturbation by minus the bias; None: a short turn."""
 
     @property
     def times_s(self) -> tuple[float, ...]:
@@ -83,19 +71,14 @@ class RotationRate(Measurement):
     def integrate(cls, readings: Sequence[Self], cuts_s: FloatArray) -> list[Self]:
         """Return the turns between neighbouring times, where readings of one instant cover all of the way.
 
-        Parameters
-        ----------
-        readings : sequence of RotationRate
-            Of lines: `t_a_s` equals `t_b_s`. Others are returned as they are.
-        cuts_s : (K,)
-            Ascending, on the sensor's clock.
+        - `readings`: of lines: `t_a_s` equals `t_b_s`. Others are returned as they are.
+        - `cuts_s` (K,): ascending, on the sensor's clock.
         """
         done = [r for r in readings if r.t_b_s > r.t_a_s]
         raw = sorted((r for r in readings if r.t_b_s == r.t_a_s), key=lambda r: r.t_a_s)
         if len(raw) < 2:
             return done
-        t = np.array([r.t_a_s for r in raw])
-        w = np.array([r.turn_rad for r in raw])
+        t, w = np.array([r.t_a_s for r in raw]), np.array([r.turn_rad for r in raw])
         for a, b in zip(cuts_s[:-1].tolist(), cuts_s[1:].tolist(), strict=True):
             first, last = np.searchsorted(t, (a, b))
             if first == 0 or last == len(t):

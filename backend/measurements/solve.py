@@ -26,20 +26,10 @@ def solve_metric(
 ) -> MetricSolution:
     """Put a map into the frame of measurements.
 
-    Where they do not fit as they are, and fit far better read otherwise, they are refused.
+    `known_offsets_s`: of clocks, by source, that were estimated with another map: they are not estimated again.
 
-    Parameters
-    ----------
-    problem : MetricProblem
-    sources : sequence of MeasurementSource
-    known_offsets_s : mapping of str to float, optional
-        Of clocks, by source, that were estimated with another map: they are not estimated again.
-
-    Raises
-    ------
-    InputError
-        In one sentence, where the measurements cannot belong to the map.
-    SolverError
+    Raises `InputError`, in one sentence, where the measurements cannot belong to the map: where they do not fit as they
+    are, and fit far better read otherwise. Raises `SolverError`.
     """
     known = known_offsets_s or {}
     names = ", ".join(source.name for source in sources)

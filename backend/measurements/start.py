@@ -33,22 +33,12 @@ N_SCREENED = 60
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MetricStart:
-    """Where the joint graph starts.
+    """Where the joint graph starts."""
 
-    Attributes
-    ----------
-    S_metric_world : (4, 4)
-    sources : sequence of MeasurementSource
-        Without what a frozen receiver repeated, sensors' mounts filled in.
-    offsets_s : list of float
-    n_repeated : int
-        Positions that were left out as repeated.
-    """
-
-    S_metric_world: FloatArray
-    sources: Sequence[MeasurementSource]
+    S_metric_world: FloatArray  # (4, 4)
+    sources: Sequence[MeasurementSource]  # without what a frozen receiver repeated, sensors' mounts filled in
     offsets_s: list[float]
-    n_repeated: int = 0
+    n_repeated: int  # positions that were left out as repeated
 
 
 def find_start(
@@ -59,10 +49,7 @@ def find_start(
 ) -> MetricStart:
     """Find it; `known_offsets_s` by source.
 
-    Raises
-    ------
-    InputError
-        In one sentence: no overlap in time, a receiver that never moves, mirrored axes of a gyroscope.
+    Raises `InputError`: no overlap in time, a receiver that never moves, mirrored axes of a gyroscope.
     """
     for source in sources:
         _check(source, path)
@@ -72,11 +59,10 @@ def find_start(
     up = up_of(problem)
     offsets = [known_offsets_s[s.name] if s.name in known_offsets_s else _offset(path, s, up) for s in sources]
     sources = [_with_mounts(path, s, offset) for s, offset in zip(sources, offsets, strict=True)]
-    for source, offset in zip(sources, offsets, strict=True):
-        S = _align(*_positions(path, source, offset), up)
-        if S is not None:
-            return MetricStart(S, sources, offsets, n_repeated)
-    return MetricStart(_by_rigid_fits(problem, path, sources, offsets), sources, offsets, n_repeated)
+    aligned = (_align(*_positions(path, s, offset), up) for s, offset in zip(sources, offsets, strict=True))
+    S = next((S for S in aligned if S is not None), None)
+    S = _by_rigid_fits(problem, path, sources, offsets) if S is None else S
+    return MetricStart(S, sources, offsets, n_repeated)
 
 
 def _without_repeats(source: MeasurementSource) -> MeasurementSource:

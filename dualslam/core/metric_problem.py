@@ -67,7 +67,7 @@ class MetricSolution:
     rejected: Mapping[str, int]
     outside: Mapping[str, int]
     repeated: int  # positions left out: they repeat the one before to the last digit
-    normalised: Mapping[str, float]  # RMS of the residuals that count, in their sigmas, by kind
+    normalised_rms: Mapping[str, float]  # RMS of the residuals that count, in their sigmas, by kind
     # By source: add the offset to the source's times to have the frames'.
     clock_offset_s: Mapping[str, float]
     clock_sigma_s: Mapping[str, float]
@@ -78,7 +78,7 @@ class MetricSolution:
     rotation_sigma_rad: float
     translation_sigma_m: float
     drift: float  # how many times the map's own sigmas had to be taken
-    misfit: float  # excess of the joint cost over its expectation, in its standard deviations, at that drift
+    misfit_sigmas: float  # excess of the joint cost over its expectation, in its standard deviations, at that drift
     exports: Mapping[str, str] = field(default_factory=dict)  # the graph as other programs read it, by file name
 
 

@@ -209,7 +209,7 @@ def _measurements(rows: Sequence[FrameRow], measured: Measured) -> list[Reason]:
         return []
     text = (
         f"Map and measurements disagree: {100 * measured.rejected_share:.0f} % of the measurements were outvoted, and "
-        f"the rest are {measured.main.misfit:.1f} standard deviations off. Check their sigmas, clock and axes."
+        f"the rest are {measured.main.misfit_sigmas:.1f} standard deviations off. Check their sigmas, clock and axes."
     )
     return [_about_all(rows, ReasonCode.MEASUREMENTS, Level.USABLE, text)]
 

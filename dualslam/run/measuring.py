@@ -33,6 +33,11 @@ MAX_METRIC_SIGMA = 0.5
 MAX_MISFIT = 5.0
 """Standard deviations of the joint cost over its expectation, at the largest drift: measurements and map disagree."""
 MANY_REJECTED = 0.2
+REPORTED = (
+    *("used", "rejected", "outside", "repeated", "normalised_rms", "clock_offset_s", "clock_sigma_s"),
+    *("metres_per_unit", "scale_sigma", "rotation_sigma_rad", "translation_sigma_m", "drift", "misfit_sigmas"),
+)
+"""Fields of the solution that ``summary.json`` has."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +54,7 @@ class Measured:
     @property
     def is_consistent(self) -> bool:
         """Whether map and measurements agree within their sigmas."""
-        return self.main.misfit <= MAX_MISFIT
+        return self.main.misfit_sigmas <= MAX_MISFIT
 
     @property
     def rejected_share(self) -> float:
@@ -70,21 +75,7 @@ class Measured:
 
     def summary(self) -> dict[str, Any]:
         """Return what ``summary.json`` holds."""
-        s = self.main
-        return {
-            "used": dict(s.used),
-            "rejected": dict(s.rejected),
-            "outside": dict(s.outside),
-            "repeated": s.repeated,
-            "normalised_rms": dict(s.normalised),
-            "clock_offset_s": dict(s.clock_offset_s),
-            "clock_sigma_s": dict(s.clock_sigma_s),
-            "metres_per_unit": s.metres_per_unit,
-            "scale_sigma": s.scale_sigma,
-            "rotation_sigma_rad": s.rotation_sigma_rad,
-            "translation_sigma_m": s.translation_sigma_m,
-            "drift": s.drift,
-            "misfit_sigmas": s.misfit,
+        return {name: getattr(self.main, name) for name in REPORTED} | {
             "frames": len(self.frames),
             "submaps_placed_by_measurements_alone": self.placed_alone,
             "joins_undone": [[link.a, link.b] for link in self.undone],
@@ -127,67 +118,51 @@ def measure(
     Raises `SolverError`.
     """
     undone: list[Link] = []
+    names, n_posed = ", ".join(s.name for s in sources), Counter(pose.submap_id for pose in poses.values())
     while True:
         metric = MetricMap.of(atlas, list(poses.values()), main, parts.covariances)
         if metric is None:
-            raise InputError(f"{', '.join(s.name for s in sources)}: no map to measure: too few frames have poses.")
+            raise InputError(f"{names}: no map to measure: too few frames have poses.")
         solution = parts.solve(metric.problem, sources, None)
         refuted = metric.refuted(solution)
         if not refuted:
             break
         undone += refuted
         atlas.links = [replace(link, rejected=True) if link in refuted else link for link in atlas.links]
-        n_posed = Counter(pose.submap_id for pose in poses.values())
         left = [c for c in atlas.components() if set(c) <= set(main)]
         main = max(left, key=lambda c: sum(n_posed[m] for m in c))
     if solution.scale_sigma > MAX_METRIC_SIGMA:
         raise InputError(
-            f"{', '.join(s.name for s in sources)}: these measurements do not fix the scale of the map; "
-            "add positions, distances or odometry."
+            f"{names}: these measurements do not fix the scale of the map; add positions, distances or odometry."
         )
-    frames, covariance = [metric.placed(solution)], [metric.covariances(solution)]
-    alone: list[int] = []
+    clocks = {s.name: solution.clock_offset_s.get(s.name, 0.0) for s in sources}
+    placed, alone = [(metric, solution)], list[int]()
     for component in atlas.components():
         if component == main:
             continue
-        placed = _place_alone(atlas, poses, component, sources, parts, solution.clock_offset_s)
-        if placed is not None:
-            frames.append(placed[0])
-            covariance.append(placed[1])
+        try:
+            other = MetricMap.of(atlas, list(poses.values()), component, parts.covariances)
+            of_other = parts.solve(other.problem, sources, clocks) if other else None
+        except (InputError, SolverError) as error:
+            log.info("submaps %s are not placed by measurements: %s", component, error)
+            continue
+        if (
+            other
+            and of_other
+            and of_other.scale_sigma <= MAX_SCALE_SIGMA
+            and of_other.rotation_sigma_rad <= MAX_TURN_RAD
+        ):
+            placed.append((other, of_other))
             alone += component
     origin = next((s.origin for s in sources if s.origin is not None), None)
-    return Measured(concatenate(frames), np.concatenate(covariance), solution, alone, undone, origin)
-
-
-def _place_alone(
-    atlas: Atlas,
-    poses: Mapping[int, FramePose],
-    component: list[int],
-    sources: Sequence[MeasurementSource],
-    parts: MetricParts,
-    offsets_s: Mapping[str, float],
-) -> tuple[Trajectory, FloatArray] | None:
-    """Place a linked set that the main map is not joined with; None where measurements do not fix it."""
-    clocks = {s.name: offsets_s.get(s.name, 0.0) for s in sources}
-    try:
-        metric = MetricMap.of(atlas, list(poses.values()), component, parts.covariances)
-        if metric is None:
-            return None
-        solution = parts.solve(metric.problem, sources, clocks)
-    except (InputError, SolverError) as error:
-        log.info("submaps %s are not placed by measurements: %s", component, error)
-        return None
-    if solution.scale_sigma > MAX_SCALE_SIGMA or solution.rotation_sigma_rad > MAX_TURN_RAD:
-        return None
-    return metric.placed(solution), metric.covariances(solution)
+    covariance = np.concatenate([m.covariances(s) for m, s in placed])
+    return Measured(concatenate([m.placed(s) for m, s in placed]), covariance, solution, alone, undone, origin)
 
 
 def write_measured(folder: Path, measured: Measured, index_of: Mapping[int, int]) -> None:
     """Write the metric files of a run folder; `index_of`: of a frame's number in the source, where it has one."""
     kept = np.array([i in index_of for i in measured.frames.index.tolist()], bool)
     frames = measured.frames.take(kept)
-    frames = Trajectory(
-        frames.timestamps_s, frames.T_world_cam, np.array([index_of[i] for i in frames.index.tolist()], np.int64)
-    )
+    frames = replace(frames, index=np.array([index_of[i] for i in frames.index.tolist()], np.int64))
     write_metric(folder, frames, measured.covariance[kept], measured.main.exports, measured.origin)
     write_scale(folder, measured.main.metres_per_unit, measured.main.scale_sigma, "measurements")

@@ -133,7 +133,7 @@ def test_positions_bend_a_map_of_drifting_scale():
     solution = solve(problem, Receiver(seed=1).positions(truth))
     assert rmse(errors_m(problem, solution, truth)) < 0.8 < rigid
     assert solution.drift == 1.0
-    assert 0.8 < solution.normalised["position"] < 1.2
+    assert 0.8 < solution.normalised_rms["position"] < 1.2
     # The errors of the nodes are as large as the graph says.
     C = solution.covariance[:, 3:6, 3:6] * sim3.scale(solution.S_metric_node)[:, None, None] ** 2
     R = sim3.rotation(solution.S_metric_node)
@@ -279,7 +279,7 @@ def test_a_gyroscope_is_turned_into_place_and_its_bias_found():
     solution = solve(problem, Receiver(seed=8).positions(moving), gyroscope.rates(moving))
     assert solution.used["rotation_rate"] > 40
     assert not solution.rejected.get("rotation_rate")
-    assert solution.normalised["rotation_rate"] < 1.0  # the map is looser: it follows
+    assert solution.normalised_rms["rotation_rate"] < 1.0  # the map is looser: it follows
     assert rmse(errors_m(problem, solution, moving)) < 1.0
 
 

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import numpy as np
 
+from dualslam.core.errors import InputError
+from dualslam.core.metric_problem import MeasurementRow
 from dualslam.core.types import FloatArray
+
+FIX = "fix"
+"""Kind of a row of time, latitude, longitude, height, horizontal and vertical sigma."""
+VERTICAL = 2.0
+"""A satellite receiver's height is about twice as uncertain as its place."""
 
 A_M, E2 = 6378137.0, 6.69437999014e-3
 """Semi-major axis and squared eccentricity of WGS 84."""
@@ -12,6 +22,19 @@ N_ROUNDS = 5
 """Of the iteration for the latitude: each gains three digits near the ground."""
 
 Geodetic = tuple[float, float, float]
+
+
+def required_sigma(sigma: float | None, where: object) -> float:
+    """Return a sigma that has to be given; raises `InputError` if it was not."""
+    if sigma is None or not sigma > 0:
+        raise InputError(f"{where} states no sigmas; give --sigma (metres of a position; rad/s, rad of an IMU).")
+    return sigma
+
+
+def fix_row(path: Path, t: float, llh: Sequence[float], sigma: float | None) -> MeasurementRow:
+    """Return the row of a receiver's position."""
+    s = required_sigma(sigma, path)
+    return MeasurementRow(FIX, (t, *llh, s, VERTICAL * s), str(path))
 
 
 def to_enu(llh: FloatArray, origin: Geodetic) -> FloatArray:
