@@ -88,7 +88,10 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 def _build_parser() -> _Parser:
     parser = _Parser(
-        prog="dualslam", description="Monocular SLAM that recovers from tracking failure.", epilog=EXIT_STATUSES
+        prog="dualslam",
+        description="Monocular SLAM that recovers from tracking failure. "
+        "Begin with: dualslam run walk.mp4 --out runs/walk (your video), or: dualslam demo",
+        epilog=EXIT_STATUSES,
     )
     parser.add_argument("--version", action="version", version=f"dualslam {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
@@ -103,7 +106,7 @@ def _build_parser() -> _Parser:
 def _command(commands: Commands, name: str, help_text: str) -> tuple[_Parser, argparse._ArgumentGroup]:
     parser = commands.add_parser(name, help=help_text, description=help_text, allow_abbrev=False)
     parser.set_defaults(execute=_late(name))
-    talk = parser.add_argument_group("talk")
+    talk = parser.add_argument_group("messages")
     talk.add_argument("-q", "--quiet", action="store_true", help="print nothing but errors")
     talk.add_argument("-v", "--verbose", action="count", default=0, help="log what happens; twice: every detail")
     return parser, talk
